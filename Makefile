@@ -1,0 +1,39 @@
+# Each target builds its own .venv from nothing but python3 and pip.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml') pyproject.toml README.md
+
+.PHONY: demo test lint help clean
+
+help:
+	@echo "make demo   drive a simulated robot over three grounds, localise it twice, write demo-out/report.html"
+	@echo "make test   the whole test suite (set TERRAFUSION_DATA to a folder of field logs to include those)"
+	@echo "make lint   ruff, mypy and the import layers"
+
+demo: $(VENV)/installed
+	$(BIN)/terrafusion demo --out demo-out
+
+test: $(VENV)/installed-dev
+	$(BIN)/python -m pytest
+
+lint: $(VENV)/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/python -m mypy
+	$(BIN)/lint-imports
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+# Not editable on purpose: what is tested is what a wheel holds.
+$(VENV)/installed: $(BIN)/python $(SOURCES)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check .
+	@touch $@
+
+$(VENV)/installed-dev: $(BIN)/python $(SOURCES)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check '.[dev]'
+	@touch $@ $(VENV)/installed
+
+clean:
+	rm -rf $(VENV) build demo-out *.egg-info

@@ -1,0 +1,50 @@
+"""The one error type a user of terrafusion is meant to see."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class TerrafusionError(Exception):
+    """A known problem with an input or a request, told in one line.
+
+    The command line prints the message and leaves with status 1; nothing else
+    is caught there, so every other exception is a defect of this library.
+
+    Args:
+        what: what is wrong, with the offending value.
+        file: the file (or folder, or catalogue name) it was found in.
+        channel: the channel, topic, table or key inside that file.
+        time_s: seconds from the start of the recording where it was found.
+        remedy: what the user can do about it.
+    """
+
+    def __init__(
+        self,
+        what: str,
+        *,
+        file: str | Path | None = None,
+        channel: str | None = None,
+        time_s: float | None = None,
+        remedy: str | None = None,
+    ) -> None:
+        self.what = what
+        self.file = None if file is None else str(file)
+        self.channel = channel
+        self.time_s = time_s
+        self.remedy = remedy
+        where = [part for part in (self.file, channel) if part]
+        if time_s is not None:
+            where.append(f"t = {time_s:.3f} s")
+        message = f"{', '.join(where)}: {what}" if where else what
+        if remedy:
+            message = f"{message}; {remedy}"
+        super().__init__(" ".join(message.split()))
+
+
+class DataError(TerrafusionError):
+    """A recording, or a part of it, that cannot be read or used."""
+
+
+class ConfigError(TerrafusionError):
+    """A parameter file with an unknown key, a wrong unit or a value out of range."""

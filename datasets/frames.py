@@ -1,0 +1,105 @@
+"""Frames, rotations and geodesy, stated once for the whole library.
+
+World frame: local east-north-up (ENU) at a datum on WGS-84 (REP-105 `map`).
+Body frame: x forward, y left, z up (REP-103 `base_link`). Yaw is zero facing
+east and grows to the left. `R_world_body` takes body vectors to the world.
+Quaternions are (x, y, z, w). Tangent order of pose covariances: GTSAM's Pose3
+has rotation first and is expressed in the body; ROS has translation first and
+is expressed in the parent frame. `gtsam_to_ros_covariance` is the one bridge.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+GRAVITY_MPS2 = 9.80665
+"""Standard gravity (3rd CGPM, 1901), m/s2."""
+
+
+def wrap_angle(angle_rad: ArrayLike) -> Array:
+    """The same angles in [-pi, pi)."""
+    return np.asarray((np.asarray(angle_rad, dtype=float) + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def quaternion_to_matrix(q_xyzw: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4); norms are divided out."""
+    q = np.asarray(q_xyzw, dtype=float)
+    x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def matrix_to_quaternion(R: ArrayLike) -> Array:
+    """Quaternions (..., 4) with w >= 0 of rotation matrices (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
+    matrices = np.asarray(R, dtype=float)
+    flat = Rotation.from_matrix(matrices.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.asarray(flat).reshape(*matrices.shape[:-2], 4)
+
+
+def rpy_to_quaternion(rpy_rad: ArrayLike) -> Array:
+    """Quaternions (..., 4) of fixed-axis roll, pitch, yaw (REP-103: R = Rz Ry Rx), rad."""
+    half = np.asarray(rpy_rad, dtype=float) / 2.0
+    cr, cp, cy = np.moveaxis(np.cos(half), -1, 0)
+    sr, sp, sy = np.moveaxis(np.sin(half), -1, 0)
+    return np.stack(
+        [
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+            cr * cp * cy + sr * sp * sy,
+        ],
+        axis=-1,
+    )
+
+
+def yaw_of(q_xyzw: ArrayLike) -> Array:
+    """Yaw angles (...), rad, of quaternions (..., 4)."""
+    x, y, z, w = np.moveaxis(np.asarray(q_xyzw, dtype=float), -1, 0)
+    return np.asarray(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)))
+
+
+def geodetic_to_enu(lat_lon_height: ArrayLike, datum: ArrayLike) -> Array:
+    """ENU positions (N, 3), m, of WGS-84 latitude, longitude (deg) and ellipsoidal height (m), shape (N, 3)."""
+    import pymap3d
+
+    llh = np.atleast_2d(np.asarray(lat_lon_height, dtype=float))
+    lat0, lon0, height0 = (float(x) for x in np.asarray(datum, dtype=float))
+    return np.stack(pymap3d.geodetic2enu(llh[:, 0], llh[:, 1], llh[:, 2], lat0, lon0, height0), axis=-1)
+
+
+def enu_to_geodetic(enu_m: ArrayLike, datum: ArrayLike) -> Array:
+    """WGS-84 latitude, longitude (deg) and height (m), (N, 3), of ENU positions (N, 3) about `datum`."""
+    import pymap3d
+
+    enu = np.atleast_2d(np.asarray(enu_m, dtype=float))
+    lat0, lon0, height0 = (float(x) for x in np.asarray(datum, dtype=float))
+    return np.stack(pymap3d.enu2geodetic(enu[:, 0], enu[:, 1], enu[:, 2], lat0, lon0, height0), axis=-1)
+
+
+def gtsam_to_ros_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> Array:
+    """Pose covariances (..., 6, 6), rotation first in the body -> translation first in the world."""
+    P = np.asarray(covariance, dtype=float)
+    R = np.asarray(R_world_body, dtype=float)
+    J = np.zeros(P.shape)
+    J[..., :3, 3:] = R
+    J[..., 3:, :3] = R
+    return np.asarray(J @ P @ np.swapaxes(J, -1, -2))
+
+
+def ros_to_gtsam_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> Array:
+    """The inverse of `gtsam_to_ros_covariance`."""
+    P = np.asarray(covariance, dtype=float)
+    R_body_world = np.swapaxes(np.asarray(R_world_body, dtype=float), -1, -2)
+    J = np.zeros(P.shape)
+    J[..., :3, 3:] = R_body_world
+    J[..., 3:, :3] = R_body_world
+    return np.asarray(J @ P @ np.swapaxes(J, -1, -2))

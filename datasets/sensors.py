@@ -1,0 +1,99 @@
+"""What is known of a robot's sensors: where they sit and how good they are.
+
+Positions are in the body frame (`base_link`: x forward, y left, z up), metres.
+Noise densities follow the Allan-variance convention (IEEE Std 952-1997): the
+standard deviation of a rate averaged over tau is density / sqrt(tau).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.config import Position, Quantity
+
+AXES = {
+    "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0),
+    "+y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class ImuSpec:
+    """Inertial measurement unit: mounting and noise.
+
+    `axes` lists the sensor axes that point along body x, y and z; a husky whose
+    body x is minus the sensor's z reads `["-z", "-x", "+y"]`. It is applied only
+    to messages whose `frame_id` is the one given here.
+    """
+
+    rate_hz: Annotated[float, Quantity("Hz", 1.0, 5000.0)]
+    gyro_noise_radps_sqrthz: Annotated[float, Quantity("rad/s/sqrt(Hz)", 1e-7, 1.0)]
+    gyro_bias_walk_radps2_sqrthz: Annotated[float, Quantity("rad/s2/sqrt(Hz)", 1e-9, 0.1)]
+    gyro_bias_sigma_radps: Annotated[float, Quantity("rad/s", 0.0, 1.0)]
+    accel_noise_mps2_sqrthz: Annotated[float, Quantity("m/s2/sqrt(Hz)", 1e-6, 10.0)]
+    accel_bias_walk_mps3_sqrthz: Annotated[float, Quantity("m/s3/sqrt(Hz)", 1e-8, 1.0)]
+    accel_bias_sigma_mps2: Annotated[float, Quantity("m/s2", 0.0, 5.0)]
+    position_m: Position
+    axes: tuple[str, ...] = ("+x", "+y", "+z")
+    frame_id: str = "imu_link"
+
+    def __post_init__(self) -> None:
+        known = all(axis in AXES for axis in self.axes)
+        if len(self.axes) != 3 or not known or np.linalg.det(self.base_from_sensor()) < 0.5:
+            raise ValueError(
+                f"axes {list(self.axes)} are not a rotation; give three of {', '.join(AXES)} that make a "
+                "right-handed frame"
+            )
+
+    def base_from_sensor(self) -> NDArray[np.float64]:
+        """Rotation matrix (3, 3): vector in the body frame = matrix @ vector in the sensor frame."""
+        return np.array([AXES[axis] for axis in self.axes])
+
+
+@dataclass(frozen=True)
+class WheelSpec:
+    """Wheel encoders as the log has them: rate and resolution at the wheel."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.5, 5000.0)]
+    quantum_rad: Annotated[float, Quantity("rad", 0.0, 1.0)]
+    speed_sigma_mps: Annotated[float, Quantity("m/s", 0.0, 1.0)]
+
+
+@dataclass(frozen=True)
+class GnssSpec:
+    """GNSS receiver: antenna position and accuracy (1 sigma)."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.05, 100.0)]
+    sigma_horizontal_m: Annotated[float, Quantity("m", 1e-3, 100.0)]
+    sigma_vertical_m: Annotated[float, Quantity("m", 1e-3, 200.0)]
+    sigma_velocity_mps: Annotated[float, Quantity("m/s", 1e-3, 10.0)]
+    correlation_time_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
+    antenna_m: Position
+
+
+@dataclass(frozen=True)
+class SensorSuite:
+    """All sensors of a robot."""
+
+    imu: ImuSpec
+    wheels: WheelSpec
+    gnss: GnssSpec
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The geometry a reader or an estimator needs to interpret a recording.
+
+    `track_m` is the track the log's wheel odometry was made with: a body twist
+    (v, yaw rate) stands for the side speeds v -+ yaw rate * track / 2.
+    """
+
+    wheel_radius_m: float
+    track_m: float
+    sensors: SensorSuite
+    topics: dict[str, str] = field(default_factory=dict)
