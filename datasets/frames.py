@@ -68,7 +68,7 @@ def yaw_of(q_xyzw: ArrayLike) -> Array:
 
 
 def geodetic_to_enu(lat_lon_height: ArrayLike, datum: ArrayLike) -> Array:
-    """ENU positions (N, 3), m, of WGS-84 latitude, longitude (deg) and ellipsoidal height (m), shape (N, 3)."""
+    """ENU positions (N, 3), m, of WGS-84 (latitude deg, longitude deg, ellipsoidal height m), (N, 3)."""
     import pymap3d
 
     llh = np.atleast_2d(np.asarray(lat_lon_height, dtype=float))

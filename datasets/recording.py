@@ -147,7 +147,7 @@ class Wheels(Channel):
         return len(self.names) > 1
 
     def side_speeds_mps(self, wheel_radius_m: float) -> Array:
-        """Circumferential speed (N, 2) of the left and right side, m/s; both equal where sides are unknown."""
+        """Circumferential speed (N, 2) of left and right, m/s; both equal where sides are unknown."""
         metres = self.speed * (wheel_radius_m if self.unit == "radps" else 1.0)
         if len(self.names) == 1:
             return np.repeat(metres, 2, axis=1)

@@ -1,0 +1,41 @@
+"""`terrafusion`: the command line. Each command's body lives in a file of its own.
+
+Heavy packages are imported inside the command that needs them, so that
+`terrafusion --help` answers at once.
+"""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.fusion.cli import convert, demo, inspect, replay, simulate
+
+app = typer.Typer(
+    name="terrafusion",
+    help="Terrain-aware localisation of ground robots, and the honest comparison of a robot with its twin.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    add_completion=False,
+)
+app.command("demo")(demo.demo)
+app.command("inspect")(inspect.inspect)
+app.command("convert")(convert.convert)
+app.command("simulate")(simulate.simulate)
+app.command("replay")(replay.replay)
+
+
+def main() -> None:
+    """Run the command line: exit status 0 done, 1 a known error in one line, 2 wrong usage."""
+    try:
+        app()
+    except TerrafusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("error: interrupted; results already written are kept", file=sys.stderr)
+        sys.exit(1)
+    except BrokenPipeError:
+        sys.exit(1)
