@@ -1,0 +1,140 @@
+"""The weighting policy: terrain class -> noise of each sensor.
+
+A policy is one YAML file made by `terrafusion policy fit` from twin drives,
+with the hash of its inputs. Where the class is uncertain, the noise is the
+moment match of the mixture: its variance includes the spread of the class
+means (law of total variance), so doubt about the ground widens the weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from terrafusion.datasets.config import Quantity, checked_number, read_yaml
+from terrafusion.datasets.errors import ConfigError
+
+SCHEMA = "terrafusion.policy/1"
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of the sensors on one ground (1 sigma).
+
+    Slip is i = 1 - v / (omega R), positive when driving wheels outrun the
+    robot. It is modelled as an Ornstein-Uhlenbeck process with the stationary
+    moments and the correlation time given here. Side-slip is the lateral over
+    the forward displacement. The inflations multiply the standard deviations
+    of the data sheet (IMU) or of the receiver's own report (GNSS).
+    """
+
+    slip_mean: Annotated[float, Quantity("", -1.0, 1.0)]
+    slip_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
+    slip_time_s: Annotated[float, Quantity("s", 0.05, 600.0)]
+    wheel_sigma_mps: Annotated[float, Quantity("m/s", 1e-4, 2.0)]
+    side_slip_sigma: Annotated[float, Quantity("", 1e-4, 2.0)]
+    gyro_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
+    accel_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
+    gnss_inflation: Annotated[float, Quantity("", 1.0, 100.0)]
+
+
+_FIELDS = tuple(f.name for f in dataclasses.fields(SensorNoise))
+_MEAN_OF = {"slip_sigma": "slip_mean"}
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Noise rows of the terrain classes, and the one row that fixed weighting uses.
+
+    Attributes:
+        classes: class name -> row; "unknown" is one of them.
+        fixed: the row fitted to all grounds together, on the same training drives.
+        inputs_sha256: hash of what the rows were fitted to.
+        name: file name, for messages and reports.
+    """
+
+    classes: dict[str, SensorNoise]
+    fixed: SensorNoise
+    inputs_sha256: str
+    name: str = "policy"
+
+    def names(self) -> tuple[str, ...]:
+        """Class names in the file's order; probabilities are given in this order."""
+        return tuple(self.classes)
+
+    @functools.cached_property
+    def _table(self) -> np.ndarray:
+        return np.array([dataclasses.astuple(row) for row in self.classes.values()])
+
+    def blend(self, probabilities: ArrayLike) -> SensorNoise:
+        """The moment-matched row for class probabilities (k,) that sum to one."""
+        p = np.asarray(probabilities, dtype=float)
+        table = self._table
+        mean = p @ table
+        moments = dict(zip(_FIELDS, mean.tolist(), strict=True))
+        square = p @ (table * table)
+        for i, field in enumerate(_FIELDS):
+            if field == "slip_mean" or field == "slip_time_s":
+                continue
+            spread = 0.0
+            if field in _MEAN_OF:
+                j = _FIELDS.index(_MEAN_OF[field])
+                spread = float(p @ (table[:, j] - mean[j]) ** 2)
+            moments[field] = float(np.sqrt(square[i] + spread))
+        return SensorNoise(**moments)
+
+
+def load_policy(path: Path | None = None) -> Policy:
+    """The policy file `path`, or the one shipped with the library.
+
+    Raises:
+        ConfigError: unknown or missing key, wrong type, out of range, no `unknown` class.
+    """
+    if path is None:
+        with resources.as_file(resources.files("terrafusion.fusion") / "policy.yaml") as shipped:
+            return _parse(read_yaml(shipped), shipped)
+    return _parse(read_yaml(path), path)
+
+
+def _parse(content: dict, file: Path) -> Policy:
+    allowed = {"schema", "inputs_sha256", "made_by", "classes", "fixed"}
+    for key in content:
+        if key not in allowed:
+            raise ConfigError(
+                f"unknown key '{key}'", file=file, remedy=f"known: {', '.join(sorted(allowed))}"
+            )
+    if content.get("schema") != SCHEMA:
+        raise ConfigError(
+            f"schema is '{content.get('schema')}'", file=file, remedy=f"this version reads {SCHEMA}"
+        )
+    classes = content.get("classes")
+    if not isinstance(classes, dict) or "unknown" not in classes:
+        raise ConfigError("'classes' must map class names to rows and hold 'unknown'", file=file)
+    rows = {name: _row(row, file, f"classes.{name}") for name, row in classes.items()}
+    fixed = _row(content.get("fixed"), file, "fixed")
+    return Policy(rows, fixed, str(content.get("inputs_sha256", "")), name=file.name)
+
+
+def _row(raw: object, file: Path, key: str) -> SensorNoise:
+    if not isinstance(raw, dict) or set(raw) != set(_FIELDS):
+        raise ConfigError(f"'{key}' must have exactly the keys {', '.join(_FIELDS)}", file=file)
+    values = {
+        name: checked_number(raw[name], quantity, file=file, key=f"{key}.{name}")
+        for name, quantity in _RANGES.items()
+    }
+    return SensorNoise(**values)  # type: ignore[arg-type]
+
+
+def _ranges() -> dict[str, Quantity]:
+    hints = get_type_hints(SensorNoise, include_extras=True)
+    return {name: hints[name].__metadata__[0] for name in _FIELDS}
+
+
+_RANGES = _ranges()
