@@ -1,0 +1,37 @@
+"""The parameter files that come with the library, found by name."""
+
+from __future__ import annotations
+
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.config import read_yaml
+from terrafusion.datasets.errors import ConfigError
+
+
+def known_names(folder: str) -> tuple[str, ...]:
+    """Names (file stems) of the YAML files in `twin/params/<folder>`, sorted."""
+    root = resources.files("terrafusion.twin.params") / folder
+    return tuple(
+        sorted(entry.name.removesuffix(".yaml") for entry in root.iterdir() if entry.name.endswith(".yaml"))
+    )
+
+
+def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dict[str, Any], str]:
+    """Content of a library file by name, or of the file at a path, and what to call it in messages.
+
+    Raises:
+        ConfigError: neither a known name (they are listed) nor an existing file.
+    """
+    text = str(name_or_path)
+    if text in known_names(folder):
+        with resources.as_file(resources.files("terrafusion.twin.params") / folder / f"{text}.yaml") as path:
+            return read_yaml(path), f"{folder}/{text}.yaml"
+    path = Path(text).expanduser()
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return read_yaml(path), text
+    raise ConfigError(
+        f"unknown {kind} '{text}'",
+        remedy=f"known are {', '.join(known_names(folder))}; or give the path of a .yaml file",
+    )

@@ -1,0 +1,156 @@
+"""Vehicle parameters: what the twin drives and what the estimator knows of a robot.
+
+A vehicle is a YAML file in `twin/params/vehicles` (or the user's own): every
+number stands as `{value, source}` under a key that carries its unit.
+Body frame: x forward, y left, z up; its origin lies in the ground plane,
+midway between the four contact points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from terrafusion.datasets.config import Quantity, structure
+from terrafusion.datasets.recording import Overrides
+from terrafusion.datasets.sensors import Rig, SensorSuite
+from terrafusion.twin.library import known_names, read_named
+
+
+@dataclass(frozen=True)
+class Body:
+    """Rigid body on four wheels; the centre of gravity is given from the body origin."""
+
+    mass_kg: Annotated[float, Quantity("kg", 1.0, 5000.0)]
+    payload_max_kg: Annotated[float, Quantity("kg", 0.0, 5000.0)]
+    yaw_inertia_kgm2: Annotated[float, Quantity("kg m2", 0.01, 20000.0)]
+    wheelbase_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+    track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+    cg_forward_m: Annotated[float, Quantity("m", -1.0, 1.0)]
+    cg_left_m: Annotated[float, Quantity("m", -1.0, 1.0)]
+    cg_height_m: Annotated[float, Quantity("m", 0.0, 2.0)]
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """One of the four equal wheels; `inertia_kgm2` includes the reflected rotor."""
+
+    radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
+    width_m: Annotated[float, Quantity("m", 0.005, 1.0)]
+    inertia_kgm2: Annotated[float, Quantity("kg m2", 1e-5, 100.0)]
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One motor and gearbox a wheel, its speed loop, and the command limits.
+
+    Torque-speed line: stall torque at rest falling to zero at the no-load
+    speed; the current limit caps it at `torque_limit_nm` (motor shaft).
+    """
+
+    gear_ratio: Annotated[float, Quantity("", 1.0, 1000.0)]
+    gear_efficiency: Annotated[float, Quantity("", 0.1, 1.0)]
+    no_load_speed_radps: Annotated[float, Quantity("rad/s", 10.0, 5000.0)]
+    stall_torque_nm: Annotated[float, Quantity("N m", 0.001, 500.0)]
+    torque_limit_nm: Annotated[float, Quantity("N m", 0.001, 500.0)]
+    supply_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
+    speed_loop_p_nms: Annotated[float, Quantity("N m s/rad at the wheel", 0.01, 10000.0)]
+    speed_loop_i_nm: Annotated[float, Quantity("N m/rad at the wheel", 0.0, 10000.0)]
+    lag_s: Annotated[float, Quantity("s", 0.001, 1.0)]
+    max_speed_mps: Annotated[float, Quantity("m/s", 0.05, 50.0)]
+    max_accel_mps2: Annotated[float, Quantity("m/s2", 0.05, 50.0)]
+    max_yaw_accel_radps2: Annotated[float, Quantity("rad/s2", 0.05, 50.0)]
+
+    def torque_constant_nm_per_a(self) -> float:
+        """Motor constant, N m/A, from supply voltage and no-load speed (ideal DC motor: k_t = k_e)."""
+        return self.supply_v / self.no_load_speed_radps
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Geometry the robot's own wheel odometry assumes (it need not be the true one)."""
+
+    wheel_radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
+    track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+
+
+@dataclass(frozen=True)
+class SensorRealism:
+    """What the twin adds to the data-sheet noise of `SensorSuite`.
+
+    `vibration_gain` scales the soil's vibration for the IMU's mounting.
+    A GNSS position error is white for `gnss_white_share` of its variance and
+    Gauss-Markov for the rest; `gnss_single_sigma_m` and
+    `gnss_single_correlation_s` hold for stand-alone fixes, the numbers of
+    `GnssSpec` for the receiver's best mode.
+    """
+
+    vibration_gain: Annotated[float, Quantity("", 0.0, 100.0)]
+    gnss_white_share: Annotated[float, Quantity("", 0.0, 1.0)]
+    gnss_single_sigma_m: Annotated[float, Quantity("m", 0.01, 100.0)]
+    gnss_single_correlation_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
+    gnss_latency_s: Annotated[float, Quantity("s", 0.0, 10.0)]
+
+
+@dataclass(frozen=True)
+class VehicleParams:
+    """A four-wheel differential-drive robot: body, drive, odometry and sensors."""
+
+    name: str
+    description: str
+    body: Body
+    wheel: Wheel
+    drive: Drive
+    odometry: Odometry
+    sensors: SensorSuite
+    realism: SensorRealism
+    topics: dict[str, str] = field(default_factory=dict)
+
+    def rig(self) -> Rig:
+        """What a reader or an estimator needs: odometry geometry, sensors and topic names."""
+        return Rig(
+            wheel_radius_m=self.odometry.wheel_radius_m,
+            track_m=self.odometry.track_m,
+            sensors=self.sensors,
+            topics=dict(self.topics),
+        )
+
+
+def vehicle_names() -> tuple[str, ...]:
+    """Names of the vehicles that come with the library."""
+    return known_names("vehicles")
+
+
+def load_vehicle(name_or_path: str | Path) -> VehicleParams:
+    """A vehicle by its name in the library, or from a YAML file.
+
+    Raises:
+        ConfigError: unknown name (the known ones are listed), or a file that
+            does not keep to the parameters' names, units and ranges.
+    """
+    raw, file = read_named("vehicles", name_or_path, kind="vehicle")
+    return structure(VehicleParams, raw, file=file)
+
+
+def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParams:
+    """The vehicle with what a log says of it: wheel radius, track, antenna and IMU position.
+
+    Radius and track replace the odometry's numbers and the body's: the log
+    knows one geometry only.
+    """
+    body, wheel, odometry, sensors = vehicle.body, vehicle.wheel, vehicle.odometry, vehicle.sensors
+    if overrides.wheel_radius_m is not None:
+        wheel = dataclasses.replace(wheel, radius_m=overrides.wheel_radius_m)
+        odometry = dataclasses.replace(odometry, wheel_radius_m=overrides.wheel_radius_m)
+    if overrides.track_m is not None:
+        body = dataclasses.replace(body, track_m=overrides.track_m)
+        odometry = dataclasses.replace(odometry, track_m=overrides.track_m)
+    if overrides.antenna_m is not None:
+        gnss = dataclasses.replace(sensors.gnss, antenna_m=overrides.antenna_m)
+        sensors = dataclasses.replace(sensors, gnss=gnss)
+    if overrides.imu_m is not None:
+        imu = dataclasses.replace(sensors.imu, position_m=overrides.imu_m)
+        sensors = dataclasses.replace(sensors, imu=imu)
+    return dataclasses.replace(vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors)
