@@ -115,7 +115,7 @@ def _write_meta(recording: Recording, path: Path) -> None:
         "antenna_m": overrides.antenna_m and [float(x) for x in overrides.antenna_m],
         "imu_m": overrides.imu_m and [float(x) for x in overrides.imu_m],
         "datum": recording.datum and [float(x) for x in recording.datum],
-        "truth_channels": list(recording.truth_channels) if recording.truth is not None else None,
+        "truth_channels": list(recording.truth_channels) or None if recording.truth is not None else None,
     }
     if recording.truth is not None and recording.truth_frame != "base":
         meta["truth_frame"] = recording.truth_frame

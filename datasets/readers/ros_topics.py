@@ -1,0 +1,200 @@
+"""Which topic of a bag becomes which channel: by type, by name, or as the user says."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from terrafusion.datasets.errors import DataError
+
+IMU = "sensor_msgs/msg/Imu"
+JOINTS = "sensor_msgs/msg/JointState"
+FIX = "sensor_msgs/msg/NavSatFix"
+ODOMETRY = "nav_msgs/msg/Odometry"
+TWIST = "geometry_msgs/msg/Twist"
+TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
+TWIST_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
+POSE = "geometry_msgs/msg/PoseStamped"
+POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+STRING = "std_msgs/msg/String"
+
+TYPES: dict[str, tuple[str, ...]] = {
+    "imu": (IMU,),
+    "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED),
+    "gnss": (FIX,),
+    "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED),
+    "command": (TWIST_STAMPED, TWIST),
+    "truth": (ODOMETRY, POSE_COVARIANCE, POSE),
+    "terrain": (STRING,),
+    "datum": (FIX,),
+}
+"""Message types of each channel, the more telling ones first."""
+
+ALIASES = {
+    "odom": "wheels",
+    "odometry": "wheels",
+    "joint_states": "wheels",
+    "fix": "gnss",
+    "gps": "gnss",
+    "navsat": "gnss",
+    "cmd_vel": "command",
+    "ground_truth": "truth",
+}
+JOINT_PREFIX = "joint."
+"""`joint.front_left` names the joint of that wheel inside a JointState."""
+
+_TRUTH = re.compile(r"(^|[/_])(ground_?truth|truth|gt)([/_]|$)", re.IGNORECASE)
+_FUSED = re.compile(
+    r"filter|fused|ekf|ukf|slam|amcl|map|visual|vio|camera|lidar|laser|icp|gps|gnss|estimate|imu",
+    re.IGNORECASE,
+)
+_COMMAND = re.compile(r"cmd|command", re.IGNORECASE)
+_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|odom|joint_states", re.IGNORECASE)
+_GNSS_VELOCITY = re.compile(r"(fix|gps|gnss|navsat).*vel|vel.*(fix|gps|gnss|navsat)", re.IGNORECASE)
+_TERRAIN = re.compile(r"terrain|ground_class|surface", re.IGNORECASE)
+_DATUM = re.compile(r"(^|/)datum$", re.IGNORECASE)
+_RAW = re.compile(r"raw", re.IGNORECASE)
+_PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|joint_states", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of the bag: name, normalised type, number of messages."""
+
+    name: str
+    msgtype: str
+    count: int
+
+
+def choose_topics(
+    bag: list[Topic],
+    *,
+    file: Path,
+    user: Mapping[str, str] | None = None,
+    usual: Mapping[str, str] | None = None,
+    is_wheel_joints: Callable[[str], bool] = lambda topic: True,
+) -> tuple[dict[str, Topic], list[str]]:
+    """The topic of each channel, and notes telling what was taken and what was left.
+
+    The user's word goes first and must hold; then the vehicle's usual topics where the bag has
+    them; then by type. Among several of a type: the more telling type, then the name (wheel
+    controllers before others, raw data last), then the most messages, then the alphabet. A
+    topic that looks like a fused estimate is never taken for a sensor by itself.
+
+    Args:
+        bag: topics with at least one message.
+        user: channel -> topic that the user asks for.
+        usual: channel -> topic that the vehicle file names.
+        is_wheel_joints: whether a JointState topic holds wheels.
+
+    Raises:
+        DataError: an unknown channel, a topic that is not in the bag or has an unfit type.
+    """
+    chosen: dict[str, Topic] = {}
+    notes: list[str] = []
+    for kind, name in _wanted(user or {}, file).items():
+        chosen[kind] = _asked_for(bag, kind, name, file)
+    for kind, name in _wanted(usual or {}, file).items():
+        fits = [t for t in bag if t.name == name and t.msgtype in TYPES[kind]]
+        if kind not in chosen and fits:
+            chosen[kind] = fits[0]
+    for kind in TYPES:
+        taken = {t.name for k, t in chosen.items() if k != kind}
+        found = [t for t in bag if t.msgtype in TYPES[kind] and t.name not in taken]
+        fits = [t for t in found if _fits(kind, t, is_wheel_joints)]
+        fits.sort(key=functools.partial(_rank, kind))
+        if kind not in chosen and fits:
+            chosen[kind] = fits[0]
+        left = [f"{t.name} ({t.count})" for t in fits if t.name != chosen[kind].name]
+        if left:
+            taken_one = chosen[kind]
+            notes.append(
+                f"{kind}: took {taken_one.name} ({taken_one.count} messages), left {', '.join(left)}"
+            )
+        elif kind not in chosen and kind in ("wheels", "gnss"):
+            fused = [t.name for t in found if _is_fused(kind, t)]
+            if fused:
+                notes.append(
+                    f"{kind}: {', '.join(fused)} looks like a fused estimate and was not taken; "
+                    f"ask for it with topic {kind}={fused[0]}"
+                )
+    return chosen, notes
+
+
+def joint_names(user: Mapping[str, str] | None) -> dict[str, str]:
+    """Wheel -> joint name from the entries `joint.<wheel>`."""
+    entries = (user or {}).items()
+    return {key.removeprefix(JOINT_PREFIX): name for key, name in entries if key.startswith(JOINT_PREFIX)}
+
+
+def _wanted(topics: Mapping[str, str], file: Path) -> dict[str, str]:
+    wanted = {}
+    for key, name in topics.items():
+        if key.startswith(JOINT_PREFIX):
+            continue
+        kind = ALIASES.get(key, key)
+        if kind not in TYPES:
+            close = difflib.get_close_matches(key, [*TYPES, *ALIASES], n=1)
+            meant = f"did you mean '{close[0]}'? " if close else ""
+            raise DataError(
+                f"'{key}' is not a channel that a topic can be given for",
+                file=file,
+                remedy=f"{meant}known: {', '.join(TYPES)}",
+            )
+        wanted[kind] = name
+    return wanted
+
+
+def _asked_for(bag: list[Topic], kind: str, name: str, file: Path) -> Topic:
+    named = [t for t in bag if t.name == name]
+    fits = [t for t in named if t.msgtype in TYPES[kind]]
+    if fits:
+        return fits[0]
+    if named:
+        what = f"topic {name} is of type {named[0].msgtype}, which cannot be {kind}"
+        remedy = f"types of {kind}: {', '.join(TYPES[kind])}"
+    else:
+        what = f"no topic {name} with messages in this bag"
+        remedy = f"topics here: {', '.join(f'{t.name} ({t.msgtype})' for t in bag) or 'none'}"
+    raise DataError(what, file=file, channel=kind, remedy=remedy)
+
+
+def _is_fused(kind: str, topic: Topic) -> bool:
+    if kind == "gnss":
+        return bool(re.search(r"filter|fused|ekf", topic.name, re.IGNORECASE))
+    return topic.msgtype != JOINTS and bool(_FUSED.search(topic.name)) and not _TRUTH.search(topic.name)
+
+
+def _fits(kind: str, topic: Topic, is_wheel_joints: Callable[[str], bool]) -> bool:
+    name = topic.name
+    if kind == "truth":
+        return bool(_TRUTH.search(name))
+    if kind == "datum":
+        return bool(_DATUM.search(name))
+    if kind == "terrain":
+        return bool(_TERRAIN.search(name))
+    if kind == "command":
+        return bool(_COMMAND.search(name))
+    if kind == "gnss_velocity":
+        return bool(_GNSS_VELOCITY.search(name))
+    if kind == "imu":
+        return True
+    if _TRUTH.search(name) or _is_fused(kind, topic):
+        return False
+    if kind == "gnss":
+        return not _DATUM.search(name)
+    if topic.msgtype == JOINTS:
+        return is_wheel_joints(name)
+    if topic.msgtype in (TWIST_STAMPED, TWIST_COVARIANCE):
+        return bool(_WHEEL.search(name)) and not _COMMAND.search(name)
+    return True
+
+
+def _rank(kind: str, topic: Topic) -> tuple[int, bool, bool, int, str]:
+    order = TYPES[kind].index(topic.msgtype)
+    unpreferred = kind == "wheels" and not _PREFERRED_WHEEL.search(topic.name)
+    return order, unpreferred, bool(_RAW.search(topic.name)), -topic.count, topic.name
