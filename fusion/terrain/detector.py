@@ -1,0 +1,97 @@
+"""`TerrainDetector`: windows in, class probabilities out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
+from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, extract
+from terrafusion.fusion.terrain.sequence import PatchFilter
+
+__all__ = ["TerrainDetector", "Window"]
+
+Array = NDArray[np.float64]
+
+EXTERNAL_TRUST = 0.3
+"""Exponent on the evidence of an external source: its frames repeat one another as windows do."""
+EXTERNAL_ERROR = 0.1
+"""Share of an external source's answers taken to be arbitrary, so that none of them rules a class out."""
+
+
+class TerrainDetector:
+    """Filters the terrain class along a drive.
+
+    Args:
+        model: densities and patch length; `TerrainModel.for_vehicle` adapts it to a robot.
+        classes: the classes to tell apart, `unknown` among them, in the order
+            of all probabilities given and taken (`Policy.names()`).
+
+    Raises:
+        ConfigError: `classes` has no `unknown`, or a name twice.
+    """
+
+    def __init__(self, model: TerrainModel, classes: tuple[str, ...]) -> None:
+        if UNKNOWN not in classes or len(set(classes)) != len(classes):
+            raise ConfigError(
+                f"terrain classes {', '.join(classes)} must differ and hold '{UNKNOWN}'",
+                remedy="mend the policy",
+            )
+        self.classes = classes
+        self._table = LikelihoodTable(model, classes)
+        self._filter = PatchFilter(len(classes), model.patch_length_m)
+
+    @property
+    def probabilities(self) -> Array:
+        """The present class probabilities (k,), a copy."""
+        return self._filter.probabilities.copy()
+
+    def update(self, window: Window) -> Array:
+        """Class probabilities (k,) after one more window; unchanged while the robot stands."""
+        speed = window.ground_speed_mps()
+        if speed > MIN_SPEED_MPS:
+            self._filter.predict(speed * max(window.dt_s, 0.0))
+            self._filter.update(self._table.evaluate(*extract(window)))
+        return self.probabilities
+
+    def fuse(self, probabilities: ArrayLike) -> Array:
+        """Class probabilities (k,) after an external source (a camera) gave its own (k,) for now.
+
+        They multiply in as evidence relative to equal probabilities, tempered
+        by `EXTERNAL_TRUST`, after a share `EXTERNAL_ERROR` of them is spread evenly.
+
+        Raises:
+            DataError: not k finite, non-negative numbers with a positive sum.
+        """
+        q = np.asarray(probabilities, dtype=float)
+        k = len(self.classes)
+        if q.shape != (k,) or not np.isfinite(q).all() or (q < 0.0).any() or not q.sum() > 0.0:
+            raise DataError(
+                f"{np.array2string(q, precision=3)} are not {k} class probabilities",
+                channel="terrain",
+                remedy=f"give one for each of {', '.join(self.classes)}",
+            )
+        q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
+        self._filter.update(EXTERNAL_TRUST * np.log(q))
+        return self.probabilities
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` needs to go on with the same bits: plain lists and texts."""
+        return {"classes": list(self.classes), "probabilities": self._filter.probabilities.tolist()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Take up a state of a detector with the same classes.
+
+        Raises:
+            DataError: the state is of other classes.
+        """
+        if tuple(state["classes"]) != self.classes:
+            raise DataError(
+                f"the state is of the classes {', '.join(state['classes'])}",
+                channel="terrain",
+                remedy=f"this detector has {', '.join(self.classes)}",
+            )
+        self._filter.probabilities = np.array(state["probabilities"], dtype=float)

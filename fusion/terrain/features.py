@@ -1,0 +1,152 @@
+"""What the ground does to a robot, as a few numbers that do not name the robot.
+
+Seven features a window of about one second: five vibration levels, the slip
+and the yaw slip. A feature that cannot be observed is NaN; the classifier
+marginalises it.
+
+Vibration is the RMS inside fixed bands of physical frequency, from a Hann
+periodogram after removing the line through the window. Bands and not the RMS
+of samples or of their differences: a 30 Hz and a 400 Hz stream of one motion
+have the same power below 14 Hz (Nyquist of 30 Hz is 15 Hz), while an RMS over
+all frequencies counts whatever the faster stream resolves and differences
+shrink with the sampling interval. The one band above 14 Hz is missing for
+slow streams. What no representation mends is a slow stream sampled without an
+anti-aliasing filter: its higher vibration is folded into the low bands.
+
+Speed: on a random profile of displacement spectrum S(n) ~ 1/n^2 (ISO 8608:2016,
+waviness 2) driven at v, the spectrum over time at f is v/f^2 times a constant,
+so the RMS in a fixed band grows with v^(1/2). That factor is divided out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+FEATURES = ("z_low", "z_mid", "z_high", "xy", "roll_pitch", "slip", "yaw_slip")
+"""log10 of band RMS at 1 m/s (m/s2; roll_pitch rad/s), then the slips (-)."""
+
+SLIP = FEATURES.index("slip")
+YAW_SLIP = FEATURES.index("yaw_slip")
+LOW_HZ, MID_HZ, HIGH_HZ = (3.0, 8.0), (8.0, 14.0), (14.0, 45.0)
+MIN_SPEED_MPS = 0.15
+"""Below this the ground says nothing: no vibration, and slip is a quotient of two noises."""
+
+_MIN_YAW_RATE_RADPS = 0.15
+_MIN_SPAN_S = 0.6
+_ACCEL_FLOOR_MPS2 = 1e-3
+_GYRO_FLOOR_RADPS = 1e-4
+_TIMING_S = 0.05
+_SLIP_RANGE = (-1.0, 1.2)
+
+
+@dataclass
+class Window:
+    """The last second or so of a drive, as the estimator hands it over.
+
+    Attributes:
+        dt_s: time since the previous update.
+        imu_t_s: (n,) sample times, s. gyro_radps, accel_mps2: (n, 3) body axes; NaN where the log has none.
+        wheel_speed_mps: mean forward circumferential speed of the wheels; wheel_speed_rate_mps2: its rate.
+        speed_mps: the estimator's forward speed.
+        yaw_rate_wheels_radps: yaw rate the wheels alone imply, or None where sides are not told apart.
+        yaw_rate_gyro_radps: mean yaw rate of the gyroscope, bias removed; NaN where unknown.
+        slip, slip_sigma: slip 1 - v / (omega R) and its 1 sigma; None when no measurement
+            independent of the terrain class supports it (the class prior would confirm itself).
+    """
+
+    dt_s: float
+    imu_t_s: Array
+    gyro_radps: Array
+    accel_mps2: Array
+    wheel_speed_mps: float
+    wheel_speed_rate_mps2: float
+    speed_mps: float
+    yaw_rate_wheels_radps: float | None
+    yaw_rate_gyro_radps: float
+    slip: float | None = None
+    slip_sigma: float | None = None
+
+    def ground_speed_mps(self) -> float:
+        """The faster of robot and wheels, m/s; 0 where both are unknown."""
+        return float(np.fmax(abs(np.nan_to_num(self.speed_mps)), abs(np.nan_to_num(self.wheel_speed_mps))))
+
+
+def extract(window: Window) -> tuple[Array, Array]:
+    """Features (7,) in the order of `FEATURES`, and the variance (7,) of each one's own measurement.
+
+    The variance is that of the slip estimate and of the yaw slip; the scatter
+    of the vibration levels is part of the class densities.
+    """
+    values = np.full(len(FEATURES), np.nan)
+    variances = np.zeros(len(FEATURES))
+    if not window.ground_speed_mps() > MIN_SPEED_MPS:
+        return values, variances
+    if abs(window.speed_mps) > MIN_SPEED_MPS:
+        values[:SLIP] = vibration_levels(window.imu_t_s, window.accel_mps2, window.gyro_radps)
+        values[:SLIP] -= 0.5 * np.log10(abs(window.speed_mps))
+    wheel = window.wheel_speed_mps
+    if window.slip is not None and window.slip_sigma is not None and abs(wheel) > MIN_SPEED_MPS:
+        values[SLIP] = np.clip(window.slip, *_SLIP_RANGE)
+        timing = _TIMING_S * window.wheel_speed_rate_mps2 / wheel
+        variances[SLIP] = window.slip_sigma**2 + timing**2
+    yaw = window.yaw_rate_wheels_radps
+    if yaw is not None and abs(yaw) > _MIN_YAW_RATE_RADPS:
+        values[YAW_SLIP] = np.clip(1.0 - window.yaw_rate_gyro_radps / yaw, *_SLIP_RANGE)
+        variances[YAW_SLIP] = (0.02 / yaw) ** 2
+    values[~np.isfinite(values + variances)] = np.nan
+    return values, variances
+
+
+def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
+    """log10 band RMS (5,) of one window of samples (n,), (n, 3), (n, 3); NaN where not observed.
+
+    Times jitter more than the sampling of an IMU does: samples are taken as
+    evenly spaced, unless a gap shows that some are missing.
+    """
+    levels = np.full(SLIP, np.nan)
+    n = len(t_s)
+    if n < 4:
+        return levels
+    step = np.diff(t_s)
+    span = float(t_s[-1] - t_s[0])
+    if not span > _MIN_SPAN_S or float(step.max()) > 4.0 * span / (n - 1):
+        return levels
+    rate = (n - 1) / span
+    signals = np.hstack([accel_mps2, gyro_radps[:, :2]])
+    density = _periodogram(signals, rate)
+    frequency = np.arange(len(density)) * rate / n
+
+    def power(band: tuple[float, float], columns: slice) -> float:
+        if rate < 2.1 * band[1]:
+            return float("nan")
+        rows = (frequency >= band[0]) & (frequency < band[1])
+        return float(density[rows, columns].sum(axis=1).mean()) * (band[1] - band[0])
+
+    wide = (LOW_HZ[0], MID_HZ[1])
+    powers = np.array(
+        [
+            power(LOW_HZ, slice(2, 3)),
+            power(MID_HZ, slice(2, 3)),
+            power(HIGH_HZ, slice(2, 3)),
+            power(wide, slice(0, 2)),
+            power(wide, slice(3, 5)),
+        ]
+    )
+    floors = np.array([_ACCEL_FLOOR_MPS2] * 4 + [_GYRO_FLOOR_RADPS])
+    return np.asarray(0.5 * np.log10(powers + floors**2))
+
+
+def _periodogram(signals: Array, rate_hz: float) -> Array:
+    """One-sided spectral density (n // 2 + 1, k) of signals (n, k), unit^2/Hz (Welch 1967, one segment)."""
+    n = len(signals)
+    line = np.arange(n) - (n - 1) / 2.0
+    slope = line @ signals / (line @ line)
+    taper = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n)
+    detrended = (signals - signals.mean(axis=0) - line[:, None] * slope) * taper[:, None]
+    spectrum = np.fft.rfft(detrended, axis=0)
+    return np.asarray(2.0 * (spectrum.real**2 + spectrum.imag**2) / (rate_hz * (taper @ taper)))
