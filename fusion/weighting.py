@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Annotated, get_type_hints
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.config import Quantity, checked_number, read_yaml
 from terrafusion.datasets.errors import ConfigError
@@ -46,7 +46,11 @@ class SensorNoise:
 
 
 _FIELDS = tuple(f.name for f in dataclasses.fields(SensorNoise))
-_MEAN_OF = {"slip_sigma": "slip_mean"}
+_SLIP_MEAN, _SLIP_SIGMA = _FIELDS.index("slip_mean"), _FIELDS.index("slip_sigma")
+_AVERAGED = np.array([name in ("slip_mean", "slip_time_s") for name in _FIELDS])
+"""Columns that blend as means; the others are standard deviations (or factors on them)."""
+_HINTS = get_type_hints(SensorNoise, include_extras=True)
+_RANGES: dict[str, Quantity] = {name: _HINTS[name].__metadata__[0] for name in _FIELDS}
 
 
 @dataclass(frozen=True)
@@ -70,25 +74,21 @@ class Policy:
         return tuple(self.classes)
 
     @functools.cached_property
-    def _table(self) -> np.ndarray:
+    def _table(self) -> NDArray[np.float64]:
         return np.array([dataclasses.astuple(row) for row in self.classes.values()])
 
     def blend(self, probabilities: ArrayLike) -> SensorNoise:
-        """The moment-matched row for class probabilities (k,) that sum to one."""
+        """The moment-matched row for class probabilities (k,) that sum to one.
+
+        Slip has the mean and the variance of the mixture (law of total
+        variance: mean of the variances plus variance of the means); the other
+        errors have zero mean in every class, so their variances average.
+        """
         p = np.asarray(probabilities, dtype=float)
-        table = self._table
-        mean = p @ table
-        moments = dict(zip(_FIELDS, mean.tolist(), strict=True))
-        square = p @ (table * table)
-        for i, field in enumerate(_FIELDS):
-            if field == "slip_mean" or field == "slip_time_s":
-                continue
-            spread = 0.0
-            if field in _MEAN_OF:
-                j = _FIELDS.index(_MEAN_OF[field])
-                spread = float(p @ (table[:, j] - mean[j]) ** 2)
-            moments[field] = float(np.sqrt(square[i] + spread))
-        return SensorNoise(**moments)
+        mean = p @ self._table
+        variance = p @ self._table**2
+        variance[_SLIP_SIGMA] += p @ (self._table[:, _SLIP_MEAN] - mean[_SLIP_MEAN]) ** 2
+        return SensorNoise(*np.where(_AVERAGED, mean, np.sqrt(variance)).tolist())
 
 
 def load_policy(path: Path | None = None) -> Policy:
@@ -130,11 +130,3 @@ def _row(raw: object, file: Path, key: str) -> SensorNoise:
         for name, quantity in _RANGES.items()
     }
     return SensorNoise(**values)  # type: ignore[arg-type]
-
-
-def _ranges() -> dict[str, Quantity]:
-    hints = get_type_hints(SensorNoise, include_extras=True)
-    return {name: hints[name].__metadata__[0] for name in _FIELDS}
-
-
-_RANGES = _ranges()
