@@ -1,0 +1,278 @@
+"""Square-root smoothing of a chain of keyframes made of GTSAM factors.
+
+A localisation graph is a chain: every factor touches one keyframe or two that
+follow each other. Eliminating keyframes in time order by QR therefore costs
+the same at every step, and only keyframes whose factors or linearisation
+changed have to be eliminated again (the idea of iSAM2, Kaess et al. 2012, IJRR
+31(2), on its simplest graph). The same code is the fixed-lag filter (old
+keyframes are dropped, what they say stays as a prior: exact marginalisation)
+and, with nothing dropped, the batch Gauss-Newton smoother.
+
+Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world
+(m/s), B(k) IMU bias (accelerometer, gyro), S(k) slip; tangent of 16 numbers in
+this order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, S, V, X
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
+
+Array = NDArray[np.float64]
+
+DIM = 16
+POSE, ROTATION, VELOCITY, BIAS, SLIP = slice(0, 6), slice(0, 3), slice(6, 9), slice(9, 15), 15
+
+
+@dataclass(frozen=True, eq=False)
+class KeyState:
+    """State of one keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `slip`."""
+
+    pose: gtsam.Pose3
+    velocity: Array
+    bias: gtsam.imuBias.ConstantBias
+    slip: float
+
+    def retract(self, delta: Array) -> KeyState:
+        """The state moved by a tangent vector (16,)."""
+        bias = gtsam.imuBias.ConstantBias(
+            self.bias.accelerometer() + delta[9:12], self.bias.gyroscope() + delta[12:15]
+        )
+        return KeyState(
+            self.pose.retract(delta[POSE]), self.velocity + delta[VELOCITY], bias, self.slip + float(delta[SLIP])
+        )
+
+
+@dataclass(eq=False)
+class Node:
+    """A keyframe in the chain: its factors, its linearisation point and the result of its elimination."""
+
+    point: KeyState
+    link: gtsam.NonlinearFactorGraph
+    wheels: WheelIncrement | None
+    unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    unary_keys: set[str] = field(default_factory=set)
+    prior: Array = field(default_factory=lambda: np.zeros((0, DIM + 1)))
+    conditional: Array | None = None
+    delta: Array = field(default_factory=lambda: np.zeros(DIM))
+
+
+_SYMBOLS = {"X": (X, slice(0, 6)), "V": (V, slice(6, 9)), "B": (B, slice(9, 15)), "S": (S, slice(15, 16))}
+
+
+class Chain:
+    """Keyframes `first` ... `last`, solved by sequential QR.
+
+    A keyframe is appended with the factors that link it to its predecessor;
+    unary factors may be added to any keyframe still held. `solve` brings the
+    newest keyframe up to date, `smooth` all of them.
+    """
+
+    RELINEARISE = np.array([0.01] * 3 + [np.inf] * 3 + [0.1] * 3 + [0.5] * 3 + [0.02] * 3 + [0.05])
+    """Change of a state (rad, m, m/s, m/s2, rad/s, -) beyond which its factors are linearised again.
+
+    Positions enter the factors linearly, so they never ask for it."""
+
+    def __init__(self) -> None:
+        self.first = 0
+        self.nodes: list[Node] = []
+        self.values = gtsam.Values()
+        self._dirty = 0
+        self._root = np.zeros((DIM, DIM + 1))
+
+    @property
+    def last(self) -> int:
+        """Index of the newest keyframe."""
+        return self.first + len(self.nodes) - 1
+
+    def append(
+        self,
+        point: KeyState,
+        link: gtsam.NonlinearFactorGraph | None = None,
+        wheels: WheelIncrement | None = None,
+    ) -> int:
+        """Add a keyframe with its initial state and its factors to the one before; gives its index.
+
+        `link` must touch X, V, B and S of both keyframes.
+        """
+        self.nodes.append(Node(point, link or gtsam.NonlinearFactorGraph(), wheels))
+        self._insert(self.last, point)
+        if len(self.nodes) > 1:
+            self._dirty = min(self._dirty, self.last - 1)
+        return self.last
+
+    def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
+        """Add a factor that touches only the states `keys` (of "XVBS") of keyframe k."""
+        node = self.nodes[k - self.first]
+        node.unary.add(factor)
+        node.unary_keys.update(keys)
+        self._dirty = min(self._dirty, k)
+
+    def state(self, k: int) -> KeyState:
+        """Best state of keyframe k as of the last `solve` (newest) or `smooth` (all)."""
+        node = self.nodes[k - self.first]
+        return node.point.retract(node.delta)
+
+    def covariance(self) -> Array:
+        """Marginal covariance (16, 16) of the newest keyframe."""
+        inverse, info = lapack.dtrtri(self._root[:, :DIM])
+        if info:
+            raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
+        return np.asarray(inverse @ inverse.T)
+
+    def solve(self, iterations: int = 4) -> None:
+        """Bring the newest keyframe up to date, linearising it again while it moves."""
+        for _ in range(iterations):
+            for i in range(max(self._dirty, self.first), self.last):
+                self._eliminate(i)
+            self._dirty = self.last
+            node = self.nodes[-1]
+            self._root = _triangular(np.vstack([node.prior, self._unary_rows(self.last)]))
+            node.delta = _back_substitute(self._root[:, :DIM], self._root[:, DIM])
+            if len(self.nodes) == 1 or (np.abs(node.delta) < self.RELINEARISE).all():
+                return
+            self._move(self.last)
+            self._dirty = self.last - 1
+
+    def smooth(self, iterations: int = 2) -> None:
+        """Bring all keyframes up to date; those that moved far are linearised again."""
+        for _ in range(iterations):
+            self.solve()
+            self._back_substitute_all()
+            moved = [
+                i
+                for i in range(self.first + 1, self.last + 1)
+                if (np.abs(self.nodes[i - self.first].delta) > self.RELINEARISE).any()
+            ]
+            if not moved:
+                return
+            for i in moved:
+                self._move(i)
+            self._dirty = min(self._dirty, moved[0] - 1)
+        self.solve()
+        self._back_substitute_all()
+
+    def optimise(self, iterations: int = 20, tolerance: float = 1e-6) -> int:
+        """Gauss-Newton over all keyframes to convergence (batch); gives the iterations taken."""
+        for count in range(1, iterations + 1):
+            self._dirty = self.first
+            self.solve(iterations=1)
+            self._back_substitute_all()
+            step = max(float(np.abs(node.delta).max()) for node in self.nodes)
+            for i in range(self.first, self.last + 1):
+                self._move(i, keep_prior=i == self.first)
+            if step < tolerance:
+                return count
+        return iterations
+
+    def forget(self, keep: int) -> None:
+        """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
+        while len(self.nodes) > keep and self._dirty > self.first:
+            for symbol, _ in _SYMBOLS.values():
+                self.values.erase(symbol(self.first))
+            self.nodes.pop(0)
+            self.first += 1
+
+    def set_prior(self, sigmas: Array) -> None:
+        """Prior of the first keyframe at its initial state, independent 1 sigmas (16,)."""
+        self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((DIM, 1))])
+        self._dirty = self.first
+
+    def _insert(self, k: int, point: KeyState) -> None:
+        self.values.insert(X(k), point.pose)
+        self.values.insert(V(k), point.velocity)
+        self.values.insert(B(k), point.bias)
+        self.values.insert(S(k), point.slip)
+
+    def _move(self, k: int, keep_prior: bool = False) -> None:
+        """Make the current estimate of keyframe k its linearisation point."""
+        node = self.nodes[k - self.first]
+        if keep_prior:
+            node.prior = node.prior.copy()
+            node.prior[:, DIM] -= node.prior[:, :DIM] @ node.delta
+        node.point = node.point.retract(node.delta)
+        node.delta = np.zeros(DIM)
+        self.values.update(X(k), node.point.pose)
+        self.values.update(V(k), node.point.velocity)
+        self.values.update(B(k), node.point.bias)
+        self.values.update(S(k), node.point.slip)
+
+    def _unary_rows(self, k: int) -> Array:
+        node = self.nodes[k - self.first]
+        present = [name for name in "XVBS" if name in node.unary_keys]
+        if not present:
+            return np.zeros((0, DIM + 1))
+        ordering = gtsam.Ordering()
+        for name in present:
+            ordering.push_back(_SYMBOLS[name][0](k))
+        packed = node.unary.linearize(self.values).augmentedJacobian(ordering)
+        rows = np.zeros((len(packed), DIM + 1))
+        column = 0
+        for name in present:
+            place = _SYMBOLS[name][1]
+            width = place.stop - place.start
+            rows[:, place] = packed[:, column : column + width]
+            column += width
+        rows[:, DIM] = packed[:, -1]
+        return rows
+
+    def _link_rows(self, k: int) -> Array:
+        """Whitened rows over keyframes k - 1 and k, shape (m, 33)."""
+        node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
+        ordering = gtsam.Ordering()
+        for i in (k - 1, k):
+            for symbol in (X, V, B, S):
+                ordering.push_back(symbol(i))
+        rows = node.link.linearize(self.values).augmentedJacobian(ordering)
+        if node.wheels is None:
+            return np.asarray(rows)
+        d, weight = node.wheels.displacement_m, 1.0 / node.wheels.sigma_m[:, None]
+        H_i, H_j, H_slip = jacobians(before.point.pose, node.point.pose, d)
+        wheel = np.zeros((3, 2 * DIM + 1))
+        wheel[:, 0:6] = H_i
+        wheel[:, DIM : DIM + 6] = H_j
+        wheel[:, DIM + SLIP] = H_slip[:, 0]
+        wheel[:, 2 * DIM] = -residual(before.point.pose, node.point.pose, node.point.slip, d)
+        return np.vstack([rows, wheel * weight])
+
+    def _eliminate(self, k: int) -> None:
+        node = self.nodes[k - self.first]
+        own = np.vstack([node.prior, self._unary_rows(k)])
+        link = self._link_rows(k + 1)
+        stacked = np.zeros((len(own) + len(link), 2 * DIM + 1))
+        stacked[: len(own), :DIM] = own[:, :DIM]
+        stacked[: len(own), 2 * DIM] = own[:, DIM]
+        stacked[len(own) :] = link
+        R = _triangular(stacked)
+        node.conditional = R[:DIM]
+        self.nodes[k + 1 - self.first].prior = R[DIM : 2 * DIM, DIM:]
+
+    def _back_substitute_all(self) -> None:
+        following = self.nodes[-1].delta
+        for node in reversed(self.nodes[:-1]):
+            assert node.conditional is not None
+            rhs = node.conditional[:, 2 * DIM] - node.conditional[:, DIM : 2 * DIM] @ following
+            node.delta = following = _back_substitute(node.conditional[:, :DIM], rhs)
+
+
+def _triangular(stacked: Array) -> Array:
+    """R of the QR decomposition of (m, n) rows, padded to n rows."""
+    rows, columns = stacked.shape
+    if rows < columns:
+        stacked = np.vstack([stacked, np.zeros((columns - rows, columns))])
+    packed, _, _, _ = lapack.dgeqrf(stacked, overwrite_a=1)
+    return np.triu(packed[:columns])[: columns - 1]
+
+
+def _back_substitute(R: Array, rhs: Array) -> Array:
+    solution, info = lapack.dtrtrs(R, rhs)
+    if info or not np.isfinite(solution).all():
+        raise ArithmeticError("a keyframe is not determined by its factors")
+    return np.asarray(solution)

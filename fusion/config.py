@@ -1,0 +1,50 @@
+"""Settings of the estimator; every one has a default that suits a ground robot."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.sensors import Rig
+from terrafusion.fusion.weighting import Policy, load_policy
+
+MODES = ("adaptive", "fixed")
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """What an `Estimator` is built from.
+
+    Attributes:
+        rig: geometry and sensors of the robot.
+        vehicle: its name, for what the terrain model knows of single robots.
+        mode: "adaptive" (noise follows the detected terrain) or "fixed" (one row for all grounds).
+        policy: noise rows by terrain.
+        keyframe_s: time between keyframes.
+        lag_s: length of the smoothing window; None keeps every keyframe (batch).
+        wheel_wait_s: how long a keyframe waits for a late wheel sample.
+        gnss_gate: chi-square probability beyond which a fix is rejected.
+        wheel_gate_sigma: normalised wheel innovation beyond which an increment is rejected.
+        yaw_sigma_start_rad: heading uncertainty at which the graph is started.
+        start_without_gnss_s: with no fix for so long, start in a local frame.
+    """
+
+    rig: Rig
+    vehicle: str | None = None
+    mode: str = "adaptive"
+    policy: Policy = field(default_factory=load_policy)
+    keyframe_s: float = 0.1
+    lag_s: float | None = 5.0
+    wheel_wait_s: float = 0.3
+    gnss_gate: float = 0.999
+    wheel_gate_sigma: float = 6.0
+    yaw_sigma_start_rad: float = 0.12
+    start_without_gnss_s: float = 30.0
+
+    def __post_init__(self) -> None:
+        if self.mode not in MODES:
+            raise ConfigError(f"unknown mode '{self.mode}'", remedy=f"this version has {', '.join(MODES)}")
+        if not 0.01 <= self.keyframe_s <= 1.0:
+            raise ConfigError(f"keyframe_s is {self.keyframe_s}", remedy="give 0.01 to 1 s")
+        if self.lag_s is not None and self.lag_s < 5 * self.keyframe_s:
+            raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")

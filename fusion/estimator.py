@@ -1,0 +1,353 @@
+"""`Estimator`: sensor messages in, pose, twist, slip and terrain out, live.
+
+    est = Estimator.for_vehicle("husky")
+    est.add_imu(t_ns, gyro, accel)
+    est.add_wheels(t_ns, left_mps, right_mps)
+    est.add_gnss(t_ns, enu_m, sigma_m)
+    state = est.latest()
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
+from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
+from terrafusion.fusion.chain import BIAS, POSE, SLIP, VELOCITY, Chain, KeyState
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimate import Innovation, State
+from terrafusion.fusion.factors import at_rest, bridge, slip_process, wheel_increment
+from terrafusion.fusion.gates import WheelGate
+from terrafusion.fusion.gnss import GnssUpdater
+from terrafusion.fusion.preintegration import Preintegrator
+from terrafusion.fusion.streams import GnssFix, ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.terrain_weights import TerrainWeights
+from terrafusion.fusion.wheel_factor import WheelIncrement
+
+Array = NDArray[np.float64]
+
+LONGEST_IMU_GAP_S = 0.5
+SMOOTH_EVERY = 5
+OUTAGE_S = 2.0
+STILL_GYRO_RADPS = 0.03
+STILL_ACCEL_MPS2 = 0.6
+GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_MPS2])
+
+
+class Estimator:
+    """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
+
+    Each sensor is fed in its own time order; keyframes are made as soon as the
+    IMU (and the wheels, or their waiting time) cover them. `on_state` is called
+    with every new `State`, `on_innovation` with every tested measurement.
+    """
+
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        on_state: Callable[[State], None] | None = None,
+        on_innovation: Callable[[Innovation], None] | None = None,
+    ) -> None:
+        self.config = config
+        self.chain = Chain()
+        self.imu = ImuStream()
+        self.wheels = WheelStream()
+        self.weights = TerrainWeights(config)
+        self.gnss = GnssUpdater(config, self._report)
+        self.wheels_rejected = 0
+        self._on_state, self._on_innovation = on_state, on_innovation
+        self._preintegrator = Preintegrator(config.rig.sensors.imu)
+        self._wheel_gate = WheelGate(config.wheel_gate_sigma)
+        self._step_ns = round(config.keyframe_s * 1e9)
+        self._keep = None if config.lag_s is None else round(config.lag_s / config.keyframe_s)
+        self._start: Start | None = None
+        self._level: Start | None = None
+        self._t_ns: list[int] = []
+        self._means: list[tuple[Array, Array]] = []
+        self._state: State | None = None
+        self._covariance = np.zeros((16, 16))
+        self._silent = False
+        self._rest = 0
+
+    @classmethod
+    def for_vehicle(cls, name: str, mode: str = "adaptive") -> Estimator:
+        """An estimator for a vehicle of the library (or a vehicle YAML)."""
+        from terrafusion.twin.vehicle import load_vehicle
+
+        return cls(EstimatorConfig(load_vehicle(name).rig(), name, mode))
+
+    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
+        """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample."""
+        self.imu.add(t_ns, gyro_radps, accel_mps2)
+        self._advance()
+
+    def add_wheels(
+        self,
+        t_ns: int,
+        left_mps: float,
+        right_mps: float,
+        left_m: float | None = None,
+        right_m: float | None = None,
+    ) -> None:
+        """Circumferential speed of each side, m/s, and its travelled distance, m, where encoders count it."""
+        self.wheels.add(t_ns, left_mps, right_mps, left_m, right_m)
+
+    def add_gnss(
+        self,
+        t_ns: int,
+        enu_m: ArrayLike,
+        sigma_m: ArrayLike,
+        velocity_mps: ArrayLike | None = None,
+        sigma_v_mps: float = float("nan"),
+    ) -> None:
+        """Antenna position (3,) and its 1 sigma (3,), ENU m; a NaN height is unknown. Velocity (3,) ENU if known."""
+        position, sigma = np.asarray(enu_m, dtype=float), np.asarray(sigma_m, dtype=float)
+        if position.shape != (3,) or not np.isfinite(position[:2]).all():
+            raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
+        if sigma.shape != (3,) or not (sigma[:2] > 0).all():
+            raise DataError(f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma")
+        velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
+        self.gnss.queue(GnssFix(t_ns, position, sigma, velocity, sigma_v_mps))
+
+    def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
+        """Class probabilities of an external source, such as a camera; they are fused with the own detector's."""
+        self.weights.external(t_ns, probabilities)
+
+    def latest(self) -> State | None:
+        """The newest state, or None before the start."""
+        return self._state
+
+    def finish(self) -> None:
+        """Tell that no more data come: keyframes no longer wait for late samples."""
+        self._advance(last=True)
+
+    def _advance(self, last: bool = False) -> None:
+        if self._start is None and not self._try_start(last):
+            return
+        while True:
+            t = self._t_ns[-1] + self._step_ns
+            if not self.imu.covers(t):
+                return
+            late = self.imu.covers(t + round(self.config.wheel_wait_s * 1e9))
+            if not (self.wheels.covers(t) or late or last):
+                return
+            self._keyframe(t)
+
+    def _try_start(self, last: bool) -> bool:
+        """Start the graph once heading is known, or once it is clear that GNSS will not come."""
+        if not self.imu.t_ns or not self.wheels.t_ns:
+            return False
+        begin = max(self.imu.t_ns[0], self.wheels.t_ns[0])
+        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
+        if elapsed < 1.0 and not last:
+            return False
+        if self._level is None:
+            self._level = level_start(self.imu, self.wheels, begin)
+        if self.gnss.waiting and self.gnss.news():
+            antenna = np.array(self.config.rig.sensors.gnss.antenna_m)
+            start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
+            if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
+                self._begin(start)
+        elif not self.gnss.waiting and (last or elapsed > self.config.start_without_gnss_s):
+            self.gnss.local = True
+            self._begin(self._level)
+        return self._start is not None
+
+    def _begin(self, start: Start) -> None:
+        self._start = start
+        rotation = gtsam.Rot3.RzRyRx(start.roll_rad, start.pitch_rad, start.yaw_rad)
+        spec = self.config.rig.sensors.imu
+        gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
+        row = self.weights.row
+        point = KeyState(
+            gtsam.Pose3(rotation, start.position_m),
+            rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
+            gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
+            row.slip_mean,
+        )
+        # The fixes that gave the heading enter the graph again as factors: the prior must not count them twice.
+        yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
+        level, gyro_sigma = start.level_sigma_rad, spec.gyro_bias_sigma_radps + 1e-6
+        sigmas = [level, level, yaw_sigma, *[start.position_sigma_m] * 3, *[0.1 + 0.3 * abs(start.speed_mps)] * 3]
+        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + [row.slip_sigma]
+        self.chain.append(point)
+        self.chain.set_prior(np.array(sigmas))
+        self.chain.solve()
+        self._covariance = self.chain.covariance()
+        self._t_ns = [start.t_ns]
+        self._means = [(gyro_bias, np.zeros(3))]
+        self.weights.begin(start.t_ns)
+        newest = min(self.imu.t_ns[-1], self.wheels.t_ns[-1])
+        self._silent = True
+        while self._t_ns[-1] + 2 * self._step_ns <= newest:
+            self._keyframe(self._t_ns[-1] + self._step_ns)
+        self._silent = False
+        self.chain.smooth(iterations=5)
+
+    def _keyframe(self, t_ns: int) -> None:
+        before_ns, dt = self._t_ns[-1], self._step_ns * 1e-9
+        before = self.chain.state(self.chain.last)
+        row = self.weights.row
+        segments = self.imu.segments(before_ns, t_ns)
+        wheels = self._wheel_increment(before_ns, t_ns, segments, before)
+        k = self.chain.last + 1
+        link = gtsam.NonlinearFactorGraph()
+        if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
+            link = bridge(k, before, wheels, dt)
+            point = _carried(before, wheels, dt)
+        else:
+            measured = self._preintegrator.integrate(segments, before.bias, row.gyro_inflation, row.accel_inflation)
+            nav = measured.predict(gtsam.NavState(before.pose, before.velocity), before.bias)
+            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip)
+            link.add(_imu_factor(k, measured))
+            wheels = self._gated(t_ns, wheels, before, point, dt)
+        slip_link, slip_prior = slip_process(k, dt, row)
+        link.add(slip_link)
+        self.chain.append(point, link, wheels)
+        self.chain.add(k, slip_prior, "S")
+        self._zero_velocity(k, wheels, segments, before, link)
+        self._t_ns.append(t_ns)
+        self._finish_keyframe(t_ns, segments)
+
+    def _finish_keyframe(self, t_ns: int, segments: list[ImuSegment]) -> None:
+        chain = self.chain
+        chain.solve()
+        self._covariance = chain.covariance()
+        gyro, accel = _mean_rates(segments)
+        self._means.append((gyro, accel))
+        if self.gnss.update(chain, self._t_ns, self._means, self._covariance, self.weights.row):
+            chain.solve()
+            self._covariance = chain.covariance()
+        if chain.last % SMOOTH_EVERY == 0:
+            chain.smooth()
+            self._covariance = chain.covariance()
+        if self._keep is not None:
+            chain.forget(self._keep)
+            surplus = len(self._t_ns) - len(chain.nodes)
+            del self._t_ns[:surplus], self._means[:surplus]
+            self.imu.forget(t_ns - 2_000_000_000)
+            self.wheels.forget(t_ns - 2_000_000_000)
+        self._emit(t_ns, gyro)
+        state = self._state
+        assert state is not None
+        self.weights.update(state, self.imu, self.wheels, slip_observed=state.status == "running")
+
+    def _wheel_increment(
+        self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState
+    ) -> WheelIncrement | None:
+        travelled = self.wheels.travelled(before_ns, t_ns)
+        if travelled is None:
+            return None
+        rig = self.config.rig
+        quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
+        bias_z = float(before.bias.gyroscope()[2])
+        return wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row)
+
+    def _gated(
+        self, t_ns: int, wheels: WheelIncrement | None, before: KeyState, point: KeyState, dt: float
+    ) -> WheelIncrement | None:
+        if wheels is None:
+            return None
+        moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
+        d = wheels.displacement_m
+        innovation = float(moved[0] - (1.0 - before.slip) * d[0])
+        P, row = self._covariance, self.weights.row
+        forward = before.pose.rotation().matrix()[:, 0]
+        variance = (
+            wheels.sigma_m[0] ** 2
+            + d[0] ** 2 * (P[SLIP, SLIP] + 2.0 * row.slip_sigma**2 * dt / row.slip_time_s)
+            + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
+            + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
+        )
+        accepted, nis = self._wheel_gate.test(innovation, float(np.sqrt(variance)))
+        self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
+        if accepted:
+            return wheels
+        self.wheels_rejected += not self._silent
+        return None
+
+    def _zero_velocity(
+        self,
+        k: int,
+        wheels: WheelIncrement | None,
+        segments: list[ImuSegment],
+        before: KeyState,
+        link: gtsam.NonlinearFactorGraph,
+    ) -> None:
+        """Zero velocity and rate, once wheels and IMU have been still for three keyframes."""
+        rig = self.config.rig
+        quantum = max(1e-4, 1.5 * rig.sensors.wheels.quantum_rad * rig.wheel_radius_m)
+        bias_g, bias_a = before.bias.gyroscope(), before.bias.accelerometer()
+        still = (
+            wheels is not None
+            and abs(wheels.distance_m) < quantum
+            and abs(wheels.turn_rad) * rig.track_m < 2 * quantum
+            and all(np.abs(s.gyro_radps - bias_g).max() < STILL_GYRO_RADPS for s in segments)
+            and all(
+                abs(float(np.linalg.norm(s.accel_mps2 - bias_a)) - GRAVITY_MPS2) < STILL_ACCEL_MPS2 for s in segments
+            )
+        )
+        self._rest = self._rest + 1 if still else 0
+        if self._rest >= 3:
+            link.add(at_rest(k))
+            self.chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _REST_NOISE), "V")
+
+    def _emit(self, t_ns: int, gyro: Array) -> None:
+        key = self.chain.state(self.chain.last)
+        P = self._covariance
+        R = key.pose.rotation().matrix()
+        silent = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
+        status = "no_gnss" if self.gnss.local else ("outage" if silent else "running")
+        self._state = State(
+            t_ns=t_ns,
+            position_m=np.asarray(key.pose.translation()),
+            quaternion=np.asarray(key.pose.rotation().toQuaternion().coeffs()),
+            velocity_mps=key.velocity,
+            angular_velocity_radps=gyro - key.bias.gyroscope(),
+            gyro_bias_radps=np.asarray(key.bias.gyroscope()),
+            accel_bias_mps2=np.asarray(key.bias.accelerometer()),
+            slip=key.slip,
+            slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
+            covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
+            velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+            terrain=self.weights.posterior(),
+            status=status,
+        )
+        if self._on_state is not None and not self._silent:
+            self._on_state(self._state)
+
+    def _report(self, innovation: Innovation) -> None:
+        if self._on_innovation is not None and not self._silent:
+            self._on_innovation(innovation)
+
+
+def _mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
+    """Mean angular rate (3,) and specific force (3,) over the segments."""
+    total = sum(s.dt_s for s in segments)
+    gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
+    accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
+    return gyro, accel
+
+
+_REST_NOISE = gtsam.noiseModel.Isotropic.Sigma(3, 0.005)
+
+
+def _imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:
+    from gtsam.symbol_shorthand import B, V, X
+
+    return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured)
+
+
+def _carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
+    if wheels is None:
+        moved = before.pose.rotation().matrix().T @ before.velocity * dt
+        turn = 0.0
+    else:
+        moved, turn = (1.0 - before.slip) * wheels.displacement_m, wheels.turn_rad
+    pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), moved))
+    return KeyState(pose, before.velocity, before.bias, before.slip)

@@ -1,0 +1,114 @@
+"""Factors of the localisation graph, each made from one measurement."""
+
+from __future__ import annotations
+
+import functools
+import math
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, S, V, X
+from numpy.typing import NDArray
+
+from terrafusion.fusion.chain import KeyState
+from terrafusion.fusion.streams import GnssFix, ImuSegment
+from terrafusion.fusion.weighting import SensorNoise
+from terrafusion.fusion.wheel_factor import WheelIncrement
+
+Array = NDArray[np.float64]
+
+REST_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
+"""Motion of a robot at rest between two keyframes: rotation (rad), then translation (m)."""
+UP_SIDE_RATIO = 0.05
+"""Vertical over forward displacement in the body frame (1 sigma): wheels follow the ground."""
+FLOOR_M = 2e-3
+"""Least sigma of a wheel displacement across the rolling direction, m a keyframe."""
+
+
+def wheel_increment(
+    travelled_m: tuple[float, float],
+    segments: list[ImuSegment],
+    gyro_bias_z: float,
+    track_m: float,
+    quantum_m: float,
+    noise: SensorNoise,
+) -> WheelIncrement:
+    """Displacement of the body origin as the wheels and the gyro tell it.
+
+    The travelled distance is spread evenly over the interval and turned by the
+    yaw integrated from the gyro (bias removed), exactly for constant rates.
+    """
+    left, right = travelled_m
+    distance = 0.5 * (left + right)
+    total = sum(piece.dt_s for piece in segments)
+    x = y = yaw = 0.0
+    for piece in segments:
+        turn = (float(piece.gyro_radps[2]) - gyro_bias_z) * piece.dt_s
+        step = distance * piece.dt_s / total
+        chord = step * (1.0 - turn * turn / 24.0)
+        x += chord * math.cos(yaw + 0.5 * turn)
+        y += chord * math.sin(yaw + 0.5 * turn)
+        yaw += turn
+    forward = math.hypot(noise.wheel_sigma_mps * total, quantum_m)
+    across = noise.side_slip_sigma * abs(distance) + FLOOR_M
+    up = UP_SIDE_RATIO * abs(distance) + FLOOR_M
+    return WheelIncrement(np.array([x, y, 0.0]), np.array([forward, across, up]), distance, (right - left) / track_m)
+
+
+def slip_process(k: int, dt_s: float, noise: SensorNoise) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
+    """Link and prior that make slip an Ornstein-Uhlenbeck process with the moments of `noise`.
+
+    A random walk with variance 2 sigma^2 dt / tau, pulled to the mean by a
+    prior of variance 2 sigma^2 tau / dt each step, has the log-density of the
+    process to first order in dt (Uhlenbeck and Ornstein 1930, Phys. Rev. 36).
+    """
+    ratio = dt_s / noise.slip_time_s
+    walk = noise.slip_sigma * math.sqrt(2.0 * ratio)
+    pull = noise.slip_sigma * math.sqrt(2.0 / ratio)
+    link = gtsam.BetweenFactorDouble(S(k - 1), S(k), 0.0, _isotropic(1, round(walk, 6)))
+    return link, gtsam.PriorFactorDouble(S(k), noise.slip_mean, _isotropic(1, round(pull, 6)))
+
+
+def at_rest(k: int) -> gtsam.NonlinearFactor:
+    """Zero velocity and zero rotation between two keyframes."""
+    return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS))
+
+
+def bridge(k: int, before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> gtsam.NonlinearFactorGraph:
+    """Loose links across a hole in the IMU: wheels or held velocity carry the robot."""
+    graph = gtsam.NonlinearFactorGraph()
+    moved = wheels.displacement_m if wheels else before.pose.rotation().matrix().T @ before.velocity * dt_s
+    sigmas = np.array([0.05, 0.05, 0.3, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
+    turn = gtsam.Rot3.Rz(wheels.turn_rad if wheels else 0.0)
+    graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(turn, moved), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
+    graph.add(gtsam.BetweenFactorVector(V(k - 1), V(k), np.zeros(3), _isotropic(3, round(2.0 * math.sqrt(dt_s), 6))))
+    same = gtsam.imuBias.ConstantBias()
+    graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, _isotropic(6, 1e-3)))
+    return graph
+
+
+def antenna_lever(state: KeyState, dt_s: float, gyro_radps: Array, accel_world_mps2: Array, antenna_m: Array) -> Array:
+    """Antenna position (3,) at `dt_s` from the keyframe, in the body frame of the keyframe, m.
+
+    A fix rarely falls on a keyframe. Within half a keyframe the body is carried
+    by its velocity, acceleration and rate, so that the fix keeps its own time.
+    """
+    R_body_world = state.pose.rotation().matrix().T
+    moved = R_body_world @ (state.velocity * dt_s + 0.5 * accel_world_mps2 * dt_s**2)
+    turned = gtsam.Rot3.Expmap(gyro_radps * dt_s).matrix() @ antenna_m
+    return np.asarray(moved + turned)
+
+
+def gnss_position(k: int, fix: GnssFix, lever_m: Array, sigma_m: Array) -> gtsam.NonlinearFactor:
+    """Antenna position with a lever arm."""
+    return gtsam.GPSFactorArm(X(k), fix.enu_m, lever_m, gtsam.noiseModel.Diagonal.Sigmas(sigma_m))
+
+
+def gnss_velocity(k: int, velocity_mps: Array, sigma_mps: float) -> gtsam.NonlinearFactor:
+    """Velocity of the body origin, the lever arm's part already removed."""
+    return gtsam.PriorFactorVector(V(k), velocity_mps, _isotropic(3, sigma_mps))
+
+
+@functools.lru_cache(maxsize=4096)
+def _isotropic(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
+    return gtsam.noiseModel.Isotropic.Sigma(dim, sigma)

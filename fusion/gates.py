@@ -1,0 +1,71 @@
+"""Tests that keep a wrong measurement out without locking good ones out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class GnssGate:
+    """Chi-square test of a fix against its prediction, with re-acquisition.
+
+    Attributes:
+        threshold: 2-D or 3-D chi-square quantiles by degrees of freedom.
+        patience: rejected fixes in a row that agree with each other before the
+            estimate, not GNSS, is taken to be wrong and the next fix is let in.
+        agreement_sigma: how well they must agree, in their own sigmas.
+    """
+
+    threshold: dict[int, float]
+    patience: int = 5
+    agreement_sigma: float = 4.0
+    rejected: list[tuple[Array, float]] = field(default_factory=list)
+
+    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[bool, float, str]:
+        """Accept or not, the normalised innovation squared, and the reason.
+
+        `innovation_m` (d,) is fix minus prediction, `covariance_m2` (d, d) of it.
+        """
+        nis = float(innovation_m @ np.linalg.solve(covariance_m2, innovation_m))
+        if nis <= self.threshold[len(innovation_m)]:
+            self.rejected.clear()
+            return True, nis, ""
+        self.rejected.append((innovation_m[:2].copy(), float(np.sqrt(covariance_m2[0, 0]))))
+        if len(self.rejected) >= self.patience and self._agree():
+            self.rejected.clear()
+            return True, nis, f"{self.patience} rejected fixes agree with each other: re-acquired"
+        return False, nis, f"normalised innovation squared {nis:.1f} beyond {self.threshold[len(innovation_m)]:.1f}"
+
+    def _agree(self) -> bool:
+        recent = self.rejected[-self.patience :]
+        points = np.array([point for point, _ in recent])
+        spread = float(np.hypot(*(points - points.mean(axis=0)).std(axis=0)))
+        return spread <= self.agreement_sigma * max(sigma for _, sigma in recent)
+
+
+@dataclass
+class WheelGate:
+    """Test of a wheel increment against the IMU's prediction.
+
+    A burst of slip or a jammed wheel shows as an increment the IMU does not
+    confirm. It is left out, and the slip state is set free, for at most
+    `patience` keyframes: the IMU alone must not judge for longer than it can.
+    """
+
+    limit_sigma: float
+    patience: int = 10
+    in_a_row: int = 0
+
+    def test(self, innovation_m: float, sigma_m: float) -> tuple[bool, float]:
+        """Accept or not, and the normalised innovation squared."""
+        nis = (innovation_m / sigma_m) ** 2
+        if nis <= self.limit_sigma**2 or self.in_a_row >= self.patience:
+            self.in_a_row = 0
+            return True, nis
+        self.in_a_row += 1
+        return False, nis

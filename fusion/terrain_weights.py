@@ -1,0 +1,133 @@
+"""From the detected terrain to the noise row in force, with a reason for every change."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimate import State, WeightChange
+from terrafusion.fusion.streams import ImuStream, WheelStream
+from terrafusion.fusion.terrain.classifier import load_terrain_model
+from terrafusion.fusion.terrain.detector import TerrainDetector, Window
+from terrafusion.fusion.weighting import SensorNoise
+
+Array = NDArray[np.float64]
+
+UPDATE_NS = 500_000_000
+WINDOW_NS = 1_000_000_000
+NOTEWORTHY = 0.1
+"""Relative change of a weight that is worth a record."""
+
+_RECORDED = {
+    "slip_mean": ("wheels", ""),
+    "slip_sigma": ("wheels", ""),
+    "wheel_sigma_mps": ("wheels", "m/s"),
+    "side_slip_sigma": ("wheels", ""),
+    "gyro_inflation": ("imu", ""),
+    "accel_inflation": ("imu", ""),
+    "gnss_inflation": ("gnss", ""),
+}
+
+
+class TerrainWeights:
+    """Runs the detector along the drive and blends the policy by its posterior.
+
+    In the mode "fixed" the terrain is still detected and reported, but the row
+    stays the policy's fixed one.
+
+    Attributes:
+        row: the noise in force.
+        changes: what changed since `take_changes` was last called.
+    """
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        self.policy = config.policy
+        self.adaptive = config.mode == "adaptive"
+        model = load_terrain_model().for_vehicle(config.vehicle)
+        self.detector = TerrainDetector(model, config.policy.names())
+        self.row = self.policy.blend(self.detector.probabilities) if self.adaptive else self.policy.fixed
+        self.changes: list[WeightChange] = []
+        self._noted: SensorNoise | None = None
+        self._rig = config.rig
+        self._next_ns = 0
+        self._last_speed = 0.0
+        self._source = "detector"
+
+    def begin(self, t_ns: int) -> None:
+        """Start the clock; the first row is a change from the policy's fixed one."""
+        self._next_ns = t_ns + WINDOW_NS
+        self._noted = self.policy.fixed
+        self._reweight(t_ns)
+
+    def posterior(self) -> dict[str, float]:
+        """Class name -> probability now."""
+        return dict(zip(self.detector.classes, self.detector.probabilities.tolist(), strict=True))
+
+    def external(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
+        """Fuse the class probabilities of another source.
+
+        Raises:
+            DataError: a class the policy does not know, or numbers that are no probabilities.
+        """
+        unknown = sorted(set(probabilities) - set(self.detector.classes))
+        if unknown:
+            raise DataError(
+                f"unknown class '{unknown[0]}'",
+                channel="terrain",
+                remedy=f"the policy knows {', '.join(self.detector.classes)}",
+            )
+        self.detector.fuse(np.array([probabilities.get(name, 0.0) for name in self.detector.classes]))
+        self._source = "external source"
+        self._reweight(t_ns)
+
+    def update(self, state: State, imu: ImuStream, wheels: WheelStream, slip_observed: bool) -> None:
+        """Look at the last second, twice a second."""
+        if state.t_ns < self._next_ns:
+            return
+        self._next_ns = state.t_ns + UPDATE_NS
+        self.detector.update(self._window(state, imu, wheels, slip_observed))
+        self._source = "detector"
+        self._reweight(state.t_ns)
+
+    def _window(self, state: State, imu: ImuStream, wheels: WheelStream, slip_observed: bool) -> Window:
+        start_ns, rig = state.t_ns - WINDOW_NS, self._rig
+        t, gyro, accel = imu.window(start_ns, state.t_ns + 1)
+        rolled = wheels.travelled(start_ns, state.t_ns)
+        left, right = rolled if rolled is not None else (np.nan, np.nan)
+        speed = 0.5 * (left + right) / (WINDOW_NS * 1e-9)
+        rate = (speed - self._last_speed) / (UPDATE_NS * 1e-9)
+        self._last_speed = 0.0 if np.isnan(speed) else speed
+        return Window(
+            dt_s=UPDATE_NS * 1e-9,
+            imu_t_s=t,
+            gyro_radps=gyro,
+            accel_mps2=accel,
+            wheel_speed_mps=speed,
+            wheel_speed_rate_mps2=0.0 if np.isnan(rate) else rate,
+            speed_mps=float(np.hypot(*state.velocity_mps[:2])),
+            yaw_rate_wheels_radps=None if rolled is None else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
+            yaw_rate_gyro_radps=float(gyro[:, 2].mean() - state.gyro_bias_radps[2]) if len(gyro) else np.nan,
+            slip=state.slip if slip_observed else None,
+            slip_sigma=state.slip_sigma if slip_observed else None,
+        )
+
+    def _reweight(self, t_ns: int) -> None:
+        if not self.adaptive:
+            return
+        p = self.detector.probabilities
+        self.row = self.policy.blend(p)
+        assert self._noted is not None
+        before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)
+        best = int(p.argmax())
+        why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
+        for name, (sensor, unit) in _RECORDED.items():
+            scale = max(abs(before[name]), 0.02)
+            if abs(now[name] - before[name]) > NOTEWORTHY * scale:
+                reason = f"{name}: {why}"
+                self.changes.append(WeightChange(t_ns, sensor, before[name], now[name], unit, reason))
+                self._noted = dataclasses.replace(self._noted, **{name: now[name]})
