@@ -100,7 +100,7 @@ def times_of(streams: Sequence[Stream], stamps: str, file: Path) -> tuple[dict[s
         far = max(offsets, key=lambda topic: abs(offsets[topic] - offset_s))
         return receipt, [
             *notes,
-            f"header clocks differ by {spread_s:.3g} s between topics ({far}); receipt stamps are used for all",
+            f"header clocks differ by {spread_s:.3g} s between topics ({far}); receipt stamps used for all",
         ]
     shift_ns = round(offset_s * 1e9) if abs(offset_s) > CLOCK_TOLERANCE_S else 0
     times = {s.topic: s.receipt_ns - shift_ns for s in streams}

@@ -1,5 +1,6 @@
 """Writers of recorded drives, one format a file."""
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.datasets.writers.mcap import write_mcap
 
-__all__ = ["write_log_folder"]
+__all__ = ["write_log_folder", "write_mcap"]
