@@ -172,7 +172,8 @@ class Estimator:
         )
         # The fixes that gave the heading enter the graph again as factors: the prior must not count them twice.
         yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
-        level, gyro_sigma = start.level_sigma_rad, spec.gyro_bias_sigma_radps + 1e-6
+        level = float(np.hypot(start.level_sigma_rad, spec.accel_bias_sigma_mps2 / GRAVITY_MPS2))
+        gyro_sigma = spec.gyro_bias_sigma_radps + 1e-6
         sigmas = [level, level, yaw_sigma, *[start.position_sigma_m] * 3, *[0.1 + 0.3 * abs(start.speed_mps)] * 3]
         sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + [row.slip_sigma]
         self.chain.append(point)

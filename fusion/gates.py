@@ -15,36 +15,36 @@ class GnssGate:
     """Chi-square test of a fix against its prediction, with re-acquisition.
 
     Attributes:
-        threshold: 2-D or 3-D chi-square quantiles by degrees of freedom.
+        threshold: chi-square quantile of the innovations tested.
         patience: rejected fixes in a row that agree with each other before the
             estimate, not GNSS, is taken to be wrong and the next fix is let in.
         agreement_sigma: how well they must agree, in their own sigmas.
     """
 
-    threshold: dict[int, float]
+    threshold: float
     patience: int = 5
     agreement_sigma: float = 4.0
     rejected: list[tuple[Array, float]] = field(default_factory=list)
 
-    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[bool, float, str]:
-        """Accept or not, the normalised innovation squared, and the reason.
+    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[bool, float]:
+        """Accept or not, the normalised innovation squared.
 
         `innovation_m` (d,) is fix minus prediction, `covariance_m2` (d, d) of it.
         """
         nis = float(innovation_m @ np.linalg.solve(covariance_m2, innovation_m))
-        if nis <= self.threshold[len(innovation_m)]:
+        if nis <= self.threshold:
             self.rejected.clear()
-            return True, nis, ""
+            return True, nis
         self.rejected.append((innovation_m[:2].copy(), float(np.sqrt(covariance_m2[0, 0]))))
         if len(self.rejected) >= self.patience and self._agree():
             self.rejected.clear()
-            return True, nis, f"{self.patience} rejected fixes agree with each other: re-acquired"
-        return False, nis, f"normalised innovation squared {nis:.1f} beyond {self.threshold[len(innovation_m)]:.1f}"
+            return True, nis
+        return False, nis
 
     def _agree(self) -> bool:
         recent = self.rejected[-self.patience :]
         points = np.array([point for point, _ in recent])
-        spread = float(np.hypot(*(points - points.mean(axis=0)).std(axis=0)))
+        spread = float(np.linalg.norm((points - points.mean(axis=0)).std(axis=0)))
         return spread <= self.agreement_sigma * max(sigma for _, sigma in recent)
 
 

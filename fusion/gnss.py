@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import dataclasses
 from collections.abc import Callable
 
 import numpy as np
@@ -22,10 +23,13 @@ Array = NDArray[np.float64]
 
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
+_CORRELATED = np.array([1.0, 1.0, 3.0])
+"""Heights are wrong for minutes at a time (atmosphere, multipath), so that fixes do not average out."""
 
 
 class GnssUpdater:
-    """Holds fixes until a keyframe has passed them, tests them and adds their factors.
+    """Holds fixes until a keyframe has passed them, tests position and height apart (a wrong
+    height must not cost a good position) them and adds their factors.
 
     Attributes:
         waiting: fixes not yet used, oldest first.
@@ -36,7 +40,8 @@ class GnssUpdater:
 
     def __init__(self, config: EstimatorConfig, report: Callable[[Innovation], None]) -> None:
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
-        self.gate = GnssGate({dof: float(chi2.ppf(config.gnss_gate, dof)) for dof in (2, 3)})
+        self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
+        self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         self.waiting: list[GnssFix] = []
         self.local = False
         self.rejected = 0
@@ -104,15 +109,19 @@ class GnssUpdater:
         accel_world = R @ (accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
         lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
         predicted = np.asarray(state.pose.translation()) + R @ lever
-        fix, sigma = _complete(fix, predicted, row.gnss_inflation)
+        sigma = np.maximum(fix.sigma_m * row.gnss_inflation * _CORRELATED, LEAST_SIGMA_M)
         innovation = fix.enu_m - predicted
-        dof = 2 if sigma[2] >= UNKNOWN_HEIGHT_SIGMA_M else 3
-        P = _antenna_covariance(covariance[POSE, POSE], R, lever) + np.diag(sigma**2)
-        accepted, nis, _ = self.gate.test(innovation[:dof], P[:dof, :dof])
-        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, dof, accepted))
+        P = _antenna_covariance(covariance[POSE, POSE], R, lever)
+        P[[0, 1], [0, 1]] += sigma[:2] ** 2
+        accepted, nis = self.gate.test(innovation[:2], P[:2, :2])
+        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, accepted))
         if not accepted:
             self.rejected += 1
             return False
+        known = bool(np.isfinite(innovation[2] + sigma[2]))
+        if not (known and self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0]):
+            fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
+            sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
         chain.add(k, gnss_position(k, fix, lever, sigma), "X")
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
@@ -120,16 +129,6 @@ class GnssUpdater:
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         self.last_used_ns = fix.t_ns
         return True
-
-
-def _complete(fix: GnssFix, predicted_m: Array, inflation: float) -> tuple[GnssFix, Array]:
-    """Fill an unknown height with the prediction at no weight; scale and floor the sigmas."""
-    sigma = np.maximum(fix.sigma_m * inflation, LEAST_SIGMA_M)
-    if np.isfinite(fix.enu_m[2] + sigma[2]):
-        return fix, sigma
-    position = np.array([fix.enu_m[0], fix.enu_m[1], predicted_m[2]])
-    sigma = np.array([sigma[0], sigma[1], UNKNOWN_HEIGHT_SIGMA_M])
-    return GnssFix(fix.t_ns, position, sigma, fix.velocity_mps, fix.sigma_v_mps), sigma
 
 
 def _antenna_covariance(P_pose: Array, R: Array, lever: Array) -> Array:
