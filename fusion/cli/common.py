@@ -1,0 +1,81 @@
+"""What commands that take a log share: its options, and opening it."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.recording import Recording
+    from terrafusion.datasets.sensors import Rig
+
+LogArgument = Annotated[
+    Path, typer.Argument(metavar="LOG", help="Log folder, ROS 1 .bag, or ROS 2 bag (folder, .mcap, .db3).")
+]
+VehicleOption = Annotated[
+    str | None,
+    typer.Option("--vehicle", help="Vehicle by name or YAML file: IMU mounting, track, usual topics."),
+]
+TopicOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--topic",
+        metavar="CHANNEL=/NAME",
+        help="Topic of a channel (imu, wheels, gnss, command, truth, terrain); repeat for more.",
+    ),
+]
+StampsOption = Annotated[
+    str, typer.Option("--stamps", help="Times of a bag: 'header' (measured) or 'receipt' (recorded).")
+]
+
+
+def parse_topics(entries: list[str] | None) -> dict[str, str]:
+    """`channel=/name` entries as a mapping; a malformed one is wrong usage (exit status 2)."""
+    topics = {}
+    for entry in entries or []:
+        channel, equals, name = entry.partition("=")
+        if not equals or not channel.strip() or not name.strip():
+            raise typer.BadParameter(f"'{entry}' is not CHANNEL=/NAME", param_hint="--topic")
+        topics[channel.strip()] = name.strip()
+    return topics
+
+
+def check_stamps(stamps: str) -> str:
+    """`stamps` when it is one of the two words; otherwise wrong usage (exit status 2)."""
+    if stamps not in ("header", "receipt"):
+        raise typer.BadParameter(f"'{stamps}' is neither 'header' nor 'receipt'", param_hint="--stamps")
+    return stamps
+
+
+def load_rig(vehicle: str | None) -> Rig | None:
+    """The sensor geometry of a vehicle, or None where none is named.
+
+    Raises:
+        ConfigError: no such vehicle.
+    """
+    if vehicle is None:
+        return None
+    from terrafusion.twin.vehicle import load_vehicle
+
+    return load_vehicle(vehicle).rig()
+
+
+def rig_of(recording: Recording, rig: Rig | None) -> Rig | None:
+    """`rig`, else that of the vehicle the log itself names, where it is known here."""
+    if rig is not None or not recording.vehicle:
+        return rig
+    from terrafusion.datasets.errors import ConfigError
+
+    try:
+        return load_rig(recording.vehicle)
+    except ConfigError:
+        return None
+
+
+def open_log(log: Path, rig: Rig | None, topic: list[str] | None, stamps: str) -> Recording:
+    """The recording at `log`, with the options of the command line."""
+    from terrafusion.datasets.readers import open_recording
+
+    return open_recording(log, rig=rig, topics=parse_topics(topic), stamps=check_stamps(stamps))
