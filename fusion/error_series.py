@@ -230,8 +230,14 @@ def _point_at(
 
 
 def _yaw_at(truth: Trajectory, t_ns: TimesNs) -> Array:
+    """Yaw (M,) of the truth, slerped between the two known orientations next to each time."""
     known = np.isfinite(truth.quaternion).all(axis=1) if truth.quaternion is not None else np.zeros(0, bool)
-    return yaw_of(truth.select(known).quaternions_at(t_ns)) if known.any() else np.full(len(t_ns), np.nan)
+    if not known.any():
+        return np.full(len(t_ns), np.nan)
+    rows = np.flatnonzero(known)
+    after = np.clip(np.searchsorted(truth.t_ns[rows], t_ns), 0, len(rows) - 1)
+    beside = np.unique(np.concatenate([after, np.maximum(after - 1, 0)]))
+    return yaw_of(truth.select(rows[beside]).quaternions_at(t_ns))
 
 
 def _common_times(estimate_ns: TimesNs, truth_ns: TimesNs) -> TimesNs:

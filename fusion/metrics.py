@@ -166,9 +166,9 @@ def score(
 
 
 def rpe_percent(errors: Errors, lengths_m: Sequence[float] = RPE_LENGTHS_M) -> dict[str, float | None]:
-    """Mean relative position error of all pairs a length of path apart, percent of that path, for each length.
+    """Mean relative position error over all pairs a length of path apart, percent of that path.
 
-    None where the drive is shorter.
+    One number for each length; None where the drive is shorter.
     """
     path = errors.path_m()
     known = np.flatnonzero(np.isfinite(errors.distance_m()))
