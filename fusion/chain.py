@@ -75,10 +75,10 @@ class Chain:
     newest keyframe up to date, `smooth` all of them.
     """
 
-    RELINEARISE = np.array([0.01] * 3 + [np.inf] * 3 + [0.1] * 3 + [0.5] * 3 + [0.02] * 3 + [0.05])
+    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf])
     """Change of a state (rad, m, m/s, m/s2, rad/s, -) beyond which its factors are linearised again.
 
-    Positions enter the factors linearly, so they never ask for it."""
+    Position and slip enter the factors linearly, so they never ask for it."""
 
     def __init__(self) -> None:
         self.first = 0
@@ -262,13 +262,16 @@ class Chain:
             node.delta = following = _back_substitute(node.conditional[:, :DIM], rhs)
 
 
+_UPPER = np.triu(np.ones((2 * DIM, 2 * DIM + 1)))
+
+
 def _triangular(stacked: Array) -> Array:
     """R of the QR decomposition of (m, n) rows, padded to n rows."""
     rows, columns = stacked.shape
     if rows < columns:
         stacked = np.vstack([stacked, np.zeros((columns - rows, columns))])
     packed, _, _, _ = lapack.dgeqrf(stacked, overwrite_a=1)
-    return np.triu(packed[:columns])[: columns - 1]
+    return np.asarray(packed[: columns - 1] * _UPPER[: columns - 1, :columns])
 
 
 def _back_substitute(R: Array, rhs: Array) -> Array:

@@ -23,8 +23,6 @@ Array = NDArray[np.float64]
 
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
-_CORRELATED = np.array([1.0, 1.0, 3.0])
-"""Heights are wrong for minutes at a time (atmosphere, multipath), so that fixes do not average out."""
 
 
 class GnssUpdater:
@@ -42,6 +40,11 @@ class GnssUpdater:
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
+        spec = config.rig.sensors.gnss
+        # Heights are wrong for minutes at a time: a white error of this size has their spectrum at low
+        # frequency (Gauss-Markov: 2 sigma^2 tau), so that many fixes do not pretend to average them out.
+        repeated = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
+        self._correlated = np.array([1.0, 1.0, repeated])
         self.waiting: list[GnssFix] = []
         self.local = False
         self.rejected = 0
@@ -109,7 +112,7 @@ class GnssUpdater:
         accel_world = R @ (accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
         lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
         predicted = np.asarray(state.pose.translation()) + R @ lever
-        sigma = np.maximum(fix.sigma_m * row.gnss_inflation * _CORRELATED, LEAST_SIGMA_M)
+        sigma = np.maximum(fix.sigma_m * row.gnss_inflation * self._correlated, LEAST_SIGMA_M)
         innovation = fix.enu_m - predicted
         P = _antenna_covariance(covariance[POSE, POSE], R, lever)
         P[[0, 1], [0, 1]] += sigma[:2] ** 2

@@ -36,18 +36,25 @@ def convert(
     """
     import dataclasses
 
+    from terrafusion.datasets.doctor import examine
     from terrafusion.datasets.writers import write_log_folder, write_mcap
 
     rig = load_rig(vehicle)
     recording = open_log(log, rig, topic, stamps)
+    rig = rig_of(recording, rig)
     if vehicle is not None:
         recording = dataclasses.replace(recording, vehicle=vehicle)
     for note in recording.notes:
         print(f"note: {note}")
     if out.suffix == ".mcap":
-        for part in write_mcap(recording, out, rig=rig_of(recording, rig), overwrite=overwrite):
+        for part in write_mcap(recording, out, rig=rig, overwrite=overwrite):
             print(f"left out: {part}")
     else:
         write_log_folder(recording, out)
     held = ", ".join(f"{name} {len(channel)}" for name, channel in recording.channels().items())
+    for finding in examine(recording, rig):
+        if finding.severity == "error":
+            print(
+                f"{finding.severity}: {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
+            )
     print(f"{out}: {held}{f', truth {len(recording.truth)}' if recording.truth is not None else ''}")

@@ -138,6 +138,7 @@ def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
         ]
     )
     floors = np.array([_ACCEL_FLOOR_MPS2] * 4 + [_GYRO_FLOOR_RADPS])
+    powers[powers == 0.0] = np.nan  # a channel the log does not have, filled in with a constant
     return np.asarray(0.5 * np.log10(powers + floors**2))
 
 

@@ -1,0 +1,170 @@
+"""Drives of the twin, cut into windows as the estimator would cut them."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.terrain.features import Window
+from terrafusion.twin.simulate import simulate
+from terrafusion.twin.vehicle import load_vehicle
+
+Array = NDArray[np.float64]
+
+GROUNDS = ("asphalt", "medium_sand", "loose_sand", "mud")
+UPDATE_S = 0.5
+WINDOW_S = 1.0
+SLIP_SIGMA = 0.04
+"""1 sigma of the slip the estimator supplies at run time, and SLIP_ERROR_S the time its error lasts."""
+SLIP_ERROR_S = 2.0
+
+
+@dataclass(frozen=True)
+class Condition:
+    """One drive of the twin."""
+
+    scenario: str
+    terrain: str | None
+    slope_deg: float
+    payload_kg: float
+    seed: int
+    vehicle: str = "elevate"
+
+    def run(self) -> Recording:
+        """Simulate it."""
+        return simulate(
+            self.scenario,
+            vehicle=self.vehicle,
+            terrain=self.terrain,
+            slope_deg=self.slope_deg,
+            payload_kg=self.payload_kg,
+            seed=self.seed,
+        )
+
+
+@dataclass(frozen=True)
+class Grid:
+    """Drives on every ground: scenarios (they set the speeds) x slopes x payloads x seeds."""
+
+    scenarios: tuple[str, ...]
+    slopes_deg: tuple[float, ...]
+    payloads_kg: tuple[float, ...]
+    seeds: tuple[int, ...]
+    grounds: tuple[str, ...] = GROUNDS
+    vehicle: str = "elevate"
+
+    def conditions(self) -> list[Condition]:
+        """All combinations, ground by ground."""
+        return [
+            Condition(scenario, ground, slope, payload, seed, self.vehicle)
+            for ground in self.grounds
+            for scenario in self.scenarios
+            for slope in self.slopes_deg
+            for payload in self.payloads_kg
+            for seed in self.seeds
+        ]
+
+    def fingerprint(self, **settings: Any) -> str:
+        """SHA-256 of the soil and vehicle files the drives are made from, and of all settings."""
+        digest = hashlib.sha256()
+        params = resources.files("terrafusion.twin.params")
+        for folder, names in (("soils", self.grounds), ("vehicles", (self.vehicle,))):
+            for name in sorted(names):
+                digest.update(f"{folder}/{name}\n".encode())
+                digest.update((params / folder / f"{name}.yaml").read_bytes())
+        text = json.dumps({"grid": dataclasses.asdict(self), **settings}, sort_keys=True)
+        digest.update(text.encode())
+        return digest.hexdigest()
+
+
+def run_all(conditions: Iterable[Condition], tick: Callable[[], None]) -> Iterator[tuple[Condition, Recording]]:
+    """Simulate one after another; `tick` is called after each."""
+    for condition in conditions:
+        yield condition, condition.run()
+        tick()
+
+
+@dataclass(frozen=True, eq=False)
+class WheelSamples:
+    """Wheels and truth on the wheels' clock (n,): side speeds (n, 2) m/s, true forward speed and yaw rate."""
+
+    t_s: Array
+    sides_mps: Array
+    forward_mps: Array
+    yaw_rate_radps: Array
+
+
+def wheel_samples(recording: Recording) -> WheelSamples:
+    """The wheels of a drive beside its truth.
+
+    Raises:
+        ValueError: the recording has no wheels, or no truth with a body twist.
+    """
+    rig = load_vehicle(recording.vehicle or "elevate").rig()
+    wheels, truth = recording.wheels, recording.truth
+    if wheels is None or truth is None or truth.twist_body is None:
+        raise ValueError(f"{recording.name}: wheels and a true twist are needed")
+    t = (wheels.t_ns - recording.start_ns) * 1e-9
+    truth_t = (truth.t_ns - recording.start_ns) * 1e-9
+    return WheelSamples(
+        t_s=t,
+        sides_mps=wheels.side_speeds_mps(rig.wheel_radius_m),
+        forward_mps=np.interp(t, truth_t, truth.twist_body[:, 0]),
+        yaw_rate_radps=np.interp(t, truth_t, truth.twist_body[:, 5]),
+    )
+
+
+def windows_of(recording: Recording, seed: int, slip_observed: bool = True) -> tuple[list[Window], NDArray[Any]]:
+    """Windows every `UPDATE_S` and the ground (n,) at the end of each, by the recording's labels.
+
+    Speed and slip stand for the estimator's: the true ones, slip blurred by a
+    Gauss-Markov error of `SLIP_SIGMA` and `SLIP_ERROR_S`, speed by 0.03 m/s.
+    """
+    imu, terrain = recording.imu, recording.terrain
+    if imu is None or terrain is None:
+        raise ValueError(f"{recording.name}: an IMU and terrain labels are needed")
+    rng = np.random.default_rng([seed, 7])
+    track = load_vehicle(recording.vehicle or "elevate").rig().track_m
+    samples = wheel_samples(recording)
+    imu_t = (imu.t_ns - recording.start_ns) * 1e-9
+    label_t = (terrain.t_ns - recording.start_ns) * 1e-9
+    mean = samples.sides_mps.mean(axis=1)
+    yaw = (samples.sides_mps[:, 1] - samples.sides_mps[:, 0]) / track
+    ends = np.arange(WINDOW_S, samples.t_s[-1], UPDATE_S)
+    keep = np.exp(-UPDATE_S / SLIP_ERROR_S)
+    error = rng.normal() * SLIP_SIGMA
+    windows, labels = [], []
+    for end in ends:
+        rows = slice(*np.searchsorted(samples.t_s, [end - WINDOW_S, end]))
+        recent = slice(*np.searchsorted(samples.t_s, [end - UPDATE_S, end]))
+        around = slice(*np.searchsorted(imu_t, [end - WINDOW_S, end]))
+        error = keep * error + np.sqrt(1.0 - keep**2) * SLIP_SIGMA * rng.normal()
+        wheel, speed = float(mean[recent].mean()), float(samples.forward_mps[recent].mean())
+        slip = 1.0 - speed / wheel + error if slip_observed and abs(wheel) > 1e-3 else None
+        span = float(samples.t_s[rows][-1] - samples.t_s[rows][0])
+        windows.append(
+            Window(
+                dt_s=UPDATE_S,
+                imu_t_s=imu_t[around],
+                gyro_radps=imu.gyro_radps[around],
+                accel_mps2=imu.accel_mps2[around],
+                wheel_speed_mps=wheel,
+                wheel_speed_rate_mps2=float(mean[rows][-5:].mean() - mean[rows][:5].mean()) / span,
+                speed_mps=speed + 0.03 * rng.normal(),
+                yaw_rate_wheels_radps=float(yaw[rows].mean()),
+                yaw_rate_gyro_radps=float(imu.gyro_radps[around, 2].mean()),
+                slip=slip,
+                slip_sigma=None if slip is None else SLIP_SIGMA,
+            )
+        )
+        labels.append(terrain.label[max(int(np.searchsorted(label_t, end, side="right")) - 1, 0)])
+    return windows, np.array(labels)
