@@ -59,7 +59,7 @@ class Trajectory:
 
     def select(self, rows: Any) -> Trajectory:
         """The same trajectory with the rows of a boolean mask, slice or index array."""
-        fields = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         return Trajectory(**{name: None if value is None else value[rows] for name, value in fields.items()})
 
     def yaw_rad(self) -> Array:

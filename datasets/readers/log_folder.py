@@ -100,7 +100,9 @@ class _FolderReader:
     def command(self) -> Command | None:
         names = ("v_mps", "yaw_rate_radps")
         table = self._table("command", names, required=names)
-        return table and Command(self._t(table), table.numbers["v_mps"], table.numbers["yaw_rate_radps"])
+        if table is None:
+            return None
+        return Command(self._t(table), table.numbers["v_mps"], table.numbers["yaw_rate_radps"])
 
     def wheels(self) -> Wheels | None:
         known = dict.fromkeys(f"{n}_{unit}" for names, unit in WHEEL_LAYOUTS for n in names)

@@ -6,7 +6,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -73,7 +73,7 @@ def write_mcap(
             writer = Writer(bag, version=8, storage_plugin=StoragePlugin.MCAP)
             writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
             with writer:
-                connections = []
+                connections: list[Any] = []
                 for topic, msgtype, messages in _parts(recording, estimate, composer, path, rig):
                     index = len(connections)
                     connections.append(writer.add_connection(topic, msgtype, typestore=store))
