@@ -46,7 +46,10 @@ class KeyState:
             self.bias.accelerometer() + delta[9:12], self.bias.gyroscope() + delta[12:15]
         )
         return KeyState(
-            self.pose.retract(delta[POSE]), self.velocity + delta[VELOCITY], bias, self.slip + float(delta[SLIP])
+            self.pose.retract(delta[POSE]),
+            self.velocity + delta[VELOCITY],
+            bias,
+            self.slip + float(delta[SLIP]),
         )
 
 
@@ -127,8 +130,20 @@ class Chain:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
         return np.asarray(inverse @ inverse.T)
 
-    def solve(self, iterations: int = 4) -> None:
-        """Bring the newest keyframe up to date, linearising it again while it moves."""
+    def covariances(self) -> Array:
+        """Marginal covariances (n, 16, 16) of all keyframes, by the backward recursion of the chain."""
+        out = np.zeros((len(self.nodes), DIM, DIM))
+        out[-1] = self.covariance()
+        for i in range(len(self.nodes) - 2, -1, -1):
+            rows = self.nodes[i].conditional
+            assert rows is not None
+            inverse, _ = lapack.dtrtri(rows[:, :DIM])
+            gain = inverse @ rows[:, DIM : 2 * DIM]
+            out[i] = inverse @ inverse.T + gain @ out[i + 1] @ gain.T
+        return out
+
+    def solve(self, iterations: int = 4, move: bool = True) -> None:
+        """Bring the newest keyframe up to date, linearising it again while it moves (unless told not to)."""
         for _ in range(iterations):
             for i in range(max(self._dirty, self.first), self.last):
                 self._eliminate(i)
@@ -136,41 +151,43 @@ class Chain:
             node = self.nodes[-1]
             self._root = _triangular(np.vstack([node.prior, self._unary_rows(self.last)]))
             node.delta = _back_substitute(self._root[:, :DIM], self._root[:, DIM])
-            if len(self.nodes) == 1 or (np.abs(node.delta) < self.RELINEARISE).all():
+            if not move or len(self.nodes) == 1 or (np.abs(node.delta) < self.RELINEARISE).all():
                 return
             self._move(self.last)
             self._dirty = self.last - 1
 
-    def smooth(self, iterations: int = 2) -> None:
-        """Bring all keyframes up to date; those that moved far are linearised again."""
+    def smooth(self, window: int, iterations: int = 2) -> None:
+        """Bring the newest `window` keyframes up to date; those that moved far are linearised again."""
+        begin = max(self.last - window + 1, self.first)
         for _ in range(iterations):
             self.solve()
-            self._back_substitute_all()
-            moved = [
-                i
-                for i in range(self.first + 1, self.last + 1)
-                if (np.abs(self.nodes[i - self.first].delta) > self.RELINEARISE).any()
-            ]
-            if not moved:
+            self._back_substitute_to(begin)
+            deltas = np.abs([node.delta for node in self.nodes[begin - self.first :]])
+            moved = begin + np.flatnonzero((deltas > self.RELINEARISE).any(axis=1))
+            moved = moved[moved > self.first]
+            if not moved.size:
                 return
-            for i in moved:
-                self._move(i)
-            self._dirty = min(self._dirty, moved[0] - 1)
+            for k in moved.tolist():
+                self._move(k)
+            self._dirty = min(self._dirty, int(moved[0]) - 1)
         self.solve()
-        self._back_substitute_all()
+        self._back_substitute_to(begin)
 
     def optimise(self, iterations: int = 20, tolerance: float = 1e-6) -> int:
         """Gauss-Newton over all keyframes to convergence (batch); gives the iterations taken."""
         for count in range(1, iterations + 1):
             self._dirty = self.first
-            self.solve(iterations=1)
-            self._back_substitute_all()
+            self.solve(iterations=1, move=False)
+            self._back_substitute_to(self.first)
             step = max(float(np.abs(node.delta).max()) for node in self.nodes)
             for i in range(self.first, self.last + 1):
                 self._move(i, keep_prior=i == self.first)
             if step < tolerance:
-                return count
-        return iterations
+                break
+        self._dirty = self.first
+        self.solve(iterations=1, move=False)
+        self._back_substitute_to(self.first)
+        return count
 
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
@@ -254,9 +271,9 @@ class Chain:
         node.conditional = R[:DIM]
         self.nodes[k + 1 - self.first].prior = R[DIM : 2 * DIM, DIM:]
 
-    def _back_substitute_all(self) -> None:
+    def _back_substitute_to(self, begin: int) -> None:
         following = self.nodes[-1].delta
-        for node in reversed(self.nodes[:-1]):
+        for node in self.nodes[-2 : begin - self.last - 2 : -1]:
             assert node.conditional is not None
             rhs = node.conditional[:, 2 * DIM] - node.conditional[:, DIM : 2 * DIM] @ following
             node.delta = following = _back_substitute(node.conditional[:, :DIM], rhs)

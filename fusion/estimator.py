@@ -1,10 +1,10 @@
 """`Estimator`: sensor messages in, pose, twist, slip and terrain out, live.
 
-    est = Estimator.for_vehicle("husky")
-    est.add_imu(t_ns, gyro, accel)
-    est.add_wheels(t_ns, left_mps, right_mps)
-    est.add_gnss(t_ns, enu_m, sigma_m)
-    state = est.latest()
+est = Estimator.for_vehicle("husky")
+est.add_imu(t_ns, gyro, accel)
+est.add_wheels(t_ns, left_mps, right_mps)
+est.add_gnss(t_ns, enu_m, sigma_m)
+state = est.latest()
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
 from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
-from terrafusion.fusion.chain import BIAS, POSE, SLIP, VELOCITY, Chain, KeyState
+from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.factors import at_rest, bridge, slip_process, wheel_increment
@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 
 LONGEST_IMU_GAP_S = 0.5
 SMOOTH_EVERY = 5
+SMOOTH_WINDOW = 50
 OUTAGE_S = 2.0
 STILL_GYRO_RADPS = 0.03
 STILL_ACCEL_MPS2 = 0.6
@@ -110,7 +111,9 @@ class Estimator:
         if position.shape != (3,) or not np.isfinite(position[:2]).all():
             raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
         if sigma.shape != (3,) or not (sigma[:2] > 0).all():
-            raise DataError(f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma")
+            raise DataError(
+                f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
+            )
         velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
         self.gnss.queue(GnssFix(t_ns, position, sigma, velocity, sigma_v_mps))
 
@@ -174,7 +177,13 @@ class Estimator:
         yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
         level = float(np.hypot(start.level_sigma_rad, spec.accel_bias_sigma_mps2 / GRAVITY_MPS2))
         gyro_sigma = spec.gyro_bias_sigma_radps + 1e-6
-        sigmas = [level, level, yaw_sigma, *[start.position_sigma_m] * 3, *[0.1 + 0.3 * abs(start.speed_mps)] * 3]
+        sigmas = [
+            level,
+            level,
+            yaw_sigma,
+            *[start.position_sigma_m] * 3,
+            *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
+        ]
         sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + [row.slip_sigma]
         self.chain.append(point)
         self.chain.set_prior(np.array(sigmas))
@@ -184,11 +193,12 @@ class Estimator:
         self._means = [(gyro_bias, np.zeros(3))]
         self.weights.begin(start.t_ns)
         newest = min(self.imu.t_ns[-1], self.wheels.t_ns[-1])
-        self._silent = True
+        # Live, what lies before the start has no estimate; a batch has one from the first keyframe on.
+        self._silent = self._keep is not None
         while self._t_ns[-1] + 2 * self._step_ns <= newest:
             self._keyframe(self._t_ns[-1] + self._step_ns)
         self._silent = False
-        self.chain.smooth(iterations=5)
+        self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _keyframe(self, t_ns: int) -> None:
         before_ns, dt = self._t_ns[-1], self._step_ns * 1e-9
@@ -202,7 +212,9 @@ class Estimator:
             link = bridge(k, before, wheels, dt)
             point = _carried(before, wheels, dt)
         else:
-            measured = self._preintegrator.integrate(segments, before.bias, row.gyro_inflation, row.accel_inflation)
+            measured = self._preintegrator.integrate(
+                segments, before.bias, row.gyro_inflation, row.accel_inflation
+            )
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), before.bias)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip)
             link.add(_imu_factor(k, measured))
@@ -225,7 +237,7 @@ class Estimator:
             chain.solve()
             self._covariance = chain.covariance()
         if chain.last % SMOOTH_EVERY == 0:
-            chain.smooth()
+            chain.smooth(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         if self._keep is not None:
             chain.forget(self._keep)
@@ -290,7 +302,8 @@ class Estimator:
             and abs(wheels.turn_rad) * rig.track_m < 2 * quantum
             and all(np.abs(s.gyro_radps - bias_g).max() < STILL_GYRO_RADPS for s in segments)
             and all(
-                abs(float(np.linalg.norm(s.accel_mps2 - bias_a)) - GRAVITY_MPS2) < STILL_ACCEL_MPS2 for s in segments
+                abs(float(np.linalg.norm(s.accel_mps2 - bias_a)) - GRAVITY_MPS2) < STILL_ACCEL_MPS2
+                for s in segments
             )
         )
         self._rest = self._rest + 1 if still else 0

@@ -90,7 +90,7 @@ class GnssUpdater:
             else:
                 k = chain.first + i
                 if k < chain.last:
-                    chain.smooth()
+                    chain.smooth(chain.last - k + 2)
                 offset_s = (fix.t_ns - times_ns[i]) * 1e-9
                 used |= self._add(chain, k, fix, offset_s, covariance, *means[i], row)
         return used
@@ -137,6 +137,8 @@ class GnssUpdater:
 def _antenna_covariance(P_pose: Array, R: Array, lever: Array) -> Array:
     """Covariance (3, 3) of the antenna position in the world from that of the pose (GTSAM order)."""
     J = np.zeros((3, 6))
-    J[:, :3] = -R @ np.array([[0.0, -lever[2], lever[1]], [lever[2], 0.0, -lever[0]], [-lever[1], lever[0], 0.0]])
+    J[:, :3] = -R @ np.array(
+        [[0.0, -lever[2], lever[1]], [lever[2], 0.0, -lever[0]], [-lever[1], lever[0], 0.0]]
+    )
     J[:, 3:] = R
     return np.asarray(J @ P_pose @ J.T)

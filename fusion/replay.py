@@ -1,0 +1,308 @@
+"""Replay a recording through the estimator as it would have run live, and score it."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import gtsam_to_ros_covariance
+from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimate import STATUS, Estimate, State
+from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.history import History
+from terrafusion.fusion.metrics import Outage, Scores, score
+from terrafusion.fusion.weighting import Policy, load_policy
+from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
+
+Array = NDArray[np.float64]
+
+HELD_OUT_EVERY = 5
+"""Without truth every fifth fix is kept from the estimator and scored against."""
+
+
+@dataclass(frozen=True, eq=False)
+class Replay:
+    """One replayed drive.
+
+    Attributes:
+        estimate, scores: what was estimated, and how well.
+        used, held_out: the fixes the estimator was given and was not given.
+        seconds: computing time of the estimation alone.
+        latencies_ms: computing time of each keyframe (live mode).
+        rejected_gnss, rejected_wheels: measurements refused by a gate.
+    """
+
+    recording: Recording
+    vehicle: VehicleParams
+    mode: str
+    estimate: Estimate
+    scores: Scores
+    used: Gnss | None
+    held_out: Gnss | None
+    outages: tuple[Outage, ...]
+    seconds: float
+    latencies_ms: Array
+    rejected_gnss: int
+    rejected_wheels: int
+
+    def realtime_factor(self) -> float:
+        """Seconds of recording per second of computing."""
+        return self.recording.duration_s() / max(self.seconds, 1e-9)
+
+    def status(self) -> tuple[str, str]:
+        """The last status and its sentence."""
+        value = str(self.estimate.status[-1]) if len(self.estimate.status) else "waiting"
+        return value, STATUS[value]
+
+
+def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParams, tuple[str, ...]]:
+    """The vehicle asked for, or named by the log, or a generic one; with the log's own geometry on top.
+
+    Raises:
+        DataError: nothing tells the robot's geometry.
+        ConfigError: an unknown vehicle name.
+    """
+    asked = name or recording.vehicle
+    overrides = recording.overrides
+    given = [f"{k} = {v}" for k, v in dataclasses.asdict(overrides).items() if v is not None]
+    notes = (f"the log's own geometry is used: {', '.join(given)}",) if given else ()
+    if asked:
+        return with_overrides(load_vehicle(asked), overrides), notes
+    wheels = recording.wheels
+    needs_radius = wheels is not None and wheels.unit == "radps"
+    if overrides.track_m is None or (needs_radius and overrides.wheel_radius_m is None):
+        raise DataError(
+            "the log names no vehicle and not its geometry",
+            file=recording.name,
+            remedy="give --vehicle NAME, or wheel_radius_m and track_m in meta.yaml",
+        )
+    notes += ("no vehicle is named: a generic one is used, with its assumed sensor noise",)
+    return with_overrides(load_vehicle("generic"), overrides), notes
+
+
+def split_fixes(recording: Recording, outages: Sequence[Outage]) -> tuple[Gnss | None, Gnss | None]:
+    """Fixes for the estimator, and fixes kept from it.
+
+    All fixes inside an outage are kept back; without a truth channel every
+    fifth of the others too.
+    """
+    gnss = recording.gnss
+    if gnss is None or not len(gnss):
+        return None, None
+    held = np.zeros(len(gnss), dtype=bool)
+    if recording.truth is None or not len(recording.truth):
+        held[HELD_OUT_EVERY - 1 :: HELD_OUT_EVERY] = True
+    for outage in outages:
+        held |= outage.covers(gnss.t_ns, recording.start_ns)
+    return gnss.select(~held), (gnss.select(held) if held.any() else None)
+
+
+def replay(
+    recording: Recording,
+    *,
+    vehicle: str | None = None,
+    mode: str = "adaptive",
+    policy: Path | Policy | None = None,
+    outages: Sequence[Outage] = (),
+    batch: bool = False,
+    progress: Callable[[float], None] | None = None,
+) -> Replay:
+    """Estimate and score one drive.
+
+    Args:
+        vehicle: name or YAML file; by default what the log says.
+        mode: "adaptive" or "fixed".
+        policy: weighting policy, or its file; by default the shipped one.
+        outages: stretches in which the estimator gets no fix.
+        batch: smooth the whole drive at once, instead of a fixed lag as live.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
+    """
+    params, notes = choose_vehicle(recording, vehicle)
+    imu, wheels = _usable(recording)
+    outages = tuple(outages)
+    for outage in outages:
+        if outage.start_s >= recording.duration_s():
+            raise DataError(
+                f"the outage starts at {outage.start_s:g} s, after the end of the log",
+                file=recording.name,
+                remedy=f"the log lasts {recording.duration_s():.1f} s",
+            )
+    used, held_out = split_fixes(recording, outages)
+    rows = policy if isinstance(policy, Policy) else load_policy(policy)
+    extra = {"lag_s": None} if batch else {}
+    config = EstimatorConfig(params.rig(), params.name, mode, rows, **extra)  # type: ignore[arg-type]
+    history = History()
+    estimator = Estimator(
+        config,
+        on_state=lambda state: history.add(state, estimator.weights.row),
+        on_innovation=history.innovations.append,
+    )
+    started = time.perf_counter()
+    latencies = _feed(
+        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, history, progress
+    )
+    if batch and history.states:
+        _smooth(estimator.chain, history)
+    seconds = time.perf_counter() - started
+    if not history.states:
+        raise _never_started(recording, used)
+    notes = (*recording.notes, *notes, *_said(estimator))
+    estimate = history.estimate(estimator.weights.detector.classes, estimator.weights.changes, notes)
+    antenna = config.rig.sensors.gnss.antenna_m
+    scores = score(
+        estimate,
+        recording,
+        held_out=held_out,
+        outages=outages,
+        antenna_m=antenna,
+        aligned=estimator.gnss.local,
+    )
+    return Replay(
+        recording, params, mode, estimate, scores, used, held_out, outages, seconds, latencies,
+        estimator.gnss.rejected, estimator.wheels_rejected,
+    )  # fmt: skip
+
+
+def _usable(recording: Recording) -> tuple[Imu, Wheels]:
+    """IMU and wheels without rows that lack a value."""
+    imu, wheels = recording.imu, recording.wheels
+    if imu is None or not len(imu) or not imu.has_gyro() or not imu.has_accel():
+        raise DataError(
+            "the log has no six-axis IMU",
+            file=recording.name,
+            channel="imu",
+            remedy="this version estimates from three gyro and three accelerometer axes",
+        )
+    if wheels is None or not len(wheels):
+        raise DataError(
+            "the log has no wheel speeds",
+            file=recording.name,
+            channel="wheels",
+            remedy="name their topic, or add wheels.csv",
+        )
+    imu = imu.select(np.isfinite(imu.gyro_radps.sum(axis=1) + imu.accel_mps2.sum(axis=1)))
+    wheels = wheels.select(np.isfinite(wheels.speed.sum(axis=1)))
+    if not len(imu) or not len(wheels):
+        raise DataError("no sample has all its values", file=recording.name, channel="imu or wheels")
+    overlap = (min(imu.t_ns[-1], wheels.t_ns[-1]) - max(imu.t_ns[0], wheels.t_ns[0])) * 1e-9
+    if overlap < 2.0:
+        raise DataError(
+            f"IMU and wheels overlap for {overlap:.1f} s only",
+            file=recording.name,
+            remedy="check their clocks; at least 2 s are needed",
+        )
+    return imu, wheels
+
+
+def _side_motion(wheels: Wheels, radius_m: float) -> tuple[list[int], list[list[float]]]:
+    """Times and rows [left m/s, right m/s (, left m, right m)] of the wheels."""
+    speeds = wheels.side_speeds_mps(radius_m)
+    if wheels.angle_rad is None or not np.isfinite(wheels.angle_rad).all():
+        return wheels.t_ns.tolist(), speeds.tolist()
+    turned = Wheels(wheels.t_ns, wheels.angle_rad, wheels.names, "radps").side_speeds_mps(radius_m)
+    return wheels.t_ns.tolist(), np.hstack([speeds, turned]).tolist()
+
+
+def _feed(
+    estimator: Estimator,
+    imu: Imu,
+    wheels: tuple[list[int], list[list[float]]],
+    gnss: Gnss | None,
+    history: History,
+    progress: Callable[[float], None] | None,
+) -> Array:
+    """Give all samples in time order; returns the computing time of each keyframe, ms."""
+    wheel_times, wheel_rows = wheels
+    gnss_times = [] if gnss is None else gnss.t_ns.tolist()
+    latencies: list[float] = []
+    w = g = made = 0
+    for i, t_ns in enumerate(imu.t_ns.tolist()):
+        while w < len(wheel_times) and wheel_times[w] <= t_ns:
+            estimator.add_wheels(wheel_times[w], *wheel_rows[w])
+            w += 1
+        while g < len(gnss_times) and gnss_times[g] <= t_ns:
+            assert gnss is not None
+            _give_fix(estimator, gnss, g)
+            g += 1
+        begun = time.perf_counter()
+        estimator.add_imu(t_ns, imu.gyro_radps[i], imu.accel_mps2[i])
+        if len(history.states) != made:
+            latencies.append((time.perf_counter() - begun) * 1e3)
+            made = len(history.states)
+            if progress is not None and made % 50 == 0:
+                progress((i + 1) / len(imu))
+    estimator.finish()
+    if progress is not None:
+        progress(1.0)
+    return np.array(latencies)
+
+
+def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
+    if not np.isfinite(gnss.enu_m[i, :2].sum() + gnss.sigma_enu_m[i, :2].sum()) or gnss.fix[i] == 0:
+        return
+    velocity = None if gnss.velocity_enu_mps is None else gnss.velocity_enu_mps[i]
+    sigma_v = float("nan") if gnss.sigma_v_mps is None else float(gnss.sigma_v_mps[i])
+    estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v)
+
+
+def _smooth(chain: Chain, history: History) -> None:
+    """Replace the live states by the batch solution over the whole drive."""
+    chain.optimise()
+    covariances = chain.covariances()
+    offset = len(chain.nodes) - len(history.states)
+    history.states[:] = [
+        _smoothed(state, chain, chain.first + offset + i, covariances[offset + i])
+        for i, state in enumerate(history.states)
+    ]
+
+
+def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
+    key = chain.state(k)
+    rotation = key.pose.rotation()
+    return dataclasses.replace(
+        live,
+        position_m=np.asarray(key.pose.translation()),
+        quaternion=np.asarray(rotation.toQuaternion().coeffs()),
+        velocity_mps=key.velocity,
+        angular_velocity_radps=live.angular_velocity_radps + live.gyro_bias_radps - key.bias.gyroscope(),
+        gyro_bias_radps=np.asarray(key.bias.gyroscope()),
+        accel_bias_mps2=np.asarray(key.bias.accelerometer()),
+        slip=key.slip,
+        slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
+        covariance=gtsam_to_ros_covariance(P[POSE, POSE], rotation.matrix()),
+        velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+    )
+
+
+def _said(estimator: Estimator) -> tuple[str, ...]:
+    notes = []
+    if estimator.gnss.local:
+        notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
+    if estimator.gnss.too_late:
+        notes.append(f"{estimator.gnss.too_late} GNSS fixes came before the start or too late for the lag")
+    return tuple(notes)
+
+
+def _never_started(recording: Recording, used: Gnss | None) -> DataError:
+    if used is not None and len(used):
+        return DataError(
+            "the robot never moved far enough for GNSS to show its heading",
+            file=recording.name,
+            channel="gnss",
+            remedy="replay a longer drive, or leave the GNSS channel out for a local path",
+        )
+    return DataError(
+        "the log is too short to start from", file=recording.name, remedy="give at least two seconds"
+    )
