@@ -1,0 +1,103 @@
+"""Soil parameters of the wheel-ground model, one YAML file a terrain.
+
+The pressure-sinkage and shear numbers are those of Bekker (1969) and Janosi
+and Hanamoto (1961); `friction_cap` is the effective Coulomb coefficient of
+the source study (Tab. 3). The `mud` section stands for mud that clings to the
+wheels, `vibration` for what an IMU on the chassis feels.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from terrafusion.datasets.config import Quantity, structure
+from terrafusion.twin.library import known_names, read_named
+
+
+@dataclass(frozen=True)
+class PressureSinkage:
+    """Bekker: pressure p = (k_c / b + k_phi) z^n; rigid-wheel sinkage grows with slip by 1 + k_ss |s|."""
+
+    k_c_n_per_m_n1: Annotated[float, Quantity("N/m^(n+1)", 0.0, 1e7)]
+    k_phi_n_per_m_n2: Annotated[float, Quantity("N/m^(n+2)", 1e3, 1e12)]
+    exponent: Annotated[float, Quantity("", 0.1, 1.8)]
+    slip_sinkage: Annotated[float, Quantity("", 0.0, 10.0)]
+    contact_length_floor_m: Annotated[float, Quantity("m", 0.005, 0.5)]
+
+
+@dataclass(frozen=True)
+class Shear:
+    """Janosi-Hanamoto shear under a Mohr-Coulomb limit, capped by an effective friction coefficient."""
+
+    cohesion_pa: Annotated[float, Quantity("Pa", 0.0, 1e6)]
+    friction_angle_rad: Annotated[float, Quantity("rad", 0.0, 0.9)]
+    shear_modulus_m: Annotated[float, Quantity("m", 2e-4, 0.2)]
+    friction_cap: Annotated[float, Quantity("", 0.01, 2.0)]
+
+
+@dataclass(frozen=True)
+class Resistance:
+    """Rolling resistance torque c_rr W R of a wheel and viscous drag of the hub, per wheel."""
+
+    rolling: Annotated[float, Quantity("", 0.0, 0.5)]
+    viscous_ns_per_m: Annotated[float, Quantity("N s/m", 0.0, 1000.0)]
+
+
+@dataclass(frozen=True)
+class Mud:
+    """Mud that clings to the wheels: a clogging state q grows by travel and slip, and is shed elsewhere.
+
+    dq/ds = pickup (1 + churn_gain q slip^2)(1 - q) - shed q per metre of wheel travel;
+    q adds the torque `torque_nm` q^4 to each wheel and the sinkage `sinkage_m` q^4.
+    """
+
+    pickup_per_m: Annotated[float, Quantity("1/m", 0.0, 10.0)]
+    churn_gain: Annotated[float, Quantity("", 0.0, 1000.0)]
+    shed_per_m: Annotated[float, Quantity("1/m", 0.0, 10.0)]
+    torque_nm: Annotated[float, Quantity("N m", 0.0, 1000.0)]
+    sinkage_m: Annotated[float, Quantity("m", 0.0, 0.5)]
+
+
+@dataclass(frozen=True)
+class Vibration:
+    """Vibration of the chassis at 1 m/s (rms, vertical and roll axes) and the band it lies in."""
+
+    accel_mps2_at_1mps: Annotated[float, Quantity("m/s2", 0.0, 50.0)]
+    gyro_radps_at_1mps: Annotated[float, Quantity("rad/s", 0.0, 10.0)]
+    low_hz: Annotated[float, Quantity("Hz", 0.1, 500.0)]
+    high_hz: Annotated[float, Quantity("Hz", 0.2, 1000.0)]
+
+
+@dataclass(frozen=True)
+class SoilParams:
+    """A terrain under a small wheeled robot."""
+
+    name: str
+    description: str
+    pressure: PressureSinkage
+    shear: Shear
+    resistance: Resistance
+    mud: Mud
+    vibration: Vibration
+
+    def __post_init__(self) -> None:
+        if self.vibration.high_hz <= self.vibration.low_hz:
+            raise ValueError("vibration.high_hz must be above vibration.low_hz")
+
+
+def soil_names() -> tuple[str, ...]:
+    """Names of the soils that come with the library."""
+    return known_names("soils")
+
+
+def load_soil(name_or_path: str | Path) -> SoilParams:
+    """A soil by its terrain name in the library, or from a YAML file.
+
+    Raises:
+        ConfigError: unknown name (the known ones are listed), or a file that
+            does not keep to the parameters' names, units and ranges.
+    """
+    raw, file = read_named("soils", name_or_path, kind="terrain")
+    return structure(SoilParams, raw, file=file)
