@@ -1,0 +1,145 @@
+"""The input doctor: a clean drive has no finding, each fault has its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.doctor import examine
+from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.sensors import Rig
+
+
+def test_clean_drive_has_no_finding(drive: Recording, husky_rig: Rig) -> None:
+    assert examine(drive) == []
+    assert examine(drive, husky_rig) == []
+
+
+def imu_gap(r: Recording) -> Recording:
+    assert r.imu is not None
+    return dataclasses.replace(
+        r, imu=r.imu.select(~((np.arange(len(r.imu)) > 2000) & (np.arange(len(r.imu)) < 2100)))
+    )
+
+
+def wheel_jitter(r: Recording) -> Recording:
+    assert r.wheels is not None
+    late = np.random.default_rng(1).integers(0, 10**8, len(r.wheels))
+    return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, t_ns=np.sort(r.wheels.t_ns + late)))
+
+
+def repeated_times(r: Recording) -> Recording:
+    assert r.gnss is not None
+    return dataclasses.replace(
+        r, gnss=r.gnss.select(np.repeat(np.arange(len(r.gnss)), [2, *[1] * (len(r.gnss) - 1)]))
+    )
+
+
+def held_wheels(r: Recording) -> Recording:
+    assert r.wheels is not None
+    index = np.arange(len(r.wheels)) // 4 * 4
+    return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, speed=r.wheels.speed[index]))
+
+
+def turned_imu(r: Recording) -> Recording:
+    assert r.imu is not None
+    return dataclasses.replace(r, imu=dataclasses.replace(r.imu, accel_mps2=r.imu.accel_mps2[:, [0, 2, 1]]))
+
+
+def imu_down(r: Recording) -> Recording:
+    assert r.imu is not None
+    return dataclasses.replace(r, imu=dataclasses.replace(r.imu, accel_mps2=-r.imu.accel_mps2))
+
+
+def accel_in_g(r: Recording) -> Recording:
+    assert r.imu is not None
+    return dataclasses.replace(r, imu=dataclasses.replace(r.imu, accel_mps2=r.imu.accel_mps2 / 9.81))
+
+
+def no_gravity(r: Recording) -> Recording:
+    assert r.imu is not None
+    return dataclasses.replace(r, imu=dataclasses.replace(r.imu, accel_mps2=r.imu.accel_mps2 - [0, 0, 9.81]))
+
+
+def gyro_flipped(r: Recording) -> Recording:
+    assert r.imu is not None
+    return dataclasses.replace(r, imu=dataclasses.replace(r.imu, gyro_radps=-r.imu.gyro_radps))
+
+
+def left_negative(r: Recording) -> Recording:
+    assert r.wheels is not None
+    return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, speed=r.wheels.speed * [-1.0, 1.0]))
+
+
+def zero_sigma(r: Recording) -> Recording:
+    assert r.gnss is not None
+    sigma = r.gnss.sigma_enu_m.copy()
+    sigma[10, 0], sigma[20, 1], sigma[30, 1] = 0.0, -1.0, np.nan
+    return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, sigma_enu_m=sigma))
+
+
+def gnss_jump(r: Recording) -> Recording:
+    assert r.gnss is not None
+    enu = r.gnss.enu_m.copy()
+    enu[100:] += [4.0, 3.0, 0.0]
+    return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, enu_m=enu))
+
+
+def wrong_radius(r: Recording) -> Recording:
+    return dataclasses.replace(r, overrides=dataclasses.replace(r.overrides, wheel_radius_m=0.25))
+
+
+def other_clock(r: Recording) -> Recording:
+    assert r.gnss is not None
+    return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, t_ns=r.gnss.t_ns + 10**12))
+
+
+FAULTS: list[tuple[Callable[[Recording], Recording], str, str, str]] = [
+    (imu_gap, "warning", "imu", "1 gap"),
+    (wheel_jitter, "warning", "wheels", "uneven sampling"),
+    (repeated_times, "warning", "gnss", "1 repeated times"),
+    (held_wheels, "warning", "wheels", "values are held"),
+    (turned_imu, "error", "imu", "gravity stands on +y"),
+    (imu_down, "error", "imu", "gravity stands on -z"),
+    (accel_in_g, "error", "imu", "looks like g"),
+    (no_gravity, "error", "imu", "not 9.8"),
+    (gyro_flipped, "error", "imu", "against the wheels"),
+    (left_negative, "warning", "wheels", "against each other"),
+    (zero_sigma, "error", "gnss", "3 of 300 fixes"),
+    (gnss_jump, "warning", "gnss", "1 jump"),
+    (wrong_radius, "warning", "wheels", "times the wheel speed"),
+    (other_clock, "error", "gnss", "begins after"),
+]
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault[0].__name__)
+def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Recording], str, str, str]) -> None:
+    spoil, severity, channel, what = fault
+    findings = examine(spoil(drive))
+    assert (severity, channel) in [(f.severity, f.channel) for f in findings]
+    found = next(f for f in findings if f.channel == channel and what in f.what)
+    assert found.evidence
+    assert found.fix
+    assert set(found.to_dict()) == {"severity", "channel", "what", "evidence", "fix"}
+
+
+def test_held_value_count_is_told(drive: Recording) -> None:
+    found = next(f for f in examine(held_wheels(drive)) if f.what == "values are held")
+    assert "every 4" in found.evidence
+
+
+def test_errors_come_first(drive: Recording) -> None:
+    severities = [f.severity for f in examine(gyro_flipped(imu_gap(drive)))]
+    assert severities == sorted(severities, key=lambda s: s != "error")
+
+
+def test_sparse_logs_do_not_trip_it(drive: Recording) -> None:
+    for name in Recording.CHANNELS:
+        channel = getattr(drive, name)
+        for n in (1, 2, 5):
+            alone = Recording("x", drive.start_ns, **{name: channel.select(slice(0, n))})
+            examine(alone)
+    examine(Recording("x", 0))
