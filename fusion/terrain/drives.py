@@ -86,7 +86,9 @@ class Grid:
         return digest.hexdigest()
 
 
-def run_all(conditions: Iterable[Condition], tick: Callable[[], None]) -> Iterator[tuple[Condition, Recording]]:
+def run_all(
+    conditions: Iterable[Condition], tick: Callable[[], None]
+) -> Iterator[tuple[Condition, Recording]]:
     """Simulate one after another; `tick` is called after each."""
     for condition in conditions:
         yield condition, condition.run()
@@ -123,7 +125,9 @@ def wheel_samples(recording: Recording) -> WheelSamples:
     )
 
 
-def windows_of(recording: Recording, seed: int, slip_observed: bool = True) -> tuple[list[Window], NDArray[Any]]:
+def windows_of(
+    recording: Recording, seed: int, slip_observed: bool = True
+) -> tuple[list[Window], NDArray[Any]]:
     """Windows every `UPDATE_S` and the ground (n,) at the end of each, by the recording's labels.
 
     Speed and slip stand for the estimator's: the true ones, slip blurred by a

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,7 +27,7 @@ ECE_BINS = 10
 
 @dataclass(frozen=True, eq=False)
 class Route:
-    """Windows in driving order with the true ground (n,) of each; `starts` are the rows where the ground changes."""
+    """Windows in driving order, the true ground (n,) of each, and the rows where the ground changes."""
 
     windows: list[Window]
     labels: NDArray[Any]
@@ -62,9 +63,7 @@ class Scores:
     windows: int
 
 
-def splice(
-    drives: Sequence[tuple[list[Window], str]], patches: int, seed: int
-) -> Route:
+def splice(drives: Sequence[tuple[list[Window], str]], patches: int, seed: int) -> Route:
     """One long drive over `patches` grounds, cut from drives (windows, ground) on one ground each."""
     rng = np.random.default_rng([seed, 11])
     grounds = sorted({ground for _, ground in drives})
@@ -149,11 +148,11 @@ def calibration_error(confidence: Array, correct: NDArray[np.bool_]) -> float:
 def _switches(
     sequence: Route, winner: NDArray[Any], true: NDArray[Any], moving: NDArray[np.bool_]
 ) -> tuple[list[float], int, int]:
-    """Delays (s of driving) of the changes of ground, how many were missed, and how many false ones were seen."""
+    """Delays (s of driving) of the changes of ground, how many were missed, how many were false."""
     delays, missed = [], 0
     settled = np.ones(len(winner), dtype=bool)
     bounds = [*sequence.starts, len(winner)]
-    for first, end in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, end in itertools.pairwise(bounds):
         rows = first + np.flatnonzero(moving[first:end])
         settled[rows[: round(SETTLING_S / UPDATE_S)]] = False
         settled[first : first + 1] = False

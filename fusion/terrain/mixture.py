@@ -100,7 +100,10 @@ def _patterns(x: Array) -> list[tuple[Array, NDArray[np.intp], NDArray[np.intp]]
 
 
 def _step(
-    patterns: list[tuple[Array, NDArray[np.intp], NDArray[np.intp]]], weight: Array, mean: Array, covariance: Array
+    patterns: list[tuple[Array, NDArray[np.intp], NDArray[np.intp]]],
+    weight: Array,
+    mean: Array,
+    covariance: Array,
 ) -> tuple[Array, Array, Array, float]:
     """One E and M step; also the log-likelihood of the parameters it was given."""
     parts, d = mean.shape
@@ -108,7 +111,9 @@ def _step(
     second = np.zeros((parts, d, d))
     total = 0.0
     for rows, seen, missing in patterns:
-        log_p = np.stack([_log_density(rows, mean[c, seen], covariance[c][np.ix_(seen, seen)]) for c in range(parts)])
+        log_p = np.stack(
+            [_log_density(rows, mean[c, seen], covariance[c][np.ix_(seen, seen)]) for c in range(parts)]
+        )
         log_p += np.log(weight)[:, None]
         top = log_p.max(axis=0)
         evidence = top + np.log(np.exp(log_p - top).sum(axis=0))
