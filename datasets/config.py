@@ -130,7 +130,7 @@ def checked_number(
 
 
 def _names(cls: type) -> list[str]:
-    return [f.name for f in dataclasses.fields(cls)]  # type: ignore[arg-type]
+    return [f.name for f in dataclasses.fields(cls)]
 
 
 def _quantity(hint: Any) -> Quantity | None:

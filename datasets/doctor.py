@@ -155,8 +155,8 @@ def _held_share(t_ns: NDArray[np.int64], values: Array) -> tuple[float, float]:
     reach = int(np.clip(round(0.5 / period), 3, 500))
     spread = np.percentile(values, 95, axis=0) - np.percentile(values, 5, axis=0)
     across = np.abs(values[2 * reach :] - values[: -2 * reach])
-    changing: NDArray[np.bool_] = (across > 0.1 * np.where(spread > 0, spread, np.inf)).any(axis=1)
-    same: NDArray[np.bool_] = (values[reach:-reach] == values[reach - 1 : -reach - 1]).all(axis=1)
+    changing = np.any(across > 0.1 * np.where(spread > 0, spread, np.inf), axis=1)
+    same = np.all(values[reach:-reach] == values[reach - 1 : -reach - 1], axis=1)
     if changing.sum() < 20:
         return 0.0, 1.0
     share = float(same[changing].mean())
@@ -225,14 +225,13 @@ def check_yaw_sign(patient: Patient) -> Iterator[Finding]:
         return
     sides = wheels.side_speeds_mps(patient.wheel_radius_m() or 0.15)
     turn = sides[:, 1] - sides[:, 0]
-    ends = np.linspace(max(wheels.t_ns[0], imu.t_ns[0]), min(wheels.t_ns[-1], imu.t_ns[-1]), 3)
-    if ends[0] >= ends[-1]:
-        return
-    grid: Array = np.arange(0.0, float(ends[-1] - ends[0]) * 1e-9, 0.5)
+    origin = max(int(wheels.t_ns[0]), int(imu.t_ns[0]))
+    common_s = (min(int(wheels.t_ns[-1]), int(imu.t_ns[-1])) - origin) * 1e-9
+    grid: Array = np.arange(0.0, common_s, 0.5)
     if len(grid) < 20:
         return
-    by_wheels = _mean_between(grid, (wheels.t_ns - int(ends[0])) * 1e-9, turn)
-    by_gyro = _mean_between(grid, (imu.t_ns - int(ends[0])) * 1e-9, rate)
+    by_wheels = _mean_between(grid, (wheels.t_ns - origin).astype(float) * 1e-9, turn)
+    by_gyro = _mean_between(grid, (imu.t_ns - origin).astype(float) * 1e-9, rate)
     if by_wheels.std() < 0.02 or by_gyro.std() < 0.02:
         return
     r = float(np.corrcoef(by_wheels, by_gyro)[0, 1])
@@ -271,7 +270,7 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
     sigma = gnss.sigma_enu_m[:, :2]
     if np.isfinite(gnss.enu_m[:, 2]).any():
         sigma = gnss.sigma_enu_m
-    bad: NDArray[np.bool_] = ~(sigma > 0.0).all(axis=1)
+    bad = ~np.all(sigma > 0.0, axis=1)
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
         at_s, said = patient.since_start_s(gnss.t_ns[first]), gnss.sigma_enu_m[first].tolist()

@@ -60,7 +60,8 @@ class Trajectory:
     def select(self, rows: Any) -> Trajectory:
         """The same trajectory with the rows of a boolean mask, slice or index array."""
         fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
-        return Trajectory(**{name: None if value is None else value[rows] for name, value in fields.items()})
+        chosen: dict[str, Any] = {k: None if v is None else v[rows] for k, v in fields.items()}
+        return Trajectory(**chosen)
 
     def yaw_rad(self) -> Array:
         """Yaw angles (N,), rad, in [-pi, pi]."""

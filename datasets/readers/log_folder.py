@@ -53,11 +53,11 @@ def read_log_folder(folder: Path) -> Recording:
     """
     meta_path = folder / META
     if not meta_path.is_file():
-        raise DataError(
-            "no meta.yaml in this folder",
-            file=folder,
-            remedy="give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle",
-        )
+        bags = sorted(p.name for p in folder.iterdir() if p.suffix in (".bag", ".mcap", ".db3"))
+        remedy = "give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle"
+        if bags:
+            remedy = f"give the bag itself: {', '.join(bags[:5])}{' ...' if len(bags) > 5 else ''}"
+        raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = read_meta(meta_path)
     reader = _FolderReader(folder, meta)
     command, wheels, imu = reader.command(), reader.wheels(), reader.imu()

@@ -53,7 +53,11 @@ def open_recording(
     if not ros:
         from terrafusion.datasets.readers.log_folder import read_log_folder
 
-        return read_log_folder(path)
+        recording = read_log_folder(path)
+        unused = [word for word, given in (("topics", topics), ("stamps", stamps != "header")) if given]
+        if unused:
+            return recording.with_notes(f"{' and '.join(unused)} only matter for ROS bags; not used here")
+        return recording
     if ros == "ros1":
         from terrafusion.datasets.readers.ros1 import read_ros1
 

@@ -94,18 +94,16 @@ def _assemble(
             remedy="name one with --topic, such as --topic imu=/imu/data",
         )
     streams = _streams(reader, {topic.name for topic in chosen.values()})
-    times, clock = times_of([s for s in streams.values() if s.messages], stamps, path)
-    start_ns = min(int(t[0]) for name, t in times.items() if chosen.get("datum", _NO_TOPIC).name != name)
+    by_kind = {kind: streams[topic.name] for kind, topic in chosen.items()}
+    times, clock = times_of([s for kind, s in by_kind.items() if kind != "datum"], stamps, path)
+    start_ns = min(int(t[0]) for t in times.values())
     builder = Builder(path, rig, start_ns, joints, [*notes, *clock])
-    return _build(builder, {kind: streams[t.name] for kind, t in chosen.items()}, times)
-
-
-_NO_TOPIC = Topic("", "", 0)
+    return _build(builder, by_kind, times)
 
 
 def _build(builder: Builder, streams: dict[str, Stream], times: Mapping[str, Any]) -> Recording:
     """One channel after the other; the order matters where one looks at another."""
-    t = {kind: times[stream.topic] for kind, stream in streams.items()}
+    t = {kind: times[stream.topic] for kind, stream in streams.items() if kind != "datum"}
     imu = builder.imu(streams["imu"], t["imu"]) if "imu" in streams else None
     wheels, track = None, None
     if "wheels" in streams:

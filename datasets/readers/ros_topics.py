@@ -49,7 +49,8 @@ JOINT_PREFIX = "joint."
 
 _TRUTH = re.compile(r"(^|[/_])(ground_?truth|truth|gt)([/_]|$)", re.IGNORECASE)
 _FUSED = re.compile(
-    r"filter|fused|ekf|ukf|slam|amcl|map|visual|vio|camera|lidar|laser|icp|gps|gnss|estimate|imu",
+    r"filter|fused|slam|visual|camera|lidar|laser|estimate"
+    r"|(^|[/_])(ekf|ukf|amcl|map|vio|icp|gps|gnss|imu)([/_]|$)",
     re.IGNORECASE,
 )
 _COMMAND = re.compile(r"cmd|command", re.IGNORECASE)
