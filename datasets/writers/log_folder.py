@@ -29,12 +29,15 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     folder = Path(folder)
     _make_room(folder)
     _check_wheels(recording.wheels, folder)
-    for name, channel in recording.channels().items():
-        _write_table(folder / f"{name}.csv", channel.t_ns - recording.start_ns, channel.columns())
-    if recording.truth is not None and len(recording.truth):
-        truth = recording.truth
-        _write_table(folder / "truth.csv", truth.t_ns - recording.start_ns, _truth_columns(truth))
-    _write_meta(recording, folder / META)
+    try:
+        for name, channel in recording.channels().items():
+            _write_table(folder / f"{name}.csv", channel.t_ns - recording.start_ns, channel.columns())
+        if recording.truth is not None and len(recording.truth):
+            truth = recording.truth
+            _write_table(folder / "truth.csv", truth.t_ns - recording.start_ns, _truth_columns(truth))
+        _write_meta(recording, folder / META)
+    except OSError as error:
+        raise DataError(f"cannot be written: {error.strerror or error}", file=folder) from None
     return folder
 
 
