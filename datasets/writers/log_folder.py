@@ -27,8 +27,8 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
             layout the format does not know.
     """
     folder = Path(folder)
-    _make_room(folder)
     _check_wheels(recording.wheels, folder)
+    _make_room(folder)
     try:
         for name, channel in recording.channels().items():
             _write_table(folder / f"{name}.csv", channel.t_ns - recording.start_ns, channel.columns())
