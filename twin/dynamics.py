@@ -71,7 +71,7 @@ def state_slice(prefix: str) -> slice:
 def vehicle_vector(
     vehicle: VehicleParams, *, slope_rad: float = 0.0, aspect_rad: float = 0.0, payload_kg: float = 0.0
 ) -> Array:
-    """Values (22,) of `VEHICLE_PARAMETERS`; `aspect_rad` is the direction of steepest ascent (0 east, left positive).
+    """Values (22,) of `VEHICLE_PARAMETERS`; `aspect_rad` is the way uphill (0 east, left positive).
 
     The payload rides at the centre of gravity and adds yaw inertia in proportion to its mass.
     """
@@ -85,7 +85,8 @@ def vehicle_vector(
             wheel.radius_m, wheel.width_m, wheel.inertia_kgm2,
             drive.gear_ratio, drive.gear_efficiency, drive.no_load_speed_radps, drive.stall_torque_nm,
             drive.torque_limit_nm, drive.supply_v, drive.speed_loop_p_nms, drive.speed_loop_i_nm, drive.lag_s,
-            downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad), GRAVITY_MPS2 * math.cos(slope_rad),
+            downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad),
+            GRAVITY_MPS2 * math.cos(slope_rad),
         ]
     )  # fmt: skip
 
@@ -196,7 +197,8 @@ def _derivative(x: Any, u: Any, pv: Any, ps: Any) -> Any:
         rim = speed * p["radius_m"]
         c = contact(
             ground, load, rim, (s["u"] - s["r"] * py, s["v"] + s["r"] * px),
-            (s[f"shear_x_{name}"], s[f"shear_y_{name}"]), s[f"brake_{name}"], s["clog"], p["radius_m"], p["width_m"],
+            (s[f"shear_x_{name}"], s[f"shear_y_{name}"]), s[f"brake_{name}"], s["clog"],
+            p["radius_m"], p["width_m"],
         )  # fmt: skip
         force_x, force_y = force_x + c.force_x_n, force_y + c.force_y_n
         moment = moment + px * c.force_y_n - py * c.force_x_n

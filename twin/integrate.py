@@ -145,8 +145,8 @@ def _run_vm(
         sample = _vm_sample(len(route.at), steps).mapaccum("tf_chunk", count)
         times = t0 + dt * np.arange(first, first + count)
         block = sample(
-            out[first], times[None, :], inputs[first : first + count].T, inputs[first + 1 : first + 1 + count].T,
-            constants, route.at, route.soil.ravel(),
+            out[first], times[None, :], inputs[first : first + count].T,
+            inputs[first + 1 : first + 1 + count].T, constants, route.at, route.soil.ravel(),
         )  # fmt: skip
         out[first + 1 : first + 1 + count] = np.asarray(block).T
     bad = np.flatnonzero(~np.isfinite(out.sum(axis=1)))

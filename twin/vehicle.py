@@ -92,6 +92,7 @@ class SensorRealism:
     gnss_single_sigma_m: Annotated[float, Quantity("m", 0.01, 100.0)]
     gnss_single_correlation_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
     gnss_latency_s: Annotated[float, Quantity("s", 0.0, 10.0)]
+    current_noise_a: Annotated[float, Quantity("A", 0.0, 100.0)]
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,120 @@
+"""From a scenario to driven states: command limits, side speeds, steering by waypoints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.dynamics import INDEX, STATES, state_slice
+from terrafusion.twin.scenario import Scenario
+from terrafusion.twin.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+Integrator = Callable[[Array, Array, float], Array]
+"""(state (38,), side speeds (N + 1, 2) rad/s, start time s) -> states (N + 1, 38)."""
+
+SETTLE_S = 3.0
+"""The robot stands this long before the run starts, so that it starts from rest in equilibrium."""
+STEERING_PERIOD_S = 0.1
+WAYPOINT_REACHED_M = 0.5
+LOOK_AHEAD_M = 1.5
+STEERING_GAIN_PER_S = 1.5
+MAX_STEERING_RADPS = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """What was wanted and what came of it: twist (N, 2) before limits, states (N, 38)."""
+
+    wanted: Array
+    states: Array
+
+
+def limit_slew(wanted: Array, dt_s: float, vehicle: VehicleParams, scenario: Scenario, start: Array) -> Array:
+    """Twist (N, 2) that follows `wanted` within the limits of speed and acceleration, from `start` (2,)."""
+    drive = vehicle.drive
+    accel = min(drive.max_accel_mps2, scenario.max_accel_mps2)
+    steps = (accel * dt_s, drive.max_yaw_accel_radps2 * dt_s)
+    out = np.empty_like(wanted)
+    goal_v = np.clip(wanted[:, 0], -drive.max_speed_mps, drive.max_speed_mps)
+    for column, (goal, step) in enumerate(zip((goal_v, wanted[:, 1]), steps, strict=True)):
+        now, row = float(start[column]), []
+        for target in goal.tolist():
+            now += min(max(target - now, -step), step)
+            row.append(now)
+        out[:, column] = row
+    return out
+
+
+def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
+    """Wheel speeds (N, 2) of left and right, rad/s, by the robot's own odometry geometry."""
+    half = 0.5 * vehicle.odometry.track_m * twist[:, 1]
+    return np.stack([twist[:, 0] - half, twist[:, 0] + half], axis=1) / vehicle.odometry.wheel_radius_m
+
+
+def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
+    """Initial state (38,): standing at the origin with the scenario's heading, settled on the slope."""
+    x0 = np.zeros(len(STATES))
+    heading = math.radians(scenario.heading_deg)
+    x0[INDEX["yaw"]] = heading
+    count = max(1, round(SETTLE_S / dt_s))
+    x = integrate(x0, np.zeros((count + 1, 2)), -SETTLE_S)[-1].copy()
+    for name in ("x", "y", "u", "v", "r", "travel", "clog", "motor_work", "electric_energy"):
+        x[INDEX[name]] = 0.0
+    for name in ("wheel_angle", "wheel_speed"):
+        x[state_slice(name)] = 0.0
+    x[INDEX["yaw"]] = heading
+    return x
+
+
+def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator) -> Driven:
+    """Drive the scenario at the samples t_s (N,), uniformly spaced from 0."""
+    dt = float(t_s[-1]) / (len(t_s) - 1)
+    start = at_rest(scenario, dt, integrate)
+    if scenario.waypoints:
+        return _steer(scenario, t_s, vehicle, integrate, start)
+    wanted = scenario.commanded(t_s)
+    twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
+    return Driven(wanted, integrate(start, side_speeds(twist, vehicle), 0.0))
+
+
+def _steer(
+    scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator, start: Array
+) -> Driven:
+    """Steer along the waypoints by the true pose, renewed every `STEERING_PERIOD_S`."""
+    dt = float(t_s[-1]) / (len(t_s) - 1)
+    period = max(1, round(STEERING_PERIOD_S / dt))
+    points = np.array([(0.0, 0.0), *scenario.waypoints])
+    states, wanted = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
+    states[0], wanted[0] = start, 0.0
+    twist, goal, first = np.zeros(2), 1, 0
+    while first < len(t_s) - 1:
+        last = min(first + period, len(t_s) - 1)
+        pose = states[first, :3]
+        while goal < len(points) and np.hypot(*(points[goal] - pose[:2])) < WAYPOINT_REACHED_M:
+            goal += 1
+        wish = _towards(points, goal, pose, scenario.waypoint_speed_mps)
+        block = np.tile(wish, (last - first, 1))
+        limited = np.vstack([twist, limit_slew(block, dt, vehicle, scenario, twist)])
+        states[first : last + 1] = integrate(states[first], side_speeds(limited, vehicle), float(t_s[first]))
+        wanted[first + 1 : last + 1] = wish
+        twist, first = limited[-1], last
+    return Driven(wanted, states)
+
+
+def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:
+    """Twist (2,) towards a point ahead on the leg that ends at `points[goal]`; rest after the last one."""
+    if goal >= len(points):
+        return np.zeros(2)
+    leg = points[goal] - points[goal - 1]
+    length = max(float(np.hypot(*leg)), 1e-9)
+    along = float((pose[:2] - points[goal - 1]) @ leg) / length
+    ahead = points[goal - 1] + leg / length * min(along + LOOK_AHEAD_M, length)
+    bearing = math.atan2(*(ahead - pose[:2])[::-1]) - float(pose[2])
+    error = math.remainder(bearing, 2.0 * math.pi)
+    rate = min(max(STEERING_GAIN_PER_S * error, -MAX_STEERING_RADPS), MAX_STEERING_RADPS)
+    return np.array([speed_mps * max(math.cos(error), 0.0), rate])
