@@ -1,0 +1,240 @@
+"""Maps of the drive, and several runs of one drive over each other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from terrafusion.datasets.recording import Fix, Gnss, Recording
+from terrafusion.fusion import plot_style as style
+from terrafusion.fusion.error_series import Errors
+from terrafusion.fusion.estimate import Estimate
+from terrafusion.fusion.metrics import Outage
+from terrafusion.fusion.plots import TIME, shade_outages
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ELLIPSE = float(np.sqrt(5.991464547))
+"""Half axes of the 95 % ellipse of two dimensions, in sigmas (chi-square, 2 degrees of freedom)."""
+
+
+def plot_map(
+    estimate: Estimate,
+    recording: Recording,
+    *,
+    held_out: Gnss | None = None,
+    outages: Sequence[Outage] = (),
+    ax: Axes | None = None,
+) -> tuple[Figure, Axes]:
+    """The path coloured by terrain with 95 % ellipses, over truth and GNSS fixes; outages are edged."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.lines import Line2D
+
+    fig, ax = style.canvas(ax, _map_size([estimate]))
+    handles = draw_references(ax, recording, held_out)
+    path = estimate.trajectory
+    keep = style.thin(len(path), 2 * style.MAX_POINTS)
+    xy = path.position_m[keep, :2]
+    handles += _edge_outages(ax, estimate, recording.start_ns, outages)
+    if len(xy) > 1 and estimate.classes:
+        label = estimate.dominant_terrain()[keep]
+        lines, colours = [], []
+        for first, last in style.runs_of(label):
+            lines.append(xy[first : last + 1])
+            colours.append(style.colour_of(str(label[first]), style.TERRAIN_COLOURS))
+        ax.add_collection(LineCollection(lines, colors=colours, linewidths=2.2, zorder=4))
+        for name in dict.fromkeys(label.tolist()):
+            colour = style.colour_of(str(name), style.TERRAIN_COLOURS)
+            handles.append(Line2D([], [], color=colour, linewidth=3, label=f"on {style.plain(name)}"))
+    elif len(xy):
+        handles += ax.plot(xy[:, 0], xy[:, 1], color="#0072b2", linewidth=2.0, label="estimate")
+    handles += _ellipses(ax, estimate)
+    if len(xy):
+        handles += ax.plot(
+            *xy[0], "^", color="#111111", markersize=8, zorder=6, label="start", linestyle="none"
+        )
+        handles += ax.plot(
+            *xy[-1], "s", color="#111111", markersize=6, zorder=6, label="end", linestyle="none"
+        )
+    _frame(ax)
+    _side_legend(ax, handles)
+    return fig, ax
+
+
+def plot_map_runs(
+    estimates: Mapping[str, Estimate],
+    recording: Recording,
+    *,
+    colours: Mapping[str, str] | None = None,
+    held_out: Gnss | None = None,
+    outages: Sequence[Outage] = (),
+    ax: Axes | None = None,
+) -> tuple[Figure, Axes]:
+    """The paths of several runs, by name, over truth and GNSS fixes; thick where a run has no GNSS."""
+    fig, ax = style.canvas(ax, _map_size(list(estimates.values())))
+    handles = draw_references(ax, recording, held_out)
+    for name, estimate in estimates.items():
+        colour = (colours or {}).get(name) or style.colour_of(name, style.MODE_COLOURS)
+        path = estimate.trajectory
+        xy = path.position_m[style.thin(len(path), 2 * style.MAX_POINTS), :2]
+        handles += ax.plot(xy[:, 0], xy[:, 1], color=colour, linewidth=1.4, zorder=5, label=style.plain(name))
+        for outage in outages:
+            rows = np.flatnonzero(outage.covers(path.t_ns, recording.start_ns))
+            inside = path.position_m[rows[style.thin(len(rows))], :2]
+            ax.plot(inside[:, 0], inside[:, 1], color=colour, linewidth=4.0, alpha=0.45, zorder=4)
+            if len(inside):
+                ax.plot(*inside[-1], "o", color=colour, markersize=6, markeredgecolor="white", zorder=6)
+    if outages:
+        from matplotlib.lines import Line2D
+
+        handles.append(
+            Line2D([], [], color="#777777", linewidth=4, alpha=0.5, label="no GNSS (dot: its end)")
+        )
+    _frame(ax)
+    _side_legend(ax, handles)
+    return fig, ax
+
+
+def plot_error_runs(
+    errors: Mapping[str, Errors],
+    start_ns: int,
+    *,
+    colours: Mapping[str, str] | None = None,
+    outages: Sequence[Outage] = (),
+    ax: Axes | None = None,
+) -> tuple[Figure, Axes]:
+    """Size of the horizontal position error of several runs, by name, over time."""
+    fig, ax = style.canvas(ax, (9.0, 3.0))
+    shade_outages(ax, outages)
+    for name, series in errors.items():
+        colour = (colours or {}).get(name) or style.colour_of(name, style.MODE_COLOURS)
+        distance = series.distance_m()
+        peak = [int(np.nanargmax(distance))] if np.isfinite(distance).any() else []
+        keep = style.thin(len(distance), keep=peak)
+        t = style.seconds(series.t_ns, start_ns)[keep]
+        ax.plot(t, distance[keep], color=colour, linewidth=1.2, label=style.plain(name))
+    ax.set_ylim(bottom=0.0)
+    style.dress(ax, x=TIME, y="position error, m")
+    style.legend_above(ax)
+    return fig, ax
+
+
+def draw_references(ax: Axes, recording: Recording, held_out: Gnss | None) -> list[Any]:
+    """Truth, the fixes used and the fixes kept back; returns the legend's handles."""
+    handles: list[Any] = []
+    truth, gnss = recording.truth, recording.gnss
+    if truth is not None and len(truth) and ("position" in (recording.truth_channels or ("position",))):
+        xy = truth.position_m[style.thin(len(truth), 2 * style.MAX_POINTS), :2]
+        handles += ax.plot(
+            xy[:, 0],
+            xy[:, 1],
+            color=style.TRUTH,
+            linewidth=1.0,
+            linestyle=(0, (4, 2)),
+            zorder=7,
+            label="truth",
+        )
+    kept_ns = held_out.t_ns if held_out is not None else np.zeros(0, dtype=np.int64)
+    if gnss is not None and len(gnss):
+        used = gnss.select((gnss.fix != Fix.NONE) & ~np.isin(gnss.t_ns, kept_ns))
+        xy = used.enu_m[style.thin(len(used), 800), :2]
+        handles += ax.plot(
+            xy[:, 0],
+            xy[:, 1],
+            ".",
+            color="#9a9a9a",
+            markersize=4,
+            zorder=2,
+            label="GNSS used",
+            linestyle="none",
+        )
+    if held_out is not None and len(held_out):
+        xy = held_out.enu_m[style.thin(len(held_out), 400), :2]
+        handles += ax.plot(
+            xy[:, 0],
+            xy[:, 1],
+            "o",
+            markerfacecolor="none",
+            color=style.HELD_OUT,
+            markersize=4,
+            markeredgewidth=0.8,
+            zorder=3,
+            label="GNSS kept back",
+            linestyle="none",
+        )
+    return handles
+
+
+def _edge_outages(ax: Axes, estimate: Estimate, start_ns: int, outages: Sequence[Outage]) -> list[Any]:
+    handles: list[Any] = []
+    path = estimate.trajectory
+    for outage in outages:
+        rows = np.flatnonzero(outage.covers(path.t_ns, start_ns))
+        xy = path.position_m[rows[style.thin(len(rows))], :2]
+        line = ax.plot(
+            xy[:, 0],
+            xy[:, 1],
+            color="#f4a582",
+            linewidth=7.0,
+            alpha=0.8,
+            zorder=3.5,
+            label="no GNSS",
+            solid_capstyle="round",
+        )
+        handles = handles or list(line)
+    return handles
+
+
+def _ellipses(ax: Axes, estimate: Estimate, count: int = 30) -> list[Any]:
+    """Draw the 95 % ellipses of the position at evenly spaced keyframes."""
+    path = estimate.trajectory
+    if path.covariance is None or len(path) < 2:
+        return []
+    rows = style.thin(len(path), count)
+    P = path.covariance[rows, :2, :2]
+    sound = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(path.position_m[rows, :2]).all(axis=1)
+    if not sound.any():
+        return []
+    size, axes = np.linalg.eigh(P[sound])
+    angle = np.linspace(0.0, 2.0 * np.pi, 41)
+    ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points = ring * ELLIPSE * np.sqrt(np.maximum(size, 0.0))[:, None, :]
+    rings = np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[sound], None, :2]
+    label = "95 % of position"
+    for i, loop in enumerate(rings):
+        ax.plot(
+            loop[:, 0],
+            loop[:, 1],
+            color="#0072b2",
+            linewidth=0.7,
+            alpha=0.8,
+            zorder=5,
+            label=label if i == 0 else None,
+        )
+    return [ax.lines[-len(rings)]]
+
+
+def _map_size(estimates: Sequence[Estimate]) -> tuple[float, float]:
+    """Figure size, inches, that suits the extent of the drive: a long straight one gets a low map."""
+    points = np.concatenate([e.trajectory.position_m[:, :2] for e in estimates] or [np.zeros((0, 2))])
+    points = points[np.isfinite(points).all(axis=1)]
+    width, height = np.ptp(points, axis=0) if len(points) else (1.0, 1.0)
+    return 9.0, float(np.clip(7.0 * height / max(width, 1e-3), 2.2, 6.0)) + 0.7
+
+
+def _frame(ax: Axes) -> None:
+    ax.set_aspect("equal", adjustable="datalim")
+    ax.margins(0.05)
+    ax.autoscale_view()
+    style.dress(ax, x="east, m", y="north, m")
+
+
+def _side_legend(ax: Axes, handles: Sequence[Any]) -> None:
+    if handles:
+        ax.legend(
+            handles=list(handles), loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8
+        )
