@@ -15,6 +15,7 @@ this order.
 
 from __future__ import annotations
 
+import bisect
 from dataclasses import dataclass, field
 
 import gtsam
@@ -28,6 +29,7 @@ from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
 Array = NDArray[np.float64]
 
 DIM = 16
+_ZERO = np.zeros(3)
 POSE, ROTATION, VELOCITY, BIAS, SLIP = slice(0, 6), slice(0, 3), slice(6, 9), slice(9, 15), 15
 
 
@@ -55,11 +57,17 @@ class KeyState:
 
 @dataclass(eq=False)
 class Node:
-    """A keyframe in the chain: its factors, its linearisation point and the result of its elimination."""
+    """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.
+
+    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before.
+    """
 
     point: KeyState
+    t_ns: int
     link: gtsam.NonlinearFactorGraph
     wheels: WheelIncrement | None
+    gyro_radps: Array
+    accel_mps2: Array
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     unary_keys: set[str] = field(default_factory=set)
     prior: Array = field(default_factory=lambda: np.zeros((0, DIM + 1)))
@@ -75,7 +83,9 @@ class Chain:
 
     A keyframe is appended with the factors that link it to its predecessor;
     unary factors may be added to any keyframe still held. `solve` brings the
-    newest keyframe up to date, `smooth` all of them.
+    newest keyframe up to date, `smooth` the newest few, `optimise` all.
+    `archive` is a second chain that is given the same factors and keeps them
+    all, for a batch solution afterwards.
     """
 
     RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf])
@@ -83,11 +93,13 @@ class Chain:
 
     Position and slip enter the factors linearly, so they never ask for it."""
 
-    def __init__(self) -> None:
+    def __init__(self, archive: Chain | None = None) -> None:
+        self.archive = archive
         self.first = 0
         self.nodes: list[Node] = []
         self.values = gtsam.Values()
         self._dirty = 0
+        self._error = 0.0
         self._root = np.zeros((DIM, DIM + 1))
 
     @property
@@ -97,18 +109,25 @@ class Chain:
 
     def append(
         self,
+        t_ns: int,
         point: KeyState,
         link: gtsam.NonlinearFactorGraph | None = None,
         wheels: WheelIncrement | None = None,
+        gyro_radps: Array = _ZERO,
+        accel_mps2: Array = _ZERO,
     ) -> int:
         """Add a keyframe with its initial state and its factors to the one before; gives its index.
 
         `link` must touch X, V, B and S of both keyframes.
         """
-        self.nodes.append(Node(point, link or gtsam.NonlinearFactorGraph(), wheels))
+        self.nodes.append(
+            Node(point, t_ns, link or gtsam.NonlinearFactorGraph(), wheels, gyro_radps, accel_mps2)
+        )
         self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
+        if self.archive is not None:
+            self.archive.append(t_ns, point, link, wheels, gyro_radps, accel_mps2)
         return self.last
 
     def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
@@ -117,6 +136,15 @@ class Chain:
         node.unary.add(factor)
         node.unary_keys.update(keys)
         self._dirty = min(self._dirty, k)
+        if self.archive is not None:
+            self.archive.add(k, factor, keys)
+
+    def at_or_after(self, t_ns: int) -> int | None:
+        """The first keyframe held at or after a time; None when none is, or when older ones were dropped."""
+        i = bisect.bisect_left(self.nodes, t_ns, key=lambda node: node.t_ns)
+        if i == len(self.nodes) or (i == 0 and self.nodes[0].t_ns != t_ns):
+            return None
+        return self.first + i
 
     def state(self, k: int) -> KeyState:
         """Best state of keyframe k as of the last `solve` (newest) or `smooth` (all)."""
@@ -142,52 +170,77 @@ class Chain:
             out[i] = inverse @ inverse.T + gain @ out[i + 1] @ gain.T
         return out
 
-    def solve(self, iterations: int = 4, move: bool = True) -> None:
-        """Bring the newest keyframe up to date, linearising it again while it moves (unless told not to)."""
-        for _ in range(iterations):
-            for i in range(max(self._dirty, self.first), self.last):
-                self._eliminate(i)
-            self._dirty = self.last
-            node = self.nodes[-1]
-            self._root = _triangular(np.vstack([node.prior, self._unary_rows(self.last)]))
-            node.delta = _back_substitute(self._root[:, :DIM], self._root[:, DIM])
-            if not move or len(self.nodes) == 1 or (np.abs(node.delta) < self.RELINEARISE).all():
-                return
-            self._move(self.last)
-            self._dirty = self.last - 1
+    def solve(self, window: int) -> None:
+        """Bring the newest keyframe up to date; if that moves it far, the newest `window` of them.
 
-    def smooth(self, window: int, iterations: int = 2) -> None:
+        Keyframes are linearised again together or not at all: a factor between
+        one that has moved and one that has not would be linearised about a
+        motion that nobody believes in.
+        """
+        self._eliminate_all()
+        if (np.abs(self.nodes[-1].delta) > self.RELINEARISE).any():
+            self.smooth(window)
+
+    def smooth(self, window: int, iterations: int = 4) -> None:
         """Bring the newest `window` keyframes up to date; those that moved far are linearised again."""
         begin = max(self.last - window + 1, self.first)
         for _ in range(iterations):
-            self.solve()
+            self._eliminate_all()
             self._back_substitute_to(begin)
             deltas = np.abs([node.delta for node in self.nodes[begin - self.first :]])
             moved = begin + np.flatnonzero((deltas > self.RELINEARISE).any(axis=1))
-            moved = moved[moved > self.first]
             if not moved.size:
                 return
             for k in moved.tolist():
                 self._move(k)
-            self._dirty = min(self._dirty, int(moved[0]) - 1)
-        self.solve()
+            self._dirty = max(min(self._dirty, int(moved[0]) - 1), self.first)
+        self._eliminate_all()
         self._back_substitute_to(begin)
 
-    def optimise(self, iterations: int = 20, tolerance: float = 1e-6) -> int:
-        """Gauss-Newton over all keyframes to convergence (batch); gives the iterations taken."""
+    def _eliminate_all(self) -> None:
+        """Eliminate what changed, and solve for the newest keyframe."""
+        for k in range(max(self._dirty, self.first), self.last):
+            self._eliminate(k)
+        self._dirty = self.last
+        node = self.nodes[-1]
+        own = np.vstack([node.prior, self._unary_rows(self.last)])
+        self._error += float(own[len(node.prior) :, DIM] @ own[len(node.prior) :, DIM])
+        self._root = _triangular(own)
+        node.delta = _back_substitute(self._root[:, :DIM], self._root[:, DIM])
+
+    def optimise(self, iterations: int = 30, tolerance: float = 1e-6) -> int:
+        """Gauss-Newton with step halving over all keyframes (batch); gives the iterations taken."""
+        error = self._linearised_error()
         for count in range(1, iterations + 1):
-            self._dirty = self.first
-            self.solve(iterations=1, move=False)
             self._back_substitute_to(self.first)
-            step = max(float(np.abs(node.delta).max()) for node in self.nodes)
-            for i in range(self.first, self.last + 1):
-                self._move(i, keep_prior=i == self.first)
-            if step < tolerance:
+            deltas = [node.delta for node in self.nodes]
+            scale = 1.0
+            while scale > 1e-3:
+                self._step(deltas, scale)
+                trial = self._linearised_error()
+                if trial <= error:
+                    break
+                self._step(deltas, -scale)
+                scale *= 0.5
+            else:
+                self._linearised_error()
+            error = min(trial, error)
+            if scale * max(float(np.abs(delta).max()) for delta in deltas) < tolerance or scale <= 1e-3:
                 break
-        self._dirty = self.first
-        self.solve(iterations=1, move=False)
         self._back_substitute_to(self.first)
         return count
+
+    def _linearised_error(self) -> float:
+        """Linearise and eliminate everything; the sum of squares of all whitened residuals."""
+        self._dirty, self._error = self.first, 0.0
+        self._eliminate_all()
+        return self._error
+
+    def _step(self, deltas: list[Array], scale: float) -> None:
+        """Move every linearisation point by `scale` times its delta."""
+        for k, delta in enumerate(deltas, self.first):
+            self.nodes[k - self.first].delta = scale * delta
+            self._move(k)
 
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
@@ -196,6 +249,29 @@ class Chain:
                 self.values.erase(symbol(self.first))
             self.nodes.pop(0)
             self.first += 1
+
+    def restart(self, extra_variance: Array) -> None:
+        """Keep only the newest keyframe, with its marginal as prior, less sure by `extra_variance` (16,).
+
+        For an estimate that has proved wrong: what comes next may move it
+        freely, and does not bend the past to reach it.
+        """
+        self._eliminate_all()
+        node, k, covariance = self.nodes[-1], self.last, self.covariance() + np.diag(extra_variance)
+        root = np.linalg.inv(np.linalg.cholesky(covariance))
+        graph, point = gtsam.NonlinearFactorGraph(), node.point.retract(node.delta)
+        fresh = Node(point, node.t_ns, graph, None, node.gyro_radps, node.accel_mps2)
+        fresh.prior = np.hstack([root, np.zeros((DIM, 1))])
+        self.nodes, self.first, self._dirty, self.values = [fresh], k, k, gtsam.Values()
+        self._insert(k, fresh.point)
+        self._eliminate_all()
+
+    def move_to(self, k: int, point: KeyState) -> None:
+        """Linearise keyframe k about another state."""
+        node = self.nodes[k - self.first]
+        node.point, node.delta = point, np.zeros(DIM)
+        self._publish(k)
+        self._dirty = min(self._dirty, max(k - 1, self.first))
 
     def set_prior(self, sigmas: Array) -> None:
         """Prior of the first keyframe at its initial state, independent 1 sigmas (16,)."""
@@ -208,14 +284,25 @@ class Chain:
         self.values.insert(B(k), point.bias)
         self.values.insert(S(k), point.slip)
 
-    def _move(self, k: int, keep_prior: bool = False) -> None:
-        """Make the current estimate of keyframe k its linearisation point."""
+    def _move(self, k: int) -> None:
+        """Make the current estimate of keyframe k its linearisation point.
+
+        The prior of the first keyframe is no factor that could be linearised
+        again: it is carried to the new tangent space, where the same state has
+        the coordinates log(exp(-delta) exp(.)).
+        """
         node = self.nodes[k - self.first]
-        if keep_prior:
-            node.prior = node.prior.copy()
-            node.prior[:, DIM] -= node.prior[:, :DIM] @ node.delta
+        if k == self.first:
+            prior = node.prior.copy()
+            prior[:, DIM] -= prior[:, :DIM] @ node.delta
+            prior[:, POSE] = prior[:, POSE] @ gtsam.Pose3.LogmapDerivative(node.delta[POSE])
+            node.prior = prior
         node.point = node.point.retract(node.delta)
         node.delta = np.zeros(DIM)
+        self._publish(k)
+
+    def _publish(self, k: int) -> None:
+        node = self.nodes[k - self.first]
         self.values.update(X(k), node.point.pose)
         self.values.update(V(k), node.point.velocity)
         self.values.update(B(k), node.point.bias)
@@ -263,6 +350,8 @@ class Chain:
         node = self.nodes[k - self.first]
         own = np.vstack([node.prior, self._unary_rows(k)])
         link = self._link_rows(k + 1)
+        fresh = 0 if k == self.first else len(node.prior)
+        self._error += float(own[fresh:, DIM] @ own[fresh:, DIM] + link[:, 2 * DIM] @ link[:, 2 * DIM])
         stacked = np.zeros((len(own) + len(link), 2 * DIM + 1))
         stacked[: len(own), :DIM] = own[:, :DIM]
         stacked[: len(own), 2 * DIM] = own[:, DIM]

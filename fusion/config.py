@@ -21,7 +21,7 @@ class EstimatorConfig:
         mode: "adaptive" (noise follows the detected terrain) or "fixed" (one row for all grounds).
         policy: noise rows by terrain.
         keyframe_s: time between keyframes.
-        lag_s: length of the smoothing window; None keeps every keyframe (batch).
+        lag_s: length of the smoothing window.
         wheel_wait_s: how long a keyframe waits for a late wheel sample.
         gnss_gate: chi-square probability beyond which a fix is rejected.
         wheel_gate_sigma: normalised wheel innovation beyond which an increment is rejected.
@@ -34,7 +34,7 @@ class EstimatorConfig:
     mode: str = "adaptive"
     policy: Policy = field(default_factory=load_policy)
     keyframe_s: float = 0.1
-    lag_s: float | None = 5.0
+    lag_s: float = 5.0
     wheel_wait_s: float = 0.3
     gnss_gate: float = 0.999
     wheel_gate_sigma: float = 6.0
@@ -46,5 +46,5 @@ class EstimatorConfig:
             raise ConfigError(f"unknown mode '{self.mode}'", remedy=f"this version has {', '.join(MODES)}")
         if not 0.01 <= self.keyframe_s <= 1.0:
             raise ConfigError(f"keyframe_s is {self.keyframe_s}", remedy="give 0.01 to 1 s")
-        if self.lag_s is not None and self.lag_s < 5 * self.keyframe_s:
+        if self.lag_s < 5 * self.keyframe_s:
             raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")

@@ -45,7 +45,8 @@ class Estimator:
 
     Each sensor is fed in its own time order; keyframes are made as soon as the
     IMU (and the wheels, or their waiting time) cover them. `on_state` is called
-    with every new `State`, `on_innovation` with every tested measurement.
+    with every new `State`, `on_innovation` with every tested measurement;
+    `archive` keeps all factors for a batch solution afterwards.
     """
 
     def __init__(
@@ -53,9 +54,10 @@ class Estimator:
         config: EstimatorConfig,
         on_state: Callable[[State], None] | None = None,
         on_innovation: Callable[[Innovation], None] | None = None,
+        archive: Chain | None = None,
     ) -> None:
         self.config = config
-        self.chain = Chain()
+        self.chain = Chain(archive)
         self.imu = ImuStream()
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
@@ -65,11 +67,9 @@ class Estimator:
         self._preintegrator = Preintegrator(config.rig.sensors.imu)
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._step_ns = round(config.keyframe_s * 1e9)
-        self._keep = None if config.lag_s is None else round(config.lag_s / config.keyframe_s)
+        self._keep = round(config.lag_s / config.keyframe_s)
         self._start: Start | None = None
         self._level: Start | None = None
-        self._t_ns: list[int] = []
-        self._means: list[tuple[Array, Array]] = []
         self._state: State | None = None
         self._covariance = np.zeros((16, 16))
         self._silent = False
@@ -133,7 +133,7 @@ class Estimator:
         if self._start is None and not self._try_start(last):
             return
         while True:
-            t = self._t_ns[-1] + self._step_ns
+            t = self.chain.nodes[-1].t_ns + self._step_ns
             if not self.imu.covers(t):
                 return
             late = self.imu.covers(t + round(self.config.wheel_wait_s * 1e9))
@@ -185,23 +185,23 @@ class Estimator:
             *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
         ]
         sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + [row.slip_sigma]
-        self.chain.append(point)
+        self.chain.append(start.t_ns, point, gyro_radps=gyro_bias)
         self.chain.set_prior(np.array(sigmas))
-        self.chain.solve()
+        if self.chain.archive is not None:
+            self.chain.archive.set_prior(np.array(sigmas))
+        self.chain.solve(SMOOTH_WINDOW)
         self._covariance = self.chain.covariance()
-        self._t_ns = [start.t_ns]
-        self._means = [(gyro_bias, np.zeros(3))]
         self.weights.begin(start.t_ns)
         newest = min(self.imu.t_ns[-1], self.wheels.t_ns[-1])
         # Live, what lies before the start has no estimate; a batch has one from the first keyframe on.
-        self._silent = self._keep is not None
-        while self._t_ns[-1] + 2 * self._step_ns <= newest:
-            self._keyframe(self._t_ns[-1] + self._step_ns)
+        self._silent = self.chain.archive is None
+        while self.chain.nodes[-1].t_ns + 2 * self._step_ns <= newest:
+            self._keyframe(self.chain.nodes[-1].t_ns + self._step_ns)
         self._silent = False
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _keyframe(self, t_ns: int) -> None:
-        before_ns, dt = self._t_ns[-1], self._step_ns * 1e-9
+        before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
         row = self.weights.row
         segments = self.imu.segments(before_ns, t_ns)
@@ -221,30 +221,25 @@ class Estimator:
             wheels = self._gated(t_ns, wheels, before, point, dt)
         slip_link, slip_prior = slip_process(k, dt, row)
         link.add(slip_link)
-        self.chain.append(point, link, wheels)
+        gyro, accel = _mean_rates(segments)
+        self.chain.append(t_ns, point, link, wheels, gyro, accel)
         self.chain.add(k, slip_prior, "S")
         self._zero_velocity(k, wheels, segments, before, link)
-        self._t_ns.append(t_ns)
-        self._finish_keyframe(t_ns, segments)
+        self._finish_keyframe(t_ns, gyro)
 
-    def _finish_keyframe(self, t_ns: int, segments: list[ImuSegment]) -> None:
+    def _finish_keyframe(self, t_ns: int, gyro: Array) -> None:
         chain = self.chain
-        chain.solve()
+        chain.solve(SMOOTH_WINDOW)
         self._covariance = chain.covariance()
-        gyro, accel = _mean_rates(segments)
-        self._means.append((gyro, accel))
-        if self.gnss.update(chain, self._t_ns, self._means, self._covariance, self.weights.row):
-            chain.solve()
+        if self.gnss.update(chain, self._covariance, self.weights.row):
+            chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         if chain.last % SMOOTH_EVERY == 0:
             chain.smooth(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
-        if self._keep is not None:
-            chain.forget(self._keep)
-            surplus = len(self._t_ns) - len(chain.nodes)
-            del self._t_ns[:surplus], self._means[:surplus]
-            self.imu.forget(t_ns - 2_000_000_000)
-            self.wheels.forget(t_ns - 2_000_000_000)
+        chain.forget(self._keep)
+        self.imu.forget(t_ns - 2_000_000_000)
+        self.wheels.forget(t_ns - 2_000_000_000)
         self._emit(t_ns, gyro)
         state = self._state
         assert state is not None

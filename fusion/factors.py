@@ -52,10 +52,14 @@ def wheel_increment(
     forward = math.hypot(noise.wheel_sigma_mps * total, quantum_m)
     across = noise.side_slip_sigma * abs(distance) + FLOOR_M
     up = UP_SIDE_RATIO * abs(distance) + FLOOR_M
-    return WheelIncrement(np.array([x, y, 0.0]), np.array([forward, across, up]), distance, (right - left) / track_m)
+    return WheelIncrement(
+        np.array([x, y, 0.0]), np.array([forward, across, up]), distance, (right - left) / track_m
+    )
 
 
-def slip_process(k: int, dt_s: float, noise: SensorNoise) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
+def slip_process(
+    k: int, dt_s: float, noise: SensorNoise
+) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
     """Link and prior that make slip an Ornstein-Uhlenbeck process with the moments of `noise`.
 
     A random walk with variance 2 sigma^2 dt / tau, pulled to the mean by a
@@ -71,23 +75,35 @@ def slip_process(k: int, dt_s: float, noise: SensorNoise) -> tuple[gtsam.Nonline
 
 def at_rest(k: int) -> gtsam.NonlinearFactor:
     """Zero velocity and zero rotation between two keyframes."""
-    return gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS))
+    return gtsam.BetweenFactorPose3(
+        X(k - 1), X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS)
+    )
 
 
-def bridge(k: int, before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> gtsam.NonlinearFactorGraph:
+def bridge(
+    k: int, before: KeyState, wheels: WheelIncrement | None, dt_s: float
+) -> gtsam.NonlinearFactorGraph:
     """Loose links across a hole in the IMU: wheels or held velocity carry the robot."""
     graph = gtsam.NonlinearFactorGraph()
     moved = wheels.displacement_m if wheels else before.pose.rotation().matrix().T @ before.velocity * dt_s
     sigmas = np.array([0.05, 0.05, 0.3, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
     turn = gtsam.Rot3.Rz(wheels.turn_rad if wheels else 0.0)
-    graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), gtsam.Pose3(turn, moved), gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
-    graph.add(gtsam.BetweenFactorVector(V(k - 1), V(k), np.zeros(3), _isotropic(3, round(2.0 * math.sqrt(dt_s), 6))))
+    graph.add(
+        gtsam.BetweenFactorPose3(
+            X(k - 1), X(k), gtsam.Pose3(turn, moved), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
+        )
+    )
+    graph.add(
+        gtsam.BetweenFactorVector(V(k - 1), V(k), np.zeros(3), _isotropic(3, round(2.0 * math.sqrt(dt_s), 6)))
+    )
     same = gtsam.imuBias.ConstantBias()
     graph.add(gtsam.BetweenFactorConstantBias(B(k - 1), B(k), same, _isotropic(6, 1e-3)))
     return graph
 
 
-def antenna_lever(state: KeyState, dt_s: float, gyro_radps: Array, accel_world_mps2: Array, antenna_m: Array) -> Array:
+def antenna_lever(
+    state: KeyState, dt_s: float, gyro_radps: Array, accel_world_mps2: Array, antenna_m: Array
+) -> Array:
     """Antenna position (3,) at `dt_s` from the keyframe, in the body frame of the keyframe, m.
 
     A fix rarely falls on a keyframe. Within half a keyframe the body is carried

@@ -12,12 +12,14 @@ Array = NDArray[np.float64]
 
 @dataclass
 class GnssGate:
-    """Chi-square test of a fix against its prediction, with re-acquisition.
+    """Chi-square test of a fix against its prediction.
+
+    When enough rejected fixes in a row agree with each other the estimate, not
+    GNSS, is taken to be wrong: `test` answers "reacquire".
 
     Attributes:
         threshold: chi-square quantile of the innovations tested.
-        patience: rejected fixes in a row that agree with each other before the
-            estimate, not GNSS, is taken to be wrong and the next fix is let in.
+        patience: rejected fixes in a row that must agree with each other.
         agreement_sigma: how well they must agree, in their own sigmas.
     """
 
@@ -34,7 +36,7 @@ class GnssGate:
         nis = float(innovation_m @ np.linalg.solve(covariance_m2, innovation_m))
         if nis <= self.threshold:
             self.rejected.clear()
-            return True, nis
+            return "accept", nis
         self.rejected.append((innovation_m[:2].copy(), float(np.sqrt(covariance_m2[0, 0]))))
         if len(self.rejected) >= self.patience and self._agree():
             self.rejected.clear()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import bisect
 import dataclasses
 from collections.abc import Callable
 
@@ -23,6 +22,7 @@ Array = NDArray[np.float64]
 
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
+LARGE_TURN_RAD = 0.05
 
 
 class GnssUpdater:
@@ -41,10 +41,12 @@ class GnssUpdater:
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         spec = config.rig.sensors.gnss
-        # Heights are wrong for minutes at a time: a white error of this size has their spectrum at low
-        # frequency (Gauss-Markov: 2 sigma^2 tau), so that many fixes do not pretend to average them out.
-        repeated = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
-        self._correlated = np.array([1.0, 1.0, repeated])
+        # Fixes repeat one another's error for a correlation time tau. Of those within the window that is
+        # solved together only one is news; heights, wrong for minutes at a time and of little use, are held
+        # to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau).
+        repeats = 2.0 * spec.correlation_time_s * spec.rate_hz
+        level = np.sqrt(1.0 + min(repeats, config.lag_s * spec.rate_hz))
+        self._correlated = np.array([level, level, np.sqrt(1.0 + repeats)])
         self.waiting: list[GnssFix] = []
         self.local = False
         self.rejected = 0
@@ -65,64 +67,47 @@ class GnssUpdater:
         self._seen = len(self.waiting)
         return changed
 
-    def update(
-        self,
-        chain: Chain,
-        times_ns: list[int],
-        means: list[tuple[Array, Array]],
-        covariance: Array,
-        row: SensorNoise,
-    ) -> bool:
-        """Use every waiting fix that some keyframe has passed; True when a factor was added.
+    def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
+        """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `times_ns` and `means`
-        (rate (3,), specific force (3,) of the interval before) run along the
-        chain's keyframes; `covariance` (16, 16) is that of the newest one.
+        A fix belongs to the first keyframe after it. `covariance` (16, 16) is
+        that of the newest keyframe.
         """
         used = False
-        while self.waiting and self.waiting[0].t_ns <= times_ns[-1]:
+        while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
             fix = self.waiting.pop(0)
-            i = bisect.bisect_left(times_ns, fix.t_ns)
+            k = chain.at_or_after(fix.t_ns)
             if self.local:
                 self.rejected += 1
-            elif i == 0 and fix.t_ns != times_ns[0]:
+            elif k is None:
                 self.too_late += 1
             else:
-                k = chain.first + i
                 if k < chain.last:
                     chain.smooth(chain.last - k + 2)
-                offset_s = (fix.t_ns - times_ns[i]) * 1e-9
-                used |= self._add(chain, k, fix, offset_s, covariance, *means[i], row)
+                used |= self._add(chain, k, fix, covariance, row)
         return used
 
-    def _add(
-        self,
-        chain: Chain,
-        k: int,
-        fix: GnssFix,
-        offset_s: float,
-        covariance: Array,
-        gyro_radps: Array,
-        accel_mps2: Array,
-        row: SensorNoise,
-    ) -> bool:
-        state = chain.state(k)
+    def _add(self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise) -> bool:
+        node, state = chain.nodes[k - chain.first], chain.state(k)
+        offset_s = (fix.t_ns - node.t_ns) * 1e-9
         R = state.pose.rotation().matrix()
-        rate = gyro_radps - state.bias.gyroscope()
-        accel_world = R @ (accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
+        rate = node.gyro_radps - state.bias.gyroscope()
+        accel_world = R @ (node.accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
         lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
         predicted = np.asarray(state.pose.translation()) + R @ lever
         sigma = np.maximum(fix.sigma_m * row.gnss_inflation * self._correlated, LEAST_SIGMA_M)
         innovation = fix.enu_m - predicted
-        P = _antenna_covariance(covariance[POSE, POSE], R, lever)
+        J = _antenna_jacobian(R, lever)
+        P = J @ covariance[POSE, POSE] @ J.T
         P[[0, 1], [0, 1]] += sigma[:2] ** 2
-        accepted, nis = self.gate.test(innovation[:2], P[:2, :2])
-        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, accepted))
-        if not accepted:
+        verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
+        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict != "reject"))
+        if verdict == "reject":
             self.rejected += 1
             return False
+        cut = k == chain.last and self._prepare(chain, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
-        if not (known and self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0]):
+        if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] == "reject":
             fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
             sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
         chain.add(k, gnss_position(k, fix, lever, sigma), "X")
@@ -130,15 +115,33 @@ class GnssUpdater:
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
+        if cut:
+            chain.smooth(1)
+            chain.restart(np.zeros(16))
         self.last_used_ns = fix.t_ns
         return True
 
+    @staticmethod
+    def _prepare(
+        chain: Chain, covariance: Array, innovation_m: Array, S: Array, jacobian: Array, verdict: str
+    ) -> bool:
+        """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
 
-def _antenna_covariance(P_pose: Array, R: Array, lever: Array) -> Array:
-    """Covariance (3, 3) of the antenna position in the world from that of the pose (GTSAM order)."""
-    J = np.zeros((3, 6))
-    J[:, :3] = -R @ np.array(
-        [[0.0, -lever[2], lever[1]], [lever[2], 0.0, -lever[0]], [-lever[1], lever[0], 0.0]]
-    )
-    J[:, 3:] = R
-    return np.asarray(J @ P_pose @ J.T)
+        A fix after a long outage can turn the heading by more than the window's
+        linearisation bears; applied to the newest keyframe alone it is a Kalman
+        update, which cannot diverge.
+        """
+        gain = covariance[:, :6] @ jacobian.T @ np.linalg.inv(S)
+        doubt = np.zeros(16)
+        if verdict == "reacquire":
+            doubt[3:6] = float(innovation_m @ innovation_m)
+        elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
+            return False
+        chain.restart(doubt)
+        return True
+
+
+def _antenna_jacobian(R: Array, lever: Array) -> Array:
+    """Derivative (3, 6) of the antenna position in the world by the pose (GTSAM tangent)."""
+    x, y, z = lever
+    return np.hstack([-R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), R])

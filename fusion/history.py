@@ -25,7 +25,9 @@ class History:
         self.states.append(state)
         self.rows.append(row)
 
-    def estimate(self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]) -> Estimate:
+    def estimate(
+        self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]
+    ) -> Estimate:
         """All keyframes as arrays along time."""
         states = self.states
 
@@ -51,7 +53,9 @@ class History:
             accel_bias_mps2=stack("accel_bias_mps2", (3,)),
             slip=stack("slip"),
             slip_sigma=stack("slip_sigma"),
-            terrain=np.array([[s.terrain[c] for c in classes] for s in states]).reshape(len(states), len(classes)),
+            terrain=np.array([[s.terrain[c] for c in classes] for s in states]).reshape(
+                len(states), len(classes)
+            ),
             classes=classes,
             weights={name: np.array([getattr(row, name) for row in self.rows]) for name in fields},
             changes=tuple(changes),

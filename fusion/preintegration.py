@@ -31,14 +31,19 @@ class Preintegrator:
         accel_inflation: float,
     ) -> gtsam.PreintegratedCombinedMeasurements:
         """Preintegrate the segments about `bias`; inflations multiply the data sheet's noise."""
-        measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(gyro_inflation, accel_inflation), bias)
+        measured = gtsam.PreintegratedCombinedMeasurements(
+            self._scaled(gyro_inflation, accel_inflation), bias
+        )
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
         return measured
 
     def _scaled(self, gyro_inflation: float, accel_inflation: float) -> gtsam.PreintegrationCombinedParams:
         # Steps of 5 % keep the number of parameter sets small.
-        key = (1.05 ** round(np.log(gyro_inflation) / np.log(1.05)), 1.05 ** round(np.log(accel_inflation) / np.log(1.05)))
+        key = (
+            1.05 ** round(np.log(gyro_inflation) / np.log(1.05)),
+            1.05 ** round(np.log(accel_inflation) / np.log(1.05)),
+        )
         if key not in self._params:
             spec, eye = self.spec, np.eye(3)
             params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)

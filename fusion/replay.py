@@ -8,13 +8,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import gtsam_to_ros_covariance
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
-from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain
+from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import STATUS, Estimate, State
 from terrafusion.fusion.estimator import Estimator
@@ -141,20 +142,21 @@ def replay(
             )
     used, held_out = split_fixes(recording, outages)
     rows = policy if isinstance(policy, Policy) else load_policy(policy)
-    extra = {"lag_s": None} if batch else {}
-    config = EstimatorConfig(params.rig(), params.name, mode, rows, **extra)  # type: ignore[arg-type]
+    config = EstimatorConfig(params.rig(), params.name, mode, rows)
+    archive = Chain() if batch else None
     history = History()
     estimator = Estimator(
         config,
         on_state=lambda state: history.add(state, estimator.weights.row),
         on_innovation=history.innovations.append,
+        archive=archive,
     )
     started = time.perf_counter()
     latencies = _feed(
         estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, history, progress
     )
-    if batch and history.states:
-        _smooth(estimator.chain, history)
+    if archive is not None and history.states:
+        _smooth(archive, history)
     seconds = time.perf_counter() - started
     if not history.states:
         raise _never_started(recording, used)
@@ -258,14 +260,23 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
 
 
 def _smooth(chain: Chain, history: History) -> None:
-    """Replace the live states by the batch solution over the whole drive."""
+    """Replace the live states by the batch solution over the whole drive, which starts from them."""
+    offset = len(chain.nodes) - len(history.states)
+    for i, state in enumerate(history.states):
+        chain.move_to(chain.first + offset + i, _key_state(state))
     chain.optimise()
     covariances = chain.covariances()
-    offset = len(chain.nodes) - len(history.states)
     history.states[:] = [
         _smoothed(state, chain, chain.first + offset + i, covariances[offset + i])
         for i, state in enumerate(history.states)
     ]
+
+
+def _key_state(state: State) -> KeyState:
+    x, y, z, w = state.quaternion
+    pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
+    return KeyState(pose, state.velocity_mps, bias, state.slip)
 
 
 def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:

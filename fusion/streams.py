@@ -117,7 +117,9 @@ class WheelStream:
     ) -> None:
         """Side speeds, and where encoders count angle the travelled distances, which are then used instead."""
         if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
-            raise DataError("a wheel speed is not a finite number", channel="wheels", remedy="leave the sample out")
+            raise DataError(
+                "a wheel speed is not a finite number", channel="wheels", remedy="leave the sample out"
+            )
         _in_order("wheels", t_ns, self.t_ns)
         if left_m is None or right_m is None:
             left_m, right_m = self._integrated(t_ns, left_mps, right_mps)
@@ -131,7 +133,9 @@ class WheelStream:
             return 0.0, 0.0
         dt = (t_ns - self.t_ns[-1]) * 1e-9
         left, right = self._last
-        return self.left_m[-1] + 0.5 * (left + left_mps) * dt, self.right_m[-1] + 0.5 * (right + right_mps) * dt
+        return self.left_m[-1] + 0.5 * (left + left_mps) * dt, self.right_m[-1] + 0.5 * (
+            right + right_mps
+        ) * dt
 
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns

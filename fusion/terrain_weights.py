@@ -110,7 +110,9 @@ class TerrainWeights:
             wheel_speed_mps=speed,
             wheel_speed_rate_mps2=0.0 if np.isnan(rate) else rate,
             speed_mps=float(np.hypot(*state.velocity_mps[:2])),
-            yaw_rate_wheels_radps=None if rolled is None else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
+            yaw_rate_wheels_radps=None
+            if rolled is None
+            else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
             yaw_rate_gyro_radps=float(gyro[:, 2].mean() - state.gyro_bias_radps[2]) if len(gyro) else np.nan,
             slip=state.slip if slip_observed else None,
             slip_sigma=state.slip_sigma if slip_observed else None,
