@@ -5,9 +5,12 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import tempfile
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +18,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.terrain.features import Window
+from terrafusion.twin.library import read_named
+from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -28,12 +33,20 @@ SLIP_SIGMA = 0.04
 SLIP_ERROR_S = 2.0
 
 
+SOIL_SCATTER = {
+    "pressure": {"k_c_n_per_m_n1": 0.2, "k_phi_n_per_m_n2": 0.2},
+    "shear": {"cohesion_pa": 0.2, "friction_angle_rad": 0.1, "shear_modulus_m": 0.2, "friction_cap": 0.2},
+    "vibration": {"accel_mps2_at_1mps": 0.2, "gyro_radps_at_1mps": 0.2},
+}
+"""No two patches of a ground are alike: each drive's soil is drawn from this relative range."""
+
+
 @dataclass(frozen=True)
 class Condition:
-    """One drive of the twin."""
+    """One drive of the twin; heading and soil are drawn from `seed` and the ground, so that drives differ."""
 
     scenario: str
-    terrain: str | None
+    terrain: str
     slope_deg: float
     payload_kg: float
     seed: int
@@ -41,14 +54,39 @@ class Condition:
 
     def run(self) -> Recording:
         """Simulate it."""
-        return simulate(
-            self.scenario,
-            vehicle=self.vehicle,
-            terrain=self.terrain,
-            slope_deg=self.slope_deg,
-            payload_kg=self.payload_kg,
-            seed=self.seed,
+        rng = self.stream("drive")
+        scenario = dataclasses.replace(
+            load_scenario(self.scenario), heading_deg=float(rng.uniform(0.0, 360.0))
         )
+        with tempfile.TemporaryDirectory() as folder:
+            soil = scattered_soil(self.terrain, rng, Path(folder))
+            return simulate(
+                scenario,
+                vehicle=self.vehicle,
+                terrain=str(soil),
+                slope_deg=self.slope_deg,
+                payload_kg=self.payload_kg,
+                seed=self.seed,
+            )
+
+    def stream(self, name: str) -> np.random.Generator:
+        """A generator of its own for each condition and purpose."""
+        text = json.dumps([*dataclasses.astuple(self), name])
+        return np.random.default_rng(zlib.crc32(text.encode()))
+
+
+def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path:
+    """A soil file in `folder`: the library's `terrain` with its numbers scattered by `SOIL_SCATTER`."""
+    from ruamel.yaml import YAML
+
+    raw, _ = read_named("soils", terrain, kind="terrain")
+    for section, ranges in SOIL_SCATTER.items():
+        for key, share in ranges.items():
+            raw[section][key]["value"] *= float(rng.uniform(1.0 - share, 1.0 + share))
+    path = folder / f"{terrain}.yaml"
+    with path.open("w", encoding="utf-8") as out:
+        YAML(typ="safe", pure=True).dump(raw, out)
+    return path
 
 
 @dataclass(frozen=True)
@@ -74,14 +112,17 @@ class Grid:
         ]
 
     def fingerprint(self, **settings: Any) -> str:
-        """SHA-256 of the soil and vehicle files the drives are made from, and of all settings."""
+        """SHA-256 of the soil, scenario and vehicle files the drives are made from, and of all settings."""
         digest = hashlib.sha256()
         params = resources.files("terrafusion.twin.params")
-        for folder, names in (("soils", self.grounds), ("vehicles", (self.vehicle,))):
+        files = {"soils": self.grounds, "scenarios": self.scenarios, "vehicles": (self.vehicle,)}
+        for folder, names in files.items():
             for name in sorted(names):
                 digest.update(f"{folder}/{name}\n".encode())
                 digest.update((params / folder / f"{name}.yaml").read_bytes())
-        text = json.dumps({"grid": dataclasses.asdict(self), **settings}, sort_keys=True)
+        text = json.dumps(
+            {"grid": dataclasses.asdict(self), "soil scatter": SOIL_SCATTER, **settings}, sort_keys=True
+        )
         digest.update(text.encode())
         return digest.hexdigest()
 
@@ -93,6 +134,11 @@ def run_all(
     for condition in conditions:
         yield condition, condition.run()
         tick()
+
+
+def seconds(t_ns: NDArray[np.int64], recording: Recording) -> Array:
+    """Seconds (n,) from the recording's start."""
+    return np.asarray((t_ns - recording.start_ns) * 1e-9, dtype=np.float64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,8 +161,7 @@ def wheel_samples(recording: Recording) -> WheelSamples:
     wheels, truth = recording.wheels, recording.truth
     if wheels is None or truth is None or truth.twist_body is None:
         raise ValueError(f"{recording.name}: wheels and a true twist are needed")
-    t = (wheels.t_ns - recording.start_ns) * 1e-9
-    truth_t = (truth.t_ns - recording.start_ns) * 1e-9
+    t, truth_t = seconds(wheels.t_ns, recording), seconds(truth.t_ns, recording)
     return WheelSamples(
         t_s=t,
         sides_mps=wheels.side_speeds_mps(rig.wheel_radius_m),
@@ -126,7 +171,7 @@ def wheel_samples(recording: Recording) -> WheelSamples:
 
 
 def windows_of(
-    recording: Recording, seed: int, slip_observed: bool = True
+    recording: Recording, rng: np.random.Generator, slip_observed: bool = True
 ) -> tuple[list[Window], NDArray[Any]]:
     """Windows every `UPDATE_S` and the ground (n,) at the end of each, by the recording's labels.
 
@@ -136,11 +181,10 @@ def windows_of(
     imu, terrain = recording.imu, recording.terrain
     if imu is None or terrain is None:
         raise ValueError(f"{recording.name}: an IMU and terrain labels are needed")
-    rng = np.random.default_rng([seed, 7])
     track = load_vehicle(recording.vehicle or "elevate").rig().track_m
     samples = wheel_samples(recording)
-    imu_t = (imu.t_ns - recording.start_ns) * 1e-9
-    label_t = (terrain.t_ns - recording.start_ns) * 1e-9
+    imu_t = seconds(imu.t_ns, recording)
+    label_t = seconds(terrain.t_ns, recording)
     mean = samples.sides_mps.mean(axis=1)
     yaw = (samples.sides_mps[:, 1] - samples.sides_mps[:, 0]) / track
     ends = np.arange(WINDOW_S, samples.t_s[-1], UPDATE_S)

@@ -15,7 +15,8 @@ anti-aliasing filter: its higher vibration is folded into the low bands.
 
 Speed: on a random profile of displacement spectrum S(n) ~ 1/n^2 (ISO 8608:2016,
 waviness 2) driven at v, the spectrum over time at f is v/f^2 times a constant,
-so the RMS in a fixed band grows with v^(1/2). That factor is divided out.
+so the RMS in a fixed band grows with v^(1/2). That factor is divided out, v
+being the faster of robot and wheels: wheels that spin on the spot shake, too.
 """
 
 from __future__ import annotations
@@ -86,9 +87,8 @@ def extract(window: Window) -> tuple[Array, Array]:
     variances = np.zeros(len(FEATURES))
     if not window.ground_speed_mps() > MIN_SPEED_MPS:
         return values, variances
-    if abs(window.speed_mps) > MIN_SPEED_MPS:
-        values[:SLIP] = vibration_levels(window.imu_t_s, window.accel_mps2, window.gyro_radps)
-        values[:SLIP] -= 0.5 * np.log10(abs(window.speed_mps))
+    values[:SLIP] = vibration_levels(window.imu_t_s, window.accel_mps2, window.gyro_radps)
+    values[:SLIP] -= 0.5 * np.log10(window.ground_speed_mps())
     wheel = window.wheel_speed_mps
     if window.slip is not None and window.slip_sigma is not None and abs(wheel) > MIN_SPEED_MPS:
         values[SLIP] = np.clip(window.slip, *_SLIP_RANGE)
