@@ -54,6 +54,17 @@ class KeyState:
             self.slip + float(delta[SLIP]),
         )
 
+    def local(self, other: KeyState) -> Array:
+        """The tangent vector (16,) that leads from this state to `other`."""
+        return np.concatenate(
+            [
+                self.pose.localCoordinates(other.pose),
+                other.velocity - self.velocity,
+                other.bias.vector() - self.bias.vector(),
+                [other.slip - self.slip],
+            ]
+        )
+
 
 @dataclass(eq=False)
 class Node:
@@ -100,6 +111,7 @@ class Chain:
         self.values = gtsam.Values()
         self._dirty = 0
         self._error = 0.0
+        self._anchor: tuple[int, KeyState, Array] | None = None
         self._root = np.zeros((DIM, DIM + 1))
 
     @property
@@ -263,6 +275,7 @@ class Chain:
         fresh = Node(point, node.t_ns, graph, None, node.gyro_radps, node.accel_mps2)
         fresh.prior = np.hstack([root, np.zeros((DIM, 1))])
         self.nodes, self.first, self._dirty, self.values = [fresh], k, k, gtsam.Values()
+        self._anchor = None
         self._insert(k, fresh.point)
         self._eliminate_all()
 
@@ -275,6 +288,7 @@ class Chain:
 
     def set_prior(self, sigmas: Array) -> None:
         """Prior of the first keyframe at its initial state, independent 1 sigmas (16,)."""
+        self._anchor = None
         self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((DIM, 1))])
         self._dirty = self.first
 
@@ -288,15 +302,19 @@ class Chain:
         """Make the current estimate of keyframe k its linearisation point.
 
         The prior of the first keyframe is no factor that could be linearised
-        again: it is carried to the new tangent space, where the same state has
-        the coordinates log(exp(-delta) exp(.)).
+        again: it stays a Gaussian in the tangent space where it was made, and
+        is carried to the new one (GTSAM's LinearContainerFactor, with the
+        derivative of the logarithm).
         """
         node = self.nodes[k - self.first]
         if k == self.first:
-            prior = node.prior.copy()
-            prior[:, DIM] -= prior[:, :DIM] @ node.delta
-            prior[:, POSE] = prior[:, POSE] @ gtsam.Pose3.LogmapDerivative(node.delta[POSE])
-            node.prior = prior
+            if self._anchor is None or self._anchor[0] != k:
+                self._anchor = (k, node.point, node.prior)
+            _, made_at, rows = self._anchor
+            offset = made_at.local(node.point.retract(node.delta))
+            node.prior = rows.copy()
+            node.prior[:, DIM] -= rows[:, :DIM] @ offset
+            node.prior[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
         node.point = node.point.retract(node.delta)
         node.delta = np.zeros(DIM)
         self._publish(k)

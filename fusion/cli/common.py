@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -79,3 +82,17 @@ def open_log(log: Path, rig: Rig | None, topic: list[str] | None, stamps: str) -
     from terrafusion.datasets.readers import open_recording
 
     return open_recording(log, rig=rig, topics=parse_topics(topic), stamps=check_stamps(stamps))
+
+
+@contextmanager
+def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
+    """A progress bar on a terminal, told the share done (0 to 1); None in a pipe."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task(what, total=1.0)
+        yield lambda share: bar.update(task, completed=share)

@@ -1,0 +1,213 @@
+"""The chain smoother against GTSAM's own optimisers, and its invariants."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+import pytest
+from gtsam.symbol_shorthand import B, S, V, X
+from terrafusion.fusion.chain import DIM, POSE, Chain, KeyState
+from terrafusion.fusion.factors import slip_process
+from terrafusion.fusion.weighting import SensorNoise
+from terrafusion.fusion.wheel_factor import WheelIncrement, as_gtsam_factor, jacobians, residual
+
+ROW = SensorNoise(0.05, 0.1, 5.0, 0.03, 0.05, 3.0, 5.0, 1.0)
+SIGMAS = np.array([0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1])
+
+
+def iso(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
+    return gtsam.noiseModel.Isotropic.Sigma(dim, sigma)
+
+
+def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list, list, list]:
+    """Initial states, links, wheel increments and fixes of a noisy drive on a circle."""
+    rng = np.random.default_rng(seed)
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.80665)
+    for name, value in (("Gyroscope", 1e-6), ("Accelerometer", 1e-4), ("Integration", 1e-8)):
+        getattr(params, f"set{name}Covariance")(np.eye(3) * value)
+    params.setBiasAccCovariance(np.eye(3) * 1e-6)
+    params.setBiasOmegaCovariance(np.eye(3) * 1e-8)
+    bias = gtsam.imuBias.ConstantBias()
+    points, links, wheels, fixes = [], [], [], []
+    rate, speed, dt = 0.2, 1.0, 0.1
+    for k in range(n):
+        yaw = heading + rate * dt * k
+        along = np.array([np.sin(yaw) - np.sin(heading), np.cos(heading) - np.cos(yaw), 0.0]) * speed / rate
+        rotation = gtsam.Rot3.Rz(yaw).compose(gtsam.Rot3.Expmap(rng.normal(0, 0.02, 3)))
+        pose = gtsam.Pose3(rotation, along + rng.normal(0, 0.3, 3))
+        velocity = speed * np.array([np.cos(yaw), np.sin(yaw), 0.0]) + rng.normal(0, 0.1, 3)
+        points.append(KeyState(pose, velocity, bias, 0.0))
+        fixes.append(along + rng.normal(0, 0.2, 3))
+        if k == 0:
+            continue
+        measured = gtsam.PreintegratedCombinedMeasurements(params, bias)
+        for _ in range(10):
+            force = np.array([0.0, rate * speed, 9.80665]) + rng.normal(0, 0.05, 3)
+            measured.integrateMeasurement(force, np.array([0, 0, rate]) + rng.normal(0, 0.005, 3), dt / 10)
+        link = gtsam.NonlinearFactorGraph()
+        link.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured))
+        link.add(slip_process(k, dt, ROW)[0])
+        links.append(link)
+        moved = np.array([speed * dt / 0.95, 0.001, 0.0]) + rng.normal(0, 0.002, 3)
+        wheels.append(WheelIncrement(moved, np.array([0.003, 0.005, 0.005]), moved[0], 0.0))
+    return points, links, wheels, fixes
+
+
+def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.NonlinearFactorGraph:
+    """Fill the chain; the same graph for GTSAM's optimiser, without the prior."""
+    points, links, wheels, fixes = drive(n, seed, heading)
+    graph = gtsam.NonlinearFactorGraph()
+    for k in range(n):
+        chain.append(k * 100_000_000, points[k], links[k - 1] if k else None, wheels[k - 1] if k else None)
+        if k == 0:
+            chain.set_prior(SIGMAS)
+        else:
+            for i in range(links[k - 1].size()):
+                graph.add(links[k - 1].at(i))
+            graph.add(as_gtsam_factor(wheels[k - 1], X(k - 1), X(k), S(k)))
+            prior = slip_process(k, 0.1, ROW)[1]
+            chain.add(k, prior, "S")
+            graph.add(prior)
+        if k % 4 == 0:
+            fix = gtsam.GPSFactorArm(X(k), fixes[k], np.array([0.2, 0.0, 0.3]), iso(3, 0.3))
+            chain.add(k, fix, "X")
+            graph.add(fix)
+    return graph
+
+
+def add_priors(graph: gtsam.NonlinearFactorGraph, start: KeyState) -> None:
+    diagonal = gtsam.noiseModel.Diagonal.Sigmas
+    graph.add(gtsam.PriorFactorPose3(X(0), start.pose, diagonal(SIGMAS[POSE])))
+    graph.add(gtsam.PriorFactorVector(V(0), start.velocity, diagonal(SIGMAS[6:9])))
+    graph.add(gtsam.PriorFactorConstantBias(B(0), start.bias, diagonal(SIGMAS[9:15])))
+    graph.add(gtsam.PriorFactorDouble(S(0), start.slip, iso(1, SIGMAS[15])))
+
+
+def test_batch_solution_is_that_of_gtsam() -> None:
+    chain = Chain()
+    graph = build(chain, 40)
+    start = chain.nodes[0].point
+    values = gtsam.Values(chain.values)
+    add_priors(graph, start)
+    params = gtsam.GaussNewtonParams()
+    params.setRelativeErrorTol(1e-14)
+    params.setAbsoluteErrorTol(1e-14)
+    solution = gtsam.GaussNewtonOptimizer(graph, values, params).optimize()
+    chain.optimise()
+    for k in (0, 17, 39):
+        state = chain.state(k)
+        assert np.abs(state.pose.localCoordinates(solution.atPose3(X(k)))).max() < 1e-7
+        assert np.abs(state.velocity - solution.atVector(V(k))).max() < 1e-7
+        assert state.slip == pytest.approx(solution.atDouble(S(k)), abs=1e-7)
+    marginals = gtsam.Marginals(graph, solution)
+    covariances = chain.covariances()
+    for k in (0, 17, 39):
+        np.testing.assert_allclose(
+            covariances[k][POSE, POSE], marginals.marginalCovariance(X(k)), rtol=2e-3, atol=1e-8
+        )
+        assert covariances[k][15, 15] == pytest.approx(marginals.marginalCovariance(S(k))[0, 0], rel=2e-3)
+
+
+def test_filter_ends_where_the_batch_ends() -> None:
+    """With all keyframes in the window, live updates reach the batch solution of the newest keyframe."""
+    live, batch = Chain(), Chain()
+    points, links, wheels, fixes = drive(40, 3)
+    for chain in (live, batch):
+        for k in range(40):
+            chain.append(
+                k * 100_000_000, points[k], links[k - 1] if k else None, wheels[k - 1] if k else None
+            )
+            if k == 0:
+                chain.set_prior(SIGMAS)
+            if k:
+                chain.add(k, slip_process(k, 0.1, ROW)[1], "S")
+            if k % 4 == 0:
+                chain.add(k, gtsam.GPSFactorArm(X(k), fixes[k], np.zeros(3), iso(3, 0.3)), "X")
+            if chain is live:
+                chain.solve(window=40)
+    live.smooth(40, iterations=10)
+    batch.optimise()
+    a, b = live.state(39), batch.state(39)
+    # Live keyframes are linearised again only beyond 0.02 rad: a tenth of a sigma is left.
+    sigma = np.sqrt(np.diag(batch.covariances()[-1]))
+    assert (np.abs(a.local(b)) < 0.1 * sigma).all()
+    np.testing.assert_allclose(
+        np.sqrt(np.diag(live.covariance())), np.sqrt(np.diag(batch.covariances()[-1])), rtol=0.02
+    )
+
+
+def test_forgetting_keeps_the_information() -> None:
+    """Dropping old keyframes changes nothing in a graph whose linearisation stands still."""
+    whole, short = Chain(), Chain()
+    build(whole, 30)
+    points, links, wheels, fixes = drive(30, 1)
+    for k in range(30):
+        short.append(
+            k * 100_000_000, whole.nodes[k].point, links[k - 1] if k else None, wheels[k - 1] if k else None
+        )
+        if k == 0:
+            short.set_prior(SIGMAS)
+        if k:
+            short.add(k, slip_process(k, 0.1, ROW)[1], "S")
+        if k % 4 == 0:
+            short.add(k, gtsam.GPSFactorArm(X(k), fixes[k], np.array([0.2, 0.0, 0.3]), iso(3, 0.3)), "X")
+        short._eliminate_all()
+        short.forget(8)
+    whole._eliminate_all()
+    assert len(short.nodes) == 8
+    assert short.first == 22
+    np.testing.assert_allclose(short.nodes[-1].delta, whole.nodes[-1].delta, atol=1e-8)
+    np.testing.assert_allclose(short.covariance(), whole.covariance(), rtol=1e-6, atol=1e-12)
+
+
+def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:
+    """A prior carried to another tangent space still has its mean where it was."""
+    rng = np.random.default_rng(5)
+    chain = Chain()
+    points, *_ = drive(1, 0)
+    chain.append(0, points[0])
+    chain.set_prior(SIGMAS)
+    delta = rng.normal(0, 1, DIM) * np.array([0.3] * 3 + [2.0] * 3 + [0.5] * 3 + [0.1] * 6 + [0.1])
+    chain.nodes[0].delta = delta
+    chain._move(0)
+    chain.smooth(1, iterations=20)
+    back = chain.state(0)
+    assert np.abs(back.pose.localCoordinates(points[0].pose)).max() < 1e-6
+    assert np.abs(back.velocity - points[0].velocity).max() < 1e-9
+
+
+def test_restart_keeps_state_and_adds_doubt() -> None:
+    chain = Chain()
+    build(chain, 20)
+    chain.solve(20)
+    before, P = chain.state(19), chain.covariance()
+    doubt = np.zeros(DIM)
+    doubt[3:6] = 25.0
+    chain.restart(doubt)
+    assert chain.first == chain.last == 19
+    assert np.abs(chain.state(19).pose.localCoordinates(before.pose)).max() < 1e-9
+    np.testing.assert_allclose(chain.covariance(), P + np.diag(doubt), rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    a, b = (gtsam.Pose3.Expmap(rng.normal(0, 1, 6)) for _ in range(2))
+    d, slip, h = rng.normal(0, 0.2, 3), float(rng.uniform(-0.2, 0.6)), 1e-6
+    H_a, H_b, H_slip = jacobians(a, b, d)
+    for i in range(6):
+        step = np.eye(6)[i] * h
+        numeric = (residual(a.retract(step), b, slip, d) - residual(a.retract(-step), b, slip, d)) / (2 * h)
+        np.testing.assert_allclose(H_a[:, i], numeric, atol=1e-6)
+        numeric = (residual(a, b.retract(step), slip, d) - residual(a, b.retract(-step), slip, d)) / (2 * h)
+        np.testing.assert_allclose(H_b[:, i], numeric, atol=1e-6)
+    numeric = (residual(a, b, slip + h, d) - residual(a, b, slip - h, d)) / (2 * h)
+    np.testing.assert_allclose(H_slip[:, 0], numeric, atol=1e-6)
+
+
+def test_an_undetermined_chain_says_so() -> None:
+    chain = Chain()
+    points, *_ = drive(1, 0)
+    chain.append(0, points[0])
+    with pytest.raises(ArithmeticError, match="not determined"):
+        chain.solve(1)
