@@ -46,7 +46,7 @@ def plot_map(
         for first, last in style.runs_of(label):
             lines.append(xy[first : last + 1])
             colours.append(style.colour_of(str(label[first]), style.TERRAIN_COLOURS))
-        ax.add_collection(LineCollection(lines, colors=colours, linewidths=2.2, zorder=4))
+        ax.add_collection(LineCollection(lines, colors=colours, linewidths=3.2, zorder=4))
         for name in dict.fromkeys(label.tolist()):
             colour = style.colour_of(str(name), style.TERRAIN_COLOURS)
             handles.append(Line2D([], [], color=colour, linewidth=3, label=f"on {style.plain(name)}"))
@@ -133,8 +133,8 @@ def draw_references(ax: Axes, recording: Recording, held_out: Gnss | None) -> li
             xy[:, 0],
             xy[:, 1],
             color=style.TRUTH,
-            linewidth=1.0,
-            linestyle=(0, (4, 2)),
+            linewidth=0.8,
+            linestyle=(0, (4, 3)),
             zorder=7,
             label="truth",
         )

@@ -1,0 +1,336 @@
+"""`report.html`: one file with the numbers, the plots and the reasons, for one run or several of one drive.
+
+Nothing in it points outside: plots are SVG inside the file, there is no
+script. Everything that comes from a log is escaped.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import platform
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from importlib import metadata, resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from terrafusion.datasets.recording import Gnss, Recording
+from terrafusion.fusion import plot_style as style
+from terrafusion.fusion import plots, plots_map
+from terrafusion.fusion import report_text as words
+from terrafusion.fusion.estimate import Estimate, WeightChange
+from terrafusion.fusion.metrics import Outage, Scores
+from terrafusion.fusion.outputs import write_atomically
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+MOST_REASONS = 20
+"""How many of the changes of weight the report lists; `weights.jsonl` has them all."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReportRun:
+    """One run of the drive: its name in the report, the content of `metrics.json`, and what is plotted."""
+
+    name: str
+    metrics: Mapping[str, Any]
+    estimate: Estimate
+    scores: Scores
+
+
+def write_report(
+    path: Path,
+    title: str,
+    runs: Sequence[ReportRun],
+    recording: Recording,
+    *,
+    held_out: Gnss | None = None,
+    outages: Sequence[Outage] = (),
+    wheel_radius_m: float | None = None,
+    provenance: Mapping[str, object] | None = None,
+) -> Path:
+    """Write the report to `path`.
+
+    Args:
+        runs: at least one; of several, the adaptive one (else the first) is shown in detail.
+        recording: the drive they all estimate.
+        held_out: the fixes kept back from all of them.
+        outages: the stretches without GNSS.
+        wheel_radius_m: to show the speed of wheels logged in rad/s.
+        provenance: further lines for the last section, such as the command line and hashes of inputs.
+
+    Raises:
+        TerrafusionError: the file cannot be written.
+    """
+    if not runs:
+        raise ValueError("a report needs at least one run")
+    ours, theirs = words.pick_pair([run.metrics for run in runs])
+    shown = runs[ours]
+    marked = plots.important_changes(shown.estimate.changes, MOST_REASONS)
+    body = [
+        _head(title, runs, ours, theirs),
+        _numbers(runs, ours, theirs),
+        _maps(runs, shown, recording, held_out, outages),
+        _errors(runs, shown, recording, outages),
+        _ground(shown, recording, outages),
+        _weights(shown, recording, marked),
+        _sensors(shown, recording, outages, wheel_radius_m),
+        _notes(runs),
+        _provenance(recording, provenance or {}),
+    ]
+    page = _PAGE.format(title=escape(title), css=_stylesheet(), body="\n".join(body))
+    return write_atomically(path, lambda part: part.write_text(page, encoding="utf-8"))
+
+
+def versions() -> dict[str, str]:
+    """Versions of this library, of Python and of what the numbers depend on."""
+    found = {"Python": platform.python_version()}
+    for name in ("terrafusion", "gtsam", "numpy", "scipy"):
+        try:
+            found[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            found[name] = "not installed"
+    return found
+
+
+_PAGE = """<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{title}</title>
+<style>
+{css}
+</style>
+</head>
+<body>
+{body}
+</body>
+</html>
+"""
+
+
+def _head(title: str, runs: Sequence[ReportRun], ours: int, theirs: int) -> str:
+    every = [run.metrics for run in runs]
+    if len(runs) == 1:
+        sentences = words.head_of_one(every[0])
+    else:
+        sentences = words.head_of_many([run.name for run in runs], every, ours, theirs)
+    return f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(" ".join(sentences))}</p>'
+
+
+def _numbers(runs: Sequence[ReportRun], ours: int, theirs: int) -> str:
+    compared = len(runs) > 1
+    head = ["<th></th>", *(f'<th class="n">{escape(run.name)}</th>' for run in runs)]
+    if compared:
+        head.append(f"<th>{escape(runs[ours].name)} against {escape(runs[theirs].name)}</th>")
+    lines = []
+    for row in words.table_rows([run.metrics for run in runs]):
+        best = row.best()
+        about = f'<span class="about">{escape(row.about)}</span>' if row.about else ""
+        cells = [f"<th>{escape(row.label)}{about}</th>"]
+        cells += [
+            f'<td class="n{" best" if i == best else ""}">{escape(row.text(i))}</td>'
+            for i in range(len(runs))
+        ]
+        if compared:
+            verdict, side = row.verdict(ours, theirs)
+            cells.append(f'<td><span class="{side}">{escape(verdict)}</span></td>')
+        lines.append(f"<tr>{''.join(cells)}</tr>")
+    key = (
+        '<p class="dim">★ best of the runs; a dash means that it could not be scored.</p>' if compared else ""
+    )
+    return (
+        f'<h2>Numbers</h2>\n<div class="scroll"><table><thead><tr>{"".join(head)}</tr></thead>'
+        f"<tbody>{''.join(lines)}</tbody></table></div>{key}"
+    )
+
+
+def _maps(
+    runs: Sequence[ReportRun],
+    shown: ReportRun,
+    recording: Recording,
+    held_out: Gnss | None,
+    outages: Sequence[Outage],
+) -> str:
+    parts = []
+    if len(runs) > 1:
+        fig, _ = plots_map.plot_map_runs(
+            {run.name: run.estimate for run in runs},
+            recording,
+            colours=_colours(runs),
+            held_out=held_out,
+            outages=outages,
+        )
+        parts.append(_figure(fig, "The paths of all runs, from above."))
+    fig, _ = plots_map.plot_map(shown.estimate, recording, held_out=held_out, outages=outages)
+    parts.append(
+        _figure(
+            fig,
+            f"The path as estimated ({shown.name}), coloured by the most probable ground. The rings hold "
+            "the true position with 95 % probability, if the claimed uncertainty is right.",
+        )
+    )
+    return "<h2>Map</h2>\n" + "\n".join(parts)
+
+
+def _errors(
+    runs: Sequence[ReportRun], shown: ReportRun, recording: Recording, outages: Sequence[Outage]
+) -> str:
+    scored = {run.name: run.scores.errors for run in runs if run.scores.errors is not None}
+    if not scored:
+        return "<h2>Errors</h2>\n<p>There was nothing to score against.</p>"
+    parts = []
+    if len(runs) > 1:
+        fig, _ = plots_map.plot_error_runs(
+            scored, recording.start_ns, colours=_colours(runs), outages=outages
+        )
+        parts.append(_figure(fig, "Horizontal distance between estimate and reference."))
+    if shown.scores.errors is not None:
+        fig, _ = plots.plot_errors(shown.scores.errors, recording.start_ns, outages=outages)
+        reference = words.REFERENCE[shown.scores.against or "truth"]
+        parts.append(
+            _figure(
+                fig,
+                f"Errors of {shown.name} against {reference}. "
+                "An honest estimate stays inside its band about 95 % of the time.",
+            )
+        )
+    return "<h2>Errors</h2>\n" + "\n".join(parts)
+
+
+def _ground(shown: ReportRun, recording: Recording, outages: Sequence[Outage]) -> str:
+    terrain, _ = plots.plot_terrain(shown.estimate, recording.start_ns, recording=recording)
+    slip, _ = plots.plot_slip(shown.estimate, recording.start_ns, outages=outages)
+    strip = " The strip on top is the log's own label." if recording.terrain is not None else ""
+    return "\n".join(
+        [
+            "<h2>Ground and slip</h2>",
+            _figure(terrain, f"Probability of each class of ground ({shown.name}).{strip}"),
+            _figure(slip, "Slip as estimated, with two sigma; the background is the most probable ground."),
+        ]
+    )
+
+
+def _weights(shown: ReportRun, recording: Recording, marked: Sequence[WeightChange]) -> str:
+    fig, _ = plots.plot_weights(shown.estimate, recording.start_ns, marked=marked)
+    caption = f"The noise each sensor was given ({shown.name}): above as 1 sigma, below as a factor."
+    if marked:
+        caption += " The numbers are those of the table."
+    parts = ["<h2>Weights and their reasons</h2>", _figure(fig, caption), _reasons(shown, recording, marked)]
+    return "\n".join(parts)
+
+
+def _reasons(shown: ReportRun, recording: Recording, marked: Sequence[WeightChange]) -> str:
+    total = len(shown.estimate.changes)
+    if not marked:
+        return f"<p>No weight changed ({escape(shown.name)}).</p>"
+    rows = []
+    for i, change in enumerate(marked, 1):
+        t_s = (change.t_ns - recording.start_ns) * 1e-9
+        rows.append(
+            f'<tr><td class="n">{i}</td><td class="n">{t_s:.1f}</td><td>{escape(change.sensor)}</td>'
+            f'<td class="n">{words.number(float(change.before))} → {words.number(float(change.after))}</td>'
+            f"<td>{escape(change.unit)}</td><td>{escape(change.reason)}</td></tr>"
+        )
+    some = "" if total == len(marked) else f" The {len(marked)} largest of {total}; weights.jsonl has all."
+    return (
+        f'<p class="dim">Changes of weight, in order of time.{some}</p>'
+        '<div class="scroll"><table><thead><tr><th class="n">no.</th><th class="n">time, s</th>'
+        '<th>weight</th><th class="n">from → to</th><th>unit</th><th>reason</th></tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _sensors(
+    shown: ReportRun, recording: Recording, outages: Sequence[Outage], wheel_radius_m: float | None
+) -> str:
+    start = recording.start_ns
+    speeds, _ = plots.plot_speeds(shown.estimate, recording, wheel_radius_m=wheel_radius_m, outages=outages)
+    biases, _ = plots.plot_biases(shown.estimate, start)
+    parts = [
+        "<h2>Sensors</h2>",
+        _figure(speeds, "Forward speed. Where the wheels run ahead of the estimate, they slip."),
+        _figure(biases, f"Biases of the IMU as estimated ({shown.name})."),
+    ]
+    if shown.estimate.innovations:
+        innovations, _ = plots.plot_innovations(shown.estimate, start)
+        parts.append(
+            _figure(
+                innovations,
+                "Normalised innovations: how surprising each measurement was. "
+                "With right weights they scatter around 1.",
+            )
+        )
+    return "\n".join(parts)
+
+
+def _notes(runs: Sequence[ReportRun]) -> str:
+    lists = [list(run.metrics.get("notes", ())) for run in runs]
+    shared = [note for note in lists[0] if all(note in other for other in lists)]
+    items = [escape(note) for note in dict.fromkeys(shared)]
+    for run, notes in zip(runs, lists, strict=True):
+        items += [
+            f"{escape(run.name)}: {escape(note)}" for note in dict.fromkeys(notes) if note not in shared
+        ]
+    text = _list(items) if items else "<p>Nothing had to be assumed.</p>"
+    return f"<h2>What was assumed</h2>\n{text}"
+
+
+def _provenance(recording: Recording, more: Mapping[str, object]) -> str:
+    lines: dict[str, object] = {"log": recording.name}
+    for label in ("source", "licence", "description"):
+        if getattr(recording, label):
+            lines[label] = getattr(recording, label)
+    lines |= more
+    lines["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
+    pairs = "".join(
+        f"<dt>{escape(str(label))}</dt><dd><code>{escape(str(text))}</code></dd>"
+        for label, text in lines.items()
+    )
+    return f"<h2>Where this comes from</h2>\n<dl>{pairs}</dl>"
+
+
+def _list(items: Iterable[str]) -> str:
+    return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
+
+
+def _colours(runs: Sequence[ReportRun]) -> dict[str, str]:
+    """A colour for each run: that of its mode, unless two runs share a mode."""
+    modes = [str(run.metrics["mode"]) for run in runs]
+    return {
+        run.name: style.colour_of(mode if modes.count(mode) == 1 else run.name, style.MODE_COLOURS)
+        for run, mode in zip(runs, modes, strict=True)
+    }
+
+
+def _figure(fig: Figure, caption: str) -> str:
+    """The figure inside the page; the caption serves as its description too."""
+    source = base64.b64encode(_svg(fig)).decode("ascii")
+    text = escape(caption)
+    return (
+        f'<figure><div class="scroll"><img alt="{text}" src="data:image/svg+xml;base64,{source}"></div>'
+        f"<figcaption>{text}</figcaption></figure>"
+    )
+
+
+_PATH_DATA = re.compile(rb' d="[^"]*"')
+_LONG_NUMBER = re.compile(rb"(\.\d\d)\d+")
+
+
+def _svg(fig: Figure) -> bytes:
+    """The figure as SVG, the same bytes each time, with paths to a hundredth of a point."""
+    import matplotlib
+
+    buffer = io.BytesIO()
+    with matplotlib.rc_context({"svg.hashsalt": "terrafusion", "svg.fonttype": "path"}):
+        fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    return _PATH_DATA.sub(lambda found: _LONG_NUMBER.sub(rb"\1", found[0]), buffer.getvalue())
+
+
+def _stylesheet() -> str:
+    return (resources.files("terrafusion.fusion") / "report.css").read_text(encoding="utf-8")
