@@ -1,0 +1,299 @@
+"""Fitting the weighting policy to drives of the twin.
+
+What counts, ground by ground, and how it is measured against the truth:
+
+- slip: 1 - v / (omega R) of half-second means while the wheels turn faster than
+  0.15 m/s. A robot that spins on the spot has slip 1 for as long as it likes, so
+  of every immobilised spell only the first 5 s count: its onset is what a policy
+  must cover, its length is chance. Mean and standard deviation are plain; the
+  correlation time is that of an Ornstein-Uhlenbeck process with this variance
+  that moves as much in 2 s as slip did: tau = -2 s / ln(rho), rho the
+  autocorrelation about the ground's mean at a lag of 2 s.
+  A rolling radius is known to about 1 %, which the twin's odometry is not subject
+  to: that constant error is added to variance and autocorrelation alike.
+- wheel sigma: speed over 0.1 s that slip, averaged over 1 s, leaves unexplained,
+  in quadrature with the vehicle file's `speed_sigma_mps` (position error, backlash,
+  uneven ground: the twin's encoders are only quantised).
+- side-slip: lateral over forward speed of the body origin, above 0.2 m/s.
+- IMU: the mean error over 0.1 s less its 20 s running mean (the bias), rms over
+  the axes, as a multiple of the data sheet's density / sqrt(0.1 s).
+- GNSS: horizontal error over the reported sigma, rms, at least 1.
+
+Every rms is of errors winsorised at their 0.5 and 99.5 % quantiles. `fixed` is
+the same of all grounds pooled with equal weight, so that it is the best single
+row for the very same drives. `unknown` is the moment match of the grounds, its
+standard deviations (not the receiver's) `UNKNOWN_SPREAD` times wider.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.frames import GRAVITY_MPS2, quaternion_to_matrix
+from terrafusion.datasets.recording import Fix, Recording
+from terrafusion.datasets.sensors import ImuSpec
+from terrafusion.fusion.terrain.drives import Grid, run_all, seconds, wheel_samples
+from terrafusion.fusion.weighting import SCHEMA, Policy, SensorNoise
+from terrafusion.twin.vehicle import VehicleParams, load_vehicle
+
+Array = NDArray[np.float64]
+
+SCENARIOS = ("staircase", "figure_eight")
+SLOPES_DEG = (0.0, 3.0, 6.0)
+PAYLOADS_KG = (0.0, 30.0)
+SHORT_S, SLIP_S, LAG_S = 0.1, 0.5, 2.0
+TURNING_MPS, SIDE_SLIP_FROM_MPS, STUCK_MPS = 0.15, 0.2, 0.05
+STUCK_COUNTS_S = 5.0
+BIAS_S = 20.0
+TAIL = 0.005
+RADIUS_SIGMA = 0.01
+UNKNOWN_SPREAD = 1.5
+DIGITS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What one drive, or many, say of a ground: (n,) samples of each quantity.
+
+    `slip_pairs` (n, 2) are slips `LAG_S` apart; `gyro` and `accel` are errors
+    over what the data sheet allows, `gnss` over the reported sigma.
+    """
+
+    slip: Array
+    slip_pairs: Array
+    wheel_mps: Array
+    side_slip: Array
+    gyro: Array
+    accel: Array
+    gnss: Array
+
+    @staticmethod
+    def joined(parts: Iterable[Evidence]) -> Evidence:
+        """All drives of a ground together."""
+        listed = list(parts)
+        names = [f.name for f in dataclasses.fields(Evidence)]
+        return Evidence(**{n: np.concatenate([getattr(p, n) for p in listed]) for n in names})
+
+
+def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None) -> Policy:
+    """Simulate the drives of `grid` and fit a row to each ground; `tick` is called after each drive."""
+    drives: dict[str, list[Evidence]] = {ground: [] for ground in grid.grounds}
+    for condition, recording in run_all(grid.conditions(), tick):
+        drives[condition.terrain].append(evidence_of(recording))
+    grounds = {name: Evidence.joined(parts) for name, parts in drives.items()}
+    rows = {name: _rounded(row_of([evidence])) for name, evidence in grounds.items()}
+    matched = Policy(rows, next(iter(rows.values())), "").blend(np.full(len(rows), 1.0 / len(rows)))
+    return Policy(
+        classes={**rows, "unknown": _rounded(_spread(matched))},
+        fixed=_rounded(row_of(list(grounds.values()))),
+        inputs_sha256=grid.fingerprint(policy=_settings()),
+    )
+
+
+def default_grid(seeds: int) -> Grid:
+    """The drives of the shipped policy, with seeds 0 to `seeds` - 1."""
+    return Grid(SCENARIOS, SLOPES_DEG, PAYLOADS_KG, tuple(range(seeds)))
+
+
+def evidence_of(recording: Recording) -> Evidence:
+    """Everything one simulated drive says of its ground."""
+    slip, pairs, wheel = _slip_evidence(recording)
+    gyro, accel = _imu_evidence(recording)
+    return Evidence(slip, pairs, wheel, _side_slips(recording), gyro, accel, _gnss_evidence(recording))
+
+
+def row_of(grounds: list[Evidence]) -> SensorNoise:
+    """The row of one ground, or of several with equal weight.
+
+    Raises:
+        ValueError: a ground never moved its wheels.
+    """
+    if any(len(e.slip_pairs) < 2 for e in grounds):
+        raise ValueError("the wheels never turned long enough to tell the slip")
+    mean = float(np.mean([e.slip.mean() for e in grounds]))
+    variance = float(np.mean([np.mean((e.slip - mean) ** 2) for e in grounds])) + RADIUS_SIGMA**2
+    paired = [e.slip_pairs - mean for e in grounds]
+    power = float(np.mean([np.mean(p**2) for p in paired])) + RADIUS_SIGMA**2
+    rho = (float(np.mean([np.mean(p[:, 0] * p[:, 1]) for p in paired])) + RADIUS_SIGMA**2) / power
+    return SensorNoise(
+        slip_mean=mean,
+        slip_sigma=float(np.sqrt(variance)),
+        slip_time_s=float(np.clip(-LAG_S / np.log(np.clip(rho, 1e-3, 0.999)), 0.2, 300.0)),
+        wheel_sigma_mps=max(_rms([e.wheel_mps for e in grounds]), 1e-3),
+        side_slip_sigma=max(_rms([e.side_slip for e in grounds]), 1e-3),
+        gyro_inflation=max(_rms([e.gyro for e in grounds]), 1.0),
+        accel_inflation=max(_rms([e.accel for e in grounds]), 1.0),
+        gnss_inflation=max(_rms([e.gnss for e in grounds]), 1.0),
+    )
+
+
+def _rms(grounds: list[Array]) -> float:
+    """Root of the mean over grounds of the mean square, each winsorised at its tails; NaN-free by making."""
+    squares = []
+    for x in grounds:
+        if len(x):
+            low, high = np.quantile(x, [TAIL, 1.0 - TAIL])
+            squares.append(float(np.mean(np.clip(x, low, high) ** 2)))
+    return float(np.sqrt(np.mean(squares))) if squares else 0.0
+
+
+def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array]:
+    """Slips (n,), pairs of them (m, 2), and speed errors (k,) m/s that slip leaves."""
+    samples = wheel_samples(recording)
+    wheel, forward = samples.sides_mps.mean(axis=1), samples.forward_mps
+    step = float(np.median(np.diff(samples.t_s)))
+    short = max(round(SHORT_S / step), 1)
+    wheel, forward = _block_means(wheel, short), _block_means(forward, short)
+    width = round(1.0 / SHORT_S)
+    kernel = np.full(width, 1.0 / width)
+    smooth_wheel, smooth = np.convolve(wheel, kernel, "same"), np.convolve(forward, kernel, "same")
+    turning = np.abs(smooth_wheel) > TURNING_MPS
+    share = np.divide(smooth, smooth_wheel, out=np.ones_like(smooth), where=turning)
+    residual = (forward - share * wheel)[turning]
+
+    blocks = round(SLIP_S / SHORT_S)
+    wheel, forward = _block_means(wheel, blocks), _block_means(forward, blocks)
+    counted = np.abs(wheel) > TURNING_MPS
+    counted &= _spell_age_s(counted & (np.abs(forward) < STUCK_MPS)) <= STUCK_COUNTS_S
+    slip = np.full(len(wheel), np.nan)
+    slip[counted] = np.clip(1.0 - forward[counted] / wheel[counted], -1.0, 1.0)
+    lag = round(LAG_S / SLIP_S)
+    pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
+    encoder = _vehicle(recording).sensors.wheels.speed_sigma_mps
+    return slip[counted], pairs[np.isfinite(pairs).all(axis=1)], np.hypot(residual, encoder)
+
+
+def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
+    """How long (n,), s, the robot has spun on the spot at each half second; 0 where it does not."""
+    age, out = 0.0, np.zeros(len(stuck))
+    for i, now in enumerate(stuck.tolist()):
+        age = age + SLIP_S if now else 0.0
+        out[i] = age
+    return out
+
+
+def _side_slips(recording: Recording) -> Array:
+    truth = recording.truth
+    assert truth is not None
+    assert truth.twist_body is not None
+    forward, lateral = truth.twist_body[:, 0], truth.twist_body[:, 1]
+    moving = np.abs(forward) > SIDE_SLIP_FROM_MPS
+    return np.asarray(lateral[moving] / forward[moving])
+
+
+def _imu_evidence(recording: Recording) -> tuple[Array, Array]:
+    """Errors of 0.1 s means of gyro and accelerometer over the data sheet's, all axes, (n,) and (n,).
+
+    The truth is the mean over the same interval: rotation and change of
+    velocity between its ends. Only while the robot or its wheels move.
+    """
+    imu, truth = recording.imu, recording.truth
+    assert imu is not None
+    assert truth is not None
+    assert truth.twist_body is not None
+    assert truth.quaternion is not None
+    spec = _vehicle(recording).sensors.imu
+    imu_t, truth_t = seconds(imu.t_ns, recording), seconds(truth.t_ns, recording)
+    count = max(round(SHORT_S / float(np.median(np.diff(imu_t)))), 1)
+    blocks = len(imu_t) // count
+    ends = np.concatenate([[imu_t[0] - SHORT_S / count], imu_t[count - 1 : blocks * count : count]])
+    tau = float(np.median(np.diff(ends)))
+
+    R = quaternion_to_matrix(truth.quaternion)
+    velocity = _imu_velocity(truth.twist_body, R, spec)
+    rows = np.clip(np.searchsorted(truth_t, ends - 1e-6), 0, len(truth_t) - 1)
+    change = np.diff(velocity[rows], axis=0) / tau + np.array([0.0, 0.0, GRAVITY_MPS2])
+    force = np.einsum("nji,nj->ni", R[(rows[:-1] + rows[1:]) // 2], change)
+    turn = np.stack([np.mean(truth.twist_body[a + 1 : b + 1, 3:], axis=0) for a, b in _intervals(rows)])
+
+    gyro = _unbiased(_block_means(imu.gyro_radps, count)[:blocks] - turn, tau)
+    accel = _unbiased(_block_means(imu.accel_mps2, count)[:blocks] - force, tau)
+    wheel_t = wheel_samples(recording)
+    rolling = np.interp(ends[1:], wheel_t.t_s, np.abs(wheel_t.sides_mps).mean(axis=1)) > TURNING_MPS
+    root = np.sqrt(tau)
+    return (
+        (gyro[rolling] * root / spec.gyro_noise_radps_sqrthz).ravel(),
+        (accel[rolling] * root / spec.accel_noise_mps2_sqrthz).ravel(),
+    )
+
+
+def _imu_velocity(twist: Array, R: Array, spec: ImuSpec) -> Array:
+    """World velocity (n, 3) of the IMU's place."""
+    return np.asarray(np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m)))
+
+
+def _intervals(rows: NDArray[np.intp]) -> Iterable[tuple[int, int]]:
+    return zip(rows[:-1].tolist(), np.maximum(rows[1:], rows[:-1] + 1).tolist(), strict=True)
+
+
+def _unbiased(error: Array, tau_s: float) -> Array:
+    """Errors (n, 3) less their running mean over `BIAS_S`."""
+    width = min(max(round(BIAS_S / tau_s), 1), len(error))
+    count = np.convolve(np.ones(len(error)), np.ones(width), "same")
+    slow = np.stack([np.convolve(e, np.ones(width), "same") / count for e in error.T], axis=1)
+    return np.asarray(error - slow)
+
+
+def _gnss_evidence(recording: Recording) -> Array:
+    """Horizontal errors of the fixes over their reported sigma, east and north together (n,)."""
+    gnss, truth = recording.gnss, recording.truth
+    if gnss is None or truth is None:
+        return np.empty(0)
+    antenna = _vehicle(recording).sensors.gnss.antenna_m
+    error = (gnss.enu_m - truth.points_at(gnss.t_ns, antenna))[:, :2] / gnss.sigma_enu_m[:, :2]
+    return np.asarray(error[(gnss.fix > Fix.NONE) & np.isfinite(error).all(axis=1)].ravel())
+
+
+def _vehicle(recording: Recording) -> VehicleParams:
+    return load_vehicle(recording.vehicle or "elevate")
+
+
+def _block_means(x: Array, count: int) -> Array:
+    """Means of `count` rows each, the rest left out."""
+    blocks = len(x) // count
+    return np.asarray(x[: blocks * count].reshape(blocks, count, *x.shape[1:]).mean(axis=1))
+
+
+def _spread(row: SensorNoise) -> SensorNoise:
+    changes = {
+        name: value * UNKNOWN_SPREAD
+        for name, value in dataclasses.asdict(row).items()
+        if name not in ("slip_mean", "slip_time_s", "gnss_inflation")
+    }
+    return dataclasses.replace(row, **{**changes, "slip_sigma": min(changes["slip_sigma"], 1.0)})
+
+
+def _rounded(row: SensorNoise) -> SensorNoise:
+    """Four significant digits: the last bits of a sum differ from machine to machine, the file must not."""
+    return SensorNoise(*(float(f"{value:.{DIGITS}g}") for value in dataclasses.astuple(row)))
+
+
+def _settings() -> dict[str, float]:
+    return {
+        "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
+        "side_slip_from_mps": SIDE_SLIP_FROM_MPS, "stuck_mps": STUCK_MPS, "stuck_counts_s": STUCK_COUNTS_S,
+        "bias_s": BIAS_S, "tail": TAIL, "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
+    }  # fmt: skip
+
+
+def write_policy(policy: Policy, path: Path, made_by: str) -> None:
+    """Write a policy file: same policy, same bytes."""
+    from ruamel.yaml import YAML
+
+    content = {
+        "schema": SCHEMA,
+        "made_by": made_by,
+        "inputs_sha256": policy.inputs_sha256,
+        "classes": {name: dataclasses.asdict(row) for name, row in policy.classes.items()},
+        "fixed": dataclasses.asdict(policy.fixed),
+    }
+    yaml = YAML()
+    yaml.default_flow_style = False
+    with path.open("w", encoding="utf-8") as out:
+        yaml.dump(content, out)
