@@ -53,8 +53,8 @@ def evaluate(
 
     Example: terrafusion terrain eval
     """
+    from terrafusion.fusion.terrain import trials
     from terrafusion.fusion.terrain.classifier import load_terrain_model
-    from terrafusion.fusion.terrain.trials import trials
 
     loaded = load_terrain_model(model)
     with progress("drives", trials.count(seeds)) as tick:

@@ -39,9 +39,9 @@ class Scores:
     """Figures of a detector over sequences; only windows in which the robot or its wheels moved count.
 
     Attributes:
-        classes: names of the rows of `confusion`; its columns have `unknown` last.
-        confusion: shares of each true ground, rows sum to one.
-        macro_f1: mean F1 of the grounds; `unknown` counts as a miss.
+        classes: names of the rows and columns of `confusion`, `unknown` last.
+        confusion: shares of each true ground that were named so, rows sum to one (0 where it did not occur).
+        macro_f1: mean F1 of the grounds that occurred; `unknown` is one where none of the others is right.
         ece: expected calibration error of the winner's probability, ten bins (Naeini et al. 2015).
         unknown_share: share of windows called unknown.
         switch_delay_s: median, 95th percentile and largest time from a change of ground to its detection.
@@ -126,8 +126,8 @@ def evaluate(model: TerrainModel, sequences: Sequence[Route]) -> Scores:
     quantiles = np.quantile(delays, [0.5, 0.95, 1.0]) if delays else np.full(3, np.nan)
     return Scores(
         classes=classes,
-        confusion=tuple(tuple(row) for row in shares[:-1].tolist()),
-        macro_f1=float(f1[:-1][present[:-1]].mean()),
+        confusion=tuple(tuple(row) for row in shares.tolist()),
+        macro_f1=float(f1[present].mean()),
         ece=calibration_error(top, winner == true),
         unknown_share=float((winner == k - 1).mean()),
         switch_delay_s=(float(quantiles[0]), float(quantiles[1]), float(quantiles[2])),
