@@ -17,7 +17,7 @@ from terrafusion.datasets.frames import gtsam_to_ros_covariance
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
 from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState
 from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import STATUS, Estimate, State
+from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.history import History
 from terrafusion.fusion.metrics import Outage, Scores, score
@@ -45,6 +45,7 @@ class Replay:
     recording: Recording
     vehicle: VehicleParams
     mode: str
+    policy: Policy
     estimate: Estimate
     scores: Scores
     used: Gnss | None
@@ -58,11 +59,6 @@ class Replay:
     def realtime_factor(self) -> float:
         """Seconds of recording per second of computing."""
         return self.recording.duration_s() / max(self.seconds, 1e-9)
-
-    def status(self) -> tuple[str, str]:
-        """The last status and its sentence."""
-        value = str(self.estimate.status[-1]) if len(self.estimate.status) else "waiting"
-        return value, STATUS[value]
 
 
 def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParams, tuple[str, ...]]:
@@ -172,7 +168,7 @@ def replay(
         aligned=estimator.gnss.local,
     )
     return Replay(
-        recording, params, mode, estimate, scores, used, held_out, outages, seconds, latencies,
+        recording, params, mode, rows, estimate, scores, used, held_out, outages, seconds, latencies,
         estimator.gnss.rejected, estimator.wheels_rejected,
     )  # fmt: skip
 

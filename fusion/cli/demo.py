@@ -11,9 +11,9 @@ from terrafusion.fusion.cli.common import progress_bar
 
 
 def demo(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the log, the results and report.html.")] = Path(
-        "demo-out"
-    ),
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for the log, the results and report.html.")
+    ] = Path("demo-out"),
     seed: Annotated[int, typer.Option(help="Seed of the simulated sensors.")] = 0,
 ) -> None:
     """Simulate a drive over firm ground, loose sand and mud, and localise it with fixed and adaptive weights.

@@ -36,11 +36,14 @@ def replay(
     log: LogArgument,
     out: OutOption,
     mode: Annotated[
-        str, typer.Option(help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds.")
+        str,
+        typer.Option(help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds."),
     ] = "adaptive",
     vehicle: VehicleOption = None,
     policy: Annotated[Path | None, typer.Option(help="Weighting policy; by default the one shipped.")] = None,
-    batch: Annotated[bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")] = False,
+    batch: Annotated[
+        bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")
+    ] = False,
     gnss_outage: OutageOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
@@ -55,7 +58,7 @@ def replay(
     from terrafusion.fusion.config import MODES
     from terrafusion.fusion.metrics import parse_outage
     from terrafusion.fusion.replay import replay as run
-    from terrafusion.fusion.replay import write_replay
+    from terrafusion.fusion.results import write_replay
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
@@ -71,7 +74,7 @@ def replay(
             batch=batch,
             progress=progress,
         )
-    write_replay(out, [result], title=f"Replay of {recording.name}", command=" ".join(["terrafusion", *sys.argv[1:]]))
+    write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     for line in summary(result):
         print(line)
     print(f"written to {out}")
@@ -79,16 +82,20 @@ def replay(
 
 def summary(result: Replay) -> list[str]:
     """The result in a few lines of text."""
+    from terrafusion.fusion.outputs import final_status
+
     scores = result.scores
-    value, sentence = result.status()
+    status = final_status(result.estimate)
     lines = [
         f"{result.recording.name}: {result.recording.duration_s():.1f} s, {result.mode}, "
         f"{result.realtime_factor():.0f} x real time",
-        f"status: {value} ({sentence})",
+        f"status: {status['value']} ({status['message']})",
     ]
     if scores.held_out is not None:
         held = scores.held_out
-        lines.append(f"{held.fixes} fixes kept back: median error {held.median_m:.2f} m, 95 % {held.p95_m:.2f} m")
+        lines.append(
+            f"{held.fixes} fixes kept back: median error {held.median_m:.2f} m, 95 % {held.p95_m:.2f} m"
+        )
     if scores.against == "truth" and scores.ate_m is not None:
         lines.append(f"against truth: position error {scores.ate_m:.3f} m (root mean square)")
     for outage in scores.outages:
