@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.codegen import driver
-from terrafusion.twin.dynamics import INDEX, INPUTS, SOIL_PARAMETERS, STATES, rhs
+from terrafusion.twin.dynamics import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, rhs
 
 Array = NDArray[np.float64]
 
 BACKENDS = ("auto", "c", "vm")
-MAX_STEP_S = 0.0025
-"""Longest RK4 step: the fastest mode is the motor lag (500/s at 2 ms), the limit of RK4 2.78/500 s."""
+MAX_STEP_S = 1.0 / 300.0
+"""Longest RK4 step."""
+MAX_STEP_LAGS = 5.0 / 3.0
+"""Longest RK4 step in motor lags, the fastest mode of the model: RK4 is stable to 2.78 of them."""
 
 _VM_CHUNK = 50
 
@@ -68,14 +70,14 @@ def integrate(
         route: soil along the way.
         t0_s: time of the first sample (matters for routes over time).
         backend: "c", "vm", or "auto" (C where a compiler is found).
-        substeps: RK4 steps a sample; by default as many as `MAX_STEP_S` asks for.
+        substeps: RK4 steps a sample; by default `steps_a_sample`.
 
     Raises:
         TerrafusionError: the state ceased to be finite (the message names the time).
     """
     if backend not in BACKENDS:
         raise TerrafusionError(f"unknown backend '{backend}'", remedy=f"known are {', '.join(BACKENDS)}")
-    steps = substeps if substeps is not None else max(1, math.ceil(dt_s / MAX_STEP_S - 1e-9))
+    steps = substeps if substeps is not None else steps_a_sample(dt_s, vehicle)
     x0, inputs = np.ascontiguousarray(x0, dtype=float), np.ascontiguousarray(inputs, dtype=float)
     if x0.shape != (len(STATES),) or inputs.ndim != 2 or inputs.shape[1] != len(INPUTS) or not len(inputs):
         raise ValueError(f"x0 {x0.shape} or inputs {inputs.shape} are misshapen")
@@ -93,6 +95,12 @@ def integrate(
             remedy="check the vehicle's and the soil's parameters",
         )
     return states
+
+
+def steps_a_sample(dt_s: float, vehicle: Array) -> int:
+    """RK4 steps in a sample interval: few enough to be fast, short enough for the vehicle's motor lag."""
+    lag_s = float(vehicle[VEHICLE_PARAMETERS.index("lag_s")])
+    return max(1, math.ceil(dt_s / min(MAX_STEP_S, MAX_STEP_LAGS * lag_s) - 1e-9))
 
 
 def compiled() -> bool:

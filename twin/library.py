@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -26,8 +27,7 @@ def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dic
     """
     text = str(name_or_path)
     if text in known_names(folder):
-        with resources.as_file(resources.files("terrafusion.twin.params") / folder / f"{text}.yaml") as path:
-            return read_yaml(path), f"{folder}/{text}.yaml"
+        return _own_file(folder, text), f"{folder}/{text}.yaml"
     path = Path(text).expanduser()
     if path.suffix in (".yaml", ".yml") or path.is_file():
         return read_yaml(path), text
@@ -35,3 +35,10 @@ def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dic
         f"unknown {kind} '{text}'",
         remedy=f"known are {', '.join(known_names(folder))}; or give the path of a .yaml file",
     )
+
+
+@functools.cache
+def _own_file(folder: str, name: str) -> dict[str, Any]:
+    """Content of a file of the library, read once; callers do not change it."""
+    with resources.as_file(resources.files("terrafusion.twin.params") / folder / f"{name}.yaml") as path:
+        return read_yaml(path)
