@@ -31,7 +31,7 @@ from terrafusion.twin.vehicle import VehicleParams
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
-ACCEL_SHAPE = (0.5, 0.6, 1.0)
+ACCEL_SHAPE = (0.9, 1.0, 1.0)
 """Vibration of the specific force along body x, y, z relative to vertical (assumed)."""
 GYRO_SHAPE = (1.0, 0.8, 0.35)
 """Vibration of the angular rate about body x, y, z relative to roll (assumed)."""
