@@ -30,6 +30,8 @@ SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
 FOREIGN_LEVEL_DECADES = 0.3
 """1 sigma of the vibration level, common to all bands, of a robot not trained on: a factor of two."""
+FOREIGN_BAND_DECADES = 0.2
+"""And of each band by itself: every chassis and mounting has resonances of its own."""
 
 _KEYS = (
     "schema", "made_by", "inputs_sha256", "vehicles", "features", "temperature", "patch_length_m", "classes",
@@ -69,14 +71,15 @@ class TerrainModel:
     scores: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     def for_vehicle(self, name: str | None) -> TerrainModel:
-        """The model as it holds for a robot: a foreign one may vibrate more or less by a common factor.
+        """The model as it holds for a robot.
 
-        Its vibration then speaks through the shape of the spectrum, hardly by its level.
+        A foreign one may vibrate more or less than the trained ones, in all
+        bands and in each: its slip then says more than its vibration.
         """
         if name in self.vehicles:
             return self
         shift = np.zeros((len(FEATURES), len(FEATURES)))
-        shift[:SLIP, :SLIP] = FOREIGN_LEVEL_DECADES**2
+        shift[:SLIP, :SLIP] = FOREIGN_LEVEL_DECADES**2 + FOREIGN_BAND_DECADES**2 * np.eye(SLIP)
         widened = {
             n: dataclasses.replace(m, covariance=m.covariance + shift) for n, m in self.classes.items()
         }
