@@ -215,7 +215,7 @@ def plot_innovations(estimate: Estimate, start_ns: int, *, ax: Axes | None = Non
                 )
                 ax.plot(
                     t,
-                    np.maximum(nis, 1e-3),
+                    np.maximum(nis, 0.01),
                     marker,
                     color=colour,
                     alpha=0.55 if accepted else 1.0,
@@ -229,9 +229,10 @@ def plot_innovations(estimate: Estimate, start_ns: int, *, ax: Axes | None = Non
         dof = max(set(dofs), key=dofs.count)
         limit = float(chi2.ppf(0.99, dof)) / dof
         ax.axhline(
-            limit, color="#555555", linewidth=0.9, linestyle="--", label=f"99 % for {dof} degrees of freedom"
+            limit, color="#555555", linewidth=0.9, linestyle="--", label=f"99 % of them are below ({dof} dof)"
         )
         ax.set_yscale("log")
+        ax.set_ylim(bottom=0.008)
         _plain_log_ticks(ax)
     style.dress(ax, x=TIME, y="NIS / degree of freedom")
     style.legend_above(ax)
@@ -268,10 +269,12 @@ def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:
 
 def mark_outages(ax: Axes, outages: Sequence[Outage]) -> None:
     """Mark the stretches without GNSS by a bar at the foot, where the background is taken."""
+    foot = ax.get_xaxis_transform()
     for outage in outages:
         x = (outage.start_s, outage.start_s + outage.seconds)
-        ax.plot(x, (0.02, 0.02), transform=ax.get_xaxis_transform(), color=style.HELD_OUT, linewidth=4)
-        ax.text(x[0], 0.05, "no GNSS", transform=ax.get_xaxis_transform(), fontsize=7, color=style.HELD_OUT)
+        ax.plot(x, (0.02, 0.02), transform=foot, color=style.HELD_OUT, linewidth=4, solid_capstyle="butt")
+        text = ax.text(x[0], 0.05, "no GNSS", transform=foot, fontsize=7, color=style.HELD_OUT, clip_on=True)
+        text.set_in_layout(False)
 
 
 def shade_terrain(ax: Axes, estimate: Estimate, start_ns: int) -> list[Any]:

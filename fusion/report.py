@@ -263,7 +263,7 @@ def _sensors(
             _figure(
                 innovations,
                 "Normalised innovations: how surprising each measurement was. "
-                "With right weights they scatter around 1.",
+                "With right weights they scatter around 1; those at the foot are 0.01 or less.",
             )
         )
     return "\n".join(parts)
@@ -277,8 +277,8 @@ def _notes(runs: Sequence[ReportRun]) -> str:
         items += [
             f"{escape(run.name)}: {escape(note)}" for note in dict.fromkeys(notes) if note not in shared
         ]
-    text = _list(items) if items else "<p>Nothing had to be assumed.</p>"
-    return f"<h2>What was assumed</h2>\n{text}"
+    text = _list(items) if items else "<p>Nothing was noted.</p>"
+    return f"<h2>Notes of the run</h2>\n{text}"
 
 
 def _provenance(recording: Recording, more: Mapping[str, object]) -> str:

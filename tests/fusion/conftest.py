@@ -150,7 +150,7 @@ def _estimate(
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def drive() -> Callable[..., Drive]:
     """The builder `build_drive`."""
     return build_drive

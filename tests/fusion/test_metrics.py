@@ -1,0 +1,277 @@
+"""Scores on drives whose errors are known in closed form."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.frames import rpy_to_quaternion
+from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.fusion.error_series import Errors, travelled_m
+from terrafusion.fusion.metrics import Outage, Scores, parse_outage, rpe_percent, score
+
+
+def without_truth(recording: Recording) -> Recording:
+    return dataclasses.replace(recording, truth=None)
+
+
+def turned(trajectory: Trajectory, angle_rad: float, shift_m: tuple[float, float]) -> Trajectory:
+    """The whole trajectory moved by one rigid motion of the plane."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    R = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    yaw = trajectory.yaw_rad() + angle_rad
+    zero = np.zeros(len(yaw))
+    covariance = trajectory.covariance
+    if covariance is not None:
+        J = np.kron(np.eye(2), R)
+        covariance = J @ covariance @ J.T
+    return dataclasses.replace(
+        trajectory,
+        position_m=trajectory.position_m @ R.T + np.array([*shift_m, 0.0]),
+        quaternion=rpy_to_quaternion(np.stack([zero, zero, yaw], axis=1)),
+        covariance=covariance,
+    )
+
+
+def numbers(scores: Scores) -> list[float]:
+    values = [scores.ate_m, scores.yaw_rmse_rad, scores.velocity_rmse_mps, scores.nees_mean]
+    values += list(scores.rpe_percent.values())
+    return [np.nan if v is None else v for v in values]
+
+
+def test_a_perfect_estimate_scores_zero(drive):
+    d = drive()
+    s = score(d.estimate, d.recording)
+    assert s.against == "truth"
+    assert numbers(s) == pytest.approx([0.0] * 7, abs=1e-9)
+    assert s.held_out is None
+
+
+@given(st.floats(-50, 50), st.floats(-50, 50))
+@settings(max_examples=15, deadline=None)
+def test_a_constant_offset_is_the_ate_and_no_rpe(drive, east, north):
+    d = drive(offset_m=(east, north))
+    s = score(d.estimate, d.recording)
+    assert s.ate_m == pytest.approx(np.hypot(east, north), abs=1e-9)
+    assert s.rpe_percent["50"] == pytest.approx(0.0, abs=1e-6)
+    assert s.nees_mean == pytest.approx((east**2 + north**2) / 0.1**2 / 2.0, abs=1e-6)
+
+
+def test_a_scale_error_on_a_straight_line_is_the_rpe(drive):
+    d = drive(turn_radps=0.0, drift_mps=0.02)
+    s = score(d.estimate, d.recording)
+    assert list(s.rpe_percent) == ["10", "50", "100"]
+    assert list(s.rpe_percent.values()) == pytest.approx([2.0, 2.0, 2.0], rel=5e-3)
+
+
+def test_a_yaw_drift_on_a_straight_line_is_the_rpe_and_the_yaw_rmse(drive):
+    """Only the heading drifts, by `a` a second, and the positions stay true.
+
+    So the relative position, seen from the drifted heading, is turned by it: |e| = 2 L sin(a t / 2).
+    """
+    rate = 0.001
+    d = drive(turn_radps=0.0, yaw_drift_radps=rate)
+    s = score(d.estimate, d.recording)
+    t = np.arange(1201) * 0.1
+    starts = t[t <= 120.0 - 50.0 + 1e-9]
+    assert s.rpe_percent["50"] == pytest.approx(float((200.0 * np.sin(rate * starts / 2)).mean()), rel=2e-2)
+    assert s.yaw_rmse_rad == pytest.approx(float(np.sqrt(np.mean((rate * t) ** 2))), rel=1e-6)
+
+
+def test_short_drives_have_no_long_rpe(drive):
+    s = score(drive(seconds=30.0).estimate, drive(seconds=30.0).recording)
+    assert s.rpe_percent["10"] is not None
+    assert s.rpe_percent["50"] is None
+    assert s.rpe_percent["100"] is None
+
+
+def test_errors_drawn_from_the_covariance_are_consistent():
+    """NEES of N independent 2-D samples: chi-square of 2 N degrees of freedom, over 2 N."""
+    from scipy.stats import chi2
+
+    n, rng = 4000, np.random.default_rng(7)
+    A = rng.normal(size=(n, 2, 2))
+    P = A @ np.swapaxes(A, 1, 2) + 0.1 * np.eye(2)
+    error = np.einsum("nij,nj->ni", np.linalg.cholesky(P), rng.normal(size=(n, 2)))
+    nothing = np.full(n, np.nan)
+    errors = Errors(np.arange(n), error, np.zeros((n, 2)), nothing, nothing, np.zeros((n, 2)), P, nothing)
+    low, high = chi2.ppf([0.0005, 0.9995], 2 * n) / (2 * n)
+    assert low < errors.nees().mean() < high
+    expected = np.einsum("ni,nij,nj->n", error, np.linalg.inv(P), error) / 2
+    np.testing.assert_allclose(errors.nees(), expected, rtol=1e-9)
+
+
+@given(st.floats(-3.1, 3.1), st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
+@settings(max_examples=15, deadline=None)
+def test_scores_do_not_depend_on_the_frame(drive, angle, east, north):
+    d = drive(drift_mps=0.02, noise_m=0.05, yaw_drift_radps=5e-4)
+    truth = turned(d.recording.truth, angle, (east, north))
+    body = turned(d.estimate.trajectory, angle, (east, north))
+    c, s = np.cos(angle), np.sin(angle)
+    velocity = d.estimate.velocity_mps @ np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]]).T
+    moved = dataclasses.replace(d.estimate, trajectory=body, velocity_mps=velocity)
+    before = score(d.estimate, d.recording, outages=[Outage(30, 40)])
+    after = score(moved, dataclasses.replace(d.recording, truth=truth), outages=[Outage(30, 40)])
+    assert numbers(after) == pytest.approx(numbers(before), rel=1e-6, abs=1e-9)
+    assert after.outages[0].end_error_m == pytest.approx(before.outages[0].end_error_m, rel=1e-6)
+
+
+@pytest.mark.parametrize("by", ["truth", "fixes"])
+def test_drift_injected_in_an_outage_is_recovered_without_realignment(drive, by):
+    d = drive(turn_radps=0.0, offset_m=(0.5, 0.0), drift_mps=0.03, drift_from_s=40.0)
+    recording = d.recording if by == "truth" else without_truth(d.recording)
+    outage = Outage(40.0, 50.0)
+    held = d.fixes.select(outage.covers(d.fixes.t_ns, recording.start_ns))
+    scored = score(d.estimate, recording, held_out=held, outages=[outage]).outages[0]
+    last = 49.9 if by == "truth" else 49.0
+    assert scored.end_error_m == pytest.approx(0.5 + 0.03 * last, abs=1e-6)
+    assert scored.median_m == pytest.approx(0.5 + 0.03 * last / 2, abs=1e-6)
+    assert scored.distance_m == pytest.approx(last, abs=0.11)
+    assert scored.percent == pytest.approx(100 * (0.5 + 0.03 * last) / scored.distance_m, rel=1e-6)
+
+
+def test_an_outage_without_reference_is_not_scored(drive):
+    d = drive()
+    beyond = score(d.estimate, d.recording, outages=[Outage(500.0, 10.0)]).outages[0]
+    assert (beyond.end_error_m, beyond.median_m, beyond.percent) == (None, None, None)
+    inside = score(d.estimate, without_truth(d.recording), outages=[Outage(10.0, 20.0)]).outages[0]
+    assert inside.end_error_m is None
+    assert inside.distance_m == pytest.approx(19.9, abs=0.2)
+
+
+def test_held_out_fixes_are_compared_at_the_antenna(drive):
+    d = drive(turn_radps=0.0)
+    ahead = dataclasses.replace(d.fixes, enu_m=d.fixes.enu_m + np.array([0.4, 0.0, 0.0]))
+    plain = score(d.estimate, without_truth(d.recording), held_out=ahead)
+    assert plain.against == "gnss_held_out"
+    assert plain.held_out.median_m == pytest.approx(0.4)
+    assert plain.held_out.fixes == len(ahead)
+    assert plain.yaw_rmse_rad is None
+    armed = score(d.estimate, without_truth(d.recording), held_out=ahead, antenna_m=(0.4, 0.0, 0.3))
+    assert armed.held_out.p95_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_truth_of_the_antenna_is_compared_at_the_antenna(drive):
+    d = drive()
+    lever = (0.3, -0.2, 0.35)
+    antenna = d.recording.truth.points_at(d.recording.truth.t_ns, lever)
+    truth = dataclasses.replace(d.recording.truth, position_m=antenna)
+    recording = dataclasses.replace(
+        d.recording, truth=truth, truth_frame="antenna", truth_channels=("position", "yaw")
+    )
+    s = score(d.estimate, recording, antenna_m=lever)
+    assert s.ate_m == pytest.approx(0.0, abs=1e-3)
+    assert s.velocity_rmse_mps is None
+
+
+def test_channels_that_are_not_listed_as_true_are_not_scored(drive):
+    d = drive()
+    s = score(d.estimate, dataclasses.replace(d.recording, truth_channels=("position",)))
+    assert s.ate_m is not None
+    assert s.yaw_rmse_rad is None
+    assert s.velocity_rmse_mps is None
+    s = score(d.estimate, dataclasses.replace(d.recording, truth_channels=("yaw",)), held_out=d.fixes)
+    assert s.against == "gnss_held_out"
+    assert s.yaw_rmse_rad is not None
+
+
+def test_nothing_to_score_against_gives_none(drive):
+    d = drive()
+    s = score(d.estimate, without_truth(d.recording))
+    assert s.against is None
+    assert np.isnan(numbers(s)).all()
+    assert s.held_out is None
+
+
+@pytest.mark.parametrize("channels", [("position", "yaw"), ("position",)])
+def test_a_local_path_is_aligned_once_and_says_so(drive, channels):
+    d = drive()
+    local = dataclasses.replace(d.estimate, trajectory=turned(d.estimate.trajectory, 1.1, (40.0, -7.0)))
+    recording = dataclasses.replace(d.recording, truth_channels=channels)
+    assert score(local, recording).ate_m > 10.0
+    s = score(local, recording, aligned=True)
+    assert s.ate_m == pytest.approx(0.0, abs=1e-6)
+    assert any("without GNSS the path is local" in note for note in s.notes)
+
+
+def test_gaps_and_keyframes_without_a_pose_are_left_out_and_told(drive):
+    d = drive(offset_m=(1.0, 0.0))
+    t_s = (d.recording.truth.t_ns - d.recording.start_ns) * 1e-9
+    truth = d.recording.truth.select((t_s < 20.0) | (t_s > 60.0))
+    position = d.estimate.trajectory.position_m.copy()
+    position[:3] = np.nan
+    status = d.estimate.status.copy()
+    status[3:10] = "aligning"
+    path = dataclasses.replace(d.estimate.trajectory, position_m=position)
+    estimate = dataclasses.replace(d.estimate, trajectory=path, status=status)
+    s = score(estimate, dataclasses.replace(d.recording, truth=truth))
+    assert s.ate_m == pytest.approx(1.0)
+    assert len(s.errors.t_ns) == pytest.approx(1201 - 10 - 400, abs=3)
+    assert sum("not scored" in note for note in s.notes) == 2
+
+
+def test_noise_at_rest_is_not_travel():
+    rng = np.random.default_rng(0)
+    standing = rng.normal(size=(2000, 2)) * 0.01
+    assert travelled_m(standing)[-1] < 0.2
+    line = np.stack([np.linspace(0.0, 100.0, 5001), np.zeros(5001)], axis=1)
+    assert travelled_m(line)[-1] == pytest.approx(100.0, abs=0.11)
+
+
+@pytest.mark.parametrize(("text", "start", "seconds"), [("120:60", 120.0, 60.0), ("0:1.5", 0.0, 1.5)])
+def test_outages_are_parsed(text, start, seconds):
+    assert parse_outage(text) == Outage(start, seconds)
+
+
+@pytest.mark.parametrize("text", ["", "120", "a:b", "-1:5", "5:0", "5:-1", "nan:5", "5:inf", "1:2:3", ":"])
+def test_nonsense_outages_are_one_line_errors(text):
+    with pytest.raises(TerrafusionError, match="is not an outage") as caught:
+        parse_outage(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_ate_and_rpe_agree_with_evo(drive):
+    """evo (Grupp 2017) is a development check only; its licence keeps it out of the dependencies."""
+    evo = pytest.importorskip("evo.core.metrics")
+    from evo.core.trajectory import PoseTrajectory3D
+
+    d = drive(drift_mps=0.02, noise_m=0.05, yaw_drift_radps=1e-3, truth_hz=10)
+
+    def pose(t: Trajectory) -> PoseTrajectory3D:
+        return PoseTrajectory3D(t.position_m, np.roll(t.quaternion, 1, axis=1), (t.t_ns - t.t_ns[0]) * 1e-9)
+
+    pair = (pose(d.recording.truth), pose(d.estimate.trajectory))
+    s = score(d.estimate, d.recording)
+    ape = evo.APE(evo.PoseRelation.translation_part)
+    ape.process_data(pair)
+    assert s.ate_m == pytest.approx(ape.get_statistic(evo.StatisticsType.rmse), rel=1e-9)
+    for length in (10, 50):
+        rpe = evo.RPE(
+            evo.PoseRelation.translation_part,
+            delta=length,
+            delta_unit=evo.Unit.meters,
+            rel_delta_tol=0.005,
+            all_pairs=True,
+            pairs_from_reference=True,
+        )
+        rpe.process_data(pair)
+        theirs = 100.0 * rpe.get_statistic(evo.StatisticsType.mean) / length
+        assert rpe_percent(s.errors, [length])[str(length)] == pytest.approx(theirs, rel=0.02)
+
+
+def test_scoring_a_long_drive_is_quick(drive):
+    """Milliseconds; the bound leaves room for a busy machine."""
+    d = drive(seconds=400.0, truth_hz=100)
+    spent = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        score(d.estimate, d.recording, held_out=d.fixes, outages=[Outage(100, 60)], antenna_m=(0.1, 0, 0.3))
+        spent.append(time.perf_counter() - begun)
+    assert min(spent) < 0.25

@@ -1,0 +1,291 @@
+"""The report: self-contained, escaped, fair to both runs; and the plots in it."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import re
+import time
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.recording import Fix, Gnss, Recording, Terrain
+from terrafusion.fusion import plots, plots_map
+from terrafusion.fusion.estimate import WeightChange
+from terrafusion.fusion.metrics import Outage, score
+from terrafusion.fusion.outputs import build_metrics, final_status, rejected_counts, terrain_shares
+from terrafusion.fusion.plot_style import colour_of, plain, thin
+from terrafusion.fusion.report import ReportRun, write_report
+from terrafusion.fusion.report_text import Row, head_of_many, number, pick_pair, table_rows
+
+HOSTILE = '<script>alert("x")</script>&_$\\frac{'
+OUTAGES = (Outage(40.0, 30.0),)
+
+
+def make_run(d, name, recording=None, *, outages=OUTAGES, log="synthetic", **changed):
+    recording = recording or d.recording
+    estimate = dataclasses.replace(d.estimate, **changed)
+    scores = score(estimate, recording, held_out=d.fixes, outages=outages)
+    metrics = build_metrics(
+        log=log,
+        vehicle="elevate",
+        mode=name if name in ("adaptive", "fixed") else "robust",
+        duration_s=recording.duration_s(),
+        distance_m=118.0,
+        realtime_factor=90.0,
+        updates=len(estimate.trajectory),
+        latencies_ms=[0.5, 1.0],
+        terrain=terrain_shares(estimate),
+        changes=len(estimate.changes),
+        rejected=rejected_counts(estimate),
+        scores=scores,
+        status=final_status(estimate),
+        notes=estimate.notes,
+    )
+    return ReportRun(name, metrics, estimate, scores)
+
+
+class Page(HTMLParser):
+    """Tags, links and headings of a page; complains about tags that do not close."""
+
+    VOID = ("meta", "img", "br", "hr")
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.headings: list[str] = []
+        self.images: list[str] = []
+        self.tags: set[str] = set()
+        self.links: list[str] = []
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.add(tag)
+        values = dict(attrs)
+        if tag == "img":
+            self.images.append(values["src"])
+        self.links += [values[k] for k in ("href", "src") if k in values]
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        if self.open and self.open[-1] == "h2":
+            self.headings.append(data)
+
+
+def parse(path):
+    page = Page()
+    page.feed(path.read_text(encoding="utf-8"))
+    assert page.open == []
+    return page
+
+
+def test_a_comparison_has_all_sections_and_nothing_outside(drive, tmp_path):
+    good, bad = drive(drift_mps=0.005), drive(drift_mps=0.03)
+    runs = [make_run(good, "adaptive"), make_run(bad, "fixed")]
+    path = write_report(
+        tmp_path / "report.html",
+        "Two ways",
+        runs,
+        good.recording,
+        held_out=good.fixes,
+        outages=OUTAGES,
+        provenance={"command": "terrafusion demo", "policy": "ab" * 32},
+    )
+    page = parse(path)
+    assert page.headings == [
+        "Numbers",
+        "Map",
+        "Errors",
+        "Ground and slip",
+        "Weights and their reasons",
+        "Sensors",
+        "Notes of the run",
+        "Where this comes from",
+    ]
+    assert len(page.images) == 10
+    assert all(link.startswith("data:image/svg+xml;base64,") for link in page.links)
+    assert not page.tags & {"script", "link", "iframe", "object"}
+    text = path.read_text(encoding="utf-8")
+    assert "loose_sand became likelier" in text
+    assert "terrafusion demo" in text
+    assert "adaptive is better than fixed in" in text
+    assert len(text) < 3_000_000
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_one_run_needs_no_comparison(drive, tmp_path):
+    d = drive(drift_mps=0.01)
+    run = make_run(d, "adaptive")
+    path = write_report(tmp_path / "r.html", "Replay", [run], d.recording, outages=OUTAGES)
+    text = path.read_text(encoding="utf-8")
+    assert len(parse(path).images) == 8
+    assert "against fixed" not in text
+    assert "★ best" not in text
+    assert "Without GNSS for 30 s from 40 s the position was" in text
+
+
+def test_what_comes_from_a_log_is_escaped(drive, tmp_path):
+    d = drive(seconds=20.0)
+    classes = (HOSTILE, "$$", "_hidden", "unknown")
+    changes = (WeightChange(int(d.estimate.trajectory.t_ns[50]), HOSTILE, 0.1, 0.4, HOSTILE, HOSTILE),)
+    recording = dataclasses.replace(
+        d.recording,
+        name=HOSTILE,
+        description=HOSTILE,
+        terrain=Terrain(d.recording.truth.t_ns[:1], np.array([HOSTILE], dtype=object), source=HOSTILE),
+    )
+    run = make_run(d, HOSTILE, recording, log=HOSTILE, classes=classes, changes=changes, notes=(HOSTILE,))
+    path = write_report(
+        tmp_path / "r.html", HOSTILE, [run], recording, outages=OUTAGES, provenance={HOSTILE: HOSTILE}
+    )
+    page = parse(path)
+    assert "script" not in page.tags
+    assert "<script" not in path.read_text(encoding="utf-8")
+    for image in page.images:
+        assert b"<script" not in base64.b64decode(image.split(",", 1)[1])
+
+
+def test_a_drive_that_cannot_be_scored_still_has_a_report(drive, tmp_path):
+    d = drive(seconds=20.0)
+    recording = Recording(name="bare", start_ns=d.recording.start_ns)
+    bare = dataclasses.replace(d, recording=recording, fixes=d.fixes.select(slice(0, 0)))
+    run = make_run(bare, "fixed", innovations=(), changes=(), notes=())
+    path = write_report(tmp_path / "r.html", "Bare", [run], recording, outages=OUTAGES)
+    text = path.read_text(encoding="utf-8")
+    assert "could not be scored" in text
+    assert "No weight changed" in text
+    parse(path)
+
+
+def test_the_same_runs_give_the_same_page(drive, tmp_path):
+    d = drive(seconds=20.0)
+    run = make_run(d, "adaptive")
+    pages = [write_report(tmp_path / f"{i}.html", "t", [run], d.recording).read_bytes() for i in range(2)]
+    assert pages[0] == pages[1]
+
+
+def test_losses_are_told_like_wins(drive):
+    good, bad = make_run(drive(drift_mps=0.005), "fixed"), make_run(drive(drift_mps=0.03), "adaptive")
+    metrics = [good.metrics, bad.metrics]
+    ours, theirs = pick_pair(metrics)
+    assert (ours, theirs) == (1, 0)
+    row = table_rows(metrics)[0]
+    assert row.verdict(1, 0) == ("6.0 times", "worse")
+    assert row.verdict(0, 1) == ("83 % lower", "better")
+    assert row.best() == 0
+    sentences = " ".join(head_of_many(["fixed", "adaptive"], metrics, ours, theirs))
+    assert "6.0 times with adaptive" in sentences
+    assert re.search(r"adaptive is better than fixed in 0 and worse in \d+", sentences)
+
+
+def test_rows_judge_by_their_goal():
+    nees = Row("NEES", (0.5, 1.2), goal="one")
+    assert nees.best() == 1
+    assert nees.verdict(0, 1) == ("farther from 1", "worse")
+    assert Row("draw", (1.0001, 1.0002), goal="low").best() is None
+    assert Row("half", (1.0, None), goal="low").best() is None
+    assert Row("count", (1, 2)).verdict(0, 1) == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0"), (3, "3"), (12345, "12\u202f345"), (0.001234, "0.00123"), (99.96, "100.0"),
+     (1.0, "1.00"), (1e-9, "1.00e-09")],
+)  # fmt: skip
+def test_numbers_read_well(value, text):
+    assert number(value) == text
+
+
+def test_plots_draw_into_given_axes_and_leave_no_global_figure(drive):
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    d = drive(seconds=30.0)
+    fig, ax = plt.subplots()
+    try:
+        before = plt.get_fignums()
+        assert plots.plot_slip(d.estimate, d.recording.start_ns, ax=ax) == (fig, ax)
+        plots_map.plot_map(d.estimate, d.recording)
+        plots.plot_weights(d.estimate, d.recording.start_ns, marked=d.estimate.changes)
+        assert plt.get_fignums() == before
+    finally:
+        plt.close(fig)
+
+
+def test_plots_bear_gaps_nan_and_single_keyframes(drive):
+    d = drive(seconds=10.0)
+    holed = dataclasses.replace(d.estimate, slip=np.full(len(d.estimate.slip), np.nan))
+    rows = slice(0, 1)
+    one = dataclasses.replace(
+        d.estimate,
+        trajectory=d.estimate.trajectory.select(rows),
+        velocity_mps=d.estimate.velocity_mps[rows],
+        gyro_bias_radps=d.estimate.gyro_bias_radps[rows],
+        accel_bias_mps2=d.estimate.accel_bias_mps2[rows],
+        slip=d.estimate.slip[rows],
+        slip_sigma=d.estimate.slip_sigma[rows],
+        terrain=d.estimate.terrain[rows],
+        weights={name: values[rows] for name, values in d.estimate.weights.items()},
+        status=d.estimate.status[rows],
+    )
+    none = Gnss(
+        d.fixes.t_ns, np.full((len(d.fixes), 3), np.nan), d.fixes.sigma_enu_m,
+        np.full(len(d.fixes), Fix.NONE, dtype=np.uint8),
+    )  # fmt: skip
+    recording = dataclasses.replace(d.recording, gnss=none)
+    for estimate in (holed, one):
+        start = recording.start_ns
+        for fig in (
+            plots.plot_slip(estimate, start, outages=OUTAGES)[0],
+            plots.plot_terrain(estimate, start)[0],
+            plots.plot_weights(estimate, start)[0],
+            plots.plot_biases(estimate, start)[0],
+            plots.plot_innovations(estimate, start)[0],
+            plots.plot_speeds(estimate, recording)[0],
+            plots_map.plot_map(estimate, recording, held_out=none, outages=OUTAGES)[0],
+            plots_map.plot_map_runs({"a": estimate}, recording, outages=OUTAGES)[0],
+        ):
+            fig.draw_without_rendering()
+
+
+def test_important_changes_are_the_largest_apart_and_in_order():
+    def change(t_s, sensor, after):
+        return WeightChange(int(t_s * 1e9), sensor, 1.0, after, "", "")
+
+    changes = [
+        change(1, "wheels", 2.0),
+        change(1.5, "wheels", 4.0),
+        change(9, "gyro", 0.1),
+        change(5, "gyro", 1.1),
+    ]
+    chosen = plots.important_changes(changes, most=2)
+    assert [(c.sensor, c.after) for c in chosen] == [("wheels", 4.0), ("gyro", 0.1)]
+    assert plots.important_changes([], most=2) == []
+
+
+def test_style_helpers():
+    assert colour_of("mud", {"mud": "#123456"}) == "#123456"
+    assert colour_of("ice", {}) == colour_of("ice", {})
+    assert plain("_a\n$b") == r"a \$b"
+    rows = thin(100_000, 100, keep=[77])
+    assert rows[0] == 0
+    assert rows[-1] == 99_999
+    assert 77 in rows
+    assert len(rows) <= 101
+
+
+def test_a_report_on_a_long_drive_is_quick(drive, tmp_path):
+    """About one second; the bound leaves room for a busy machine."""
+    d = drive(seconds=400.0, truth_hz=100, noise_m=0.05)
+    runs = [make_run(d, "adaptive"), make_run(d, "fixed")]
+    begun = time.perf_counter()
+    path = write_report(tmp_path / "r.html", "Long", runs, d.recording, held_out=d.fixes, outages=OUTAGES)
+    assert time.perf_counter() - begun < 10.0
+    assert path.stat().st_size < 3_000_000
