@@ -24,7 +24,7 @@ from gtsam.symbol_shorthand import B, S, V, X
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
+from terrafusion.fusion.wheel_factor import SlipTransition, WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
 
@@ -76,6 +76,7 @@ class Node:
     point: KeyState
     t_ns: int
     link: gtsam.NonlinearFactorGraph
+    slip: SlipTransition | None
     wheels: WheelIncrement | None
     gyro_radps: Array
     accel_mps2: Array
@@ -124,22 +125,22 @@ class Chain:
         t_ns: int,
         point: KeyState,
         link: gtsam.NonlinearFactorGraph | None = None,
+        slip: SlipTransition | None = None,
         wheels: WheelIncrement | None = None,
         gyro_radps: Array = _ZERO,
         accel_mps2: Array = _ZERO,
     ) -> int:
         """Add a keyframe with its initial state and its factors to the one before; gives its index.
 
-        `link` must touch X, V, B and S of both keyframes.
+        `link` must touch X, V and B of both keyframes; `slip` links S.
         """
-        self.nodes.append(
-            Node(point, t_ns, link or gtsam.NonlinearFactorGraph(), wheels, gyro_radps, accel_mps2)
-        )
+        link = link if link is not None else gtsam.NonlinearFactorGraph()
+        self.nodes.append(Node(point, t_ns, link, slip, wheels, gyro_radps, accel_mps2))
         self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
         if self.archive is not None:
-            self.archive.append(t_ns, point, link, wheels, gyro_radps, accel_mps2)
+            self.archive.append(t_ns, point, link, slip, wheels, gyro_radps, accel_mps2)
         return self.last
 
     def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
@@ -223,7 +224,9 @@ class Chain:
     def optimise(self, iterations: int = 30, tolerance: float = 1e-6) -> int:
         """Gauss-Newton with step halving over all keyframes (batch); gives the iterations taken."""
         error = self._linearised_error()
-        for count in range(1, iterations + 1):
+        taken = 0
+        while taken < iterations:
+            taken += 1
             self._back_substitute_to(self.first)
             deltas = [node.delta for node in self.nodes]
             scale = 1.0
@@ -240,7 +243,7 @@ class Chain:
             if scale * max(float(np.abs(delta).max()) for delta in deltas) < tolerance or scale <= 1e-3:
                 break
         self._back_substitute_to(self.first)
-        return count
+        return taken
 
     def _linearised_error(self) -> float:
         """Linearise and eliminate everything; the sum of squares of all whitened residuals."""
@@ -272,7 +275,7 @@ class Chain:
         node, k, covariance = self.nodes[-1], self.last, self.covariance() + np.diag(extra_variance)
         root = np.linalg.inv(np.linalg.cholesky(covariance))
         graph, point = gtsam.NonlinearFactorGraph(), node.point.retract(node.delta)
-        fresh = Node(point, node.t_ns, graph, None, node.gyro_radps, node.accel_mps2)
+        fresh = Node(point, node.t_ns, graph, None, None, node.gyro_radps, node.accel_mps2)
         fresh.prior = np.hstack([root, np.zeros((DIM, 1))])
         self.nodes, self.first, self._dirty, self.values = [fresh], k, k, gtsam.Values()
         self._anchor = None
@@ -350,19 +353,28 @@ class Chain:
         node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
         ordering = gtsam.Ordering()
         for i in (k - 1, k):
-            for symbol in (X, V, B, S):
+            for symbol in (X, V, B):
                 ordering.push_back(symbol(i))
-        rows = node.link.linearize(self.values).augmentedJacobian(ordering)
-        if node.wheels is None:
-            return np.asarray(rows)
-        d, weight = node.wheels.displacement_m, 1.0 / node.wheels.sigma_m[:, None]
-        H_i, H_j, H_slip = jacobians(before.point.pose, node.point.pose, d)
-        wheel = np.zeros((3, 2 * DIM + 1))
-        wheel[:, 0:6] = H_i
-        wheel[:, DIM : DIM + 6] = H_j
-        wheel[:, DIM + SLIP] = H_slip[:, 0]
-        wheel[:, 2 * DIM] = -residual(before.point.pose, node.point.pose, node.point.slip, d)
-        return np.vstack([rows, wheel * weight])
+        packed = node.link.linearize(self.values).augmentedJacobian(ordering)
+        n = len(packed)
+        rows = np.zeros((n + 4, 2 * DIM + 1))
+        rows[:n, :SLIP] = packed[:, :SLIP]
+        rows[:n, DIM : DIM + SLIP] = packed[:, SLIP : 2 * SLIP]
+        rows[:n, 2 * DIM] = packed[:, 2 * SLIP]
+        if node.slip is not None:
+            step = node.slip
+            predicted = step.mean + step.decay * (before.point.slip - step.mean)
+            rows[n, SLIP], rows[n, DIM + SLIP] = -step.decay, 1.0
+            rows[n, 2 * DIM] = predicted - node.point.slip
+            rows[n] /= step.sigma
+        if node.wheels is not None:
+            d, sigma = node.wheels.displacement_m, node.wheels.sigma_m[:, None]
+            H_i, H_j, H_slip = jacobians(before.point.pose, node.point.pose, d)
+            wheel = rows[n + 1 :]
+            wheel[:, 0:6], wheel[:, DIM : DIM + 6], wheel[:, DIM + SLIP] = H_i, H_j, H_slip[:, 0]
+            wheel[:, 2 * DIM] = -residual(before.point.pose, node.point.pose, node.point.slip, d)
+            wheel /= sigma
+        return rows
 
     def _eliminate(self, k: int) -> None:
         node = self.nodes[k - self.first]

@@ -21,13 +21,13 @@ from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
 from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
-from terrafusion.fusion.factors import at_rest, bridge, slip_process, wheel_increment
+from terrafusion.fusion.factors import at_rest, bridge, wheel_increment
 from terrafusion.fusion.gates import WheelGate
 from terrafusion.fusion.gnss import GnssUpdater
 from terrafusion.fusion.preintegration import Preintegrator
 from terrafusion.fusion.streams import GnssFix, ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.terrain_weights import TerrainWeights
-from terrafusion.fusion.wheel_factor import WheelIncrement
+from terrafusion.fusion.wheel_factor import WheelIncrement, slip_transition
 
 Array = NDArray[np.float64]
 
@@ -106,7 +106,7 @@ class Estimator:
         velocity_mps: ArrayLike | None = None,
         sigma_v_mps: float = float("nan"),
     ) -> None:
-        """Antenna position (3,) and its 1 sigma (3,), ENU m; a NaN height is unknown. Velocity (3,) ENU if known."""
+        """Antenna position and 1 sigma (3,), ENU m, a NaN height being unknown; velocity (3,) ENU if known."""
         position, sigma = np.asarray(enu_m, dtype=float), np.asarray(sigma_m, dtype=float)
         if position.shape != (3,) or not np.isfinite(position[:2]).all():
             raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
@@ -118,7 +118,7 @@ class Estimator:
         self.gnss.queue(GnssFix(t_ns, position, sigma, velocity, sigma_v_mps))
 
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
-        """Class probabilities of an external source, such as a camera; they are fused with the own detector's."""
+        """Class probabilities of an external source, such as a camera, fused with the own detector's."""
         self.weights.external(t_ns, probabilities)
 
     def latest(self) -> State | None:
@@ -173,7 +173,7 @@ class Estimator:
             gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
             row.slip_mean,
         )
-        # The fixes that gave the heading enter the graph again as factors: the prior must not count them twice.
+        # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
         level = float(np.hypot(start.level_sigma_rad, spec.accel_bias_sigma_mps2 / GRAVITY_MPS2))
         gyro_sigma = spec.gyro_bias_sigma_radps + 1e-6
@@ -201,6 +201,7 @@ class Estimator:
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _keyframe(self, t_ns: int) -> None:
+        switch = self.weights.take_switch()
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
         row = self.weights.row
@@ -218,12 +219,10 @@ class Estimator:
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), before.bias)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip)
             link.add(_imu_factor(k, measured))
-            wheels = self._gated(t_ns, wheels, before, point, dt)
-        slip_link, slip_prior = slip_process(k, dt, row)
-        link.add(slip_link)
+            wheels = self._gated(t_ns, wheels, before, point, dt, switch)
+        slip = slip_transition(dt, switch, row.slip_mean, row.slip_sigma, row.slip_time_s)
         gyro, accel = _mean_rates(segments)
-        self.chain.append(t_ns, point, link, wheels, gyro, accel)
-        self.chain.add(k, slip_prior, "S")
+        self.chain.append(t_ns, point, link, slip, wheels, gyro, accel)
         self._zero_velocity(k, wheels, segments, before, link)
         self._finish_keyframe(t_ns, gyro)
 
@@ -257,7 +256,13 @@ class Estimator:
         return wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row)
 
     def _gated(
-        self, t_ns: int, wheels: WheelIncrement | None, before: KeyState, point: KeyState, dt: float
+        self,
+        t_ns: int,
+        wheels: WheelIncrement | None,
+        before: KeyState,
+        point: KeyState,
+        dt: float,
+        switch: float,
     ) -> WheelIncrement | None:
         if wheels is None:
             return None
@@ -268,7 +273,7 @@ class Estimator:
         forward = before.pose.rotation().matrix()[:, 0]
         variance = (
             wheels.sigma_m[0] ** 2
-            + d[0] ** 2 * (P[SLIP, SLIP] + 2.0 * row.slip_sigma**2 * dt / row.slip_time_s)
+            + d[0] ** 2 * (P[SLIP, SLIP] + row.slip_sigma**2 * (2.0 * dt / row.slip_time_s + switch))
             + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
             + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
         )

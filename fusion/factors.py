@@ -7,7 +7,7 @@ import math
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, S, V, X
+from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
 from terrafusion.fusion.chain import KeyState
@@ -55,22 +55,6 @@ def wheel_increment(
     return WheelIncrement(
         np.array([x, y, 0.0]), np.array([forward, across, up]), distance, (right - left) / track_m
     )
-
-
-def slip_process(
-    k: int, dt_s: float, noise: SensorNoise
-) -> tuple[gtsam.NonlinearFactor, gtsam.NonlinearFactor]:
-    """Link and prior that make slip an Ornstein-Uhlenbeck process with the moments of `noise`.
-
-    A random walk with variance 2 sigma^2 dt / tau, pulled to the mean by a
-    prior of variance 2 sigma^2 tau / dt each step, has the log-density of the
-    process to first order in dt (Uhlenbeck and Ornstein 1930, Phys. Rev. 36).
-    """
-    ratio = dt_s / noise.slip_time_s
-    walk = noise.slip_sigma * math.sqrt(2.0 * ratio)
-    pull = noise.slip_sigma * math.sqrt(2.0 / ratio)
-    link = gtsam.BetweenFactorDouble(S(k - 1), S(k), 0.0, _isotropic(1, round(walk, 6)))
-    return link, gtsam.PriorFactorDouble(S(k), noise.slip_mean, _isotropic(1, round(pull, 6)))
 
 
 def at_rest(k: int) -> gtsam.NonlinearFactor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import bisect
+import itertools
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,7 +84,7 @@ class ImuStream:
         i = max(bisect.bisect_right(self.t_ns, start_ns) - 1, 0)
         j = bisect.bisect_left(self.t_ns, end_ns)
         times = self.t_ns[i : j + 1]
-        return max((b - a for a, b in zip(times, times[1:], strict=False)), default=0) * 1e-9
+        return max((b - a for a, b in itertools.pairwise(times)), default=0) * 1e-9
 
     def window(self, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
         """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end."""
@@ -117,9 +118,7 @@ class WheelStream:
     ) -> None:
         """Side speeds, and where encoders count angle the travelled distances, which are then used instead."""
         if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
-            raise DataError(
-                "a wheel speed is not a finite number", channel="wheels", remedy="leave the sample out"
-            )
+            raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
         _in_order("wheels", t_ns, self.t_ns)
         if left_m is None or right_m is None:
             left_m, right_m = self._integrated(t_ns, left_mps, right_mps)

@@ -54,9 +54,19 @@ class TerrainWeights:
         self.changes: list[WeightChange] = []
         self._noted: SensorNoise | None = None
         self._rig = config.rig
+        self._before = self.detector.probabilities
         self._next_ns = 0
         self._last_speed = 0.0
         self._source = "detector"
+
+    def take_switch(self) -> float:
+        """Probability mass that changed class since the last call (total variation); 0 with fixed weights."""
+        if not self.adaptive:
+            return 0.0
+        p = self.detector.probabilities
+        moved = 0.5 * float(np.abs(p - self._before).sum())
+        self._before = p
+        return moved
 
     def begin(self, t_ns: int) -> None:
         """Start the clock; the first row is a change from the policy's fixed one."""
