@@ -101,13 +101,13 @@ def table_rows(runs: Sequence[Metrics]) -> list[Row]:
             f"ATE: horizontal, against {reference}, nothing aligned" if reference else "",
         )
     ]
-    for length in runs[0]["rpe_percent"]:
+    for i, length in enumerate(runs[0]["rpe_percent"]):
         rows.append(
             row(
                 f"Relative error over {length} m, %",
                 lambda m, key=length: m["rpe_percent"].get(key),  # type: ignore[misc]
                 "low",
-                "RPE: mean over all stretches of that length",
+                "RPE: mean over all stretches of that length" if i == 0 else "",
             )
         )
     rows += [
