@@ -98,7 +98,9 @@ def table_rows(runs: Sequence[Metrics]) -> list[Row]:
             "Position error, RMS, m",
             lambda m: m["ate_m"],
             "low",
-            f"ATE: horizontal, against {reference}, nothing aligned" if reference else "",
+            f"ATE: horizontal, against {reference}; aligned only at the start of a drive without GNSS"
+            if reference
+            else "",
         )
     ]
     for i, length in enumerate(runs[0]["rpe_percent"]):
