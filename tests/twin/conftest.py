@@ -1,0 +1,46 @@
+"""Helpers shared by the twin's tests."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.dynamics import STATES, soil_vector, vehicle_vector
+from terrafusion.twin.integrate import RouteTable, integrate
+from terrafusion.twin.soil import SoilParams, load_soil
+from terrafusion.twin.vehicle import load_vehicle
+
+
+@pytest.fixture
+def frictionless() -> SoilParams:
+    """Firm ground without any resistance to rolling."""
+    firm = load_soil("asphalt")
+    return dataclasses.replace(
+        firm,
+        pressure=dataclasses.replace(firm.pressure, k_phi_n_per_m_n2=1e18),
+        resistance=dataclasses.replace(firm.resistance, rolling=0.0, viscous_ns_per_m=0.0),
+    )
+
+
+@pytest.fixture
+def run() -> Callable[..., np.ndarray]:
+    """run(soil, sides (N, 2) rad/s, ...) -> states (N, 38) at 100 Hz on one soil."""
+
+    def call(
+        soil: SoilParams | str,
+        sides: np.ndarray,
+        *,
+        slope_rad: float = 0.0,
+        start: np.ndarray | None = None,
+        **kw,
+    ) -> np.ndarray:
+        soil = load_soil(soil) if isinstance(soil, str) else soil
+        route = RouteTable("travel", np.zeros(1), soil_vector(soil)[None])
+        vehicle = vehicle_vector(load_vehicle("elevate"), slope_rad=slope_rad)
+        x0 = np.zeros(len(STATES)) if start is None else start
+        return integrate(x0, sides, 0.01, vehicle, route, **kw)
+
+    return call

@@ -1,0 +1,111 @@
+"""The two backends, convergence, and what happens when a run diverges."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.twin import codegen, integrate, simulate
+from terrafusion.twin.dynamics import INDEX
+from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.simulate import simulate_run
+
+needs_compiler = pytest.mark.skipif(codegen.find_compiler() is None, reason="no C compiler")
+A_MINUTE = dataclasses.replace(load_scenario("mixed_terrain"), duration_s=60.0)
+
+
+@needs_compiler
+def test_compiled_and_interpreted_runs_agree() -> None:
+    """60 s over a border of two grounds, with a turn."""
+    c, vm = (simulate_run(A_MINUTE, backend=backend).states for backend in ("c", "vm"))
+    assert np.abs(c - vm).max() < 1e-9
+
+
+@pytest.mark.parametrize(("terrain", "slope"), [("loose_sand", 5.0), ("asphalt", 0.0), ("mud", 0.0)])
+def test_halving_the_step_changes_almost_nothing(monkeypatch, terrain, slope) -> None:
+    whole = integrate.integrate
+
+    def states(substeps: int) -> np.ndarray:
+        monkeypatch.setattr(simulate, "integrate", lambda *a, **k: whole(*a, **k, substeps=substeps))
+        scenario = dataclasses.replace(load_scenario("figure_eight"), duration_s=40.0)
+        return simulate_run(scenario, terrain=terrain, slope_deg=slope).states
+
+    default, half = states(3), states(6)
+    assert np.abs(default[:, :2] - half[:, :2]).max() < 2e-4
+    assert np.abs(default[:, 2] - half[:, 2]).max() < 2e-5
+
+
+def test_order_of_convergence_is_four_where_inputs_are_smooth(run) -> None:
+    t = np.arange(0.0, 5.001, 0.01)
+    speed = 2.0 * np.sin(np.pi * t / 5.0) ** 2
+    sides = np.stack([speed, 1.5 * speed], axis=1)
+    ends = {n: run("medium_sand", sides, substeps=n)[-1, :3] for n in (4, 8, 64)}
+    errors = [np.abs(ends[n] - ends[64]).max() for n in (4, 8)]
+    assert errors[0] / errors[1] > 10.0
+
+
+def test_longer_lag_allows_longer_steps_and_shorter_lag_asks_for_shorter() -> None:
+    from terrafusion.twin.dynamics import VEHICLE_PARAMETERS
+
+    vehicle = np.ones(len(VEHICLE_PARAMETERS))
+    lag = VEHICLE_PARAMETERS.index("lag_s")
+    vehicle[lag] = 0.002
+    assert integrate.steps_a_sample(0.01, vehicle) == 3
+    vehicle[lag] = 0.001
+    assert integrate.steps_a_sample(0.01, vehicle) == 6
+
+
+@pytest.mark.parametrize("backend", ["auto", "vm"])
+def test_divergence_names_its_time(run, backend) -> None:
+    sides = np.zeros((101, 2))
+    sides[50:] = np.nan
+    with pytest.raises(TerrafusionError, match=r"t = 0\.500 s.*diverged"):
+        run("asphalt", sides, backend=backend)
+
+
+def test_unknown_backend_is_an_error(run) -> None:
+    with pytest.raises(TerrafusionError, match="auto, c, vm"):
+        run("asphalt", np.zeros((2, 2)), backend="gpu")
+
+
+def test_without_a_compiler_the_virtual_machine_runs_and_is_named(monkeypatch, caplog) -> None:
+    codegen.driver.cache_clear()
+    monkeypatch.setattr(codegen, "find_compiler", lambda: None)
+    try:
+        short = dataclasses.replace(load_scenario("straight"), duration_s=5.0)
+        first, second = simulate_run(short), simulate_run(short)
+    finally:
+        codegen.driver.cache_clear()
+    assert any("virtual machine" in note for note in first.recording.notes)
+    assert sum("no C compiler" in record.message for record in caplog.records) == 1
+    assert np.array_equal(first.states, second.states)
+
+
+@needs_compiler
+def test_the_library_is_compiled_once_and_found_again(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
+    for _ in range(2):
+        codegen.driver.cache_clear()
+        assert codegen.driver() is not None
+    codegen.driver.cache_clear()
+    files = list((tmp_path / "cache").iterdir())
+    assert len(files) == 1
+
+
+@needs_compiler
+def test_a_compiler_that_fails_is_told_and_replaced(monkeypatch, tmp_path, caplog) -> None:
+    monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(codegen, "FLAGS", ("-no-such-flag",))
+    codegen.driver.cache_clear()
+    assert codegen.driver() is None
+    codegen.driver.cache_clear()
+    assert "could not be compiled" in caplog.text
+
+
+def test_a_route_crosses_its_border_smoothly() -> None:
+    states = simulate_run(A_MINUTE, noiseless=True).states
+    accelerations = np.diff(states[:, INDEX["u"]]) * 100.0
+    assert np.abs(accelerations).max() < 1.5
