@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,12 +11,20 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+class Verdict(Enum):
+    """What a gate says of a fix."""
+
+    ACCEPT = "accept"
+    REJECT = "reject"
+    REACQUIRE = "reacquire"
+
+
 @dataclass
 class GnssGate:
     """Chi-square test of a fix against its prediction.
 
     When enough rejected fixes in a row agree with each other the estimate, not
-    GNSS, is taken to be wrong: `test` answers "reacquire".
+    GNSS, is taken to be wrong: `test` answers REACQUIRE.
 
     Attributes:
         threshold: chi-square quantile of the innovations tested.
@@ -28,20 +37,20 @@ class GnssGate:
     agreement_sigma: float = 4.0
     rejected: list[tuple[Array, float]] = field(default_factory=list)
 
-    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[bool, float]:
-        """Accept or not, the normalised innovation squared.
+    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[Verdict, float]:
+        """What to do with the fix, and the normalised innovation squared.
 
         `innovation_m` (d,) is fix minus prediction, `covariance_m2` (d, d) of it.
         """
         nis = float(innovation_m @ np.linalg.solve(covariance_m2, innovation_m))
         if nis <= self.threshold:
             self.rejected.clear()
-            return "accept", nis
+            return Verdict.ACCEPT, nis
         self.rejected.append((innovation_m[:2].copy(), float(np.sqrt(covariance_m2[0, 0]))))
         if len(self.rejected) >= self.patience and self._agree():
             self.rejected.clear()
-            return True, nis
-        return False, nis
+            return Verdict.REACQUIRE, nis
+        return Verdict.REJECT, nis
 
     def _agree(self) -> bool:
         recent = self.rejected[-self.patience :]
@@ -55,8 +64,8 @@ class WheelGate:
     """Test of a wheel increment against the IMU's prediction.
 
     A burst of slip or a jammed wheel shows as an increment the IMU does not
-    confirm. It is left out, and the slip state is set free, for at most
-    `patience` keyframes: the IMU alone must not judge for longer than it can.
+    confirm. It is left out, for at most `patience` keyframes in a row: the IMU
+    alone must not judge for longer than it can.
     """
 
     limit_sigma: float

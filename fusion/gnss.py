@@ -14,7 +14,7 @@ from terrafusion.fusion.chain import POSE, Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.factors import antenna_lever, gnss_position, gnss_velocity
-from terrafusion.fusion.gates import GnssGate
+from terrafusion.fusion.gates import GnssGate, Verdict
 from terrafusion.fusion.streams import GnssFix
 from terrafusion.fusion.weighting import SensorNoise
 
@@ -101,13 +101,13 @@ class GnssUpdater:
         P = J @ covariance[POSE, POSE] @ J.T
         P[[0, 1], [0, 1]] += sigma[:2] ** 2
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
-        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict != "reject"))
-        if verdict == "reject":
+        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
+        if verdict is Verdict.REJECT:
             self.rejected += 1
             return False
         cut = k == chain.last and self._prepare(chain, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
-        if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] == "reject":
+        if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
             fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
             sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
         chain.add(k, gnss_position(k, fix, lever, sigma), "X")
@@ -123,7 +123,7 @@ class GnssUpdater:
 
     @staticmethod
     def _prepare(
-        chain: Chain, covariance: Array, innovation_m: Array, S: Array, jacobian: Array, verdict: str
+        chain: Chain, covariance: Array, innovation_m: Array, S: Array, jacobian: Array, verdict: Verdict
     ) -> bool:
         """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
 
@@ -133,7 +133,7 @@ class GnssUpdater:
         """
         gain = covariance[:, :6] @ jacobian.T @ np.linalg.inv(S)
         doubt = np.zeros(16)
-        if verdict == "reacquire":
+        if verdict is Verdict.REACQUIRE:
             doubt[3:6] = float(innovation_m @ innovation_m)
         elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
             return False
