@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import hashlib
 import json
@@ -79,7 +80,7 @@ def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path
     """A soil file in `folder`: the library's `terrain` with its numbers scattered by `SOIL_SCATTER`."""
     from ruamel.yaml import YAML
 
-    raw, _ = read_named("soils", terrain, kind="terrain")
+    raw = copy.deepcopy(read_named("soils", terrain, kind="terrain")[0])
     for section, ranges in SOIL_SCATTER.items():
         for key, share in ranges.items():
             raw[section][key]["value"] *= float(rng.uniform(1.0 - share, 1.0 + share))
