@@ -6,12 +6,14 @@ The cache lies in `$TERRAFUSION_CACHE`, else `$XDG_CACHE_HOME/terrafusion`, else
 
 from __future__ import annotations
 
+import atexit
 import ctypes
 import functools
 import hashlib
 import importlib.util
 import logging
 import os
+import platform
 import shutil
 import subprocess
 import sys
@@ -45,7 +47,7 @@ def find_compiler() -> tuple[str, ...] | None:
         if path:
             return (path,)
     if importlib.util.find_spec("ziglang") is not None:
-        return (sys.executable, "-m", "ziglang", "cc")
+        return (sys.executable, "-m", "ziglang", "cc", "-mcpu=baseline")
     return None
 
 
@@ -94,28 +96,30 @@ def _generate(function: Any) -> str:
 def _compiled(source: str, compiler: tuple[str, ...]) -> Path:
     """Path of the shared library, from the cache or freshly compiled (written atomically)."""
     version = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=True)
-    key = "\0".join([source, *FLAGS, *compiler, version.stdout, sys.platform])
+    key = "\0".join([source, *FLAGS, *compiler, version.stdout, sys.platform, platform.machine()])
     name = f"twin-{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
-    for folder in (cache_folder(), Path(tempfile.gettempdir()) / f"terrafusion-{os.getpid()}"):
-        target = folder / name
-        if target.is_file():
-            return target
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            return _compile_into(folder, target, source, compiler)
-        except PermissionError:
-            continue
-    raise OSError("no folder to keep the compiled code in")
+    target = cache_folder() / name
+    if target.is_file():
+        return target
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return _compile_into(target, source, compiler)
+    except OSError as error:  # a read-only or full home: compile for this process only
+        LOG.info("no cache in %s (%s)", target.parent, error)
+        folder = Path(tempfile.mkdtemp(prefix="terrafusion-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        return _compile_into(folder / name, source, compiler)
 
 
-def _compile_into(folder: Path, target: Path, source: str, compiler: tuple[str, ...]) -> Path:
-    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+def _compile_into(target: Path, source: str, compiler: tuple[str, ...]) -> Path:
+    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
         code, library = Path(scratch) / "twin.c", Path(scratch) / "twin.so"
         code.write_text(source, encoding="utf-8")
         command = [*compiler, *FLAGS, "-o", str(library), str(code), "-lm"]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
         if done.returncode != 0:
-            raise OSError(f"{compiler[0]}: {done.stderr.strip().splitlines()[-1:] or 'failed'}")
+            said = done.stderr.strip().splitlines() or ["no message"]
+            raise subprocess.SubprocessError(f"{' '.join(compiler)}: {said[-1]}")
         os.replace(library, target)
     return target
 

@@ -105,8 +105,9 @@ def study_table() -> list[str]:
         summary = runs[0].summary
         at = "no" if summary.immobilised_at_s is None else f"{summary.immobilised_at_s:.1f} s"
         lines.append(
-            f"{terrain:12s} {100 * summary.mean_abs_slip:6.1f} {known[0]:6.1f} {odometry:6.1f} {known[1]:6.1f} "
-            f"{imu:6.1f} {known[2]:6.1f} {positions:6.1f} {velocity:6.1f} {known[3]:8.1f}            {at}"
+            f"{terrain:12s} {100 * summary.mean_abs_slip:6.1f} {known[0]:6.1f} "
+            f"{odometry:6.1f} {known[1]:6.1f} {imu:6.1f} {known[2]:6.1f} {positions:6.1f} {velocity:6.1f} "
+            f"{known[3]:8.1f}            {at}"
         )
     return lines
 

@@ -109,3 +109,13 @@ def test_a_route_crosses_its_border_smoothly() -> None:
     states = simulate_run(A_MINUTE, noiseless=True).states
     accelerations = np.diff(states[:, INDEX["u"]]) * 100.0
     assert np.abs(accelerations).max() < 1.5
+
+
+@needs_compiler
+def test_a_home_that_cannot_be_written_still_gets_compiled_code(monkeypatch, tmp_path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    monkeypatch.setenv("TERRAFUSION_CACHE", str(blocked / "cache"))
+    codegen.driver.cache_clear()
+    assert codegen.driver() is not None
+    codegen.driver.cache_clear()
