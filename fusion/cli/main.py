@@ -11,7 +11,7 @@ import sys
 import typer
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.fusion.cli import convert, demo, inspect, replay, simulate
+from terrafusion.fusion.cli import convert, demo, inspect, policy, replay, simulate, terrain
 
 app = typer.Typer(
     name="terrafusion",
@@ -25,6 +25,8 @@ app.command("inspect")(inspect.inspect)
 app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("replay")(replay.replay)
+app.add_typer(terrain.app, name="terrain")
+app.add_typer(policy.app, name="policy")
 
 
 def main() -> None:
