@@ -92,7 +92,7 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None) -> Policy:
     return Policy(
         classes={**rows, "unknown": _rounded(_spread(matched))},
         fixed=_rounded(row_of(list(grounds.values()))),
-        inputs_sha256=grid.fingerprint(policy=_settings()),
+        inputs_sha256=fingerprint_of(grid),
     )
 
 
@@ -210,7 +210,7 @@ def _imu_evidence(recording: Recording) -> tuple[Array, Array]:
     rows = np.clip(np.searchsorted(truth_t, ends - 1e-6), 0, len(truth_t) - 1)
     change = np.diff(velocity[rows], axis=0) / tau + np.array([0.0, 0.0, GRAVITY_MPS2])
     force = np.einsum("nji,nj->ni", R[(rows[:-1] + rows[1:]) // 2], change)
-    turn = np.stack([np.mean(truth.twist_body[a + 1 : b + 1, 3:], axis=0) for a, b in _intervals(rows)])
+    turn = _rotation_vectors(np.swapaxes(R[rows[:-1]], 1, 2) @ R[rows[1:]]) / tau
 
     gyro = _unbiased(_block_means(imu.gyro_radps, count)[:blocks] - turn, tau)
     accel = _unbiased(_block_means(imu.accel_mps2, count)[:blocks] - force, tau)
@@ -228,8 +228,11 @@ def _imu_velocity(twist: Array, R: Array, spec: ImuSpec) -> Array:
     return np.asarray(np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m)))
 
 
-def _intervals(rows: NDArray[np.intp]) -> Iterable[tuple[int, int]]:
-    return zip(rows[:-1].tolist(), np.maximum(rows[1:], rows[:-1] + 1).tolist(), strict=True)
+def _rotation_vectors(R: Array) -> Array:
+    """Rotation vectors (n, 3), rad, of rotations (n, 3, 3) by less than a quarter turn."""
+    twice = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.maximum(0.5 * np.linalg.norm(twice, axis=1, keepdims=True), 1e-12)
+    return np.asarray(0.5 * twice * np.arcsin(np.minimum(sine, 1.0)) / sine)
 
 
 def _unbiased(error: Array, tau_s: float) -> Array:
@@ -274,12 +277,14 @@ def _rounded(row: SensorNoise) -> SensorNoise:
     return SensorNoise(*(float(f"{value:.{DIGITS}g}") for value in dataclasses.astuple(row)))
 
 
-def _settings() -> dict[str, float]:
-    return {
+def fingerprint_of(grid: Grid) -> str:
+    """SHA-256 of what a policy fitted on `grid` depends on: parameter files and settings."""
+    settings = {
         "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
         "side_slip_from_mps": SIDE_SLIP_FROM_MPS, "stuck_mps": STUCK_MPS, "stuck_counts_s": STUCK_COUNTS_S,
         "bias_s": BIAS_S, "tail": TAIL, "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
     }  # fmt: skip
+    return grid.fingerprint(policy=settings)
 
 
 def write_policy(policy: Policy, path: Path, made_by: str) -> None:

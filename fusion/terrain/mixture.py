@@ -33,7 +33,7 @@ def fit_best(x: Array, sigma_floor: Array, order_by: int, most: int = 3) -> Mixt
     d = x.shape[1]
     samples = len(x) / WINDOWS_PER_SAMPLE
     for parts in range(1, most + 1):
-        if samples < 10 * parts * d:
+        if samples < (4 * d if parts == 1 else 10 * parts * d):
             break
         mixture, log_likelihood = fit(x, parts, sigma_floor, order_by)
         free = parts * (d + d * (d + 1) / 2) + parts - 1

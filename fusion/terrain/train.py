@@ -87,7 +87,7 @@ def train(plan: Plan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainM
         temperature=1.0,
         patch_length_m=PATCH_LENGTH_M,
         vehicles=(plan.training().vehicle,),
-        inputs_sha256=plan.training().fingerprint(settings=_settings(plan)),
+        inputs_sha256=fingerprint_of(plan),
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
     )
     held_out = list(drives_of(plan.grid(CALIBRATION_SEED), tick))
@@ -127,29 +127,43 @@ def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
     The weight is the largest of a falling series for which at most
     `UNKNOWN_SHARE` of the windows are called unknown.
     """
-    temperature = min(TEMPERATURES, key=lambda t: _log_loss(model, route, float(t))[0])
+    evidence = _evidence(model, route)
+    temperature = min((float(t) for t in TEMPERATURES), key=lambda t: _log_loss(model, evidence, t, 0.0)[0])
     for exponent in range(0, -13, -1):
-        weighted = dataclasses.replace(model.unknown, log_weight=np.array([np.log(10.0) * exponent]))
-        candidate = dataclasses.replace(model, unknown=weighted, temperature=float(temperature))
-        if _log_loss(candidate, route, float(temperature))[1] <= UNKNOWN_SHARE:
+        log_weight = np.log(10.0) * exponent
+        if _log_loss(model, evidence, temperature, log_weight)[1] <= UNKNOWN_SHARE:
             break
-    return candidate
+    weighted = dataclasses.replace(model.unknown, log_weight=np.array([log_weight]))
+    return dataclasses.replace(model, unknown=weighted, temperature=temperature)
 
 
-def _log_loss(model: TerrainModel, route: Route, temperature: float) -> tuple[float, float]:
-    """Mean -log posterior of the true ground along the route, and the share of windows called unknown."""
+def _evidence(model: TerrainModel, route: Route) -> list[tuple[float, Array, int]]:
+    """Distance driven, untempered log-likelihoods (k,) and true class of every moving window."""
     classes = (*model.classes, UNKNOWN)
-    table = LikelihoodTable(dataclasses.replace(model, temperature=temperature), classes)
-    patch = PatchFilter(len(classes), model.patch_length_m)
-    loss, unknown = [], []
-    for window, label in zip(route.windows, route.labels, strict=True):
-        speed = window.ground_speed_mps()
-        if speed > MIN_SPEED_MPS:
-            patch.predict(speed * window.dt_s)
-            p = patch.update(table.evaluate(*extract(window)))
-            loss.append(-np.log(p[classes.index(str(label))]))
-            unknown.append(p.argmax() == len(classes) - 1)
-    return float(np.mean(loss)), float(np.mean(unknown))
+    table = LikelihoodTable(dataclasses.replace(model, temperature=1.0), classes)
+    return [
+        (w.ground_speed_mps() * w.dt_s, table.evaluate(*extract(w)), classes.index(str(label)))
+        for w, label in zip(route.windows, route.labels, strict=True)
+        if w.ground_speed_mps() > MIN_SPEED_MPS
+    ]
+
+
+def _log_loss(
+    model: TerrainModel,
+    evidence: list[tuple[float, Array, int]],
+    temperature: float,
+    unknown_log_weight: float,
+) -> tuple[float, float]:
+    """Mean -log posterior of the true ground along a route, and the share of windows called unknown."""
+    patch = PatchFilter(len(model.classes) + 1, model.patch_length_m)
+    weight = np.append(np.zeros(len(model.classes)), unknown_log_weight)
+    loss, unknown = 0.0, 0
+    for distance, log_likelihood, true in evidence:
+        patch.predict(distance)
+        p = patch.update((log_likelihood + weight) / temperature)
+        loss -= float(np.log(p[true]))
+        unknown += int(p.argmax() == len(p) - 1)
+    return loss / len(evidence), unknown / len(evidence)
 
 
 def _broad(mixtures: dict[str, Mixture]) -> Mixture:
@@ -163,14 +177,16 @@ def _broad(mixtures: dict[str, Mixture]) -> Mixture:
     return Mixture(np.zeros(1), mean[None], UNKNOWN_SPREAD**2 * covariance[None])
 
 
-def _settings(plan: Plan) -> dict[str, Any]:
-    return {
+def fingerprint_of(plan: Plan) -> str:
+    """SHA-256 of what a model made by `plan` depends on: parameter files and settings."""
+    settings = {
         "plan": dataclasses.asdict(plan),
         "features": list(FEATURES),
         "sigma_floor": SIGMA_FLOOR.tolist(),
         "unknown": [UNKNOWN_SPREAD, UNKNOWN_SHARE],
         "patch_length_m": PATCH_LENGTH_M,
     }
+    return plan.training().fingerprint(settings=settings)
 
 
 def _plain(scores: Scores) -> dict[str, Any]:

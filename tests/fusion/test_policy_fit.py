@@ -1,0 +1,134 @@
+"""The policy's statistics on made-up errors, and the file on drives of the twin."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.policy_fit import (
+    LAG_S,
+    RADIUS_SIGMA,
+    SLIP_S,
+    STUCK_COUNTS_S,
+    UNKNOWN_SPREAD,
+    Evidence,
+    default_grid,
+    evidence_of,
+    fingerprint_of,
+    fit_policy,
+    row_of,
+    write_policy,
+)
+from terrafusion.fusion.terrain.drives import Grid
+from terrafusion.fusion.weighting import Policy, load_policy
+from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate
+
+GRID = Grid(("staircase",), (3.0,), (0.0,), (5,))
+
+
+@pytest.fixture(scope="module")
+def policy() -> Policy:
+    return fit_policy(GRID)
+
+
+def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: int) -> Evidence:
+    rng = np.random.default_rng(seed)
+    keep = np.exp(-SLIP_S / tau_s)
+    slip = np.empty(n)
+    slip[0] = rng.normal()
+    for i in range(1, n):
+        slip[i] = keep * slip[i - 1] + np.sqrt(1.0 - keep**2) * rng.normal()
+    slip = mean + sigma * slip
+    lag = round(LAG_S / SLIP_S)
+
+    def noise(scale: float) -> np.ndarray:
+        return scale * rng.normal(size=n)
+
+    pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
+    return Evidence(slip, pairs, noise(0.03), noise(0.05), noise(7.0), noise(12.0), noise(1.4))
+
+
+def test_a_known_process_is_found_again() -> None:
+    row = row_of([ornstein_uhlenbeck(0.2, 0.1, 6.0, 100_000, 0)])
+    assert row.slip_mean == pytest.approx(0.2, abs=0.01)
+    assert row.slip_sigma == pytest.approx(np.hypot(0.1, RADIUS_SIGMA), rel=0.03)
+    assert row.slip_time_s == pytest.approx(6.0, rel=0.1)
+    assert row.wheel_sigma_mps == pytest.approx(0.03, rel=0.03)
+    assert row.side_slip_sigma == pytest.approx(0.05, rel=0.03)
+    assert row.gyro_inflation == pytest.approx(7.0, rel=0.03)
+    assert row.accel_inflation == pytest.approx(12.0, rel=0.03)
+    assert row.gnss_inflation == pytest.approx(1.4, rel=0.03)
+
+
+def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
+    grounds = [
+        ornstein_uhlenbeck(0.0, 0.02, 3.0, 4000, 1),
+        ornstein_uhlenbeck(0.4, 0.2, 9.0, 20_000, 2),  # more drives must not weigh more
+    ]
+    rows = [row_of([ground]) for ground in grounds]
+    pooled = row_of(grounds)
+    matched = Policy({"a": rows[0], "b": rows[1]}, rows[0], "").blend([0.5, 0.5])
+    assert pooled.slip_mean == pytest.approx(matched.slip_mean, rel=1e-9)
+    assert pooled.slip_sigma == pytest.approx(matched.slip_sigma, rel=1e-9)
+    assert pooled.accel_inflation == pytest.approx(matched.accel_inflation, rel=1e-9)
+
+
+def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
+    nothing = Evidence(*(np.empty(0), np.empty((0, 2)), *(np.empty(0) for _ in range(5))))
+    with pytest.raises(ValueError, match="never turned"):
+        row_of([nothing])
+
+
+def test_a_robot_that_spins_on_the_spot_counts_for_five_seconds() -> None:
+    stuck = Scenario(
+        name="stuck", duration_s=60.0, drive=(DriveSegment(2.0), DriveSegment(58.0, v_mps=1.0)),
+        route=(RouteLeg("mud"),), slope_deg=20.0,
+    )  # fmt: skip
+    recording = simulate(stuck, seed=1)
+    evidence = evidence_of(recording)
+    full = evidence.slip > 0.95
+    spells = 1 + np.count_nonzero(np.diff(full.astype(int)) > 0)
+    assert full.sum() * SLIP_S <= spells * (STUCK_COUNTS_S + 1.0)
+
+
+def test_noiseless_drives_leave_almost_no_sensor_error() -> None:
+    recording: Recording = simulate("figure_eight", terrain="asphalt", noiseless=True)
+    evidence = evidence_of(recording)
+    # What is left: a block of specific forces is compared in the axes of its middle.
+    assert np.sqrt(np.mean(evidence.gyro**2)) < 1e-6
+    assert np.sqrt(np.mean(evidence.accel**2)) < 0.2
+    assert np.abs(evidence.gnss).max() < 1e-6
+
+
+def test_made_again_the_file_has_the_same_bytes(policy: Policy, tmp_path: Path) -> None:
+    write_policy(policy, tmp_path / "a.yaml", made_by="a test")
+    write_policy(fit_policy(GRID), tmp_path / "b.yaml", made_by="a test")
+    assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
+    again = load_policy(tmp_path / "a.yaml")
+    assert again.classes == policy.classes
+    assert again.fixed == policy.fixed
+    assert again.inputs_sha256 == fingerprint_of(GRID)
+    assert fingerprint_of(dataclasses.replace(GRID, seeds=(6,))) != again.inputs_sha256
+
+
+def test_rows_are_in_the_order_the_grounds_suggest(policy: Policy) -> None:
+    rows = policy.classes
+    assert rows["asphalt"].slip_sigma < rows["loose_sand"].slip_sigma
+    assert rows["asphalt"].slip_mean < rows["loose_sand"].slip_mean
+    assert abs(rows["medium_sand"].slip_mean) < 0.05
+    matched = Policy({n: r for n, r in rows.items() if n != "unknown"}, policy.fixed, "").blend(
+        np.full(4, 0.25)
+    )
+    assert rows["unknown"].slip_mean == pytest.approx(matched.slip_mean, rel=1e-3)
+    assert rows["unknown"].slip_sigma == pytest.approx(UNKNOWN_SPREAD * matched.slip_sigma, rel=1e-3)
+    assert policy.fixed.slip_sigma == pytest.approx(matched.slip_sigma, rel=1e-3)
+
+
+def test_the_shipped_policy_is_of_the_present_parameter_files() -> None:
+    # If this fails, a soil, scenario or vehicle changed: run `terrafusion policy fit --out ...` again.
+    assert load_policy().inputs_sha256 == fingerprint_of(default_grid(3))

@@ -1,0 +1,42 @@
+"""The commands: wrong input is one line, before any long work."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.fusion.cli import policy, terrain
+from terrafusion.fusion.terrain.evaluate import Scores
+
+
+@pytest.mark.parametrize(("app", "command"), [(terrain.app, "train"), (policy.app, "fit")])
+def test_an_output_that_cannot_be_written_is_told_at_once(app: object, command: str, tmp_path: Path) -> None:
+    for out in (tmp_path, tmp_path / "missing" / "file.yaml"):
+        result = CliRunner().invoke(app, [command, "--out", str(out)])  # type: ignore[arg-type]
+        assert isinstance(result.exception, TerrafusionError)
+        assert "existing folder" in str(result.exception)
+
+
+def test_no_seeds_is_wrong_usage(tmp_path: Path) -> None:
+    result = CliRunner().invoke(terrain.app, ["train", "--out", str(tmp_path / "m.yaml"), "--seeds", "0"])
+    assert result.exit_code == 2
+
+
+def test_a_missing_model_is_a_known_error(tmp_path: Path) -> None:
+    result = CliRunner().invoke(terrain.app, ["eval", "--model", str(tmp_path / "none.yaml")])
+    assert isinstance(result.exception, TerrafusionError)
+
+
+def test_scores_are_printed_for_the_grounds_that_occurred(capsys: pytest.CaptureFixture[str]) -> None:
+    confusion = ((0.9, 0.1, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    scores = Scores(("mud", "ice", "unknown"), confusion, 0.9, 0.01, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2, 50)
+    terrain.print_scores("trial", scores)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "trial: 50 windows"
+    assert [line.split()[0] for line in lines[2:4]] == ["mud", "macro-F1"]
+    with terrain.progress("drives", 3) as tick:
+        tick()
+    assert capsys.readouterr().err == ""
