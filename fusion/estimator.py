@@ -171,7 +171,7 @@ class Estimator:
             gtsam.Pose3(rotation, start.position_m),
             rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
             gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
-            row.slip_mean,
+            row.slip_at(float(rotation.matrix()[2, 0])),
         )
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
@@ -220,7 +220,8 @@ class Estimator:
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip)
             link.add(_imu_factor(k, measured))
             wheels = self._gated(t_ns, wheels, before, point, dt, switch)
-        slip = slip_transition(dt, switch, row.slip_mean, row.slip_sigma, row.slip_time_s)
+        mean = row.slip_at(float(before.pose.rotation().matrix()[2, 0]))
+        slip = slip_transition(dt, switch, mean, row.slip_sigma, row.slip_time_s)
         gyro, accel = _mean_rates(segments)
         self.chain.append(t_ns, point, link, slip, wheels, gyro, accel)
         self._zero_velocity(k, wheels, segments, before, link)

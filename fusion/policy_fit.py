@@ -4,11 +4,12 @@ What counts, ground by ground, and how it is measured against the truth:
 
 - slip: 1 - v / (omega R) of half-second means while the wheels turn faster than
   0.15 m/s. A robot that spins on the spot has slip 1 for as long as it likes, so
-  of every immobilised spell only the first 5 s count: its onset is what a policy
-  must cover, its length is chance. Mean and standard deviation are plain; the
-  correlation time is that of an Ornstein-Uhlenbeck process with this variance
+  of every immobilised spell only the first second counts: its onset is what a
+  policy must cover, its length is chance. A line over the grade (sine of the
+  pitch) is fitted by least absolute deviations, the standard deviation is the rms
+  about it; the correlation time is that of an Ornstein-Uhlenbeck process with this variance
   that moves as much in 2 s as slip did: tau = -2 s / ln(rho), rho the
-  autocorrelation about the ground's mean at a lag of 2 s.
+  autocorrelation about the ground's line at a lag of 2 s.
   A rolling radius is known to about 1 %, which the twin's odometry is not subject
   to: that constant error is added to variance and autocorrelation alike.
 - wheel sigma: speed over 0.1 s that slip, averaged over 1 s, leaves unexplained,
@@ -54,9 +55,10 @@ PAYLOADS_KG = (0.0, 30.0)
 SHORT_S, SLIP_S, LAG_S = 0.1, 0.5, 2.0
 GYRO_S, ACCEL_S = 5.0, 2.0
 TURNING_MPS, SIDE_SLIP_FROM_MPS, STUCK_MPS = 0.15, 0.2, 0.05
-STUCK_COUNTS_S = 5.0
+STUCK_COUNTS_S = 1.0
 BIAS_S = 60.0
 TAIL = 0.005
+GRADE_RIDGE, LAD_STEPS, LAD_FLOOR = 1e-5, 30, 5e-3
 RADIUS_SIGMA = 0.01
 UNKNOWN_SPREAD = 1.5
 DIGITS = 4
@@ -66,12 +68,14 @@ DIGITS = 4
 class Evidence:
     """What one drive, or many, say of a ground: (n,) samples of each quantity.
 
-    `slip_pairs` (n, 2) are slips `LAG_S` apart; `gyro` and `accel` are errors
+    `slip_pairs` and `grade_pairs` (n, 2) are slips and grades `LAG_S` apart; `gyro` and `accel` are errors
     over what the data sheet allows, `gnss` over the reported sigma.
     """
 
     slip: Array
+    grade: Array
     slip_pairs: Array
+    grade_pairs: Array
     wheel_mps: Array
     side_slip: Array
     gyro: Array
@@ -108,9 +112,11 @@ def default_grid(seeds: int) -> Grid:
 
 def evidence_of(recording: Recording) -> Evidence:
     """Everything one simulated drive says of its ground."""
-    slip, pairs, wheel = _slip_evidence(recording)
+    slip, grade, pairs, grade_pairs, wheel = _slip_evidence(recording)
     gyro, accel = _imu_evidence(recording)
-    return Evidence(slip, pairs, wheel, _side_slips(recording), gyro, accel, _gnss_evidence(recording))
+    return Evidence(
+        slip, grade, pairs, grade_pairs, wheel, _side_slips(recording), gyro, accel, _gnss_evidence(recording)
+    )
 
 
 def row_of(grounds: list[Evidence]) -> SensorNoise:
@@ -121,13 +127,15 @@ def row_of(grounds: list[Evidence]) -> SensorNoise:
     """
     if any(len(e.slip_pairs) < 2 for e in grounds):
         raise ValueError("the wheels never turned long enough to tell the slip")
-    mean = float(np.mean([e.slip.mean() for e in grounds]))
-    variance = float(np.mean([np.mean((e.slip - mean) ** 2) for e in grounds])) + RADIUS_SIGMA**2
-    paired = [e.slip_pairs - mean for e in grounds]
+    mean, per_grade = _slip_line(grounds)
+    left = [e.slip - mean - per_grade * e.grade for e in grounds]
+    variance = float(np.mean([np.mean(x**2) for x in left])) + RADIUS_SIGMA**2
+    paired = [e.slip_pairs - mean - per_grade * e.grade_pairs for e in grounds]
     power = float(np.mean([np.mean(p**2) for p in paired])) + RADIUS_SIGMA**2
     rho = (float(np.mean([np.mean(p[:, 0] * p[:, 1]) for p in paired])) + RADIUS_SIGMA**2) / power
     return SensorNoise(
         slip_mean=mean,
+        slip_per_grade=per_grade,
         slip_sigma=float(np.sqrt(variance)),
         slip_time_s=float(np.clip(-LAG_S / np.log(np.clip(rho, 1e-3, 0.999)), 0.2, 300.0)),
         wheel_sigma_mps=max(_rms([e.wheel_mps for e in grounds]), 1e-3),
@@ -136,6 +144,26 @@ def row_of(grounds: list[Evidence]) -> SensorNoise:
         accel_inflation=max(_rms([e.accel for e in grounds]), 1.0),
         gnss_inflation=max(_rms([e.gnss for e in grounds]), 1.0),
     )
+
+
+def _slip_line(grounds: list[Evidence]) -> tuple[float, float]:
+    """Slip on the level and its slope over the grade: the mean of the grounds' own lines.
+
+    Least absolute deviations, by reweighted least squares: slip has a long tail
+    of bursts and of wheels digging in, which the IMU shows as they happen; the
+    line is to stand for steady driving. Grades all alike leave the slope at zero.
+    """
+    lines = []
+    for e in grounds:
+        rows = np.stack([np.ones_like(e.grade), e.grade], axis=1)
+        weight, line = np.ones(len(rows)), np.zeros(2)
+        for _ in range(LAD_STEPS):
+            ridge = np.diag([0.0, GRADE_RIDGE * weight.sum()])
+            line = np.linalg.solve(rows.T @ (weight[:, None] * rows) + ridge, rows.T @ (weight * e.slip))
+            weight = 1.0 / np.maximum(np.abs(e.slip - rows @ line), LAD_FLOOR)
+        lines.append(line)
+    level, per_grade = np.mean(lines, axis=0)
+    return float(level), float(per_grade)
 
 
 def _rms(grounds: list[Array]) -> float:
@@ -148,13 +176,14 @@ def _rms(grounds: list[Array]) -> float:
     return float(np.sqrt(np.mean(squares))) if squares else 0.0
 
 
-def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array]:
-    """Slips (n,), pairs of them (m, 2), and speed errors (k,) m/s that slip leaves."""
+def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array, Array, Array]:
+    """Slips and grades (n,), pairs of both (m, 2), and speed errors (k,) m/s that slip leaves."""
     samples = wheel_samples(recording)
     wheel, forward = samples.sides_mps.mean(axis=1), samples.forward_mps
     step = float(np.median(np.diff(samples.t_s)))
     short = max(round(SHORT_S / step), 1)
     wheel, forward = _block_means(wheel, short), _block_means(forward, short)
+    grade = _block_means(_grades(recording, samples.t_s), short)
     width = round(1.0 / SHORT_S)
     kernel = np.full(width, 1.0 / width)
     smooth_wheel, smooth = np.convolve(wheel, kernel, "same"), np.convolve(forward, kernel, "same")
@@ -164,14 +193,26 @@ def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array]:
 
     blocks = round(SLIP_S / SHORT_S)
     wheel, forward = _block_means(wheel, blocks), _block_means(forward, blocks)
+    grade = _block_means(grade, blocks)
     counted = np.abs(wheel) > TURNING_MPS
     counted &= _spell_age_s(counted & (np.abs(forward) < STUCK_MPS)) <= STUCK_COUNTS_S
     slip = np.full(len(wheel), np.nan)
     slip[counted] = np.clip(1.0 - forward[counted] / wheel[counted], -1.0, 1.0)
     lag = round(LAG_S / SLIP_S)
     pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
+    grade_pairs = np.stack([grade[:-lag], grade[lag:]], axis=1)
+    both = np.isfinite(pairs).all(axis=1)
     encoder = _vehicle(recording).sensors.wheels.speed_sigma_mps
-    return slip[counted], pairs[np.isfinite(pairs).all(axis=1)], np.hypot(residual, encoder)
+    return slip[counted], grade[counted], pairs[both], grade_pairs[both], np.hypot(residual, encoder)
+
+
+def _grades(recording: Recording, t_s: Array) -> Array:
+    """Sine of the true pitch (n,), uphill positive."""
+    truth = recording.truth
+    assert truth is not None
+    assert truth.quaternion is not None
+    up = quaternion_to_matrix(truth.quaternion)[:, 2, 0]
+    return np.interp(t_s, seconds(truth.t_ns, recording), up)
 
 
 def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
@@ -273,7 +314,7 @@ def _spread(row: SensorNoise) -> SensorNoise:
     changes = {
         name: value * UNKNOWN_SPREAD
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("slip_mean", "slip_time_s", "gnss_inflation")
+        if name not in ("slip_mean", "slip_per_grade", "slip_time_s", "gnss_inflation")
     }
     return dataclasses.replace(row, **{**changes, "slip_sigma": min(changes["slip_sigma"], 1.0)})
 
@@ -289,7 +330,7 @@ def fingerprint_of(grid: Grid) -> str:
         "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
         "side_slip_from_mps": SIDE_SLIP_FROM_MPS, "stuck_mps": STUCK_MPS, "stuck_counts_s": STUCK_COUNTS_S,
         "bias_s": BIAS_S, "gyro_s": GYRO_S, "accel_s": ACCEL_S,
-        "tail": TAIL, "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
+        "tail": TAIL, "line": [GRADE_RIDGE, LAD_STEPS, LAD_FLOOR], "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
     }  # fmt: skip
     return grid.fingerprint(policy=settings)
 

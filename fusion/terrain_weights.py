@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State, WeightChange
 from terrafusion.fusion.streams import ImuStream, WheelStream
@@ -56,6 +57,7 @@ class TerrainWeights:
         self._rig = config.rig
         self._before = self.detector.probabilities
         self._next_ns = 0
+        self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
 
@@ -102,6 +104,7 @@ class TerrainWeights:
         self._next_ns = state.t_ns + UPDATE_NS
         self.detector.update(self._window(state, imu, wheels, slip_observed))
         self._source = "detector"
+        self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
         self._reweight(state.t_ns)
 
     def _window(self, state: State, imu: ImuStream, wheels: WheelStream, slip_observed: bool) -> Window:
@@ -132,7 +135,7 @@ class TerrainWeights:
         if not self.adaptive:
             return
         p = self.detector.probabilities
-        self.row = self.policy.blend(p)
+        self.row = self.policy.blend(p, self._grade)
         assert self._noted is not None
         before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)
         best = int(p.argmax())

@@ -29,13 +29,16 @@ class SensorNoise:
     """Noise of the sensors on one ground (1 sigma).
 
     Slip is i = 1 - v / (omega R), positive when driving wheels outrun the
-    robot. It is modelled as an Ornstein-Uhlenbeck process with the stationary
-    moments and the correlation time given here. Side-slip is the lateral over
+    robot. It is modelled as an Ornstein-Uhlenbeck process about
+    `slip_mean + slip_per_grade * grade`, grade being the sine of the pitch
+    (uphill positive), with the standard deviation and the correlation time
+    given here. Side-slip is the lateral over
     the forward displacement. The inflations multiply the standard deviations
     of the data sheet (IMU) or of the receiver's own report (GNSS).
     """
 
     slip_mean: Annotated[float, Quantity("", -1.0, 1.0)]
+    slip_per_grade: Annotated[float, Quantity("", -20.0, 20.0)]
     slip_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
     slip_time_s: Annotated[float, Quantity("s", 0.05, 600.0)]
     wheel_sigma_mps: Annotated[float, Quantity("m/s", 1e-4, 2.0)]
@@ -44,10 +47,15 @@ class SensorNoise:
     accel_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
     gnss_inflation: Annotated[float, Quantity("", 1.0, 100.0)]
 
+    def slip_at(self, grade: float) -> float:
+        """Expected slip at a grade (sine of the pitch, uphill positive)."""
+        return min(max(self.slip_mean + self.slip_per_grade * grade, -0.9), 0.9)
+
 
 _FIELDS = tuple(f.name for f in dataclasses.fields(SensorNoise))
 _SLIP_MEAN, _SLIP_SIGMA = _FIELDS.index("slip_mean"), _FIELDS.index("slip_sigma")
-_AVERAGED = np.array([name in ("slip_mean", "slip_time_s") for name in _FIELDS])
+_SLIP_PER_GRADE = _FIELDS.index("slip_per_grade")
+_AVERAGED = np.array([name in ("slip_mean", "slip_per_grade", "slip_time_s") for name in _FIELDS])
 """Columns that blend as means; the others are standard deviations (or factors on them)."""
 _HINTS = get_type_hints(SensorNoise, include_extras=True)
 _RANGES: dict[str, Quantity] = {name: _HINTS[name].__metadata__[0] for name in _FIELDS}
@@ -77,8 +85,8 @@ class Policy:
     def _table(self) -> NDArray[np.float64]:
         return np.array([dataclasses.astuple(row) for row in self.classes.values()])
 
-    def blend(self, probabilities: ArrayLike) -> SensorNoise:
-        """The moment-matched row for class probabilities (k,) that sum to one.
+    def blend(self, probabilities: ArrayLike, grade: float = 0.0) -> SensorNoise:
+        """The moment-matched row for class probabilities (k,) that sum to one, at a grade.
 
         Slip has the mean and the variance of the mixture (law of total
         variance: mean of the variances plus variance of the means); the other
@@ -87,7 +95,8 @@ class Policy:
         p = np.asarray(probabilities, dtype=float)
         mean = p @ self._table
         variance = p @ self._table**2
-        variance[_SLIP_SIGMA] += p @ (self._table[:, _SLIP_MEAN] - mean[_SLIP_MEAN]) ** 2
+        slips = self._table[:, _SLIP_MEAN] + grade * self._table[:, _SLIP_PER_GRADE]
+        variance[_SLIP_SIGMA] += p @ (slips - p @ slips) ** 2
         return SensorNoise(*np.where(_AVERAGED, mean, np.sqrt(variance)).tolist())
 
 

@@ -50,7 +50,8 @@ def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: in
         return scale * rng.normal(size=n)
 
     pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
-    return Evidence(slip, pairs, noise(0.03), noise(0.05), noise(7.0), noise(12.0), noise(1.4))
+    flat, level = np.zeros(n), np.zeros_like(pairs)
+    return Evidence(slip, flat, pairs, level, noise(0.03), noise(0.05), noise(7.0), noise(12.0), noise(1.4))
 
 
 def test_a_known_process_is_found_again() -> None:
@@ -65,6 +66,26 @@ def test_a_known_process_is_found_again() -> None:
     assert row.gnss_inflation == pytest.approx(1.4, rel=0.03)
 
 
+def test_slip_that_follows_the_grade_is_told_from_scatter() -> None:
+    rng = np.random.default_rng(4)
+    flat = ornstein_uhlenbeck(0.1, 0.02, 5.0, 20_000, 3)
+    grade = rng.choice([-0.1, 0.0, 0.1], 20_000)
+    lag = round(LAG_S / SLIP_S)
+    pairs = np.stack([grade[:-lag], grade[lag:]], axis=1)
+    sloped = dataclasses.replace(
+        flat,
+        grade=grade,
+        grade_pairs=pairs,
+        slip=flat.slip + 1.5 * grade,
+        slip_pairs=flat.slip_pairs + 1.5 * pairs,
+    )
+    row = row_of([sloped])
+    assert row.slip_per_grade == pytest.approx(1.5, abs=0.02)
+    assert row.slip_mean == pytest.approx(0.1, abs=0.01)
+    assert row.slip_sigma == pytest.approx(np.hypot(0.02, RADIUS_SIGMA), rel=0.05)
+    assert row.slip_time_s == pytest.approx(row_of([flat]).slip_time_s, rel=0.05)
+
+
 def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
     grounds = [
         ornstein_uhlenbeck(0.0, 0.02, 3.0, 4000, 1),
@@ -74,17 +95,19 @@ def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
     pooled = row_of(grounds)
     matched = Policy({"a": rows[0], "b": rows[1]}, rows[0], "").blend([0.5, 0.5])
     assert pooled.slip_mean == pytest.approx(matched.slip_mean, rel=1e-9)
-    assert pooled.slip_sigma == pytest.approx(matched.slip_sigma, rel=1e-9)
+    assert pooled.slip_sigma >= matched.slip_sigma * (1 - 1e-9)  # the rms is least about the mean
     assert pooled.accel_inflation == pytest.approx(matched.accel_inflation, rel=1e-9)
 
 
 def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
-    nothing = Evidence(*(np.empty(0), np.empty((0, 2)), *(np.empty(0) for _ in range(5))))
+    nothing = Evidence(
+        *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(5)))
+    )
     with pytest.raises(ValueError, match="never turned"):
         row_of([nothing])
 
 
-def test_a_robot_that_spins_on_the_spot_counts_for_five_seconds() -> None:
+def test_of_a_robot_that_spins_on_the_spot_only_the_onset_counts() -> None:
     stuck = Scenario(
         name="stuck", duration_s=60.0, drive=(DriveSegment(2.0), DriveSegment(58.0, v_mps=1.0)),
         route=(RouteLeg("mud"),), slope_deg=20.0,
@@ -125,7 +148,9 @@ def test_rows_are_in_the_order_the_grounds_suggest(policy: Policy) -> None:
     )
     assert rows["unknown"].slip_mean == pytest.approx(matched.slip_mean, rel=1e-3)
     assert rows["unknown"].slip_sigma == pytest.approx(UNKNOWN_SPREAD * matched.slip_sigma, rel=1e-3)
-    assert policy.fixed.slip_sigma == pytest.approx(matched.slip_sigma, rel=1e-3)
+    assert policy.fixed.slip_mean == pytest.approx(matched.slip_mean, rel=1e-2, abs=1e-3)
+    # The line is no mean, so the rms about the common line is not quite the sum of the parts.
+    assert policy.fixed.slip_sigma == pytest.approx(matched.slip_sigma, rel=0.05)
 
 
 def test_the_shipped_policy_is_of_the_present_parameter_files() -> None:

@@ -15,11 +15,14 @@ from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.weighting import SCHEMA, Policy, SensorNoise, load_policy
 
 FIELDS = [f.name for f in dataclasses.fields(SensorNoise)]
-ZERO_MEAN = [name for name in FIELDS if name not in ("slip_mean", "slip_sigma", "slip_time_s")]
+ZERO_MEAN = [
+    name for name in FIELDS if name not in ("slip_mean", "slip_per_grade", "slip_sigma", "slip_time_s")
+]
 
 ROWS = st.builds(
     SensorNoise,
     slip_mean=st.floats(-1.0, 1.0),
+    slip_per_grade=st.floats(-5.0, 5.0),
     slip_sigma=st.floats(1e-3, 1.0),
     slip_time_s=st.floats(0.05, 600.0),
     wheel_sigma_mps=st.floats(1e-3, 2.0),
@@ -42,17 +45,18 @@ def column(policy: Policy, name: str) -> NDArray[np.float64]:
     return np.array([getattr(row, name) for row in policy.classes.values()])
 
 
-@given(policies())
-def test_blend_has_the_moments_of_the_mixture(case: tuple[Policy, NDArray[np.float64]]) -> None:
+@given(policies(), st.floats(-0.3, 0.3))
+def test_blend_has_the_moments_of_the_mixture(case: tuple[Policy, NDArray[np.float64]], grade: float) -> None:
     policy, p = case
-    row = policy.blend(p)
+    row = policy.blend(p, grade)
     # Three-point (Gauss-Hermite) nodes carry mean and variance of each Gaussian exactly:
     # a weighted sample of 3 k points that has the mixture's first two moments.
     nodes, node_weights = np.array([-np.sqrt(3.0), 0.0, np.sqrt(3.0)]), np.array([1.0, 4.0, 1.0]) / 6.0
     w = (p[:, None] * node_weights).ravel()
-    slip = (column(policy, "slip_mean")[:, None] + column(policy, "slip_sigma")[:, None] * nodes).ravel()
+    means = column(policy, "slip_mean") + grade * column(policy, "slip_per_grade")
+    slip = (means[:, None] + column(policy, "slip_sigma")[:, None] * nodes).ravel()
     mean = w @ slip
-    assert row.slip_mean == pytest.approx(mean, rel=1e-12, abs=1e-12)
+    assert row.slip_mean + grade * row.slip_per_grade == pytest.approx(mean, rel=1e-12, abs=1e-12)
     assert row.slip_sigma**2 == pytest.approx(w @ (slip - mean) ** 2, rel=1e-12)
     for name in ZERO_MEAN:
         error = (column(policy, name)[:, None] * nodes).ravel()
