@@ -1,0 +1,136 @@
+"""The examples of the documents run, and what they point at is there."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from terrafusion.fusion.cli.main import app
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
+
+SLOW = ("terrain train", "terrain eval", "policy fit")
+"""Commands that take longer than a test should: only their options are checked."""
+
+
+def blocks(document: Path) -> Iterator[tuple[int, str, str]]:
+    """Line, language and text of the fenced blocks."""
+    text = document.read_text(encoding="utf-8")
+    for match in re.finditer(r"^```(\w+)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        yield text[: match.start()].count("\n") + 2, match[1], match[2]
+
+
+def run_command(line: str) -> None:
+    name, *arguments = shlex.split(line)
+    assert name == "terrafusion", line
+    if " ".join(arguments[:2]) in SLOW:
+        arguments.append("--help")
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, f"{line}\n{result.output}"
+
+
+def run_python(document: Path, line: int, code: str, session: dict[str, Any]) -> None:
+    """Run one block; a traceback shows the document's own line numbers."""
+    exec(compile("\n" * (line - 1) + code, str(document), "exec"), session)
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def test_readme(folder: Path) -> None:
+    """The README shows Python first, on the log that its commands make."""
+    found = list(blocks(ROOT / "README.md"))
+    for _, language, text in found:
+        if language == "bash":
+            for line in text.splitlines():
+                run_command(line)
+    session: dict[str, Any] = {"__name__": "readme"}
+    for line, language, text in found:
+        if language == "python":
+            run_python(ROOT / "README.md", line, text, session)
+    assert session["result"].scores.ate_m < 5.0
+    assert session["state"].status in ("running", "outage")
+    assert (folder / "demo-out" / "report.html").is_file()
+
+
+def test_tutorial(folder: Path) -> None:
+    """One session from top to bottom."""
+    document = ROOT / "docs" / "tutorial.md"
+    session: dict[str, Any] = {"__name__": "tutorial"}
+    for line, language, text in blocks(document):
+        if language == "python":
+            run_python(document, line, text, session)
+        else:
+            for command in text.splitlines():
+                run_command(command)
+    assert (folder / "demo.png").stat().st_size > 10_000
+    assert (folder / "own-results" / "metrics.json").is_file()
+    assert abs(session["state"].slip) < 1.0
+
+
+@pytest.mark.parametrize("name", ["conventions.md", "estimator.md", "limits.md", "terrain.md", "twin.md"])
+def test_python_of_the_other_documents(name: str, folder: Path) -> None:
+    document = ROOT / "docs" / name
+    session: dict[str, Any] = {"__name__": name}
+    for line, language, text in blocks(document):
+        if language == "python":
+            run_python(document, line, text, session)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_lead_somewhere(document: Path) -> None:
+    """Files exist, and so do the headings that are pointed at."""
+    for target in re.findall(r"\]\(([^)\s]+)\)", document.read_text(encoding="utf-8")):
+        if target.startswith("http"):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (document.parent / name).resolve() if name else document
+        assert path.exists(), target
+        if anchor:
+            headings = re.findall(r"^#+ (.+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+            assert anchor in {anchor_of(heading) for heading in headings}, target
+
+
+def anchor_of(heading: str) -> str:
+    """The anchor that a heading gets where Markdown is shown."""
+    return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
+
+
+def test_readme_is_short() -> None:
+    assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 150
+
+
+def test_pictures_are_small() -> None:
+    pictures = list((ROOT / "docs" / "img").iterdir())
+    assert pictures
+    for picture in pictures:
+        assert picture.suffix == ".png"
+        assert picture.stat().st_size < 200_000, picture.name
+
+
+def test_numbers_stand_between_marks() -> None:
+    """Measured figures of the README stand in one place, where they can be made anew."""
+    text = (ROOT / "README.md").read_text(encoding="utf-8")
+    assert text.count("<!-- numbers:start -->") == text.count("<!-- numbers:end -->") == 1
+
+
+def test_log_folder_columns_are_told() -> None:
+    """Every column and key the reader knows stands in the conventions."""
+    from terrafusion.datasets.readers import log_folder, log_meta
+
+    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    columns = [*log_folder.GYRO, *log_folder.ACCEL, *log_folder.GNSS_POSITION, *log_folder.GNSS_HEIGHT]
+    columns += [*log_folder.GNSS_VELOCITY, *log_folder.QUATERNION, *log_folder.TRUTH_TWIST]
+    columns += [f"{name}_{unit}" for names, unit in log_folder.WHEEL_LAYOUTS for name in names]
+    for word in [*columns, *(f"{name}.csv" for name in log_folder.CHANNELS), *log_meta.KEYS]:
+        assert re.search(rf"\b{re.escape(word)}\b", text), word
