@@ -9,8 +9,9 @@ keyframes are dropped, what they say stays as a prior: exact marginalisation)
 and, with nothing dropped, the batch Gauss-Newton smoother.
 
 Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world
-(m/s), B(k) IMU bias (accelerometer, gyro), S(k) slip; tangent of 16 numbers in
-this order.
+(m/s), B(k) IMU bias (accelerometer, gyro), then slip and the drift of GNSS
+(east, north; m); a tangent of 18 numbers in this order. Pose, velocity and bias
+are GTSAM variables; slip and drift are linear and live in the chain alone.
 """
 
 from __future__ import annotations
@@ -20,30 +21,40 @@ from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import B, S, V, X
+from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from terrafusion.fusion.wheel_factor import SlipTransition, WheelIncrement, jacobians, residual
+from terrafusion.fusion import gnss_factor
+from terrafusion.fusion.gnss_factor import GnssPosition
+from terrafusion.fusion.markov import MarkovStep
+from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
 
-DIM = 16
+DIM = 18
 _ZERO = np.zeros(3)
-POSE, ROTATION, VELOCITY, BIAS, SLIP = slice(0, 6), slice(0, 3), slice(6, 9), slice(9, 15), 15
+POSE, VELOCITY, BIAS, SLIP, DRIFT = slice(0, 6), slice(6, 9), slice(9, 15), 15, slice(16, 18)
+NAV, MARKOV = slice(0, 15), slice(15, 18)
+"""The states that GTSAM holds, and the Gauss-Markov states."""
 
 
 @dataclass(frozen=True, eq=False)
 class KeyState:
-    """State of one keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `slip`."""
+    """State of one keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `slip`, `drift` (2,) m."""
 
     pose: gtsam.Pose3
     velocity: Array
     bias: gtsam.imuBias.ConstantBias
     slip: float
+    drift: Array
+
+    def markov(self) -> Array:
+        """Slip and drift (3,)."""
+        return np.array([self.slip, self.drift[0], self.drift[1]])
 
     def retract(self, delta: Array) -> KeyState:
-        """The state moved by a tangent vector (16,)."""
+        """The state moved by a tangent vector (18,)."""
         bias = gtsam.imuBias.ConstantBias(
             self.bias.accelerometer() + delta[9:12], self.bias.gyroscope() + delta[12:15]
         )
@@ -52,16 +63,17 @@ class KeyState:
             self.velocity + delta[VELOCITY],
             bias,
             self.slip + float(delta[SLIP]),
+            self.drift + delta[DRIFT],
         )
 
     def local(self, other: KeyState) -> Array:
-        """The tangent vector (16,) that leads from this state to `other`."""
+        """The tangent vector (18,) that leads from this state to `other`."""
         return np.concatenate(
             [
                 self.pose.localCoordinates(other.pose),
                 other.velocity - self.velocity,
                 other.bias.vector() - self.bias.vector(),
-                [other.slip - self.slip],
+                other.markov() - self.markov(),
             ]
         )
 
@@ -76,18 +88,19 @@ class Node:
     point: KeyState
     t_ns: int
     link: gtsam.NonlinearFactorGraph
-    slip: SlipTransition | None
+    markov: MarkovStep | None
     wheels: WheelIncrement | None
     gyro_radps: Array
     accel_mps2: Array
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     unary_keys: set[str] = field(default_factory=set)
+    fixes: list[GnssPosition] = field(default_factory=list)
     prior: Array = field(default_factory=lambda: np.zeros((0, DIM + 1)))
     conditional: Array | None = None
     delta: Array = field(default_factory=lambda: np.zeros(DIM))
 
 
-_SYMBOLS = {"X": (X, slice(0, 6)), "V": (V, slice(6, 9)), "B": (B, slice(9, 15)), "S": (S, slice(15, 16))}
+_SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
 
 
 class Chain:
@@ -100,10 +113,10 @@ class Chain:
     all, for a batch solution afterwards.
     """
 
-    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf])
+    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf] * 3)
     """Change of a state (rad, m, m/s, m/s2, rad/s, -) beyond which its factors are linearised again.
 
-    Position and slip enter the factors linearly, so they never ask for it."""
+    Position, slip and drift enter the factors linearly, so they never ask for it."""
 
     def __init__(self, archive: Chain | None = None) -> None:
         self.archive = archive
@@ -125,32 +138,39 @@ class Chain:
         t_ns: int,
         point: KeyState,
         link: gtsam.NonlinearFactorGraph | None = None,
-        slip: SlipTransition | None = None,
+        markov: MarkovStep | None = None,
         wheels: WheelIncrement | None = None,
         gyro_radps: Array = _ZERO,
         accel_mps2: Array = _ZERO,
     ) -> int:
         """Add a keyframe with its initial state and its factors to the one before; gives its index.
 
-        `link` must touch X, V and B of both keyframes; `slip` links S.
+        `link` must touch X, V and B of both keyframes; `markov` links slip and drift.
         """
         link = link if link is not None else gtsam.NonlinearFactorGraph()
-        self.nodes.append(Node(point, t_ns, link, slip, wheels, gyro_radps, accel_mps2))
+        self.nodes.append(Node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2))
         self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
         if self.archive is not None:
-            self.archive.append(t_ns, point, link, slip, wheels, gyro_radps, accel_mps2)
+            self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2)
         return self.last
 
     def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
-        """Add a factor that touches only the states `keys` (of "XVBS") of keyframe k."""
+        """Add a factor that touches only the states `keys` (of "XVB") of keyframe k."""
         node = self.nodes[k - self.first]
         node.unary.add(factor)
         node.unary_keys.update(keys)
         self._dirty = min(self._dirty, k)
         if self.archive is not None:
             self.archive.add(k, factor, keys)
+
+    def add_fix(self, k: int, fix: GnssPosition) -> None:
+        """Add a GNSS position to keyframe k."""
+        self.nodes[k - self.first].fixes.append(fix)
+        self._dirty = min(self._dirty, k)
+        if self.archive is not None:
+            self.archive.add_fix(k, fix)
 
     def at_or_after(self, t_ns: int) -> int | None:
         """The first keyframe held at or after a time; None when none is, or when older ones were dropped."""
@@ -165,14 +185,14 @@ class Chain:
         return node.point.retract(node.delta)
 
     def covariance(self) -> Array:
-        """Marginal covariance (16, 16) of the newest keyframe."""
+        """Marginal covariance (18, 18) of the newest keyframe."""
         inverse, info = lapack.dtrtri(self._root[:, :DIM])
         if info:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
         return np.asarray(inverse @ inverse.T)
 
     def covariances(self) -> Array:
-        """Marginal covariances (n, 16, 16) of all keyframes, by the backward recursion of the chain."""
+        """Marginal covariances (n, 18, 18) of all keyframes, by the backward recursion of the chain."""
         out = np.zeros((len(self.nodes), DIM, DIM))
         out[-1] = self.covariance()
         for i in range(len(self.nodes) - 2, -1, -1):
@@ -266,7 +286,7 @@ class Chain:
             self.first += 1
 
     def restart(self, extra_variance: Array) -> None:
-        """Keep only the newest keyframe, with its marginal as prior, less sure by `extra_variance` (16,).
+        """Keep only the newest keyframe, with its marginal as prior, less sure by `extra_variance` (18,).
 
         For an estimate that has proved wrong: what comes next may move it
         freely, and does not bend the past to reach it.
@@ -290,7 +310,7 @@ class Chain:
         self._dirty = min(self._dirty, max(k - 1, self.first))
 
     def set_prior(self, sigmas: Array) -> None:
-        """Prior of the first keyframe at its initial state, independent 1 sigmas (16,)."""
+        """Prior of the first keyframe at its initial state, independent 1 sigmas (18,)."""
         self._anchor = None
         self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((DIM, 1))])
         self._dirty = self.first
@@ -299,7 +319,6 @@ class Chain:
         self.values.insert(X(k), point.pose)
         self.values.insert(V(k), point.velocity)
         self.values.insert(B(k), point.bias)
-        self.values.insert(S(k), point.slip)
 
     def _move(self, k: int) -> None:
         """Make the current estimate of keyframe k its linearisation point.
@@ -327,13 +346,21 @@ class Chain:
         self.values.update(X(k), node.point.pose)
         self.values.update(V(k), node.point.velocity)
         self.values.update(B(k), node.point.bias)
-        self.values.update(S(k), node.point.slip)
 
     def _unary_rows(self, k: int) -> Array:
+        """Whitened rows over keyframe k alone, shape (m, 19)."""
         node = self.nodes[k - self.first]
-        present = [name for name in "XVBS" if name in node.unary_keys]
-        if not present:
-            return np.zeros((0, DIM + 1))
+        blocks = [self._gtsam_rows(k)] if node.unary_keys else []
+        for fix in node.fixes:
+            rows = np.zeros((3, DIM + 1))
+            rows[:, POSE], rows[:, DRIFT] = gnss_factor.jacobians(fix, node.point.pose)
+            rows[:, DIM] = -gnss_factor.residual(fix, node.point.pose, node.point.drift)
+            blocks.append(rows / fix.sigma_m[:, None])
+        return np.vstack(blocks) if blocks else np.zeros((0, DIM + 1))
+
+    def _gtsam_rows(self, k: int) -> Array:
+        node = self.nodes[k - self.first]
+        present = [name for name in "XVB" if name in node.unary_keys]
         ordering = gtsam.Ordering()
         for name in present:
             ordering.push_back(_SYMBOLS[name][0](k))
@@ -349,7 +376,7 @@ class Chain:
         return rows
 
     def _link_rows(self, k: int) -> Array:
-        """Whitened rows over keyframes k - 1 and k, shape (m, 33)."""
+        """Whitened rows over keyframes k - 1 and k, shape (m, 37)."""
         node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
         ordering = gtsam.Ordering()
         for i in (k - 1, k):
@@ -357,20 +384,21 @@ class Chain:
                 ordering.push_back(symbol(i))
         packed = node.link.linearize(self.values).augmentedJacobian(ordering)
         n = len(packed)
-        rows = np.zeros((n + 4, 2 * DIM + 1))
-        rows[:n, :SLIP] = packed[:, :SLIP]
-        rows[:n, DIM : DIM + SLIP] = packed[:, SLIP : 2 * SLIP]
-        rows[:n, 2 * DIM] = packed[:, 2 * SLIP]
-        if node.slip is not None:
-            step = node.slip
-            predicted = step.mean + step.decay * (before.point.slip - step.mean)
-            rows[n, SLIP], rows[n, DIM + SLIP] = -step.decay, 1.0
-            rows[n, 2 * DIM] = predicted - node.point.slip
-            rows[n] /= step.sigma
+        rows = np.zeros((n + 6, 2 * DIM + 1))
+        rows[:n, NAV] = packed[:, :15]
+        rows[:n, DIM : DIM + 15] = packed[:, 15:30]
+        rows[:n, 2 * DIM] = packed[:, 30]
+        if node.markov is not None:
+            step = node.markov
+            own = rows[n : n + 3]
+            own[:, MARKOV] = -np.diag(step.decay)
+            own[:, DIM + 15 : DIM + 18] = np.eye(3)
+            own[:, 2 * DIM] = -step.residual(before.point.markov(), node.point.markov())
+            own /= step.sigma[:, None]
         if node.wheels is not None:
             d, sigma = node.wheels.displacement_m, node.wheels.sigma_m[:, None]
             H_i, H_j, H_slip = jacobians(before.point.pose, node.point.pose, d)
-            wheel = rows[n + 1 :]
+            wheel = rows[n + 3 :]
             wheel[:, 0:6], wheel[:, DIM : DIM + 6], wheel[:, DIM + SLIP] = H_i, H_j, H_slip[:, 0]
             wheel[:, 2 * DIM] = -residual(before.point.pose, node.point.pose, node.point.slip, d)
             wheel /= sigma

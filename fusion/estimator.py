@@ -18,16 +18,17 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
 from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
-from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState
+from terrafusion.fusion.chain import DIM, POSE, SLIP, VELOCITY, Chain, KeyState
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.factors import at_rest, bridge, wheel_increment
 from terrafusion.fusion.gates import WheelGate
 from terrafusion.fusion.gnss import GnssUpdater
+from terrafusion.fusion.markov import markov_step
 from terrafusion.fusion.preintegration import Preintegrator
 from terrafusion.fusion.streams import GnssFix, ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.terrain_weights import TerrainWeights
-from terrafusion.fusion.wheel_factor import WheelIncrement, slip_transition
+from terrafusion.fusion.wheel_factor import WheelIncrement
 
 Array = NDArray[np.float64]
 
@@ -71,7 +72,7 @@ class Estimator:
         self._start: Start | None = None
         self._level: Start | None = None
         self._state: State | None = None
-        self._covariance = np.zeros((16, 16))
+        self._covariance = np.zeros((DIM, DIM))
         self._silent = False
         self._rest = 0
 
@@ -172,6 +173,7 @@ class Estimator:
             rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
             gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
             row.slip_at(float(rotation.matrix()[2, 0])),
+            np.zeros(2),
         )
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
@@ -185,6 +187,7 @@ class Estimator:
             *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
         ]
         sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + [row.slip_sigma]
+        sigmas += [self.gnss.drift_sigma_m] * 2
         self.chain.append(start.t_ns, point, gyro_radps=gyro_bias)
         self.chain.set_prior(np.array(sigmas))
         if self.chain.archive is not None:
@@ -217,13 +220,20 @@ class Estimator:
                 segments, before.bias, row.gyro_inflation, row.accel_inflation
             )
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), before.bias)
-            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip)
+            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip, before.drift)
             link.add(_imu_factor(k, measured))
             wheels = self._gated(t_ns, wheels, before, point, dt, switch)
         mean = row.slip_at(float(before.pose.rotation().matrix()[2, 0]))
-        slip = slip_transition(dt, switch, mean, row.slip_sigma, row.slip_time_s)
+        drift, drift_s = self.gnss.drift_sigma_m, self.gnss.drift_time_s
+        markov = markov_step(
+            dt,
+            mean=[mean, 0.0, 0.0],
+            sigma=[row.slip_sigma, drift, drift],
+            time_s=[row.slip_time_s, drift_s, drift_s],
+            forget=[switch, 0.0, 0.0],
+        )
         gyro, accel = _mean_rates(segments)
-        self.chain.append(t_ns, point, link, slip, wheels, gyro, accel)
+        self.chain.append(t_ns, point, link, markov, wheels, gyro, accel)
         self._zero_velocity(k, wheels, segments, before, link)
         self._finish_keyframe(t_ns, gyro)
 
@@ -327,6 +337,7 @@ class Estimator:
             gyro_bias_radps=np.asarray(key.bias.gyroscope()),
             accel_bias_mps2=np.asarray(key.bias.accelerometer()),
             slip=key.slip,
+            gnss_drift_m=key.drift,
             slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
@@ -365,4 +376,4 @@ def _carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyS
     else:
         moved, turn = (1.0 - before.slip) * wheels.displacement_m, wheels.turn_rad
     pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), moved))
-    return KeyState(pose, before.velocity, before.bias, before.slip)
+    return KeyState(pose, before.velocity, before.bias, before.slip, before.drift)

@@ -11,7 +11,7 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
 from terrafusion.fusion.chain import KeyState
-from terrafusion.fusion.streams import GnssFix, ImuSegment
+from terrafusion.fusion.streams import ImuSegment
 from terrafusion.fusion.weighting import SensorNoise
 from terrafusion.fusion.wheel_factor import WheelIncrement
 
@@ -97,11 +97,6 @@ def antenna_lever(
     moved = R_body_world @ (state.velocity * dt_s + 0.5 * accel_world_mps2 * dt_s**2)
     turned = gtsam.Rot3.Expmap(gyro_radps * dt_s).matrix() @ antenna_m
     return np.asarray(moved + turned)
-
-
-def gnss_position(k: int, fix: GnssFix, lever_m: Array, sigma_m: Array) -> gtsam.NonlinearFactor:
-    """Antenna position with a lever arm."""
-    return gtsam.GPSFactorArm(X(k), fix.enu_m, lever_m, gtsam.noiseModel.Diagonal.Sigmas(sigma_m))
 
 
 def gnss_velocity(k: int, velocity_mps: Array, sigma_mps: float) -> gtsam.NonlinearFactor:

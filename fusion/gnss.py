@@ -10,11 +10,12 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.fusion.chain import POSE, Chain
+from terrafusion.fusion.chain import DIM, DRIFT, POSE, Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
-from terrafusion.fusion.factors import antenna_lever, gnss_position, gnss_velocity
+from terrafusion.fusion.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.gates import GnssGate, Verdict
+from terrafusion.fusion.gnss_factor import GnssPosition, antenna_jacobian
 from terrafusion.fusion.streams import GnssFix
 from terrafusion.fusion.weighting import SensorNoise
 
@@ -23,6 +24,8 @@ Array = NDArray[np.float64]
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
 LARGE_TURN_RAD = 0.05
+WHITE_SHARE = 0.1
+"""Share of a fix's variance that is new at every fix; the rest drifts slowly."""
 
 
 class GnssUpdater:
@@ -41,12 +44,11 @@ class GnssUpdater:
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         spec = config.rig.sensors.gnss
-        # Fixes repeat one another's error for a correlation time tau. Of those within the window that is
-        # solved together only one is news; heights, wrong for minutes at a time and of little use, are held
-        # to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau).
-        repeats = 2.0 * spec.correlation_time_s * spec.rate_hz
-        level = np.sqrt(1.0 + min(repeats, config.lag_s * spec.rate_hz))
-        self._correlated = np.array([level, level, np.sqrt(1.0 + repeats)])
+        self.drift_sigma_m = spec.sigma_horizontal_m * float(np.sqrt(1.0 - WHITE_SHARE))
+        self.drift_time_s = max(spec.correlation_time_s, 0.1)
+        # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
+        # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
+        self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
         self.local = False
         self.rejected = 0
@@ -70,7 +72,7 @@ class GnssUpdater:
     def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `covariance` (16, 16) is
+        A fix belongs to the first keyframe after it. `covariance` (18, 18) is
         that of the newest keyframe.
         """
         used = False
@@ -95,10 +97,11 @@ class GnssUpdater:
         accel_world = R @ (node.accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
         lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
         predicted = np.asarray(state.pose.translation()) + R @ lever
-        sigma = np.maximum(fix.sigma_m * row.gnss_inflation * self._correlated, LEAST_SIGMA_M)
-        innovation = fix.enu_m - predicted
-        J = _antenna_jacobian(R, lever)
-        P = J @ covariance[POSE, POSE] @ J.T
+        sigma = self._white_sigma(fix, row)
+        innovation = fix.enu_m - predicted - np.append(state.drift, 0.0)
+        J = np.zeros((3, DIM))
+        J[:, POSE], J[:, DRIFT] = antenna_jacobian(R, lever), np.eye(3)[:, :2]
+        P = J @ covariance @ J.T
         P[[0, 1], [0, 1]] += sigma[:2] ** 2
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
@@ -110,16 +113,24 @@ class GnssUpdater:
         if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
             fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
             sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
-        chain.add(k, gnss_position(k, fix, lever, sigma), "X")
+        chain.add_fix(k, GnssPosition(fix.enu_m, lever, sigma))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
             chain.smooth(1)
-            chain.restart(np.zeros(16))
+            chain.restart(np.zeros(DIM))
         self.last_used_ns = fix.t_ns
         return True
+
+    def _white_sigma(self, fix: GnssFix, row: SensorNoise) -> Array:
+        """1 sigma (3,) of what is new in a fix, beyond the drift that is a state."""
+        reported = fix.sigma_m * row.gnss_inflation
+        level = np.sqrt(
+            np.maximum(reported[:2] ** 2 - self.drift_sigma_m**2, WHITE_SHARE * reported[:2] ** 2)
+        )
+        return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
 
     @staticmethod
     def _prepare(
@@ -131,17 +142,11 @@ class GnssUpdater:
         linearisation bears; applied to the newest keyframe alone it is a Kalman
         update, which cannot diverge.
         """
-        gain = covariance[:, :6] @ jacobian.T @ np.linalg.inv(S)
-        doubt = np.zeros(16)
+        gain = covariance @ jacobian.T @ np.linalg.inv(S)
+        doubt = np.zeros(DIM)
         if verdict is Verdict.REACQUIRE:
             doubt[3:6] = float(innovation_m @ innovation_m)
         elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
             return False
         chain.restart(doubt)
         return True
-
-
-def _antenna_jacobian(R: Array, lever: Array) -> Array:
-    """Derivative (3, 6) of the antenna position in the world by the pose (GTSAM tangent)."""
-    x, y, z = lever
-    return np.hstack([-R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), R])

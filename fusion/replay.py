@@ -272,7 +272,7 @@ def _key_state(state: State) -> KeyState:
     x, y, z, w = state.quaternion
     pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
     bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
-    return KeyState(pose, state.velocity_mps, bias, state.slip)
+    return KeyState(pose, state.velocity_mps, bias, state.slip, state.gnss_drift_m)
 
 
 def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
@@ -287,6 +287,7 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
         slip=key.slip,
+        gnss_drift_m=key.drift,
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
         covariance=gtsam_to_ros_covariance(P[POSE, POSE], rotation.matrix()),
         velocity_covariance=P[VELOCITY, VELOCITY].copy(),

@@ -1,4 +1,4 @@
-"""The wheel factor: displacement between two keyframes with a slip scale, and how slip goes on.
+"""The wheel factor: displacement between two keyframes with a slip scale.
 
 Residual (3,), in the body frame of keyframe i, metres::
 
@@ -13,7 +13,6 @@ usual definition v = (1 - slip) omega R, Wong 2008, Theory of Ground Vehicles).
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -41,26 +40,6 @@ class WheelIncrement:
     turn_rad: float
 
 
-@dataclass(frozen=True)
-class SlipTransition:
-    """Slip from one keyframe to the next: s_j = mean + decay (s_i - mean) + noise of `sigma`."""
-
-    decay: float
-    mean: float
-    sigma: float
-
-
-def slip_transition(dt_s: float, switch: float, mean: float, sigma: float, time_s: float) -> SlipTransition:
-    """Exact step of an Ornstein-Uhlenbeck process with the stationary moments `mean` and `sigma`.
-
-    (Uhlenbeck and Ornstein 1930, Phys. Rev. 36.) `switch` in [0, 1] is the
-    probability that the ground has just changed: the slip of another ground
-    says nothing, so the process then forgets.
-    """
-    decay = (1.0 - min(max(switch, 0.0), 1.0)) * math.exp(-dt_s / time_s)
-    return SlipTransition(decay, mean, sigma * math.sqrt(1.0 - decay * decay))
-
-
 def residual(pose_i: Any, pose_j: Any, slip: float, displacement_m: Array) -> Array:
     """The residual (3,) of the module's docstring, unwhitened."""
     moved = pose_i.rotation().matrix().T @ (pose_j.translation() - pose_i.translation())
@@ -84,26 +63,15 @@ def jacobians(pose_i: Any, pose_j: Any, displacement_m: Array) -> tuple[Array, A
     return H_i, H_j, displacement_m.reshape(3, 1)
 
 
-def slip_as_gtsam_factor(step: SlipTransition, slip_i: int, slip_j: int) -> gtsam.CustomFactor:
-    """The slip transition for GTSAM's own optimisers."""
-
-    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        if H is not None:
-            H[0], H[1] = np.array([[-step.decay]]), np.array([[1.0]])
-        before, now = values.atDouble(slip_i), values.atDouble(slip_j)
-        return np.array([now - step.mean - step.decay * (before - step.mean)])
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Isotropic.Sigma(1, step.sigma), [slip_i, slip_j], error)
-
-
-def as_gtsam_factor(increment: WheelIncrement, pose_i: int, pose_j: int, slip_j: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers (slower: each call goes through Python)."""
+def as_gtsam_factor(increment: WheelIncrement, pose_i: int, pose_j: int, markov_j: int) -> gtsam.CustomFactor:
+    """The same factor for GTSAM's own optimisers; `markov_j` is a vector (slip, drift east, drift north)."""
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         a, b = values.atPose3(pose_i), values.atPose3(pose_j)
         if H is not None:
-            H[0], H[1], H[2] = jacobians(a, b, increment.displacement_m)
-        return residual(a, b, values.atDouble(slip_j), increment.displacement_m)
+            H[0], H[1], H_slip = jacobians(a, b, increment.displacement_m)
+            H[2] = np.hstack([H_slip, np.zeros((3, 2))])
+        return residual(a, b, float(values.atVector(markov_j)[0]), increment.displacement_m)
 
     noise = gtsam.noiseModel.Diagonal.Sigmas(increment.sigma_m)
-    return gtsam.CustomFactor(noise, [pose_i, pose_j, slip_j], error)
+    return gtsam.CustomFactor(noise, [pose_i, pose_j, markov_j], error)

@@ -5,20 +5,16 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 import pytest
-from gtsam.symbol_shorthand import B, S, V, X
+from gtsam.symbol_shorthand import B, M, V, X
 
-from terrafusion.fusion.chain import DIM, POSE, Chain, KeyState
-from terrafusion.fusion.wheel_factor import (
-    WheelIncrement,
-    as_gtsam_factor,
-    jacobians,
-    residual,
-    slip_as_gtsam_factor,
-    slip_transition,
-)
+from terrafusion.fusion import gnss_factor, markov, wheel_factor
+from terrafusion.fusion.chain import DIM, MARKOV, POSE, Chain, KeyState
+from terrafusion.fusion.gnss_factor import GnssPosition
+from terrafusion.fusion.markov import markov_step
+from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
 
-SLIP = slip_transition(0.1, 0.0, mean=0.05, sigma=0.1, time_s=5.0)
-SIGMAS = np.array([0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1])
+STEP = markov_step(0.1, mean=[0.05, 0.0, 0.0], sigma=[0.1, 0.5, 0.5], time_s=[5.0, 30.0, 30.0])
+SIGMAS = np.array([0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5])
 
 
 def iso(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
@@ -42,7 +38,7 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
         rotation = gtsam.Rot3.Rz(yaw).compose(gtsam.Rot3.Expmap(rng.normal(0, 0.02, 3)))
         pose = gtsam.Pose3(rotation, along + rng.normal(0, 0.3, 3))
         velocity = speed * np.array([np.cos(yaw), np.sin(yaw), 0.0]) + rng.normal(0, 0.1, 3)
-        points.append(KeyState(pose, velocity, bias, 0.0))
+        points.append(KeyState(pose, velocity, bias, 0.0, np.zeros(2)))
         fixes.append(along + rng.normal(0, 0.2, 3))
         if k == 0:
             continue
@@ -60,7 +56,7 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
 
 def steps(links: list, wheels: list, k: int) -> tuple:
     """What links keyframe k to the one before."""
-    return (links[k - 1], SLIP, wheels[k - 1]) if k else ()
+    return (links[k - 1], STEP, wheels[k - 1]) if k else ()
 
 
 def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.NonlinearFactorGraph:
@@ -74,12 +70,12 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
         else:
             for i in range(links[k - 1].size()):
                 graph.add(links[k - 1].at(i))
-            graph.add(as_gtsam_factor(wheels[k - 1], X(k - 1), X(k), S(k)))
-            graph.add(slip_as_gtsam_factor(SLIP, S(k - 1), S(k)))
+            graph.add(wheel_factor.as_gtsam_factor(wheels[k - 1], X(k - 1), X(k), M(k)))
+            graph.add(markov.as_gtsam_factor(STEP, M(k - 1), M(k)))
         if k % 4 == 0:
-            fix = gtsam.GPSFactorArm(X(k), fixes[k], np.array([0.2, 0.0, 0.3]), iso(3, 0.3))
-            chain.add(k, fix, "X")
-            graph.add(fix)
+            fix = GnssPosition(fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3))
+            chain.add_fix(k, fix)
+            graph.add(gnss_factor.as_gtsam_factor(fix, X(k), M(k)))
     return graph
 
 
@@ -88,7 +84,7 @@ def add_priors(graph: gtsam.NonlinearFactorGraph, start: KeyState) -> None:
     graph.add(gtsam.PriorFactorPose3(X(0), start.pose, diagonal(SIGMAS[POSE])))
     graph.add(gtsam.PriorFactorVector(V(0), start.velocity, diagonal(SIGMAS[6:9])))
     graph.add(gtsam.PriorFactorConstantBias(B(0), start.bias, diagonal(SIGMAS[9:15])))
-    graph.add(gtsam.PriorFactorDouble(S(0), start.slip, iso(1, SIGMAS[15])))
+    graph.add(gtsam.PriorFactorVector(M(0), start.markov(), diagonal(SIGMAS[MARKOV])))
 
 
 def test_batch_solution_is_that_of_gtsam() -> None:
@@ -96,24 +92,29 @@ def test_batch_solution_is_that_of_gtsam() -> None:
     graph = build(chain, 40)
     start = chain.nodes[0].point
     values = gtsam.Values(chain.values)
+    for k, node in enumerate(chain.nodes):
+        values.insert(M(k), node.point.markov())
     add_priors(graph, start)
     params = gtsam.GaussNewtonParams()
     params.setRelativeErrorTol(1e-14)
     params.setAbsoluteErrorTol(1e-14)
+    params.setLinearSolverType("MULTIFRONTAL_QR")
     solution = gtsam.GaussNewtonOptimizer(graph, values, params).optimize()
     chain.optimise()
     for k in (0, 17, 39):
         state = chain.state(k)
         assert np.abs(state.pose.localCoordinates(solution.atPose3(X(k)))).max() < 1e-7
         assert np.abs(state.velocity - solution.atVector(V(k))).max() < 1e-7
-        assert state.slip == pytest.approx(solution.atDouble(S(k)), abs=1e-7)
+        np.testing.assert_allclose(state.markov(), solution.atVector(M(k)), atol=1e-7)
     marginals = gtsam.Marginals(graph, solution)
     covariances = chain.covariances()
     for k in (0, 17, 39):
         np.testing.assert_allclose(
             covariances[k][POSE, POSE], marginals.marginalCovariance(X(k)), rtol=2e-3, atol=1e-8
         )
-        assert covariances[k][15, 15] == pytest.approx(marginals.marginalCovariance(S(k))[0, 0], rel=2e-3)
+        np.testing.assert_allclose(
+            covariances[k][MARKOV, MARKOV], marginals.marginalCovariance(M(k)), rtol=2e-3, atol=1e-8
+        )
 
 
 def test_filter_ends_where_the_batch_ends() -> None:
@@ -126,7 +127,7 @@ def test_filter_ends_where_the_batch_ends() -> None:
             if k == 0:
                 chain.set_prior(SIGMAS)
             if k % 4 == 0:
-                chain.add(k, gtsam.GPSFactorArm(X(k), fixes[k], np.zeros(3), iso(3, 0.3)), "X")
+                chain.add_fix(k, GnssPosition(fixes[k], np.zeros(3), np.full(3, 0.3)))
             if chain is live:
                 chain.solve(window=40)
     live.smooth(40, iterations=10)
@@ -150,7 +151,7 @@ def test_forgetting_keeps_the_information() -> None:
         if k == 0:
             short.set_prior(SIGMAS)
         if k % 4 == 0:
-            short.add(k, gtsam.GPSFactorArm(X(k), fixes[k], np.array([0.2, 0.0, 0.3]), iso(3, 0.3)), "X")
+            short.add_fix(k, GnssPosition(fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3)))
         short._eliminate_all()
         short.forget(8)
     whole._eliminate_all()
@@ -167,7 +168,7 @@ def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:
     points, *_ = drive(1, 0)
     chain.append(0, points[0])
     chain.set_prior(SIGMAS)
-    delta = rng.normal(0, 1, DIM) * np.array([0.3] * 3 + [2.0] * 3 + [0.5] * 3 + [0.1] * 6 + [0.1])
+    delta = rng.normal(0, 1, DIM) * np.array([0.3] * 3 + [2.0] * 3 + [0.5] * 3 + [0.1] * 6 + [0.1, 0.5, 0.5])
     chain.nodes[0].delta = delta
     chain._move(0)
     chain.smooth(1, iterations=20)
@@ -203,6 +204,34 @@ def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
         np.testing.assert_allclose(H_b[:, i], numeric, atol=1e-6)
     numeric = (residual(a, b, slip + h, d) - residual(a, b, slip - h, d)) / (2 * h)
     np.testing.assert_allclose(H_slip[:, 0], numeric, atol=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose, h = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), 1e-6
+    fix = GnssPosition(rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), np.ones(3))
+    drift = rng.normal(0, 1, 2)
+    H_pose, H_drift = gnss_factor.jacobians(fix, pose)
+    for i in range(6):
+        step = np.eye(6)[i] * h
+        up, down = (gnss_factor.residual(fix, pose.retract(s), drift) for s in (step, -step))
+        np.testing.assert_allclose(H_pose[:, i], (up - down) / (2 * h), atol=1e-6)
+    for i in range(2):
+        step = np.eye(2)[i] * h
+        up, down = (gnss_factor.residual(fix, pose, drift + s) for s in (step, -step))
+        np.testing.assert_allclose(H_drift[:, i], (up - down) / (2 * h), atol=1e-6)
+
+
+def test_a_markov_step_keeps_the_stationary_variance() -> None:
+    """Two half steps make a whole one, and the variance neither grows nor shrinks."""
+    whole, half = (markov_step(dt, 0.3, 0.2, 4.0) for dt in (2.0, 1.0))
+    assert whole.decay == pytest.approx(half.decay**2)
+    assert whole.sigma**2 == pytest.approx(half.sigma**2 * (1 + half.decay**2))
+    assert whole.decay**2 * 0.04 + whole.sigma**2 == pytest.approx(0.04)
+    fresh = markov_step(0.1, 0.3, 0.2, 4.0, forget=1.0)
+    assert fresh.decay == 0.0
+    assert fresh.sigma == pytest.approx(0.2)
 
 
 def test_an_undetermined_chain_says_so() -> None:

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
 from terrafusion.datasets.recording import Recording

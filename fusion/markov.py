@@ -1,0 +1,55 @@
+"""States that forget: slip and the slow drift of GNSS positions.
+
+Each is a first-order Gauss-Markov (Ornstein-Uhlenbeck) process with a mean, a
+stationary standard deviation and a correlation time (Uhlenbeck and Ornstein
+1930, Phys. Rev. 36), stepped exactly.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class MarkovStep:
+    """From one keyframe to the next: x_j = mean + decay (x_i - mean) + noise of `sigma`, each (n,)."""
+
+    decay: Array
+    mean: Array
+    sigma: Array
+
+    def residual(self, before: Array, now: Array) -> Array:
+        """Noise (n,) that leads from `before` to `now`, unwhitened."""
+        return np.asarray(now - self.mean - self.decay * (before - self.mean))
+
+
+def markov_step(
+    dt_s: float, mean: ArrayLike, sigma: ArrayLike, time_s: ArrayLike, forget: ArrayLike = 0.0
+) -> MarkovStep:
+    """Exact step over `dt_s` of processes with the given moments and correlation times.
+
+    `forget` in [0, 1] is the probability that the process has just started
+    anew, as slip does where the ground changes.
+    """
+    means, sigmas = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
+    kept = 1.0 - np.clip(np.asarray(forget, dtype=float), 0.0, 1.0)
+    decay = kept * np.exp(-dt_s / np.asarray(time_s, dtype=float))
+    return MarkovStep(decay, means, sigmas * np.sqrt(1.0 - decay * decay))
+
+
+def as_gtsam_factor(step: MarkovStep, key_i: int, key_j: int) -> gtsam.CustomFactor:
+    """The same step between two vector variables, for GTSAM's own optimisers."""
+
+    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
+        if H is not None:
+            H[0], H[1] = -np.diag(step.decay), np.eye(len(step.decay))
+        return step.residual(values.atVector(key_i), values.atVector(key_j))
+
+    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(step.sigma), [key_i, key_j], error)
