@@ -106,15 +106,18 @@ def test_batch_solution_is_that_of_gtsam() -> None:
         assert np.abs(state.pose.localCoordinates(solution.atPose3(X(k)))).max() < 1e-7
         assert np.abs(state.velocity - solution.atVector(V(k))).max() < 1e-7
         np.testing.assert_allclose(state.markov(), solution.atVector(M(k)), atol=1e-7)
-    marginals = gtsam.Marginals(graph, solution)
+    # GTSAM's Marginals uses Cholesky, which gives up here: a dense QR of its own linear system instead.
+    ordering = gtsam.Ordering()
+    for k in range(40):
+        for symbol in (X, V, B, M):
+            ordering.push_back(symbol(k))
+    A, _ = graph.linearize(solution).jacobian(ordering)
+    root = np.linalg.inv(np.linalg.qr(A, mode="r"))
+    dense = root @ root.T
     covariances = chain.covariances()
     for k in (0, 17, 39):
-        np.testing.assert_allclose(
-            covariances[k][POSE, POSE], marginals.marginalCovariance(X(k)), rtol=2e-3, atol=1e-8
-        )
-        np.testing.assert_allclose(
-            covariances[k][MARKOV, MARKOV], marginals.marginalCovariance(M(k)), rtol=2e-3, atol=1e-8
-        )
+        block = slice(DIM * k, DIM * (k + 1))
+        np.testing.assert_allclose(covariances[k], dense[block, block], rtol=1e-4, atol=1e-9)
 
 
 def test_filter_ends_where_the_batch_ends() -> None:
