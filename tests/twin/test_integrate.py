@@ -9,9 +9,11 @@ import pytest
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin import codegen, integrate, simulate
-from terrafusion.twin.dynamics import INDEX
+from terrafusion.twin.dynamics import INDEX, rhs, soil_vector, vehicle_vector
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
+from terrafusion.twin.soil import load_soil, soil_names
+from terrafusion.twin.vehicle import load_vehicle, vehicle_names
 
 needs_compiler = pytest.mark.skipif(codegen.find_compiler() is None, reason="no C compiler")
 A_MINUTE = dataclasses.replace(load_scenario("mixed_terrain"), duration_s=60.0)
@@ -119,3 +121,19 @@ def test_a_home_that_cannot_be_written_still_gets_compiled_code(monkeypatch, tmp
     codegen.driver.cache_clear()
     assert codegen.driver() is not None
     codegen.driver.cache_clear()
+
+
+@pytest.mark.parametrize("terrain", soil_names())
+@pytest.mark.parametrize("vehicle", vehicle_names())
+def test_the_motor_lag_is_the_fastest_mode(terrain, vehicle) -> None:
+    """What the step rests on: along a drive with turns and stops, no eigenvalue exceeds 1 / lag."""
+    import casadi as ca
+
+    f = rhs()
+    x, u, p, s = (ca.SX.sym(name, f.size1_in(i)) for i, name in enumerate(("x", "u", "p", "s")))
+    jacobian = ca.Function("jacobian", [x, u, p, s], [ca.jacobian(f(x, u, p, s), x)])
+    params = load_vehicle(vehicle)
+    vectors = vehicle_vector(params), soil_vector(load_soil(terrain))
+    states = simulate_run("figure_eight", vehicle=params, terrain=terrain).states[::200]
+    rates = [np.abs(np.linalg.eigvals(np.array(jacobian(row, [0.0, 0.0], *vectors)))).max() for row in states]
+    assert max(rates) < 1.01 / params.drive.lag_s
