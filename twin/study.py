@@ -57,7 +57,7 @@ def imu_speed(recording: Recording) -> tuple[Array, Array]:
     imu = recording.imu
     if imu is None:
         raise ValueError("the recording has no IMU")
-    t = (imu.t_ns - recording.start_ns) * 1e-9
+    t: Array = np.asarray((imu.t_ns - recording.start_ns) * 1e-9, dtype=float)
     forward = imu.accel_mps2[:, 0] - imu.accel_mps2[t <= _REST_S, 0].mean()
     width = max(1, round(_AVERAGE_S / float(np.median(np.diff(t)))))
     smooth = np.convolve(forward, np.ones(width) / width, mode="same")
@@ -79,8 +79,8 @@ def speed_errors(recording: Recording, wheel_radius_m: float) -> SpeedErrors:
         relative = np.abs(speed - np.abs(reference))[moving] / np.abs(reference)[moving]
         return float(relative.mean()) if moving.any() else float("nan")
 
-    t_wheels = (wheels.t_ns - recording.start_ns) * 1e-9
-    t_gnss = (gnss.t_ns - recording.start_ns) * 1e-9
+    t_wheels: Array = np.asarray((wheels.t_ns - recording.start_ns) * 1e-9, dtype=float)
+    t_gnss: Array = np.asarray((gnss.t_ns - recording.start_ns) * 1e-9, dtype=float)
     t_imu, v_imu = imu_speed(recording)
     velocity = gnss.velocity_enu_mps if gnss.velocity_enu_mps is not None else np.full((len(gnss), 3), np.nan)
     between = np.hypot(*np.diff(gnss.enu_m[:, :2], axis=0).T) / np.diff(t_gnss)
