@@ -78,6 +78,11 @@ class KeyState:
         )
 
 
+def quaternion_of(pose: gtsam.Pose3) -> Array:
+    """Orientation (4,) x, y, z, w."""
+    return np.asarray(pose.rotation().toQuaternion().coeffs())  # type: ignore[attr-defined,unused-ignore]
+
+
 @dataclass(eq=False)
 class Node:
     """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.

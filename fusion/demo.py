@@ -35,7 +35,8 @@ def run_demo(out: Path, seed: int, progress: Callable[[float], None] | None = No
 def comparison(results: list[Replay]) -> list[str]:
     """A table of the replays, one column each."""
     first = results[0]
-    rows = [
+    yaw = [r.scores.yaw_rmse_rad for r in results]
+    rows: list[tuple[str, list[float | None]]] = [
         ("position error, whole drive (m)", [r.scores.ate_m for r in results]),
         ("median error in the outage (m)", [r.scores.outages[0].median_m for r in results]),
         ("error at the end of the outage (m)", [r.scores.outages[0].end_error_m for r in results]),

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
 from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
-from terrafusion.fusion.chain import DIM, POSE, SLIP, VELOCITY, Chain, KeyState
+from terrafusion.fusion.chain import DIM, POSE, SLIP, VELOCITY, Chain, KeyState, quaternion_of
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.factors import at_rest, bridge, wheel_increment
@@ -107,7 +107,7 @@ class Estimator:
         velocity_mps: ArrayLike | None = None,
         sigma_v_mps: float = float("nan"),
     ) -> None:
-        """Antenna position and 1 sigma (3,), ENU m, a NaN height being unknown; velocity (3,) ENU if known."""
+        """Antenna position and 1 sigma (3,), ENU m (a NaN height is unknown); velocity (3,) ENU if known."""
         position, sigma = np.asarray(enu_m, dtype=float), np.asarray(sigma_m, dtype=float)
         if position.shape != (3,) or not np.isfinite(position[:2]).all():
             raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
@@ -331,7 +331,7 @@ class Estimator:
         self._state = State(
             t_ns=t_ns,
             position_m=np.asarray(key.pose.translation()),
-            quaternion=np.asarray(key.pose.rotation().toQuaternion().coeffs()),
+            quaternion=quaternion_of(key.pose),
             velocity_mps=key.velocity,
             angular_velocity_radps=gyro - key.bias.gyroscope(),
             gyro_bias_radps=np.asarray(key.bias.gyroscope()),

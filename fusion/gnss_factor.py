@@ -50,7 +50,7 @@ def antenna_jacobian(R: Array, lever: Array) -> Array:
 
 
 def as_gtsam_factor(fix: GnssPosition, pose_key: int, markov_key: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `markov_key` is a vector (slip, drift east, drift north)."""
+    """The same factor for GTSAM's own optimisers; `markov_key` is the vector (slip, drift e, drift n)."""
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         pose = values.atPose3(pose_key)

@@ -156,11 +156,12 @@ def _slip_line(grounds: list[Evidence]) -> tuple[float, float]:
     lines = []
     for e in grounds:
         rows = np.stack([np.ones_like(e.grade), e.grade], axis=1)
-        weight, line = np.ones(len(rows)), np.zeros(2)
+        weight: Array = np.ones(len(rows))
+        line: Array = np.zeros(2)
         for _ in range(LAD_STEPS):
             ridge = np.diag([0.0, GRADE_RIDGE * weight.sum()])
             line = np.linalg.solve(rows.T @ (weight[:, None] * rows) + ridge, rows.T @ (weight * e.slip))
-            weight = 1.0 / np.maximum(np.abs(e.slip - rows @ line), LAD_FLOOR)
+            weight = np.asarray(1.0 / np.maximum(np.abs(e.slip - rows @ line), LAD_FLOOR))
         lines.append(line)
     level, per_grade = np.mean(lines, axis=0)
     return float(level), float(per_grade)
@@ -330,7 +331,8 @@ def fingerprint_of(grid: Grid) -> str:
         "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
         "side_slip_from_mps": SIDE_SLIP_FROM_MPS, "stuck_mps": STUCK_MPS, "stuck_counts_s": STUCK_COUNTS_S,
         "bias_s": BIAS_S, "gyro_s": GYRO_S, "accel_s": ACCEL_S,
-        "tail": TAIL, "line": [GRADE_RIDGE, LAD_STEPS, LAD_FLOOR], "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
+        "tail": TAIL, "line": [GRADE_RIDGE, LAD_STEPS, LAD_FLOOR],
+        "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
     }  # fmt: skip
     return grid.fingerprint(policy=settings)
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import gtsam_to_ros_covariance
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
-from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState
+from terrafusion.fusion.chain import POSE, SLIP, VELOCITY, Chain, KeyState, quaternion_of
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
@@ -71,7 +71,7 @@ def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParam
     asked = name or recording.vehicle
     overrides = recording.overrides
     given = [f"{k} = {v}" for k, v in dataclasses.asdict(overrides).items() if v is not None]
-    notes = (f"the log's own geometry is used: {', '.join(given)}",) if given else ()
+    notes: tuple[str, ...] = (f"the log's own geometry is used: {', '.join(given)}",) if given else ()
     if asked:
         return with_overrides(load_vehicle(asked), overrides), notes
     wheels = recording.wheels
@@ -281,7 +281,7 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
     return dataclasses.replace(
         live,
         position_m=np.asarray(key.pose.translation()),
-        quaternion=np.asarray(rotation.toQuaternion().coeffs()),
+        quaternion=quaternion_of(key.pose),
         velocity_mps=key.velocity,
         angular_velocity_radps=live.angular_velocity_radps + live.gyro_bias_radps - key.bias.gyroscope(),
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),

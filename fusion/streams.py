@@ -116,7 +116,7 @@ class WheelStream:
         left_m: float | None = None,
         right_m: float | None = None,
     ) -> None:
-        """Side speeds, and where encoders count angle the travelled distances, which are then used instead."""
+        """Side speeds, and, where encoders count angle, the travelled distances, used instead."""
         if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
             raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
         _in_order("wheels", t_ns, self.t_ns)

@@ -64,7 +64,7 @@ def jacobians(pose_i: Any, pose_j: Any, displacement_m: Array) -> tuple[Array, A
 
 
 def as_gtsam_factor(increment: WheelIncrement, pose_i: int, pose_j: int, markov_j: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `markov_j` is a vector (slip, drift east, drift north)."""
+    """The same factor for GTSAM's own optimisers; `markov_j` is the vector (slip, drift e, drift n)."""
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
         a, b = values.atPose3(pose_i), values.atPose3(pose_j)
