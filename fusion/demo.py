@@ -40,10 +40,7 @@ def comparison(results: list[Replay]) -> list[str]:
         ("position error, whole drive (m)", [r.scores.ate_m for r in results]),
         ("median error in the outage (m)", [r.scores.outages[0].median_m for r in results]),
         ("error at the end of the outage (m)", [r.scores.outages[0].end_error_m for r in results]),
-        (
-            "heading error (deg)",
-            [None if r.scores.yaw_rmse_rad is None else 57.29578 * r.scores.yaw_rmse_rad for r in results],
-        ),
+        ("heading error (deg)", [None if x is None else math.degrees(x) for x in yaw]),
         ("real-time factor", [r.realtime_factor() for r in results]),
     ]
     lines = [

@@ -160,7 +160,8 @@ def _slip_line(grounds: list[Evidence]) -> tuple[float, float]:
         line: Array = np.zeros(2)
         for _ in range(LAD_STEPS):
             ridge = np.diag([0.0, GRADE_RIDGE * weight.sum()])
-            line = np.linalg.solve(rows.T @ (weight[:, None] * rows) + ridge, rows.T @ (weight * e.slip))
+            weighted = weight[:, None] * rows
+            line = np.asarray(np.linalg.solve(rows.T @ weighted + ridge, weighted.T @ e.slip))
             weight = np.asarray(1.0 / np.maximum(np.abs(e.slip - rows @ line), LAD_FLOOR))
         lines.append(line)
     level, per_grade = np.mean(lines, axis=0)

@@ -42,7 +42,7 @@ def fit(
     for name, row in {**fitted.classes, "fixed": fitted.fixed}.items():
         print(
             f"{name:12s} {row.slip_mean:.3f} ± {row.slip_sigma:.3f} {row.slip_per_grade:8.2f}"
-            f"  {row.slip_time_s:5.1f}  {row.wheel_sigma_mps:.4f}     {row.side_slip_sigma:.4f}  {row.gyro_inflation:4.1f}"
-            f"  {row.accel_inflation:5.1f}  {row.gnss_inflation:4.2f}"
+            f"  {row.slip_time_s:5.1f}  {row.wheel_sigma_mps:.4f}     {row.side_slip_sigma:.4f}"
+            f"  {row.gyro_inflation:4.1f}  {row.accel_inflation:5.1f}  {row.gnss_inflation:4.2f}"
         )
     print(f"inputs {fitted.inputs_sha256[:16]}; written to {out}")
