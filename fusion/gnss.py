@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
 LARGE_TURN_RAD = 0.05
-WHITE_SHARE = 0.1
+WHITE_SHARE = 0.2
 """Share of a fix's variance that is new at every fix; the rest drifts slowly."""
 
 
@@ -102,7 +102,8 @@ class GnssUpdater:
         J = np.zeros((3, DIM))
         J[:, POSE], J[:, DRIFT] = antenna_jacobian(R, lever), np.eye(3)[:, :2]
         P = J @ covariance @ J.T
-        P[[0, 1], [0, 1]] += sigma[:2] ** 2
+        # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
+        P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * row.gnss_inflation) ** 2
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
         if verdict is Verdict.REJECT:
