@@ -18,12 +18,13 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
 from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
-from terrafusion.fusion.chain import DIM, POSE, SLIP, VELOCITY, Chain, KeyState, quaternion_of
+from terrafusion.fusion.chain import Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.factors import at_rest, bridge, wheel_increment
 from terrafusion.fusion.gates import WheelGate
 from terrafusion.fusion.gnss import GnssUpdater
+from terrafusion.fusion.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.markov import markov_step
 from terrafusion.fusion.preintegration import Preintegrator
 from terrafusion.fusion.streams import GnssFix, ImuSegment, ImuStream, WheelStream
@@ -125,6 +126,13 @@ class Estimator:
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
         return self._state
+
+    @property
+    def status(self) -> str:
+        """A key of `STATUS`: what the estimator is doing now, also before the first state."""
+        if self._state is not None:
+            return self._state.status
+        return "waiting" if self._level is None else "aligning"
 
     def finish(self) -> None:
         """Tell that no more data come: keyframes no longer wait for late samples."""

@@ -10,7 +10,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.chain import KeyState
+from terrafusion.fusion.key_state import KeyState
 from terrafusion.fusion.streams import ImuSegment
 from terrafusion.fusion.weighting import SensorNoise
 from terrafusion.fusion.wheel_factor import WheelIncrement

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.fusion.chain import DIM, DRIFT, POSE, Chain
+from terrafusion.fusion.chain import Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.gates import GnssGate, Verdict
 from terrafusion.fusion.gnss_factor import GnssPosition, antenna_jacobian
+from terrafusion.fusion.key_state import DIM, DRIFT, POSE
 from terrafusion.fusion.streams import GnssFix
 from terrafusion.fusion.weighting import SensorNoise
 

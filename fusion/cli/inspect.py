@@ -118,10 +118,10 @@ def _print_page(recording: Recording, findings: list[Finding]) -> None:
         f"[bold]{escape(page['name'])}[/bold]  {escape(', '.join(about))}  {_utc(page['start_ns'])}"
     )
     table = Table(box=None, padding=(0, 1, 0, 0), pad_edge=False, header_style="bold")
-    table.add_column("channel")
+    table.add_column("channel", no_wrap=True)
     for title in ("samples", "rate Hz", "span s", "gaps"):
-        table.add_column(title, justify="right")
-    table.add_column("ranges", no_wrap=True)
+        table.add_column(title, justify="right", no_wrap=True)
+    table.add_column("ranges", overflow="fold")
     for name, c in page["channels"].items():
         rate = f"{c['rate_hz']:.4g}" if c["rate_hz"] else "-"
         span = f"{c['start_s']:.1f} to {c['end_s']:.1f}"

@@ -44,6 +44,10 @@ def replay(
     batch: Annotated[
         bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")
     ] = False,
+    mcap: Annotated[
+        bool,
+        typer.Option("--mcap", help="Also write the log with the estimate as odometry to estimate.mcap."),
+    ] = False,
     gnss_outage: OutageOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
@@ -75,6 +79,17 @@ def replay(
             progress=progress,
         )
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
+    if mcap:
+        from terrafusion.datasets.writers.mcap import write_mcap
+
+        for left_out in write_mcap(
+            recording,
+            out / "estimate.mcap",
+            result.estimate.trajectory,
+            rig=result.vehicle.rig(),
+            overwrite=True,
+        ):
+            print(f"not in estimate.mcap: {left_out}")
     for line in summary(result):
         print(line)
     print(f"written to {out}")

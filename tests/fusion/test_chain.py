@@ -8,8 +8,9 @@ import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 
 from terrafusion.fusion import gnss_factor, markov, wheel_factor
-from terrafusion.fusion.chain import DIM, MARKOV, POSE, Chain, KeyState
+from terrafusion.fusion.chain import Chain
 from terrafusion.fusion.gnss_factor import GnssPosition
+from terrafusion.fusion.key_state import DIM, MARKOV, POSE, KeyState
 from terrafusion.fusion.markov import markov_step
 from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
 

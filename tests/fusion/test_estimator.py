@@ -189,6 +189,8 @@ def test_live_use_without_replay(exact: Recording) -> None:
     assert gnss is not None
     sides = wheels.side_speeds_mps(load_vehicle("elevate").wheel.radius_m)
     assert estimator.latest() is None
+    assert estimator.status == "waiting"
+    seen = set()
     events = sorted(
         [(int(t), 0, i) for i, t in enumerate(wheels.t_ns)]
         + [(int(t), 1, i) for i, t in enumerate(gnss.t_ns)]
@@ -201,6 +203,8 @@ def test_live_use_without_replay(exact: Recording) -> None:
             estimator.add_gnss(t_ns, gnss.enu_m[i], gnss.sigma_enu_m[i])
         else:
             estimator.add_imu(t_ns, imu.gyro_radps[i], imu.accel_mps2[i])
+            seen.add(estimator.status)
+    assert seen == {"waiting", "aligning", "running"}
     state = estimator.latest()
     assert state is states[-1]
     assert state is not None
