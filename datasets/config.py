@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -41,6 +42,23 @@ class Quantity:
         return f"{kind}{bounds} {self.unit}".rstrip()
 
 
+MAX_BYTES = 256 * 1024
+"""A larger file is no parameter file: pure-Python YAML would take seconds over it."""
+
+_SHORT = reprlib.Repr()
+_SHORT.maxlevel = 2
+
+
+def shown(value: Any) -> str:
+    """`value` as messages quote it: shortened, since aliases in YAML can stand for billions of entries."""
+    if isinstance(value, str):
+        return value if len(value) <= 80 else f"{value[:77]}..."
+    try:
+        return _SHORT.repr(value)
+    except ValueError:  # Python does not print integers of more than 4300 digits
+        return "a huge number"
+
+
 Position = Annotated[tuple[float, ...], Quantity("m", -20.0, 20.0, size=3)]
 """A point in the body frame (x forward, y left, z up), metres."""
 
@@ -49,12 +67,16 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """The mapping at the top of a YAML 1.2 file; twice the same key is an error.
 
     Raises:
-        ConfigError: the file is missing, not UTF-8, not YAML, or not a mapping.
+        ConfigError: the file is missing, very large, not UTF-8, not YAML, or not a mapping.
     """
     from ruamel.yaml import YAML
     from ruamel.yaml.error import YAMLError
 
     try:
+        if path.stat().st_size > MAX_BYTES:
+            raise ConfigError(
+                f"the file has more than {MAX_BYTES // 1024} KiB", file=path, remedy="give a parameter file"
+            )
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
         raise ConfigError("no such file", file=path, remedy="check the path") from None
@@ -84,7 +106,7 @@ def structure(cls: type[T], raw: Any, *, file: Path | str, key: str = "") -> T:
     """
     if not isinstance(raw, Mapping):
         raise ConfigError(
-            f"'{raw}' is not a section",
+            f"'{shown(raw)}' is not a section",
             file=file,
             channel=key or None,
             remedy=f"give keys from {', '.join(_names(cls))}",
@@ -118,11 +140,11 @@ def checked_number(
     items = list(value) if quantity.size and isinstance(value, (list, tuple)) else [value]
     numeric = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in items)
     if not numeric or len(items) != (quantity.size or 1):
-        raise ConfigError(f"'{key}' is '{value}'", file=file, remedy=f"give {quantity.allowed()}")
-    numbers = tuple(float(x) for x in items)
+        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy=f"give {quantity.allowed()}")
+    numbers = tuple(float(x) if abs(x) < 1e300 else math.inf for x in items)
     if not all(math.isfinite(x) and quantity.low <= x <= quantity.high for x in numbers):
         raise ConfigError(
-            f"'{key}' is {value}, out of range",
+            f"'{key}' is {shown(value)}, out of range",
             file=file,
             remedy=f"give {quantity.allowed()}; is the unit right?",
         )
@@ -152,16 +174,16 @@ def _value(hint: Any, raw: Any, file: Path | str, key: str) -> Any:
         return structure(hint, raw, file=file, key=key)  # type: ignore[arg-type]
     if get_origin(hint) is dict:
         if not isinstance(raw, Mapping):
-            raise ConfigError(f"'{key}' is '{raw}'", file=file, remedy="give a mapping")
+            raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a mapping")
         item = get_args(hint)[1]
         return {str(name): _value(item, value, file, f"{key}.{name}") for name, value in raw.items()}
     if get_origin(hint) is tuple:
         if not isinstance(raw, list) or not all(isinstance(x, str) for x in raw):
-            raise ConfigError(f"'{key}' is '{raw}'", file=file, remedy="give a list of words")
+            raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a list of words")
         return tuple(raw)
     if hint is str or hint == (str | None):
         if not isinstance(raw, str):
-            raise ConfigError(f"'{key}' is '{raw}'", file=file, remedy="give a text")
+            raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a text")
         return raw
     raise TypeError(
         f"{key}: a field of type {hint} cannot be loaded"
@@ -171,7 +193,7 @@ def _value(hint: Any, raw: Any, file: Path | str, key: str) -> Any:
 def _sourced(quantity: Quantity, raw: Any, file: Path | str, key: str) -> Any:
     if not isinstance(raw, Mapping):
         raise ConfigError(
-            f"'{key}' is '{raw}' without a source",
+            f"'{key}' is '{shown(raw)}' without a source",
             file=file,
             remedy=f"write {{value: {quantity.allowed()}, source: where it comes from}}",
         )
@@ -179,7 +201,7 @@ def _sourced(quantity: Quantity, raw: Any, file: Path | str, key: str) -> Any:
         if name not in ("value", "source"):
             why = " (the unit is the suffix of the key)" if name == "unit" else ""
             raise ConfigError(
-                f"'{key}' has the unknown entry '{name}'{why}",
+                f"'{key}' has the unknown entry '{shown(name)}'{why}",
                 file=file,
                 remedy="keep 'value' and 'source' only",
             )
@@ -196,4 +218,4 @@ def _unknown_key(name: str, known: list[str], file: Path | str, key: str) -> Con
     remedy = f"did you mean '{close[0]}'?" if close else f"known here: {', '.join(known)}"
     if same:
         remedy = f"write '{same[0]}' (the unit is part of the name)"
-    return ConfigError(f"unknown key '{here}'", file=file, remedy=remedy)
+    return ConfigError(f"unknown key '{shown(here)}'", file=file, remedy=remedy)

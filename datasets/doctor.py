@@ -21,6 +21,24 @@ Array = NDArray[np.float64]
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
 """Channels that should tick evenly; terrain labels come when they come."""
 
+LIMITS = {
+    ("command", "_mps"): 100.0,
+    ("command", "_radps"): 100.0,
+    ("wheels", "_mps"): 100.0,
+    ("wheels", "_radps"): 1000.0,
+    ("imu", "_radps"): 100.0,
+    ("imu", "_mps2"): 2000.0,
+    ("gnss", "_m"): 2e7,
+    ("gnss", "_mps"): 1e4,
+    ("motor", "_a"): 1e5,
+    ("motor", "_v"): 1e5,
+    ("truth", "_m"): 2e7,
+}
+"""Magnitudes that nothing on a ground robot reaches, by channel and unit. MEMS gyros end at 70 rad/s
+(4000 deg/s), accelerometers at 2000 m/s2 (200 g); projected coordinates at 1e7 m."""
+
+DEGREES_SLOPE = 15.0
+"""Gyro rate over the difference of the side speeds, 1/m: the inverse track, 0.3 to 4, unless in deg/s."""
 GAP_PERIODS, GAP_S = 5.0, 0.2
 JITTER_SHARE = 0.2
 MOVING_MPS = 0.1
@@ -68,8 +86,32 @@ def examine(recording: Recording, rig: Rig | None = None) -> list[Finding]:
         rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
     """
     patient = Patient(recording, rig)
-    findings = [finding for check in CHECKS for finding in check(patient)]
+    findings = list(check_magnitude(patient))
+    if not findings:  # the others would compute with impossible numbers
+        findings = [finding for check in CHECKS for finding in check(patient)]
     return sorted(findings, key=lambda finding: finding.severity != "error")
+
+
+def check_magnitude(patient: Patient) -> Iterator[Finding]:
+    """Numbers that no robot reaches: a wrong unit, or memory read as numbers."""
+    recording = patient.recording
+    tables = {name: (channel.t_ns, channel.columns()) for name, channel in recording.channels().items()}
+    if recording.truth is not None and len(recording.truth):
+        position = dict(zip(("x_m", "y_m", "z_m"), recording.truth.position_m.T, strict=True))
+        tables["truth"] = recording.truth.t_ns, position
+    for name, (t_ns, columns) in tables.items():
+        for column, values in columns.items():
+            limit = LIMITS.get((name, column[column.rindex("_") :] if "_" in column else ""))
+            bad = np.flatnonzero(np.abs(values) > limit) if limit is not None else np.zeros(0, dtype=int)
+            if bad.size:
+                at_s = patient.since_start_s(t_ns[bad[0]])
+                yield Finding(
+                    "error",
+                    name,
+                    f"{column} is {values[bad[0]]:g}, beyond anything possible",
+                    f"at t = {at_s:.3f} s; {bad.size} of {len(values)} values beyond {limit:g}",
+                    "is the unit right? mend these rows, or leave the cells empty",
+                )
 
 
 def check_jitter(patient: Patient) -> Iterator[Finding]:
@@ -236,7 +278,16 @@ def check_yaw_sign(patient: Patient) -> Iterator[Finding]:
         return
     r = float(np.corrcoef(by_wheels, by_gyro)[0, 1])
     evidence = f"correlation {r:.2f} of the half-second means"
-    if r < -0.5:
+    slope = abs(r) * float(by_gyro.std() / by_wheels.std())
+    if slope > DEGREES_SLOPE and abs(r) > 0.5:
+        yield Finding(
+            "error",
+            "imu",
+            "gyro z is far larger than the wheels' yaw rate: it looks like deg/s",
+            f"{slope:.0f} rad/s for each m/s between the sides; {evidence}",
+            "multiply by pi / 180, and check the wheel radius",
+        )
+    elif r < -0.5:
         yield Finding(
             "error",
             "imu",
@@ -273,9 +324,10 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
     bad = ~np.all(sigma > 0.0, axis=1)
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
+        missing_only = not (sigma <= 0.0).any()  # such fixes are left out, the others would mislead
         at_s, said = patient.since_start_s(gnss.t_ns[first]), gnss.sigma_enu_m[first].tolist()
         yield Finding(
-            "error",
+            "warning" if missing_only else "error",
             "gnss",
             f"{int(bad.sum())} of {len(bad)} fixes have a sigma that is zero, negative or missing",
             f"first at t = {at_s:.2f} s: {said} m",

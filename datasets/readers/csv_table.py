@@ -8,7 +8,7 @@ import gzip
 import io
 import warnings
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.config import shown
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.trajectory import seconds_to_ns
 
@@ -87,7 +88,7 @@ def read_table(
     _check_times(path, seconds)
     notes = () if data.endswith(b"\n") else (f"{path.name}: the last line has no line end; was it cut off?",)
     return Table(
-        _to_ns(data, header, seconds),
+        _to_ns(path, data, header, seconds),
         {name: table[name] for name in numeric if name != "t_s"},
         {name: table[name] for name in header if name in texts},
         notes,
@@ -116,16 +117,15 @@ def _read_bytes(path: Path) -> bytes:
 def _header(
     path: Path, data: bytes, known: list[str], texts: Sequence[str], prefixes: Sequence[str]
 ) -> list[str]:
-    first = data.split(b"\n", 1)[0].decode("utf-8")
-    header = [name.strip() for name in next(csv.reader([first.rstrip("\r")]), [])]
+    header = [name.strip() for _, cells in _lines(path, data.split(b"\n", 1)[0] + b"\n") for name in cells]
     allowed = ["t_s", *known, *texts]
     for name in header:
         if name in allowed or any(name.startswith(p) and name != p for p in prefixes):
             continue
-        close = difflib.get_close_matches(name, allowed, n=1)
+        close = difflib.get_close_matches(name[:100], allowed, n=1)
         meant = f"did you mean '{close[0]}'? " if close else ""
         listed = ", ".join([*allowed, *(f"{p}<name>" for p in prefixes)])
-        raise DataError(f"unknown column '{name}'", file=path, remedy=f"{meant}allowed: {listed}")
+        raise DataError(f"unknown column '{shown(name)}'", file=path, remedy=f"{meant}allowed: {listed}")
     repeated = [name for i, name in enumerate(header) if name in header[:i]]
     if repeated:
         raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="keep one of them")
@@ -164,12 +164,9 @@ def _fast_parse(data: bytes, header: list[str], numeric: list[str]) -> dict[str,
 
 def _check_cells(path: Path, data: bytes, header: list[str], numeric: list[str]) -> None:
     """Raise for the first line or cell that is neither a finite number nor empty."""
-    reader = csv.reader(io.StringIO(data.decode("utf-8"), newline=""))
-    next(reader)
-    for cells in reader:
-        if not cells:
-            continue
-        line = reader.line_num
+    rows = _lines(path, data)
+    next(rows)
+    for line, cells in rows:
         if len(cells) != len(header):
             raise DataError(
                 f"line {line} has {len(cells)} cells for {len(header)} columns",
@@ -182,6 +179,23 @@ def _check_cells(path: Path, data: bytes, header: list[str], numeric: list[str])
                 _bad_cell(path, name, cell, line, float(time_s) if _is_finite(time_s) else None)
 
 
+def _lines(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of every line that is not blank, the header among them."""
+    reader = csv.reader(io.StringIO(data.decode("utf-8"), newline=""))
+    begun = 1
+    try:
+        for cells in reader:
+            if cells:
+                yield reader.line_num, cells
+            begun = reader.line_num + 1
+    except csv.Error as error:
+        raise DataError(
+            f"line {begun} is not a line of a table: {error}",
+            file=path,
+            remedy="write plain comma-separated numbers, without quotes",
+        ) from None
+
+
 def _is_finite(cell: str) -> bool:
     try:
         return bool(np.isfinite(float(cell))) and "_" not in cell
@@ -190,6 +204,7 @@ def _is_finite(cell: str) -> bool:
 
 
 def _bad_cell(path: Path, name: str, cell: str, line: int, time_s: float | None) -> NoReturn:
+    cell = shown(cell)
     if name == "t_s" and not cell.strip():
         what, remedy = f"line {line} has no t_s", "every row needs its time"
     elif name == "t_s":
@@ -220,10 +235,10 @@ def _check_times(path: Path, seconds: Array) -> None:
         )
 
 
-def _to_ns(data: bytes, header: list[str], seconds: Array) -> NDArray[np.int64]:
+def _to_ns(path: Path, data: bytes, header: list[str], seconds: Array) -> NDArray[np.int64]:
     if not seconds.size or np.abs(seconds).max() < _EXACT_T_S:
         return np.rint(seconds * 1e9).astype(np.int64)
-    rows = csv.reader(io.StringIO(data.decode("utf-8"), newline=""))
+    rows = _lines(path, data)
     next(rows)
     column = header.index("t_s")
-    return np.array([seconds_to_ns(cells[column].strip()) for cells in rows if cells], dtype=np.int64)
+    return np.array([seconds_to_ns(cells[column].strip()) for _, cells in rows], dtype=np.int64)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.config import Quantity, checked_number, read_yaml
+from terrafusion.datasets.config import Quantity, checked_number, read_yaml, shown
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Overrides
 
@@ -78,13 +78,13 @@ def _unknown_key(path: Path, key: str) -> ConfigError:
         remedy = f"write '{same[0]}', in metres (the unit is part of the name)"
     else:
         remedy = (f"did you mean '{close[0]}'? " if close else "") + f"known: {', '.join(KEYS)}"
-    return ConfigError(f"unknown key '{key}'", file=path, remedy=remedy)
+    return ConfigError(f"unknown key '{shown(key)}'", file=path, remedy=remedy)
 
 
 def _start_ns(path: Path, raw: dict[str, Any]) -> int:
     value = raw.get("start_ns")
     if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_START_NS:
-        said = f"'start_ns' is '{value}'" if "start_ns" in raw else "'start_ns' is missing"
+        said = f"'start_ns' is '{shown(value)}'" if "start_ns" in raw else "'start_ns' is missing"
         raise ConfigError(
             said, file=path, remedy="give the Unix time of t_s = 0 in whole nanoseconds (0 when unknown)"
         )
@@ -93,14 +93,14 @@ def _start_ns(path: Path, raw: dict[str, Any]) -> int:
 
 def _text(path: Path, key: str, value: Any) -> str:
     if not isinstance(value, str):
-        raise ConfigError(f"'{key}' is '{value}'", file=path, remedy="give a text, in quotes")
+        raise ConfigError(f"'{key}' is '{shown(value)}'", file=path, remedy="give a text, in quotes")
     return value
 
 
 def _datum(path: Path, value: Any) -> tuple[float, float, float]:
     if not isinstance(value, list) or len(value) != 3:
         raise ConfigError(
-            f"'datum' is '{value}'", file=path, remedy="give [latitude deg, longitude deg, height m]"
+            f"'datum' is '{shown(value)}'", file=path, remedy="give [latitude deg, longitude deg, height m]"
         )
     lat, lon, height = (
         checked_number(number, quantity, file=path, key=f"datum {name}")
@@ -115,20 +115,19 @@ def _truth_channels(path: Path, raw: dict[str, Any]) -> tuple[tuple[str, ...] | 
     value = raw["truth_channels"]
     if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise ConfigError(
-            f"'truth_channels' is '{value}'",
+            f"'truth_channels' is '{shown(value)}'",
             file=path,
             remedy=f"give a list from {', '.join(TRUTH_CHANNELS)}",
         )
     strange = [name for name in value if name not in TRUTH_CHANNELS]
-    notes = (
-        f"meta.yaml: truth channels {', '.join(strange)} are not used; known are {', '.join(TRUTH_CHANNELS)}",
-    )
+    named = ", ".join(shown(name) for name in strange)
+    notes = (f"meta.yaml: truth channels {named} are not used; known are {', '.join(TRUTH_CHANNELS)}",)
     return tuple(value), notes if strange else ()
 
 
 def _truth_frame(path: Path, value: Any) -> str:
     if value not in TRUTH_FRAMES:
         raise ConfigError(
-            f"'truth_frame' is '{value}'", file=path, remedy=f"give one of {', '.join(TRUTH_FRAMES)}"
+            f"'truth_frame' is '{shown(value)}'", file=path, remedy=f"give one of {', '.join(TRUTH_FRAMES)}"
         )
     return str(value)

@@ -37,8 +37,16 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
             _write_table(folder / "truth.csv", truth.t_ns - recording.start_ns, _truth_columns(truth))
         _write_meta(recording, folder / META)
     except OSError as error:
-        raise DataError(f"cannot be written: {error.strerror or error}", file=folder) from None
+        raise _unwritable(folder, error) from None
     return folder
+
+
+def _unwritable(folder: Path, error: OSError) -> DataError:
+    return DataError(
+        f"cannot be written: {error.strerror or error}",
+        file=folder,
+        remedy="choose a folder you may write to, with room on the disk",
+    )
 
 
 def _make_room(folder: Path) -> None:
@@ -55,7 +63,7 @@ def _make_room(folder: Path) -> None:
             (folder / f"{name}.csv").unlink(missing_ok=True)
             (folder / f"{name}.csv.gz").unlink(missing_ok=True)
     except OSError as error:
-        raise DataError(f"cannot be written: {error.strerror or error}", file=folder) from None
+        raise _unwritable(folder, error) from None
 
 
 def _check_wheels(wheels: Wheels | None, folder: Path) -> None:

@@ -83,7 +83,11 @@ def write_mcap(
                     writer.write(connections[index], t, raw)
             shutil.move(next(bag.glob("*.mcap")), path)
     except OSError as error:
-        raise DataError(f"cannot be written: {error.strerror or error}", file=path) from None
+        raise DataError(
+            f"cannot be written: {error.strerror or error}",
+            file=path,
+            remedy="choose a folder you may write to, with room on the disk",
+        ) from None
     return tuple(composer.left_out)
 
 

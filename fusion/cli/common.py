@@ -84,6 +84,24 @@ def open_log(log: Path, rig: Rig | None, topic: list[str] | None, stamps: str) -
     return open_recording(log, rig=rig, topics=parse_topics(topic), stamps=check_stamps(stamps))
 
 
+def refuse_errors(log: Path, recording: Recording, rig: Rig | None) -> None:
+    """Refuse a log whose numbers would mislead: what the input doctor calls an error.
+
+    Raises:
+        DataError: the first such finding, with its evidence and what to do.
+    """
+    from terrafusion.datasets.doctor import examine
+    from terrafusion.datasets.errors import DataError
+
+    errors = [f for f in examine(recording, rig_of(recording, rig)) if f.severity == "error"]
+    if errors:
+        first, more = errors[0], len(errors) - 1
+        told = f" (`terrafusion inspect` tells {more} more)" if more else ""
+        raise DataError(
+            f"{first.what} ({first.evidence})", file=log, channel=first.channel, remedy=first.fix + told
+        )
+
+
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
     """A progress bar on a terminal, told the share done (0 to 1); None in a pipe."""

@@ -52,15 +52,19 @@ def inspect(
 
 def summary(recording: Recording, findings: list[Finding]) -> dict[str, Any]:
     """The page as plain data: numbers in the unit of their key, null where unknown."""
+    import numpy as np
+
     from terrafusion.datasets.trajectory import Trajectory
 
     channels = {name: _channel(recording, name, c) for name, c in recording.channels().items()}
     truth: Trajectory | None = recording.truth
     if truth is not None and len(truth):
+        with np.errstate(over="ignore"):
+            path_m = truth.path_length_m()
         channels["truth"] = _clock(recording, truth.t_ns) | {
             "holds": list(recording.truth_channels),
             "frame": recording.truth_frame,
-            "path_m": truth.path_length_m(),
+            "path_m": path_m if np.isfinite(path_m) else None,
         }
     return {
         "name": recording.name,
@@ -149,7 +153,8 @@ def _utc(start_ns: int) -> str:
 
 def _ranges(channel: dict[str, Any]) -> str:
     if "ranges" not in channel:
-        return f"{', '.join(channel['holds'])} of {channel['frame']}, path {channel['path_m']:.1f} m"
+        path = "unknown" if channel["path_m"] is None else f"{channel['path_m']:.1f} m"
+        return f"{', '.join(channel['holds'])} of {channel['frame']}, path {path}"
     lines = []
     for column, found in channel["ranges"].items():
         if isinstance(found, dict):

@@ -16,6 +16,7 @@ from terrafusion.fusion.cli.common import (
     load_rig,
     open_log,
     progress_bar,
+    refuse_errors,
 )
 
 if TYPE_CHECKING:
@@ -67,7 +68,9 @@ def replay(
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
     outages = [parse_outage(text) for text in gnss_outage or []]
-    recording = open_log(log, load_rig(vehicle), topic, stamps)
+    rig = load_rig(vehicle)
+    recording = open_log(log, rig, topic, stamps)
+    refuse_errors(log, recording, rig)
     with progress_bar(f"{mode} {log.name}") as progress:
         result = run(
             recording,

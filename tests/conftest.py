@@ -1,0 +1,67 @@
+"""The command line inside the test process: exit status, standard output and standard error."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from terrafusion.fusion.cli.main import main
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What a command left behind."""
+
+    status: int
+    out: str
+    err: str
+
+    def refused(self, *words: str) -> None:
+        """Assert that the command ended as a known error must: status 1, one line, each word in it."""
+        assert self.status == 1, (self.status, self.out, self.err)
+        assert self.err.startswith("error: "), self.err
+        assert self.err.count("\n") == 1, self.err
+        assert self.err.endswith("\n")
+        assert len(self.err) < 1500, f"{len(self.err)} characters: {self.err[:300]}"
+        for word in words:
+            assert word in self.err, f"'{word}' is not told in: {self.err}"
+
+
+Terrafusion = Callable[..., Outcome]
+"""`terrafusion("replay", log, "--out", out)`."""
+
+
+@pytest.fixture
+def terrafusion(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Terrafusion:
+    """Runs the console script's own `main`, with the descriptors captured, so that C++ is heard too."""
+
+    def run(*words: object) -> Outcome:
+        monkeypatch.setattr(sys, "argv", ["terrafusion", *map(str, words)])
+        capfd.readouterr()
+        status: object = 0
+        try:
+            main()
+        except SystemExit as end:
+            status = end.code or 0
+        out, err = capfd.readouterr()
+        assert isinstance(status, int)
+        return Outcome(status, out, err)
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def husky_bag() -> Path:
+    """The public Husky bag, where the environment names the folder of field logs."""
+    root = os.environ.get("TERRAFUSION_DATA")
+    if not root:
+        pytest.skip("TERRAFUSION_DATA is not set: the field logs are not at hand")
+    bag = Path(root) / "husky_parkinglot" / "test1.bag"
+    if not bag.is_file():
+        pytest.skip("TERRAFUSION_DATA holds no husky_parkinglot/test1.bag")
+    return bag
