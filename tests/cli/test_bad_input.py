@@ -397,22 +397,8 @@ BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
             f"replay LOG --out results --gnss-outage={text}",
             (f"'{text}'", "--gnss-outage", "START:SECONDS"),
         )
-        for text in (
-            "soon",
-            "12",
-            ":",
-            "5:",
-            ":5",
-            "-5:10",
-            "5:0",
-            "5:-1",
-            "nan:5",
-            "5:inf",
-            "1e999:5",
-            "1:2:3",
-            "5;10",
-        )
-    },  # fmt: skip
+        for text in "soon 12 : 5: :5 -5:10 5:0 5:-1 nan:5 5:inf 1e999:5 1:2:3 5;10".split()
+    },
     "outage after the end": (
         "replay LOG --out results --gnss-outage 1000:10",
         ("outage", "1000", "after the end", "lasts 26"),
