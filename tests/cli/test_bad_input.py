@@ -369,6 +369,22 @@ def files(folder: Path) -> None:
     (folder / "notes.txt").write_text("hello")
 
 
+OUTAGES = (
+    "soon",
+    "12",
+    ":",
+    "5:",
+    ":5",
+    "-5:10",
+    "5:0",
+    "5:-1",
+    "nan:5",
+    "5:inf",
+    "1e999:5",
+    "1:2:3",
+    "5;10",
+)
+
 BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
     "missing file": ("replay gone.bag --out results", ("gone.bag", "no such file", "check the path")),
     "missing folder": ("inspect gone", ("gone", "no such file")),
@@ -397,7 +413,7 @@ BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
             f"replay LOG --out results --gnss-outage={text}",
             (f"'{text}'", "--gnss-outage", "START:SECONDS"),
         )
-        for text in "soon 12 : 5: :5 -5:10 5:0 5:-1 nan:5 5:inf 1e999:5 1:2:3 5;10".split()
+        for text in OUTAGES
     },
     "outage after the end": (
         "replay LOG --out results --gnss-outage 1000:10",

@@ -1,0 +1,155 @@
+"""The whole path as a user walks it: simulate, inspect, convert, replay; and the twin without a compiler."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.recording import Recording
+
+ENTRY = "from terrafusion.fusion.cli.main import main; main()"
+NO_ZIG = "import sys; sys.modules['ziglang'] = None; "
+"""Import of ziglang fails, and `find_spec` finds nothing."""
+
+SCORES = ("ate_m", "yaw_rmse_rad", "velocity_rmse_mps", "nees_mean", "distance_m", "duration_s")
+
+
+def shell(
+    folder: Path, *words: str, code: str = ENTRY, **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """A command in a process of its own; it must succeed."""
+    done = subprocess.run(
+        [sys.executable, "-c", code, *words], capture_output=True, text=True, timeout=300, check=False,
+        cwd=folder, env=os.environ | {"PYTHONWARNINGS": "default", "COLUMNS": "100"} | environment,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def walked(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+    """The folder after the walk, and what each step printed."""
+    folder = tmp_path_factory.mktemp("walk")
+    steps = {
+        "simulate": "simulate demo --out log --seed 4",
+        "inspect": "inspect log",
+        "convert": "convert log drive.mcap",
+        "back": "convert drive.mcap back --vehicle elevate",
+        "log": "replay log --out of_log --gnss-outage 75:60",
+        "mcap": "replay drive.mcap --vehicle elevate --out of_mcap --gnss-outage 75:60",
+        "back again": "replay back --out of_back --gnss-outage 75:60",
+    }
+    printed = {}
+    for name, line in steps.items():
+        done = shell(folder, *line.split())
+        assert done.stderr == "", (line, done.stderr)
+        printed[name] = done.stdout
+    return folder, printed
+
+
+def metrics_of(folder: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((folder / "metrics.json").read_text())
+    return found
+
+
+def test_each_step_tells_what_it_did(walked: tuple[Path, dict[str, str]]) -> None:
+    _, printed = walked
+    assert "written to log" in printed["simulate"]
+    for word in ("imu", "15000", "accel_z_mps2", "wheels", "gnss", "fix fixed", "truth", "no findings"):
+        assert word in printed["inspect"], printed["inspect"]
+    assert "drive.mcap: " in printed["convert"]
+    assert "imu 15000" in printed["convert"]
+    assert "left out: motor" in printed["convert"]
+    assert "written to of_log" in printed["log"]
+
+
+@pytest.mark.parametrize("other", ["of_mcap", "of_back"])
+def test_every_format_gives_the_same_scores(walked: tuple[Path, dict[str, str]], other: str) -> None:
+    """MCAP holds fixes as latitude and longitude in doubles: 1e-9 m; all else is kept to the bit."""
+    folder, _ = walked
+    log, converted = metrics_of(folder / "of_log"), metrics_of(folder / other)
+    for name in SCORES:
+        assert converted[name] == pytest.approx(log[name], rel=1e-4), name
+    for name in ("updates", "against", "mode", "status", "vehicle", "weights", "rejected"):
+        assert converted[name] == log[name], name
+    assert converted["held_out"] == pytest.approx(log["held_out"], rel=1e-4)
+    assert converted["outages"][0] == pytest.approx(log["outages"][0], rel=1e-4)
+    assert converted["rpe_percent"] == pytest.approx(log["rpe_percent"], rel=1e-4)
+    a, b = (np.loadtxt(folder / name / "trajectory.tum") for name in ("of_log", other))
+    np.testing.assert_allclose(a, b, atol=1e-4)
+
+
+def test_the_numbers_make_sense(walked: tuple[Path, dict[str, str]]) -> None:
+    """RTK fixes of 2 cm outside the outage: an error of metres would be a defect of the path."""
+    metrics = metrics_of(walked[0] / "of_log")
+    assert metrics["against"] == "truth"
+    assert metrics["status"]["value"] == "running"
+    assert metrics["distance_m"] == pytest.approx(126.0, abs=6.0)
+    assert metrics["ate_m"] < 3.0
+    assert metrics["outages"][0]["median_m"] < 5.0
+    assert metrics["held_out"]["fixes"] == 300
+    assert metrics["terrain"].get("loose_sand", 0.0) > 0.1
+
+
+def assert_same(a: Recording, b: Recording, tolerance: float) -> None:
+    assert a.channels().keys() == b.channels().keys()
+    for name, channel in a.channels().items():
+        other = b.channels()[name]
+        np.testing.assert_array_equal(channel.t_ns, other.t_ns)
+        for column, values in channel.columns().items():
+            again = other.columns()[column]
+            if values.dtype == object:
+                assert values.tolist() == again.tolist(), column
+            else:
+                np.testing.assert_allclose(values, again, rtol=tolerance, atol=tolerance, err_msg=column)
+    assert a.truth is not None
+    assert b.truth is not None
+    np.testing.assert_array_equal(a.truth.t_ns, b.truth.t_ns)
+    np.testing.assert_allclose(a.truth.position_m, b.truth.position_m, atol=tolerance)
+
+
+def test_without_a_compiler(tmp_path: Path) -> None:
+    """CasADi's virtual machine makes the recording that compiled code makes, and says why it is slow, once."""
+    from terrafusion.twin.codegen import find_compiler
+
+    if find_compiler() is None:
+        pytest.skip("no C compiler here to compare with")
+    (tmp_path / "nothing").mkdir()
+    bare = {"PATH": str(tmp_path / "nothing"), "CC": "", "HOME": str(tmp_path)}
+    bare |= {"TERRAFUSION_CACHE": str(tmp_path / "cache"), "XDG_CACHE_HOME": str(tmp_path / "xdg")}
+    words = ("simulate", "figure_eight", "--terrain", "loose_sand", "--slope-deg", "5", "--seed", "3")
+    vm = shell(tmp_path, *words, "--out", "vm", code=NO_ZIG + ENTRY, **bare)
+    assert vm.stderr.count("\n") == 1, vm.stderr
+    assert "no C compiler" in vm.stderr
+    assert "ziglang" in vm.stderr
+    assert not (tmp_path / "cache").exists()
+    compiled = shell(tmp_path, *words, "--out", "compiled", TERRAFUSION_CACHE=str(tmp_path / "cache"))
+    assert compiled.stderr == ""
+    assert len(list((tmp_path / "cache").glob("twin-*.so"))) == 1
+    assert vm.stdout.splitlines()[:-1] == compiled.stdout.splitlines()[:-1]
+    assert_same(open_recording(tmp_path / "vm"), open_recording(tmp_path / "compiled"), 1e-6)
+    replayed = shell(tmp_path, "replay", "vm", "--out", "results", code=NO_ZIG + ENTRY, **bare)
+    assert replayed.stderr == ""
+
+
+def test_a_broken_compiler_is_no_obstacle(tmp_path: Path) -> None:
+    """A `cc` that fails: said in one line, and the virtual machine takes over."""
+    (tmp_path / "bin").mkdir()
+    compiler = tmp_path / "bin" / "cc"
+    compiler.write_text('#!/bin/sh\n[ "$1" = --version ] && echo broken 1.0 && exit 0\necho no >&2\nexit 1\n')
+    compiler.chmod(0o755)
+    path = f"{tmp_path / 'bin'}{os.pathsep}/bin{os.pathsep}/usr/bin"
+    (tmp_path / "short.yaml").write_text("drive: [{duration_s: 5, v_mps: 1.0}]\nroute: [{terrain: mud}]\n")
+    words = ("simulate", "short.yaml", "--out", "log")
+    done = shell(tmp_path, *words, PATH=path, CC="", TERRAFUSION_CACHE=str(tmp_path / "cache"))
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert "could not be compiled" in done.stderr
+    assert len(open_recording(tmp_path / "log").channels()) == 6
