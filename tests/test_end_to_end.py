@@ -117,7 +117,7 @@ def assert_same(a: Recording, b: Recording, tolerance: float) -> None:
 
 
 def test_without_a_compiler(tmp_path: Path) -> None:
-    """CasADi's virtual machine makes the recording that compiled code makes, and says why it is slow, once."""
+    """CasADi's virtual machine makes the recording that compiled code makes, and says once why it is slow."""
     from terrafusion.twin.codegen import find_compiler
 
     if find_compiler() is None:
@@ -134,7 +134,9 @@ def test_without_a_compiler(tmp_path: Path) -> None:
     compiled = shell(tmp_path, *words, "--out", "compiled", TERRAFUSION_CACHE=str(tmp_path / "cache"))
     assert compiled.stderr == ""
     assert len(list((tmp_path / "cache").glob("twin-*.so"))) == 1
-    assert vm.stdout.splitlines()[:-1] == compiled.stdout.splitlines()[:-1]
+    said, wanted = vm.stdout.splitlines()[:-1], compiled.stdout.splitlines()[:-1]
+    assert [line for line in said if "virtual machine" not in line] == wanted
+    assert len(said) == len(wanted) + 1
     assert_same(open_recording(tmp_path / "vm"), open_recording(tmp_path / "compiled"), 1e-6)
     replayed = shell(tmp_path, "replay", "vm", "--out", "results", code=NO_ZIG + ENTRY, **bare)
     assert replayed.stderr == ""
