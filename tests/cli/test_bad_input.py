@@ -515,6 +515,15 @@ def test_truncated_bag(share: float, husky_bag: Path, tmp_path: Path, terrafusio
     )
 
 
+@pytest.mark.parametrize(("channel", "told"), [("wheels", "no wheel speeds"), ("imu", "no six-axis IMU")])
+def test_bag_without_a_channel(channel: str, told: str, good_log: Path, tmp_path: Path, terrafusion) -> None:
+    shutil.copytree(good_log, tmp_path / "log")
+    (tmp_path / "log" / f"{channel}.csv").unlink()
+    assert terrafusion("convert", "log", "part.mcap").status == 0
+    outcome = terrafusion("replay", "part.mcap", "--vehicle", "elevate", "--out", "results")
+    outcome.refused("part", channel, told)
+
+
 @pytest.mark.parametrize("share", [0.0005, 0.1, 0.5, 0.9, 1.0])
 def test_truncated_mcap(share: float, good_log: Path, tmp_path: Path, terrafusion) -> None:
     assert terrafusion("convert", good_log, "whole.mcap").status == 0
