@@ -19,7 +19,8 @@ import reprlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar, get_args, get_origin, get_type_hints
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from terrafusion.datasets.errors import ConfigError
 
@@ -161,12 +162,20 @@ def _quantity(hint: Any) -> Quantity | None:
     return None
 
 
+def _present(hint: Any) -> Any:
+    """`X` of `X | None`: a key that is there has a value."""
+    if get_origin(hint) not in (Union, UnionType):
+        return hint
+    return next(kind for kind in get_args(hint) if kind is not type(None))
+
+
 def _hint(hint: Any) -> str:
     quantity = _quantity(hint)
     return f": {{value: {quantity.allowed()}, source: where it comes from}}" if quantity else ""
 
 
 def _value(hint: Any, raw: Any, file: Path | str, key: str) -> Any:
+    hint = _present(hint)
     quantity = _quantity(hint)
     if quantity is not None:
         return _sourced(quantity, raw, file, key)
@@ -181,7 +190,7 @@ def _value(hint: Any, raw: Any, file: Path | str, key: str) -> Any:
         if not isinstance(raw, list) or not all(isinstance(x, str) for x in raw):
             raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a list of words")
         return tuple(raw)
-    if hint is str or hint == (str | None):
+    if hint is str:
         if not isinstance(raw, str):
             raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a text")
         return raw

@@ -257,6 +257,18 @@ class Overrides:
     imu_m: tuple[float, float, float] | None = None
 
 
+@dataclass(frozen=True)
+class ClockJump:
+    """A step of a channel's clock that was taken out on reading, because it was asked for.
+
+    From `t_ns` on (repaired time) the log's own times stood `step_s` off: negative where time ran back.
+    """
+
+    channel: str
+    t_ns: int
+    step_s: float
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """One drive.
@@ -264,7 +276,8 @@ class Recording:
     `datum` is (latitude deg, longitude deg, height m) of the ENU origin where
     it is known. `truth_channels` names what the truth really holds ("position",
     "yaw", "orientation", "velocity"); `truth_frame` is "base" or "antenna".
-    `notes` records what a reader assumed or left out, in sentences.
+    `imu_frame_id` is the frame the log gives its IMU, where it gives one. `notes` records what a
+    reader assumed or left out, in sentences; `clock_jumps` what it repaired in the times.
     """
 
     name: str
@@ -286,6 +299,8 @@ class Recording:
     licence: str = ""
     source: str = ""
     notes: tuple[str, ...] = ()
+    clock_jumps: tuple[ClockJump, ...] = ()
+    imu_frame_id: str = ""
 
     CHANNELS: ClassVar[tuple[str, ...]] = ("command", "wheels", "imu", "gnss", "motor", "terrain")
 

@@ -22,6 +22,25 @@ AXES = {
 }  # fmt: skip
 
 
+def axes_matrix(axes: tuple[str, ...]) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) of sensor axes that lie along body x, y, z: v_body = matrix @ v_sensor.
+
+    Raises:
+        ValueError: the axes are not three of `AXES` that make a right-handed frame.
+    """
+    R = (
+        np.array([AXES[axis] for axis in axes])
+        if len(axes) == 3 and set(axes) <= set(AXES)
+        else np.zeros((3, 3))
+    )
+    if np.linalg.det(R) < 0.5:
+        raise ValueError(
+            f"axes {list(axes)} are not a rotation; give three of {', '.join(AXES)} that make a "
+            "right-handed frame"
+        )
+    return R
+
+
 @dataclass(frozen=True)
 class ImuSpec:
     """Inertial measurement unit: mounting and noise.
@@ -43,16 +62,11 @@ class ImuSpec:
     frame_id: str = "imu_link"
 
     def __post_init__(self) -> None:
-        known = all(axis in AXES for axis in self.axes)
-        if len(self.axes) != 3 or not known or np.linalg.det(self.base_from_sensor()) < 0.5:
-            raise ValueError(
-                f"axes {list(self.axes)} are not a rotation; give three of {', '.join(AXES)} that make a "
-                "right-handed frame"
-            )
+        axes_matrix(self.axes)
 
     def base_from_sensor(self) -> NDArray[np.float64]:
         """Rotation matrix (3, 3): vector in the body frame = matrix @ vector in the sensor frame."""
-        return np.array([AXES[axis] for axis in self.axes])
+        return axes_matrix(self.axes)
 
 
 @dataclass(frozen=True)

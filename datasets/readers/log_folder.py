@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.csv_table import Table, read_table
+from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Motor, Recording, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
@@ -38,6 +39,16 @@ GNSS_VELOCITY = ("v_e_mps", "v_n_mps", "v_u_mps")
 QUATERNION = ("qx", "qy", "qz", "qw")
 TRUTH_TWIST = {"u_mps": 0, "v_mps": 1, "r_radps": 5}
 """Columns of truth.csv and where they stand in `Trajectory.twist_body`."""
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether `path` is a log folder: any folder that is not a ROS 2 bag."""
+    return path.is_dir() and ((path / META).is_file() or not (path / "metadata.yaml").is_file())
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a log folder."""
+    return [read_log_folder(request.path)]
 
 
 def read_log_folder(folder: Path) -> Recording:

@@ -1,67 +1,141 @@
-"""`open_recording`: one door to every format."""
+"""`open_recording` and `open_recordings`: one door to every format."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+from terrafusion.datasets.catalog import CatalogFile, load_catalog, locate
+from terrafusion.datasets.conventions import BODY_AXES, Conventions, apply
 from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.formats import Format, Request, format_of
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.sensors import Rig
 
 STAMPS = ("header", "receipt")
-KINDS = "give a log folder (with meta.yaml), a ROS 1 .bag, or a ROS 2 bag (its folder, .mcap, .db3)"
 
 
-def open_recording(
+def open_recordings(
     path: Path | str,
     *,
     rig: Rig | None = None,
     topics: dict[str, str] | None = None,
     stamps: str = "header",
-) -> Recording:
-    """Read a recorded drive, whatever its format.
+    repair_clock: bool = False,
+    columns: Path | str | None = None,
+) -> list[Recording]:
+    """Read the recorded drives of a log, whatever its format.
 
     Args:
-        path: a log folder, a ROS 1 `.bag`, a ROS 2 bag folder, or a lone `.mcap` or `.db3` file.
+        path: a log folder, a ROS bag, a file of a public set, a table, ..., or the name of a
+            recording in the catalogue (`set/recording`). `path#3` is the fourth of several.
         rig: geometry of the robot: how its IMU is mounted, the track its odometry uses, its usual
-            topics. Without it the IMU is taken as mounted along the body axes.
+            topics. Without it the IMU is taken as mounted along the body axes, unless the
+            catalogue knows better.
         topics: topic of a channel where the choice by type is not the one wanted, such as
             {"imu": "/imu/data", "wheels": "/odom", "gnss": "/fix"}; ROS bags only.
         stamps: times of a ROS bag: "header" (when measured) or "receipt" (when recorded).
+        repair_clock: take out steps of a clock, which are refused otherwise; each is listed in
+            the recording's `clock_jumps`.
+        columns: YAML file that says what the columns of a plain table are.
 
     Returns:
-        Recording; its notes tell what was chosen, assumed and left out.
+        The recordings, mostly one; their notes tell what was chosen, assumed and left out.
 
     Raises:
         TerrafusionError: in one line the file, the channel, the time where known, and the remedy.
     """
-    path = Path(path)
     if stamps not in STAMPS:
         raise DataError(f"stamps is '{stamps}'", file=path, remedy=f"give one of {', '.join(STAMPS)}")
-    try:
-        if not path.exists():
-            raise DataError("no such file or folder", file=path, remedy="check the path")
-        ros = "ros1" if path.suffix == ".bag" and path.is_file() else "ros2"
-        if path.is_dir() and ((path / "meta.yaml").is_file() or not (path / "metadata.yaml").is_file()):
-            ros = ""
-        elif path.is_file() and path.suffix not in (".bag", ".mcap", ".db3"):
-            raise DataError(f"unknown kind of file '{path.suffix or path.name}'", file=path, remedy=KINDS)
-        if path.is_file() and path.stat().st_size == 0:
-            raise DataError("the file is empty", file=path, remedy="record or copy it again")
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
-    if not ros:
-        from terrafusion.datasets.readers.log_folder import read_log_folder
+    place, number = _place(path)
+    form = format_of(place)
+    entry, conventions, notes = _known(place, form)
+    if rig is not None and form.name in ("ros1", "ros2"):
+        conventions = dataclasses.replace(conventions, imu_axes=BODY_AXES)  # the reader turns it by the rig
+    request = Request(
+        place,
+        rig,
+        topics,
+        stamps,
+        repair_clock,
+        Path(columns) if columns is not None else None,
+        entry is not None,
+        conventions,
+    )
+    recordings = form.read(request)
+    chosen = recordings if number is None else [_chosen(place, recordings, number)]
+    return [
+        apply(_credited(r, entry).with_notes(*notes, *_unused(form, request)), conventions) for r in chosen
+    ]
 
-        recording = read_log_folder(path)
-        unused = [word for word, given in (("topics", topics), ("stamps", stamps != "header")) if given]
-        if unused:
-            return recording.with_notes(f"{' and '.join(unused)} only matter for ROS bags; not used here")
+
+def open_recording(path: Path | str, **options: Any) -> Recording:
+    """Read the one recorded drive of a log; arguments and errors as in `open_recordings`.
+
+    Raises:
+        DataError: also where the log holds several: choose one with `path#number`.
+    """
+    recordings = open_recordings(path, **options)
+    if len(recordings) != 1:
+        raise DataError(
+            f"holds {len(recordings)} recordings",
+            file=path,
+            remedy=f"choose one: '{path}#0' to '{path}#{len(recordings) - 1}'",
+        )
+    return recordings[0]
+
+
+def _place(path: Path | str) -> tuple[Path, int | None]:
+    """The file or folder that is meant, and the number behind `#` where there is one."""
+    text, mark, number = str(path).rpartition("#")
+    numbered = bool(mark) and number.isdigit() and len(number) < 9 and not Path(path).exists()
+    name = text if numbered else str(path)
+    place = Path(name)
+    if not place.exists():
+        place = locate(name) or place
+    return place, int(number) if numbered else None
+
+
+def _known(path: Path, form: Format) -> tuple[CatalogFile | None, Conventions, tuple[str, ...]]:
+    """What the catalogue says of a file, by its bytes, else by its format."""
+    catalog = load_catalog()
+    entry = catalog.find(path) if path.is_file() else None
+    if entry is not None:
+        known = catalog.sets[entry.set_name]
+        return entry, known.conventions_of(entry.recording), known.notes_of(entry.recording)
+    kin = catalog.of_format(form.name)
+    if kin is None:
+        return None, Conventions(), ()
+    note = f"this file is not in the catalogue; read with the conventions of {kin.name}: check the findings"
+    return None, kin.conventions_of(), (note,)
+
+
+def _credited(recording: Recording, entry: CatalogFile | None) -> Recording:
+    if entry is None:
         return recording
-    if ros == "ros1":
-        from terrafusion.datasets.readers.ros1 import read_ros1
+    known = load_catalog().sets[entry.set_name]
+    return dataclasses.replace(
+        recording, licence=known.licence, source=recording.source or f"{known.homepage} ({entry.file})"
+    )
 
-        return read_ros1(path, rig=rig, topics=topics, stamps=stamps)
-    from terrafusion.datasets.readers.ros2 import read_ros2
 
-    return read_ros2(path, rig=rig, topics=topics, stamps=stamps)
+def _chosen(path: Path, recordings: Sequence[Recording], number: int) -> Recording:
+    if number >= len(recordings):
+        raise DataError(
+            f"holds {len(recordings)} recordings, numbered from 0", file=path, remedy="give a smaller number"
+        )
+    return recordings[number]
+
+
+def _unused(form: Format, request: Request) -> list[str]:
+    """Options that were given and mean nothing for this format."""
+    bag = form.name in ("ros1", "ros2")
+    given = [
+        word for word, said in (("topics", request.topics), ("stamps", request.stamps != "header")) if said
+    ]
+    notes = [] if bag or not given else [f"{' and '.join(given)} only matter for ROS bags; not used here"]
+    if request.columns is not None and form.name != "table":
+        notes.append("columns only matter for plain tables; not used here")
+    return notes

@@ -6,11 +6,22 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros_bag import read_bag
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.sensors import Rig
 
 REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether `path` is a ROS 2 bag: a folder with `metadata.yaml`, or a file named `.mcap` or `.db3`."""
+    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix in (".mcap", ".db3")
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a ROS 2 bag."""
+    return [read_ros2(request.path, rig=request.rig, topics=request.topics, stamps=request.stamps)]
 
 
 def read_ros2(

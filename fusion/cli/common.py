@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
+    from terrafusion.datasets.doctor import Finding
     from terrafusion.datasets.recording import Recording
     from terrafusion.datasets.sensors import Rig
 
@@ -91,9 +92,25 @@ def refuse_errors(log: Path, recording: Recording, rig: Rig | None) -> None:
         DataError: the first such finding, with its evidence and what to do.
     """
     from terrafusion.datasets.doctor import examine
+
+    _refuse(log, examine(recording, rig_of(recording, rig)))
+
+
+def refuse_impossible(log: Path, recording: Recording) -> None:
+    """Refuse a log with numbers beyond anything possible.
+
+    Raises:
+        DataError: the first of them.
+    """
+    from terrafusion.datasets.doctor import Patient, check_magnitude
+
+    _refuse(log, list(check_magnitude(Patient(recording, None))))
+
+
+def _refuse(log: Path, findings: list[Finding]) -> None:
     from terrafusion.datasets.errors import DataError
 
-    errors = [f for f in examine(recording, rig_of(recording, rig)) if f.severity == "error"]
+    errors = [finding for finding in findings if finding.severity == "error"]
     if errors:
         first, more = errors[0], len(errors) - 1
         told = f" (`terrafusion inspect` tells {more} more)" if more else ""

@@ -14,6 +14,7 @@ from terrafusion.fusion.cli.common import (
     VehicleOption,
     load_rig,
     open_log,
+    refuse_impossible,
     rig_of,
 )
 
@@ -47,6 +48,7 @@ def convert(
     for note in recording.notes:
         print(f"note: {note}")
     if out.suffix == ".mcap":
+        refuse_impossible(log, recording)  # their latitudes would be nonsense
         for part in write_mcap(recording, out, rig=rig, overwrite=overwrite):
             print(f"left out: {part}")
     else:

@@ -95,7 +95,7 @@ def _channel(recording: Recording, name: str, channel: Any) -> dict[str, Any]:
 def _clock(recording: Recording, t_ns: Any) -> dict[str, Any]:
     import numpy as np
 
-    from terrafusion.datasets.doctor import GAP_PERIODS, GAP_S
+    from terrafusion.datasets.doctor.timing import GAP_PERIODS, GAP_S
 
     dt = np.diff(t_ns) * 1e-9
     period = float(np.median(dt)) if len(dt) else 0.0

@@ -214,6 +214,17 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         ],
         ("imu", "gyro z turns against the wheels", "swap left and right"),
     ),
+    "east and north swapped": (
+        lambda log: [
+            swap("gnss.csv", "east_m", "north_m")(log),
+            swap("gnss.csv", "v_e_mps", "v_n_mps")(log),
+        ],
+        ("log", "gnss", "turns against the gyro", "east and north may be swapped"),
+    ),
+    "north upside down": (
+        scaled("gnss.csv", ("north_m", "v_n_mps"), -1.0),
+        ("log", "gnss", "turns against the gyro"),
+    ),
     "gyro upside down": (
         scaled("imu.csv", ("gyro_z_radps",), -1.0),
         ("imu", "gyro z turns against the wheels"),
@@ -342,6 +353,14 @@ def test_looking_at_a_bad_log_is_quiet(
     outcome = terrafusion(command, "log", *(["copy"] if command == "convert" else []))
     assert (outcome.status, outcome.err) == (0, "")
     assert "error" in outcome.out
+
+
+@pytest.mark.parametrize("case", ["huge gyro_z_radps", "huge east_m", "huge x_m"])
+def test_a_bag_gets_no_impossible_numbers(case: str, good_log: Path, tmp_path: Path, terrafusion) -> None:
+    shutil.copytree(good_log, tmp_path / "log")
+    BAD_LOGS[case][0](tmp_path / "log")
+    terrafusion("convert", "log", "out.mcap").refused("log", "beyond anything possible")
+    assert not (tmp_path / "out.mcap").exists()
 
 
 def test_fixes_without_sigma_are_left_out(good_log: Path, tmp_path: Path, terrafusion) -> None:

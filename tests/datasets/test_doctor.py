@@ -123,7 +123,9 @@ def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Record
     found = next(f for f in findings if f.channel == channel and what in f.what)
     assert found.evidence
     assert found.fix
-    assert set(found.to_dict()) == {"severity", "channel", "what", "evidence", "fix"}
+    assert set(found.to_dict()) == {
+        "code", "severity", "channel", "what", "evidence", "fix", "repairable"
+    }
 
 
 def test_held_value_count_is_told(drive: Recording) -> None:

@@ -1,0 +1,65 @@
+"""`examine` a recording, and `treat` what it finds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+from terrafusion.datasets.doctor import gnss, inertial, signals, timing, wheels
+from terrafusion.datasets.doctor.finding import Finding, Patient
+from terrafusion.datasets.doctor.magnitude import check_magnitude
+from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.sensors import Rig
+
+Check = Callable[[Patient], Iterator[Finding]]
+
+CHECKS: tuple[Check, ...] = (
+    timing.check_spans,
+    timing.check_jitter,
+    timing.check_gaps,
+    timing.check_duplicates,
+    signals.check_held,
+    inertial.check_gravity,
+    inertial.check_yaw_sign,
+    wheels.check_wheel_signs,
+    wheels.check_speed_scale,
+    gnss.check_sigma,
+    gnss.check_jumps,
+    gnss.check_course,
+)
+
+MAX_ROUNDS = 20
+
+
+def examine(recording: Recording, rig: Rig | None = None) -> list[Finding]:
+    """All findings of all checks, errors first.
+
+    Args:
+        recording: the drive.
+        rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
+    """
+    patient = Patient(recording, rig)
+    findings = list(check_magnitude(patient))
+    if not findings:  # the others would compute with impossible numbers
+        findings = [finding for check in CHECKS for finding in check(patient)]
+    return sorted(findings, key=lambda finding: finding.severity != "error")
+
+
+def treat(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:
+    """Make the repairs that the findings propose, one after the other, looking again after each.
+
+    Returns:
+        The mended recording, with a note for every repair, and the findings that were mended, in
+        the order of their repairs. What `examine` still finds afterwards nobody could mend.
+    """
+    mended: list[Finding] = []
+    for _ in range(MAX_ROUNDS):
+        done = {(finding.code, finding.channel) for finding in mended}
+        open_findings = [f for f in examine(recording, rig) if f.repair and (f.code, f.channel) not in done]
+        if not open_findings:
+            break
+        first = open_findings[0]
+        assert first.repair is not None
+        note = f"mended: {first.channel}: {first.what} ({first.evidence}); {first.fix}"
+        recording = first.repair(recording).with_notes(note)
+        mended.append(first)
+    return recording, mended

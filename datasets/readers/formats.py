@@ -1,0 +1,103 @@
+"""The formats that can be read: who claims a file, and who reads it.
+
+A reader module has two functions: `claims(path, head)` tells from the name and the first bytes
+whether a file is of its format, `read(request)` reads it. Modules import their parsers inside
+`read`, so that asking all of them costs nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+
+from terrafusion.datasets.conventions import Conventions
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.sensors import Rig
+
+HEAD_BYTES = 4096
+
+
+@dataclass(frozen=True)
+class Request:
+    """What is asked of a reader.
+
+    Attributes:
+        path: the file or folder.
+        rig: geometry of the robot, where known.
+        topics: topic by channel, for bags.
+        stamps: "header" or "receipt", for bags.
+        repair_clock: take steps of a clock out (and list them in `clock_jumps`) instead of refusing them.
+        columns: YAML that says what the columns of a plain table are.
+        trusted: the file's bytes are those of a catalogue entry.
+        conventions: what the catalogue says of it; applied after reading, here for readers that
+            must know some of them to read at all.
+    """
+
+    path: Path
+    rig: Rig | None = None
+    topics: Mapping[str, str] | None = None
+    stamps: str = "header"
+    repair_clock: bool = False
+    columns: Path | None = None
+    trusted: bool = False
+    conventions: Conventions = field(default_factory=Conventions)
+
+
+@dataclass(frozen=True)
+class Format:
+    """A kind of file: its name in the catalogue, what it is called, and the module that reads it."""
+
+    name: str
+    words: str
+    module: str
+
+    def claims(self, path: Path, head: bytes) -> bool:
+        """Whether the file is of this format, by its name and first bytes (none for a folder)."""
+        return bool(import_module(self.module).claims(path, head))
+
+    def read(self, request: Request) -> Sequence[Recording]:
+        """The recordings in the file."""
+        recordings: Sequence[Recording] = import_module(self.module).read(request)
+        return recordings
+
+
+_READERS = "terrafusion.datasets.readers"
+FORMATS: tuple[Format, ...] = (
+    Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
+    Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros1"),
+    Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros2"),
+)
+"""In the order in which they are asked; the first that claims a file reads it."""
+
+
+def format_of(path: Path) -> Format:
+    """The format of a file or folder.
+
+    Raises:
+        DataError: it cannot be read, is empty, or no format claims it.
+    """
+    try:
+        if not path.exists():
+            raise DataError("no such file or folder", file=path, remedy="check the path")
+        head = b""
+        if path.is_file():
+            with path.open("rb") as file:
+                head = file.read(HEAD_BYTES)
+            if not head:
+                raise DataError("the file is empty", file=path, remedy="record or copy it again")
+        elif not path.is_dir():
+            raise DataError("is neither a file nor a folder", file=path, remedy="give a log")
+        found = next((form for form in FORMATS if form.claims(path, head)), None)
+    except OSError as error:
+        raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
+    if found is None:
+        kinds = ", ".join(form.words for form in FORMATS)
+        raise DataError(
+            f"unknown kind of {'folder' if path.is_dir() else 'file'} '{path.suffix or path.name}'",
+            file=path,
+            remedy=f"give {kinds}",
+        )
+    return found
