@@ -1,9 +1,10 @@
 """The catalogue of public recordings: what they are, whose, where, and how to read them.
 
 `catalog.yaml` describes the sets and their conventions; `catalog_files.csv` pins every file by
-repository, commit and SHA-256. Own sets are added by a folder with two such files, which
-`TERRAFUSION_CATALOG` names. The library carries no recording: `TERRAFUSION_DATA` names a folder
-that holds them, otherwise they are downloaded (`fetch`).
+repository, commit and SHA-256. Own files and sets are added by a folder with two such files, which
+`TERRAFUSION_CATALOG` names; its `repository` may be a URL, and without own sets it needs no YAML.
+The library carries no recording: `TERRAFUSION_DATA` names a folder that holds them, otherwise they
+are downloaded (`fetch`).
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ import fnmatch
 import functools
 import hashlib
 import os
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.config import read_yaml, structure
+from terrafusion.datasets.config import read_yaml, shown, structure
 from terrafusion.datasets.conventions import Conventions
 from terrafusion.datasets.errors import ConfigError, DataError
 
@@ -139,7 +141,8 @@ def _load(own: str) -> Catalog:
     sets: dict[str, DataSet] = {}
     files: list[CatalogFile] = []
     for folder in [HERE, *([Path(own)] if own else [])]:
-        sets |= _read_sets(folder / "catalog.yaml")
+        if folder == HERE or (folder / "catalog.yaml").exists():  # own files may be of a known set
+            sets |= _read_sets(folder / "catalog.yaml")
         files += _read_files(folder / "catalog_files.csv", set(sets))
     return Catalog(sets, tuple(files))
 
@@ -179,16 +182,32 @@ def _read_files(path: Path, sets: set[str]) -> list[CatalogFile]:
         raise ConfigError(
             "the columns are not those of a catalogue", file=path, remedy=f"give {', '.join(FILE_COLUMNS)}"
         )
-    files = []
-    for number, row in enumerate(rows[1:], 2):
-        good = len(row) == len(FILE_COLUMNS) and row[0] in sets and len(row[6]) == 64 and row[7].isdigit()
-        if not good:
-            raise ConfigError(
-                f"line {number} is not an entry", file=path, remedy=f"give {', '.join(FILE_COLUMNS)}"
-            )
-        of_set, recording, file, repository, commit, source, sha256, size = row
-        files.append(CatalogFile(of_set, recording, file, repository, commit, source, sha256, int(size)))
-    return files
+    return [_entry(path, number, row, sets) for number, row in enumerate(rows[1:], 2)]
+
+
+def _entry(path: Path, number: int, row: list[str], sets: set[str]) -> CatalogFile:
+    """A row as an entry; its file must stay inside the folder it is downloaded to."""
+    fields = dict(zip(FILE_COLUMNS, row, strict=False))
+    wrong = next((name for name in FILE_COLUMNS if name not in fields), "")
+    if not wrong:
+        file = Path(fields["file"])
+        good = {
+            "set": fields["set"] in sets,
+            "file": bool(fields["file"]) and not file.is_absolute() and ".." not in file.parts,
+            "repository": bool(re.fullmatch(r"(https?://\S+|[\w.-]+/[\w.-]+)", fields["repository"])),
+            "sha256": bool(re.fullmatch(r"[0-9a-f]{64}", fields["sha256"])),
+            "bytes": bool(re.fullmatch(r"[0-9]{1,15}", fields["bytes"])),
+        }
+        wrong = next((name for name, fits in good.items() if not fits), "")
+    if wrong:
+        said = f"'{shown(fields[wrong])}'" if wrong in fields else "missing"
+        raise ConfigError(
+            f"column '{wrong}' is {said} at line {number}",
+            file=path,
+            remedy="give a known set, a relative file, owner/name or a URL, and the file's SHA-256 and size",
+        )
+    of_set, recording, name, repository, commit, source, sha256, size = row
+    return CatalogFile(of_set, recording, name, repository, commit, source, sha256, int(size))
 
 
 def locate(name: str) -> Path | None:

@@ -11,7 +11,7 @@ import sys
 import typer
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.fusion.cli import convert, demo, inspect, policy, replay, simulate, terrain
+from terrafusion.fusion.cli import convert, demo, fetch, inspect, policy, replay, simulate, terrain
 
 app = typer.Typer(
     name="terrafusion",
@@ -22,6 +22,7 @@ app = typer.Typer(
 )
 app.command("demo")(demo.demo)
 app.command("inspect")(inspect.inspect)
+app.command("fetch")(fetch.fetch)
 app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("replay")(replay.replay)

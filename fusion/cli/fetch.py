@@ -1,0 +1,134 @@
+"""`terrafusion fetch [NAME...]`: the catalogue of public recordings, and downloads from it."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.catalog import Catalog, CatalogFile
+
+
+def fetch(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="[NAME]...", help="A set, or SET/RECORDING; none shows the catalogue."),
+    ] = None,
+    to: Annotated[
+        Path | None, typer.Option("--to", help="Folder for the files; the user's cache folder otherwise.")
+    ] = None,
+    offline: Annotated[bool, typer.Option("--offline", help="Use what is here, download nothing.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
+) -> None:
+    """Show the catalogue of public recordings, or download from it.
+
+    Every file is pinned by its SHA-256; one that is in TERRAFUSION_DATA or in the cache is not
+    downloaded again, and one that broke off is gone on with. The licences are those of the authors.
+
+    Examples:
+
+      terrafusion fetch
+
+      terrafusion fetch husky_parkinglot
+
+      terrafusion fetch borealtc/SNOW/00 wvu_pathfinder/s5t1 --to fieldlogs
+    """
+    import json
+
+    from terrafusion.datasets.catalog import load_catalog
+
+    catalog = load_catalog()
+    if not names:
+        rows = [_row(catalog, name) for name in catalog.sets]
+        if as_json:
+            print(json.dumps(rows, indent=2))
+        else:
+            _print_catalog(rows)
+        return
+    _download(catalog, names, to, offline, as_json)
+
+
+def _row(catalog: Catalog, name: str) -> dict[str, Any]:
+    from terrafusion.datasets.catalog import data_folders
+
+    known = catalog.sets[name]
+    files = [entry for entry in catalog.files if entry.set_name == name]
+    here = sum(any((folder / entry.file).is_file() for folder in data_folders()) for entry in files)
+    return {
+        "name": name,
+        "title": known.title,
+        "holds": known.holds,
+        "licence": known.licence,
+        "citation": known.citation,
+        "homepage": known.homepage,
+        "recordings": [entry for entry in dict.fromkeys(e.recording for e in files) if entry],
+        "files": len(files),
+        "bytes": sum(entry.bytes for entry in files),
+        "files_here": here,
+    }
+
+
+def _print_catalog(rows: list[dict[str, Any]]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+
+    console = Console(highlight=False)
+    for row in rows:
+        count = len(row["recordings"])
+        console.print(
+            f"[bold]{row['name']}[/bold]  {count} recording{'s' if count > 1 else ''}, "
+            f"{row['bytes'] / 1e6:.1f} MB, {row['licence']}, "
+            f"{row['files_here']} of {row['files']} files here"
+        )
+        for key in ("title", "holds", "citation", "homepage"):
+            console.print(f"    {escape(row[key])}", soft_wrap=True)
+        names = ", ".join(row["recordings"][:4]) + (f", ... ({count})" if count > 4 else "")
+        console.print(f"    {escape(names)}", style="dim", soft_wrap=True)
+
+
+def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool, as_json: bool) -> None:
+    import json
+
+    from terrafusion.datasets.fetch import entries_of, fetch
+
+    wanted = {entry.file: entry for name in names for entry in entries_of(catalog, name)}
+    done = []
+    with _bar(sum(entry.bytes for entry in wanted.values())) as advance:
+        for got in fetch(names, to, offline=offline, progress=advance):
+            done.append(got)
+            advance(got.entry, got.entry.bytes)
+            if not as_json:
+                print(f"{'fetched' if got.downloaded else 'here   '}  {got.path}")
+    sets = [catalog.sets[name] for name in dict.fromkeys(got.entry.set_name for got in done)]
+    if as_json:
+        files = [{"file": g.entry.file, "path": str(g.path), "downloaded": g.downloaded} for g in done]
+        print(json.dumps({"files": files, "licences": {s.name: s.licence for s in sets}}, indent=2))
+        return
+    for known in sets:
+        print(f"{known.name}: {known.licence}; please cite: {known.citation} ({known.homepage})")
+
+
+@contextmanager
+def _bar(total_bytes: int) -> Iterator[Callable[[CatalogFile, int], None]]:
+    """A progress bar over all bytes on a terminal; silent in a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda entry, done: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
+
+    bytes_of: dict[str, int] = {}
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=total_bytes)
+
+        def advance(entry: CatalogFile, done: int) -> None:
+            bytes_of[entry.file] = done
+            bar.update(task, completed=sum(bytes_of.values()), description=entry.file)
+
+        yield advance
