@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,7 +17,12 @@ if TYPE_CHECKING:
     from terrafusion.datasets.sensors import Rig
 
 LogArgument = Annotated[
-    Path, typer.Argument(metavar="LOG", help="Log folder, ROS 1 .bag, or ROS 2 bag (folder, .mcap, .db3).")
+    str,
+    typer.Argument(
+        metavar="LOG",
+        help="A log folder, a bag, another file that can be read, or a catalogue name such as "
+        "wvu_pathfinder/s5t1. LOG#3 is the fourth of several recordings in one file.",
+    ),
 ]
 VehicleOption = Annotated[
     str | None,
@@ -32,6 +38,16 @@ TopicOption = Annotated[
 ]
 StampsOption = Annotated[
     str, typer.Option("--stamps", help="Times of a bag: 'header' (measured) or 'receipt' (recorded).")
+]
+ColumnsOption = Annotated[
+    Path | None,
+    typer.Option("--columns", metavar="FILE", help="YAML that says what the columns of a plain table are."),
+]
+RepairClockOption = Annotated[
+    bool,
+    typer.Option(
+        "--repair-clock", help="Take steps of a clock out of the times instead of refusing the log."
+    ),
 ]
 
 
@@ -78,14 +94,20 @@ def rig_of(recording: Recording, rig: Rig | None) -> Rig | None:
         return None
 
 
-def open_log(log: Path, rig: Rig | None, topic: list[str] | None, stamps: str) -> Recording:
-    """The recording at `log`, with the options of the command line."""
-    from terrafusion.datasets.readers import open_recording
+def reading(
+    rig: Rig | None, topic: list[str] | None, stamps: str, columns: Path | None, repair_clock: bool
+) -> dict[str, Any]:
+    """The options of the command line as those of `open_recordings`."""
+    return {
+        "rig": rig,
+        "topics": parse_topics(topic),
+        "stamps": check_stamps(stamps),
+        "columns": columns,
+        "repair_clock": repair_clock,
+    }
 
-    return open_recording(log, rig=rig, topics=parse_topics(topic), stamps=check_stamps(stamps))
 
-
-def refuse_errors(log: Path, recording: Recording, rig: Rig | None) -> None:
+def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> None:
     """Refuse a log whose numbers would mislead: what the input doctor calls an error.
 
     Raises:
@@ -96,7 +118,7 @@ def refuse_errors(log: Path, recording: Recording, rig: Rig | None) -> None:
     _refuse(log, examine(recording, rig_of(recording, rig)))
 
 
-def refuse_impossible(log: Path, recording: Recording) -> None:
+def refuse_impossible(log: str, recording: Recording) -> None:
     """Refuse a log with numbers beyond anything possible.
 
     Raises:
@@ -107,16 +129,19 @@ def refuse_impossible(log: Path, recording: Recording) -> None:
     _refuse(log, list(check_magnitude(Patient(recording, None))))
 
 
-def _refuse(log: Path, findings: list[Finding]) -> None:
+def _refuse(log: str, findings: list[Finding]) -> None:
     from terrafusion.datasets.errors import DataError
 
     errors = [finding for finding in findings if finding.severity == "error"]
-    if errors:
-        first, more = errors[0], len(errors) - 1
-        told = f" (`terrafusion inspect` tells {more} more)" if more else ""
-        raise DataError(
-            f"{first.what} ({first.evidence})", file=log, channel=first.channel, remedy=first.fix + told
-        )
+    if not errors:
+        return
+    first, more = errors[0], len(errors) - 1
+    remedy = first.fix
+    if first.repair is not None:
+        remedy += f": `terrafusion convert {shlex.quote(log)} OUT --apply-fixes` does it"
+    if more:
+        remedy += f" (`terrafusion inspect` tells {more} more)"
+    raise DataError(f"{first.what} ({first.evidence})", file=log, channel=first.channel, remedy=remedy)
 
 
 @contextmanager

@@ -1,22 +1,29 @@
-"""`terrafusion convert LOG OUT`: any readable log -> log folder or MCAP."""
+"""`terrafusion convert LOG OUT`: any readable log -> log folder or MCAP, mended where that is asked for."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from terrafusion.fusion.cli.common import (
+    ColumnsOption,
     LogArgument,
+    RepairClockOption,
     StampsOption,
     TopicOption,
     VehicleOption,
     load_rig,
-    open_log,
+    reading,
     refuse_impossible,
     rig_of,
 )
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.doctor import Finding
+    from terrafusion.datasets.recording import Recording
+    from terrafusion.datasets.sensors import Rig
 
 
 def convert(
@@ -25,38 +32,70 @@ def convert(
     vehicle: VehicleOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
+    columns: ColumnsOption = None,
+    repair_clock: RepairClockOption = False,
+    apply_fixes: Annotated[
+        bool,
+        typer.Option("--apply-fixes", help="Make the repairs that `inspect` offers, and say each."),
+    ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an .mcap that exists.")] = False,
 ) -> None:
     """Convert a log to a log folder, or to a ROS 2 MCAP file when OUT ends in .mcap.
+
+    The numbers stay as they are, unless `--apply-fixes` asks for the input doctor's repairs: then each is
+    printed and kept as a note of the log, and so is what could not be mended.
 
     Examples:
 
       terrafusion convert drive.bag drive_folder --vehicle husky
 
       terrafusion convert drive_folder drive.mcap
+
+      terrafusion convert odd_log mended_log --apply-fixes
     """
     import dataclasses
 
-    from terrafusion.datasets.doctor import examine
-    from terrafusion.datasets.writers import write_log_folder, write_mcap
+    from terrafusion.datasets.doctor import examine, treat
+    from terrafusion.datasets.readers import open_recording
 
     rig = load_rig(vehicle)
-    recording = open_log(log, rig, topic, stamps)
+    recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock or apply_fixes))
     rig = rig_of(recording, rig)
     if vehicle is not None:
         recording = dataclasses.replace(recording, vehicle=vehicle)
     for note in recording.notes:
         print(f"note: {note}")
-    if out.suffix == ".mcap":
-        refuse_impossible(log, recording)  # their latitudes would be nonsense
-        for part in write_mcap(recording, out, rig=rig, overwrite=overwrite):
-            print(f"left out: {part}")
-    else:
-        write_log_folder(recording, out)
-    held = ", ".join(f"{name} {len(channel)}" for name, channel in recording.channels().items())
+    if apply_fixes:
+        recording, mended = treat(recording, rig)
+        for finding in mended:
+            print(f"mended: {_told(finding)}")
+    left_out = _write(log, recording, rig, out, overwrite)
+    for part in left_out:
+        print(f"left out: {part}")
     for finding in examine(recording, rig):
-        if finding.severity == "error":
-            print(
-                f"{finding.severity}: {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
-            )
+        if apply_fixes or finding.severity == "error":
+            print(f"{finding.severity}: {_told(finding)}{_why_left(finding, apply_fixes)}")
+    held = ", ".join(f"{name} {len(channel)}" for name, channel in recording.channels().items())
     print(f"{out}: {held}{f', truth {len(recording.truth)}' if recording.truth is not None else ''}")
+
+
+def _write(log: str, recording: Recording, rig: Rig | None, out: Path, overwrite: bool) -> list[str]:
+    """Write the log; what an MCAP has no message for is returned."""
+    from terrafusion.datasets.writers import write_log_folder, write_mcap
+
+    if out.suffix != ".mcap":
+        write_log_folder(recording, out)
+        return []
+    refuse_impossible(log, recording)  # their latitudes would be nonsense
+    return list(write_mcap(recording, out, rig=rig, overwrite=overwrite))
+
+
+def _told(finding: Finding) -> str:
+    return f"{finding.code}, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
+
+
+def _why_left(finding: Finding, apply_fixes: bool) -> str:
+    """Why a finding is left in a log that was written."""
+    if finding.repair is None:
+        return " [left: no repair can know the true numbers]" if apply_fixes else ""
+    return " [left: its repair did not mend it]" if apply_fixes else " [--apply-fixes does it]"

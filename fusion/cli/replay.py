@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.fusion.cli.common import (
+    ColumnsOption,
     LogArgument,
+    RepairClockOption,
     StampsOption,
     TopicOption,
     VehicleOption,
     load_rig,
-    open_log,
     progress_bar,
+    reading,
     refuse_errors,
 )
 
@@ -52,6 +54,8 @@ def replay(
     gnss_outage: OutageOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
+    columns: ColumnsOption = None,
+    repair_clock: RepairClockOption = False,
 ) -> None:
     """Estimate a recorded drive as it would have run live, and score it.
 
@@ -60,6 +64,7 @@ def replay(
 
     Example: terrafusion replay drive.bag --vehicle husky --gnss-outage 150:60 --out results
     """
+    from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config import MODES
     from terrafusion.fusion.metrics import parse_outage
     from terrafusion.fusion.replay import replay as run
@@ -69,9 +74,9 @@ def replay(
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
     outages = [parse_outage(text) for text in gnss_outage or []]
     rig = load_rig(vehicle)
-    recording = open_log(log, rig, topic, stamps)
+    recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
     refuse_errors(log, recording, rig)
-    with progress_bar(f"{mode} {log.name}") as progress:
+    with progress_bar(f"{mode} {recording.name}") as progress:
         result = run(
             recording,
             vehicle=vehicle,

@@ -1,0 +1,218 @@
+"""The page of `terrafusion inspect` as lines of text, none wider than 100 columns.
+
+Made of the data that `--json` prints, so that the two cannot differ. A line is a text with the
+style of its first word; styles show on a terminal only.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator
+from typing import Any
+
+WIDTH = 100
+INDENT = 10
+Line = tuple[str, str]
+
+
+def print_lines(lines: Iterable[Line]) -> None:
+    """Print, in colour where standard output is a terminal."""
+    from rich.console import Console
+    from rich.text import Text
+
+    console = Console(highlight=False, soft_wrap=True)
+    for style, line in lines:
+        text = Text(line)
+        if style:
+            text.stylize(style, 0, len(line.split(" ", 1)[0]))
+        console.print(text)
+
+
+def page_lines(page: dict[str, Any]) -> Iterator[Line]:
+    """The whole page."""
+    yield from _title(page)
+    yield from _channels(page["channels"])
+    yield from _measured(page["measured"])
+    for note in page["notes"]:
+        yield from _entry("note", "dim", _note(note, page["recordings"]))
+    yield from _findings(page)
+
+
+def _title(page: dict[str, Any]) -> Iterator[Line]:
+    duration = page["duration_s"]
+    about = []
+    if page["recordings"] == 1:
+        about += [f"{duration:.1f} s", _utc(page["start_ns"])]
+    else:
+        about += [
+            f"{page['recordings']} recordings of {_spread(duration, 'g')} s, {duration['total']:.0f} s in all"
+        ]
+    for key in ("vehicle", "terrain"):
+        found = page[key]
+        if isinstance(found, dict):
+            found = ", ".join(f"{word} {count}" for word, count in found.items())
+        about += [f"{key} {found}"] if found else []
+    yield from _wrapped(page["name"], "bold", f"  {'; '.join(about)}", 4)
+    given = [text for text in (page["licence"] and f"licence {page['licence']}", page["source"]) if text]
+    if given:
+        yield from _wrapped(" " * 3, "", f" {'; '.join(given)}", 4)
+
+
+def _channels(channels: dict[str, Any]) -> Iterator[Line]:
+    pooled = any("recordings" in c for c in channels.values())
+    heads = ["channel", "samples", "rate Hz", "in" if pooled else "span s", "gaps", "longest s"]
+    rows = [heads]
+    for name, c in channels.items():
+        rate, gap = c["rate_hz"], c["longest_gap_s"]
+        ticks = name != "terrain"  # labels come when they come
+        rows.append([
+            name,
+            str(c["samples"]),
+            "-" if not rate or not ticks else _spread(rate, ".4g") if pooled else f"{rate:.4g}",
+            f"{c['recordings']}" if pooled else f"{c['start_s']:.1f} to {c['end_s']:.1f}",
+            str(c["gaps"]) if ticks else "-",
+            f"{gap:.2g}" if c["gaps"] and ticks else "-",
+        ])  # fmt: skip
+    widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
+    yield "", ""
+    for number, row in enumerate(rows):
+        cells = [row[0].ljust(max(widths[0], INDENT - 2))]
+        cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
+        yield ("bold" if number == 0 else ""), "  ".join(cells).rstrip()
+    yield "", ""
+    for name, c in channels.items():
+        yield from _entry(name, "", _ranges(c))
+
+
+def _ranges(channel: dict[str, Any]) -> str:
+    if "ranges" not in channel:
+        path = "unknown" if channel["path_m"] is None else f"{channel['path_m']:.1f} m"
+        return f"{', '.join(channel['holds']) or 'nothing to score'} of {channel['frame']}, path {path}"
+    parts = []
+    for column, found in channel["ranges"].items():
+        if isinstance(found, dict):
+            parts.append(_glued(f"{column} {', '.join(f'{word} {count}' for word, count in found.items())}"))
+        else:
+            low, high = (format(value, ".3g") for value in found)
+            parts.append(_glued(f"{column} {low}" if low == high else f"{column} {low} to {high}"))
+    return "; ".join(parts)
+
+
+def _measured(measured: dict[str, Any]) -> Iterator[Line]:
+    lines = [*_inertial(measured), *_scales(measured), *_times(measured)]
+    if lines:
+        yield "", ""
+    for name, text in lines:
+        yield from _entry(name, "", text)
+
+
+def _inertial(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    gravity, yaw = measured["gravity"], measured["yaw"]
+    if gravity:
+        vector = ", ".join(f"{value:.2f}" for value in gravity["mean_mps2"])
+        yield (
+            "gravity",
+            (
+                f"({vector}) m/s2, size {gravity['size_mps2']:.2f}: along {gravity['axis']}, "
+                f"{gravity['tilt_deg']:.1f} deg off"
+            ),
+        )
+    if yaw:
+        track = yaw["effective_track_m"]
+        width = f", effective track {track:.2f} m" if track else ""
+        yield "yaw", f"gyro z against wheels: r {yaw['r']:.3f}{width} ({yaw['seconds']:.0f} s in common)"
+
+
+def _scales(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for name, ratio in measured["speed_ratio"].items():
+        yield (
+            "speed",
+            (
+                f"{name} over wheels {ratio['median']:.3f} ({ratio['low']:.3f} to {ratio['high']:.3f}; "
+                f"{ratio['stretches']} straight stretches)"
+            ),
+        )
+    if measured["path_m"]:
+        yield "path", ", ".join(f"{name} {length:.1f} m" for name, length in measured["path_m"].items())
+    sigma = measured["sigma_m"]
+    if sigma:
+        yield (
+            "sigma",
+            (
+                f"of the fixes, horizontal, {sigma['min']:.3g} to {sigma['max']:.3g} m, "
+                f"median {sigma['median']:.3g} m"
+            ),
+        )
+
+
+def _times(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    for lag in measured["lags"]:
+        yield (
+            "lag",
+            (
+                f"{lag['later']} after {lag['earlier']} by {lag['seconds']:.3f} s ({lag['low_s']:.3f} to "
+                f"{lag['high_s']:.3f}), by the {lag['quantity']}, r {lag['r']:.2f}"
+            ),
+        )
+    for name, updates in measured["held"].items():
+        yield (
+            "held",
+            (f"{name}: {updates['update_hz']:.3g} new values in {updates['rate_hz']:.3g} rows a second"),
+        )
+
+
+def _note(note: str | dict[str, Any], recordings: int) -> str:
+    if isinstance(note, str):
+        return note
+    count = note["recordings"]
+    return note["note"] if recordings == count else f"{note['note']} ({count} of {recordings})"
+
+
+def _findings(page: dict[str, Any]) -> Iterator[Line]:
+    yield "", ""
+    if not page["findings"]:
+        yield "green", "no findings"
+    for f in page["findings"]:
+        style = "red" if f["severity"] == "error" else "yellow"
+        yield from _entry(f["severity"], style, f"{f['channel']}: {f['what']} [{f['code']}]")
+        if "recordings" in f:
+            yield from _entry("", "", f"in {f['recordings']} of {page['recordings']}, first in #{f['first']}")
+        yield from _entry("", "", f["evidence"])
+        hand = "by `convert --apply-fixes`" if f["repairable"] else "by hand"
+        yield from _entry("", "", f"{f['fix']} ({_glued(hand)})")
+
+
+def _entry(name: str, style: str, text: str) -> Iterator[Line]:
+    yield from _wrapped(name.ljust(INDENT - 1), style, f" {text}", INDENT)
+
+
+def _wrapped(head: str, style: str, text: str, indent: int) -> Iterator[Line]:
+    """`head` and `text` on as many lines as needed; what is glued stays on one line."""
+    lines = textwrap.wrap(
+        head.replace(" ", GLUE) + text,
+        WIDTH,
+        subsequent_indent=" " * indent,
+        break_on_hyphens=False,
+    )
+    for number, line in enumerate(lines):
+        yield (style if number == 0 else ""), line.replace(GLUE, " ")
+
+
+GLUE = "\N{NO-BREAK SPACE}"
+
+
+def _glued(text: str) -> str:
+    return text.replace(" ", GLUE)
+
+
+def _spread(values: dict[str, float], form: str) -> str:
+    low, middle, high = (format(values[key], form) for key in ("min", "median", "max"))
+    return middle if low == high else f"{middle} ({low} to {high})"
+
+
+def _utc(start_ns: int) -> str:
+    from datetime import UTC, datetime
+
+    if start_ns < 10**18:
+        return f"start {start_ns / 1e9:.3f} s (no calendar time)"
+    return f"start {datetime.fromtimestamp(start_ns / 1e9, UTC):%Y-%m-%d %H:%M:%S} UTC"
