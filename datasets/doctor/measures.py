@@ -339,12 +339,12 @@ def _ruler_path_m(position_m: Array, ruler_m: float) -> float:
     points = position_m[np.isfinite(position_m[:, :2]).all(axis=1), :2].tolist()
     if not points:
         return 0.0
-    (x, y), length = points[0], 0.0
+    (x, y), length, step = points[0], 0.0, 0.0
     for east, north in points[1:]:
         step = float(np.hypot(east - x, north - y))
         if step > ruler_m:
-            x, y, length = east, north, length + step
-    return length
+            x, y, length, step = east, north, length + step, 0.0
+    return length + step
 
 
 def _sigma(patients: Sequence[Patient]) -> Sigma | None:

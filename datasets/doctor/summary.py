@@ -121,7 +121,7 @@ def _pooled(each: Sequence[dict[str, dict[str, Any]]]) -> dict[str, dict[str, An
         if name == "truth":
             paths = [part["path_m"] for part in parts]
             pooled[name] |= {
-                "holds": sorted({word for part in parts for word in part["holds"]}),
+                "holds": list(dict.fromkeys(word for part in parts for word in part["holds"])),
                 "frame": _common(part["frame"] for part in parts),
                 "path_m": None if None in paths else float(sum(paths)),
             }

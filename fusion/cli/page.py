@@ -60,7 +60,7 @@ def _title(page: dict[str, Any]) -> Iterator[Line]:
 
 def _channels(channels: dict[str, Any]) -> Iterator[Line]:
     pooled = any("recordings" in c for c in channels.values())
-    heads = ["channel", "samples", "rate Hz", "in" if pooled else "span s", "gaps", "longest s"]
+    heads = ["channel", "samples", "rate Hz", "recordings" if pooled else "span s", "gaps", "longest s"]
     rows = [heads]
     for name, c in channels.items():
         rate, gap = c["rate_hz"], c["longest_gap_s"]
@@ -178,8 +178,8 @@ def _findings(page: dict[str, Any]) -> Iterator[Line]:
         if "recordings" in f:
             yield from _entry("", "", f"in {f['recordings']} of {page['recordings']}, first in #{f['first']}")
         yield from _entry("", "", f["evidence"])
-        hand = "by `convert --apply-fixes`" if f["repairable"] else "by hand"
-        yield from _entry("", "", f"{f['fix']} ({_glued(hand)})")
+        hand = "convert --apply-fixes" if f["repairable"] else "by hand"
+        yield from _entry("", "", f"{_glued(hand)}: {f['fix']}")
 
 
 def _entry(name: str, style: str, text: str) -> Iterator[Line]:
