@@ -69,6 +69,8 @@ FORMATS: tuple[Format, ...] = (
     Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
     Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros1"),
     Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros2"),
+    Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.umich_text"),
+    Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.borealtc_csv"),
 )
 """In the order in which they are asked; the first that claims a file reads it."""
 
