@@ -201,7 +201,7 @@ class Gnss(Channel):
             "sigma_e_m": self.sigma_enu_m[:, 0],
             "sigma_n_m": self.sigma_enu_m[:, 1],
         }
-        if not np.isnan(self.enu_m[:, 2]).all():
+        if not (np.isnan(self.enu_m[:, 2]).all() and np.isnan(self.sigma_enu_m[:, 2]).all()):
             table |= {"up_m": self.enu_m[:, 2], "sigma_u_m": self.sigma_enu_m[:, 2]}
         if self.velocity_enu_mps is not None:
             table |= {f"v_{axis}_mps": self.velocity_enu_mps[:, i] for i, axis in enumerate("enu")}
@@ -323,3 +323,28 @@ class Recording:
     def with_notes(self, *notes: str) -> Recording:
         """The same recording with further notes."""
         return dataclasses.replace(self, notes=(*self.notes, *notes))
+
+
+def differences(a: Any, b: Any, where: str = "") -> list[str]:
+    """Names of the fields in which two recordings (or parts of them) differ, [] when they are equal.
+
+    Arrays are compared to the bit, except that any NaN equals any other.
+    """
+    if dataclasses.is_dataclass(a) and type(a) is type(b):
+        names = [spec.name for spec in dataclasses.fields(a)]
+        return [
+            found
+            for name in names
+            for found in differences(getattr(a, name), getattr(b, name), f"{where}.{name}".lstrip("."))
+        ]
+    return [] if _equal(a, b) else [where]
+
+
+def _equal(a: Any, b: Any) -> bool:
+    if not (isinstance(a, np.ndarray) and isinstance(b, np.ndarray)):
+        return type(a) is type(b) and bool(a == b)
+    if a.shape != b.shape:
+        return False
+    if a.dtype.kind != "f":
+        return bool(a.tolist() == b.tolist())
+    return bool(((np.isnan(a) & np.isnan(b)) | ((a == b) & (np.signbit(a) == np.signbit(b)))).all())

@@ -1,4 +1,4 @@
-"""`meta.yaml` of a log folder, strictly."""
+"""`meta.yaml` of a log folder, strictly; a bag written by this library carries the same keys."""
 
 from __future__ import annotations
 
@@ -9,9 +9,18 @@ from typing import Any
 
 from terrafusion.datasets.config import Quantity, checked_number, read_yaml, shown
 from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import Overrides
+from terrafusion.datasets.recording import ClockJump, Overrides
 
-TEXT_KEYS = ("vehicle", "terrain", "description", "licence", "source", "terrain_source")
+TEXT_KEYS = (
+    "name",
+    "vehicle",
+    "terrain",
+    "description",
+    "licence",
+    "source",
+    "terrain_source",
+    "imu_frame_id",
+)
 NUMBER_KEYS = {
     "wheel_radius_m": Quantity("m", 0.01, 2.0),
     "track_m": Quantity("m", 0.05, 10.0),
@@ -25,14 +34,19 @@ DATUM = (
 )
 TRUTH_CHANNELS = ("position", "yaw", "orientation", "velocity")
 TRUTH_FRAMES = ("base", "antenna")
-KEYS = ("start_ns", *TEXT_KEYS, *NUMBER_KEYS, "datum", "truth_channels", "truth_frame")
+HISTORY_KEYS = ("notes", "clock_jumps", "keep_empty")
+KEYS = ("start_ns", *TEXT_KEYS, *NUMBER_KEYS, "datum", "truth_channels", "truth_frame", *HISTORY_KEYS)
 MAX_START_NS = 8 * 10**18
 """Leaves room for any t_s in int64."""
 
 
 @dataclass(frozen=True)
 class Meta:
-    """What `meta.yaml` says; `truth_channels` is None where the file does not tell."""
+    """What `meta.yaml` says.
+
+    `truth_channels` is None where the file does not tell, `notes` are those of the log, `remarks`
+    what was odd about the file; with `keep_empty` rows and tables without a value are kept.
+    """
 
     start_ns: int
     texts: dict[str, str] = field(default_factory=dict)
@@ -41,6 +55,9 @@ class Meta:
     truth_channels: tuple[str, ...] | None = None
     truth_frame: str = "base"
     notes: tuple[str, ...] = ()
+    clock_jumps: tuple[ClockJump, ...] = ()
+    keep_empty: bool = False
+    remarks: tuple[str, ...] = ()
 
 
 def read_meta(path: Path) -> Meta:
@@ -49,7 +66,12 @@ def read_meta(path: Path) -> Meta:
     Raises:
         ConfigError: not YAML, unknown key, wrong type, value out of range; names key and remedy.
     """
-    raw = {key: value for key, value in read_yaml(path).items() if value is not None}
+    return parse_meta(read_yaml(path), path)
+
+
+def parse_meta(content: dict[str, Any], path: Path) -> Meta:
+    """Check the keys and values of `meta.yaml`; errors as in `read_meta`, about the file `path`."""
+    raw = {key: value for key, value in content.items() if value is not None}
     for key in raw:
         if key not in KEYS:
             raise _unknown_key(path, key)
@@ -58,7 +80,7 @@ def read_meta(path: Path) -> Meta:
         for key, quantity in NUMBER_KEYS.items()
         if key in raw
     }
-    channels, notes = _truth_channels(path, raw)
+    channels, remarks = _truth_channels(path, raw)
     return Meta(
         start_ns=_start_ns(path, raw),
         texts={key: _text(path, key, raw[key]) for key in TEXT_KEYS if key in raw},
@@ -66,7 +88,10 @@ def read_meta(path: Path) -> Meta:
         datum=_datum(path, raw["datum"]) if "datum" in raw else None,
         truth_channels=channels,
         truth_frame=_truth_frame(path, raw.get("truth_frame", "base")),
-        notes=notes,
+        notes=tuple(_texts(path, raw, "notes")),
+        clock_jumps=_clock_jumps(path, raw.get("clock_jumps", [])),
+        keep_empty=_flag(path, raw, "keep_empty"),
+        remarks=remarks,
     )
 
 
@@ -112,17 +137,45 @@ def _datum(path: Path, value: Any) -> tuple[float, float, float]:
 def _truth_channels(path: Path, raw: dict[str, Any]) -> tuple[tuple[str, ...] | None, tuple[str, ...]]:
     if "truth_channels" not in raw:
         return None, ()
-    value = raw["truth_channels"]
-    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
-        raise ConfigError(
-            f"'truth_channels' is '{shown(value)}'",
-            file=path,
-            remedy=f"give a list from {', '.join(TRUTH_CHANNELS)}",
-        )
+    value = _texts(path, raw, "truth_channels", f"give a list from {', '.join(TRUTH_CHANNELS)}")
     strange = [name for name in value if name not in TRUTH_CHANNELS]
     named = ", ".join(shown(name) for name in strange)
-    notes = (f"meta.yaml: truth channels {named} are not used; known are {', '.join(TRUTH_CHANNELS)}",)
-    return tuple(value), notes if strange else ()
+    remarks = (f"meta.yaml: truth channels {named} are not used; known are {', '.join(TRUTH_CHANNELS)}",)
+    return tuple(value), remarks if strange else ()
+
+
+def _texts(path: Path, raw: dict[str, Any], key: str, remedy: str = "give a list of texts") -> list[str]:
+    value = raw.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(text, str) for text in value):
+        raise ConfigError(f"'{key}' is '{shown(value)}'", file=path, remedy=remedy)
+    return value
+
+
+def _flag(path: Path, raw: dict[str, Any], key: str) -> bool:
+    value = raw.get(key, False)
+    if not isinstance(value, bool):
+        raise ConfigError(f"'{key}' is '{shown(value)}'", file=path, remedy="give true or false")
+    return value
+
+
+def _clock_jumps(path: Path, value: Any) -> tuple[ClockJump, ...]:
+    entries = value if isinstance(value, list) else [value]
+    for entry in entries:
+        if not (
+            isinstance(entry, dict)
+            and entry.keys() == {"channel", "t_ns", "step_s"}
+            and isinstance(entry["channel"], str)
+            and type(entry["t_ns"]) is int
+            and abs(entry["t_ns"]) < 2**63
+            and type(entry["step_s"]) in (int, float)
+            and abs(entry["step_s"]) < 1e10
+        ):
+            raise ConfigError(
+                f"'clock_jumps' has the entry '{shown(entry)}'",
+                file=path,
+                remedy="give entries of channel, t_ns (whole nanoseconds) and step_s (seconds)",
+            )
+    return tuple(ClockJump(e["channel"], e["t_ns"], float(e["step_s"])) for e in entries)
 
 
 def _truth_frame(path: Path, value: Any) -> str:

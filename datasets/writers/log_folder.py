@@ -1,41 +1,67 @@
-"""Write a recording as a log folder; reading it back gives the same numbers to the bit."""
+"""Write a recording as a log folder; reading it back gives the same recording to the bit."""
 
 from __future__ import annotations
 
-import csv
+import os
+import tempfile
+from collections.abc import Sequence
+from io import StringIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.config import MAX_BYTES
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers.log_folder import CHANNELS, META, QUATERNION, TRUTH_TWIST, WHEEL_LAYOUTS
+from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
+from terrafusion.datasets.readers.csv_table import MAX_T_S
+from terrafusion.datasets.readers.log_folder import CHANNELS, META
 from terrafusion.datasets.recording import Recording, Wheels
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of
+
+BLOCK_ROWS = 100_000
+"""Rows that are turned into text at a time, which bounds the memory."""
 
 
 def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     """Write `meta.yaml` and one CSV a channel into `folder`, which is made where needed.
 
-    Values keep all their bits, times their nanoseconds; NaN becomes an empty cell. What the
-    format has no column for is not kept: the reader's notes, and of the truth its covariance
-    and the twist beyond u, v, r. A log folder that is already there is replaced.
+    Values keep all their bits, times their nanoseconds; NaN becomes an empty cell. A log folder
+    that is already there is replaced. The log is written beside its place and moved there when it
+    is whole: a writer that fails or is stopped leaves no folder that could be taken for a log.
 
     Raises:
-        DataError: `folder` is a file, or holds other things than a log; or the wheels have a
-            layout the format does not know.
+        DataError: `folder` is a file, or holds other things than a log; or the recording holds what
+            the format has no place for: wheels of another layout, an infinite value, a time more
+            than 1e9 s from its start. ConfigError: a text, position or datum out of its range.
     """
     folder = Path(folder)
+    tables = tables_of(recording)
     _check_wheels(recording.wheels, folder)
-    _make_room(folder)
+    for name, table in tables.items():
+        _check_table(table, recording.start_ns, folder, name)
+    meta = meta_of(recording, folder / META, folder.resolve().name)
+    if not all(table.is_full() for table in tables.values()):
+        meta["keep_empty"] = True
+    text = _meta_text(meta, folder)
+    _check_room(folder)
     try:
-        for name, channel in recording.channels().items():
-            _write_table(folder / f"{name}.csv", channel.t_ns - recording.start_ns, channel.columns())
-        if recording.truth is not None and len(recording.truth):
-            truth = recording.truth
-            _write_table(folder / "truth.csv", truth.t_ns - recording.start_ns, _truth_columns(truth))
-        _write_meta(recording, folder / META)
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        beside = folder if folder.is_dir() else folder.parent
+        with tempfile.TemporaryDirectory(dir=beside, prefix=".log-") as scratch:
+            whole = Path(scratch) / folder.name
+            whole.mkdir()
+            for name, table in tables.items():
+                _write_table(whole / f"{name}.csv", recording.start_ns, table)
+            (whole / META).write_text(text, encoding="utf-8", newline="\n")
+            _put_in_place(whole, folder)
+    except UnicodeEncodeError as error:
+        raise DataError(
+            f"a text holds {error.object[error.start : error.end]!r}, which is no character",
+            file=folder,
+            remedy="take it out of the texts of the recording",
+        ) from None
     except OSError as error:
         raise _unwritable(folder, error) from None
     return folder
@@ -49,91 +75,114 @@ def _unwritable(folder: Path, error: OSError) -> DataError:
     )
 
 
-def _make_room(folder: Path) -> None:
-    """Make the folder, and take an older log out of it so that no stale channel stays."""
-    if folder.exists() and not folder.is_dir():
-        raise DataError("is a file", file=folder, remedy="give a folder to write the log into")
+def _check_room(folder: Path) -> None:
+    """Refuse a place that holds something other than a log."""
     try:
+        if folder.exists() and not folder.is_dir():
+            raise DataError("is a file", file=folder, remedy="give a folder to write the log into")
         if folder.is_dir() and any(folder.iterdir()) and not (folder / META).is_file():
             raise DataError(
                 "the folder is not empty and holds no log", file=folder, remedy="give an empty or new folder"
             )
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in CHANNELS:
-            (folder / f"{name}.csv").unlink(missing_ok=True)
-            (folder / f"{name}.csv.gz").unlink(missing_ok=True)
     except OSError as error:
         raise _unwritable(folder, error) from None
 
 
+def _put_in_place(whole: Path, folder: Path) -> None:
+    """Move a written log to its place. `meta.yaml` goes first and comes last: without it nothing is a log."""
+    if not folder.exists():
+        whole.rename(folder)
+        return
+    (folder / META).unlink(missing_ok=True)
+    for name in CHANNELS:
+        (folder / f"{name}.csv").unlink(missing_ok=True)
+        (folder / f"{name}.csv.gz").unlink(missing_ok=True)
+    for path in sorted(whole.iterdir(), key=lambda path: path.name == META):
+        os.replace(path, folder / path.name)
+
+
 def _check_wheels(wheels: Wheels | None, folder: Path) -> None:
-    if wheels is not None and (wheels.names, wheels.unit) not in WHEEL_LAYOUTS:
+    if wheels is None:
+        return
+    known = (wheels.names, wheels.unit) in WHEEL_LAYOUTS
+    if not known or (wheels.angle_rad is not None and wheels.names == ("speed",)):
+        what = "wheels" if not known else "an angle of wheels"
         raise DataError(
-            f"the format has no columns for wheels {', '.join(wheels.names)} in {wheels.unit}",
+            f"the format has no columns for {what} {', '.join(wheels.names)} in {wheels.unit}",
             file=folder,
             channel="wheels",
             remedy="give left and right, or four wheels in rad/s",
         )
 
 
-def _truth_columns(truth: Trajectory) -> dict[str, NDArray[Any]]:
-    columns: dict[str, NDArray[Any]] = {"x_m": truth.position_m[:, 0], "y_m": truth.position_m[:, 1]}
-    if not np.isnan(truth.position_m[:, 2]).all():
-        columns["z_m"] = truth.position_m[:, 2]
-    if truth.quaternion is not None:
-        columns |= {name: truth.quaternion[:, k] for k, name in enumerate(QUATERNION)}
-    if truth.twist_body is not None:
-        columns |= {name: truth.twist_body[:, k] for name, k in TRUTH_TWIST.items()}
-    return columns
+def _check_table(table: Columns, start_ns: int, folder: Path, channel: str) -> None:
+    """Refuse what the reader would refuse."""
+    for name, column in table.columns.items():
+        if column.dtype.kind == "f":
+            what = f"{name} holds infinite values" if np.isinf(column).any() else ""
+        else:
+            zero = any("\0" in str(text) for text in set(column.tolist()))
+            what = f"a {name} holds a zero byte" if zero else ""
+        if what:
+            raise DataError(what, file=folder, channel=channel, remedy="mark what is unknown by NaN or ''")
+        if not name.isprintable() or name != name.strip() or name == "p_":
+            raise DataError(f"'{name}' cannot be a column", file=folder, channel=channel, remedy="rename it")
+    ends = [int(table.t_ns[0]), int(table.t_ns[-1])] if len(table.t_ns) else []
+    far = [t for t in ends if abs(t - int(start_ns)) > int(MAX_T_S) * 10**9]
+    if far:
+        raise DataError(
+            f"time {far[0]} ns is {abs(far[0] - int(start_ns)) / 1e9:.3g} s from start_ns",
+            file=folder,
+            channel=channel,
+            remedy=f"times must stay within {MAX_T_S:g} s of start_ns",
+        )
 
 
-def _write_table(path: Path, since_start_ns: NDArray[np.int64], columns: dict[str, NDArray[Any]]) -> None:
-    cells = [[seconds_text(t) for t in since_start_ns.tolist()]]
-    cells += [_cells(column) for column in columns.values()]
+def _write_table(path: Path, start_ns: int, table: Columns) -> None:
     with path.open("w", encoding="utf-8", newline="") as out:
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(["t_s", *columns])
-        writer.writerows(zip(*cells, strict=True))
+        out.write(",".join(["t_s", *_quoted(list(table.columns))]) + "\n")
+        for first in range(0, len(table.t_ns), BLOCK_ROWS):
+            rows = slice(first, first + BLOCK_ROWS)
+            since_start = table.t_ns[rows] - np.int64(start_ns)
+            cells = [_seconds(since_start), *(_cells(c[rows]) for c in table.columns.values())]
+            out.write("\n".join(map(",".join, zip(*cells, strict=True))) + "\n")
 
 
 def _cells(column: NDArray[Any]) -> list[str]:
     """Shortest decimals that read back to the same double; empty for NaN."""
-    if column.dtype == object or column.dtype.kind in "US":
-        return [str(value) for value in column.tolist()]
-    return ["" if value != value else repr(value) for value in column.astype(float).tolist()]
+    if column.dtype.kind != "f":
+        return _quoted([str(value) for value in column.tolist()])
+    return repr(column.astype(float).tolist())[1:-1].replace("nan", "").split(", ")
 
 
-def seconds_text(t_ns: int) -> str:
+def _quoted(texts: Sequence[str]) -> list[str]:
+    return [f'"{text.replace(chr(34), chr(34) * 2)}"' if _special(text) else text for text in texts]
+
+
+def _special(text: str) -> bool:
+    return any(mark in text for mark in ',"\r\n')
+
+
+def _seconds(t_ns: NDArray[np.int64]) -> list[str]:
     """Nanoseconds as decimal seconds with 9 decimals, exactly."""
-    sign = "-" if t_ns < 0 else ""
-    whole, rest = divmod(abs(t_ns), 10**9)
-    return f"{sign}{whole}.{rest:09d}"
+    whole, rest = np.divmod(np.abs(t_ns), 10**9)
+    signs = np.where(t_ns < 0, "-", "").tolist()
+    rows = zip(signs, whole.tolist(), rest.tolist(), strict=True)
+    return [f"{sign}{seconds}.{nanos:09d}" for sign, seconds, nanos in rows]
 
 
-def _write_meta(recording: Recording, path: Path) -> None:
+def _meta_text(meta: dict[str, Any], folder: Path) -> str:
     from ruamel.yaml import YAML
 
-    overrides = recording.overrides
-    meta: dict[str, Any] = {
-        "start_ns": int(recording.start_ns),
-        "vehicle": recording.vehicle,
-        "terrain": recording.terrain_name,
-        "description": recording.description,
-        "licence": recording.licence,
-        "source": recording.source,
-        "wheel_radius_m": overrides.wheel_radius_m,
-        "track_m": overrides.track_m,
-        "antenna_m": overrides.antenna_m and [float(x) for x in overrides.antenna_m],
-        "imu_m": overrides.imu_m and [float(x) for x in overrides.imu_m],
-        "datum": recording.datum and [float(x) for x in recording.datum],
-        "truth_channels": list(recording.truth_channels) or None if recording.truth is not None else None,
-    }
-    if recording.truth is not None and recording.truth_frame != "base":
-        meta["truth_frame"] = recording.truth_frame
-    if recording.terrain is not None and recording.terrain.source != "annotation":
-        meta["terrain_source"] = recording.terrain.source
     yaml = YAML(typ="safe", pure=True)
     yaml.default_flow_style = None
     yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-    with path.open("w", encoding="utf-8") as out:
-        yaml.dump({key: value for key, value in meta.items() if value not in (None, "")}, out)
+    out = StringIO()
+    yaml.dump(meta, out)
+    if len(out.getvalue()) * 4 > MAX_BYTES and len(out.getvalue().encode(errors="replace")) > MAX_BYTES:
+        raise DataError(
+            f"its texts take more than {MAX_BYTES // 1024} KiB",
+            file=folder / META,
+            remedy="shorten the notes",
+        )
+    return out.getvalue()

@@ -1,0 +1,274 @@
+"""Tables of the log folder's columns -> channels of a recording.
+
+The tables come from the CSVs of a log folder, or from a bag that this library wrote.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.csv_table import Table
+from terrafusion.datasets.readers.log_meta import Meta
+from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Motor, Terrain, Wheels
+from terrafusion.datasets.trajectory import Trajectory
+
+Layouts = tuple[tuple[tuple[str, ...], str], ...]
+
+WHEEL_LAYOUTS: Layouts = (
+    (("left", "right"), "radps"),
+    (("front_left", "front_right", "rear_left", "rear_right"), "radps"),
+    (("left", "right"), "mps"),
+    (("speed",), "mps"),
+)
+"""Layouts of wheels.csv: names and unit; the column is name_unit. name_rad may hold the angle."""
+
+GYRO = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps")
+ACCEL = ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
+GNSS_POSITION = ("east_m", "north_m", "sigma_e_m", "sigma_n_m")
+GNSS_HEIGHT = ("up_m", "sigma_u_m")
+GNSS_VELOCITY = ("v_e_mps", "v_n_mps", "v_u_mps")
+QUATERNION = ("qx", "qy", "qz", "qw")
+TRUTH_TWIST = {"u_mps": 0, "v_mps": 1, "w_mps": 2, "p_radps": 3, "q_radps": 4, "r_radps": 5}
+"""Columns of truth.csv and where they stand in `Trajectory.twist_body`."""
+
+_POSE = ("x", "y", "z", "rx", "ry", "rz")
+COVARIANCE = {f"cov_{a}_{b}": (i, j) for i, a in enumerate(_POSE) for j, b in enumerate(_POSE)}
+"""Columns of truth.csv and where they stand in `Trajectory.covariance`; below the diagonal optional."""
+
+
+class TableSource(Protocol):
+    """Where the tables come from."""
+
+    def table(
+        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
+    ) -> Table | None:
+        """The table of a channel, None where there is none; columns as in `read_table`."""
+
+    def place(self, channel: str) -> Path:
+        """The file the channel is in, for messages."""
+
+
+class ChannelReader:
+    """Makes channels of tables; `notes` gathers what is to be noted."""
+
+    def __init__(self, source: TableSource, meta: Meta, layouts: Layouts = WHEEL_LAYOUTS) -> None:
+        self.source = source
+        self.meta = meta
+        self.layouts = layouts
+        self.notes: list[str] = list(meta.remarks)
+
+    def command(self) -> Command | None:
+        names = ("v_mps", "yaw_rate_radps")
+        table = self._table("command", names, required=names)
+        if table is None:
+            return None
+        return Command(self._t(table), table.numbers["v_mps"], table.numbers["yaw_rate_radps"])
+
+    def wheels(self) -> Wheels | None:
+        known = dict.fromkeys(f"{n}_{unit}" for names, unit in self.layouts for n in names)
+        turning = [names for names, unit in self.layouts if (names, unit) != (("speed",), "mps")]
+        angles = dict.fromkeys(f"{n}_rad" for names in turning for n in names)
+        table = self._table("wheels", [*known, *angles])
+        if table is None:
+            return None
+        names, unit = self._wheel_layout(table)
+        columns = [f"{n}_rad" for n in names]
+        present = [c for c in columns if c in table.numbers]
+        if present and len(present) < len(columns):
+            lacking = next(c for c in columns if c not in present)
+            raise self._error("wheels", f"column '{lacking}' is missing beside '{present[0]}'", "add it")
+        speed = table.stack([f"{n}_{unit}" for n in names])
+        return Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
+
+    def _wheel_layout(self, table: Table) -> tuple[tuple[str, ...], str]:
+        speeds = [c for c in table.numbers if not c.endswith("_rad")]
+        for names, unit in self.layouts:
+            if sorted(speeds) == sorted(f"{n}_{unit}" for n in names):
+                angles = {c for c in table.numbers if c.endswith("_rad")}
+                stray = angles - {f"{n}_rad" for n in names}
+                if stray:
+                    raise self._error(
+                        "wheels",
+                        f"column '{min(stray)}' has no speed beside it",
+                        "remove it or add the speed",
+                    )
+                return names, unit
+        layouts = " | ".join(", ".join(f"{n}_{unit}" for n in names) for names, unit in self.layouts)
+        raise self._error(
+            "wheels", f"columns {', '.join(speeds) or '(none)'} are not a layout", f"give one of: {layouts}"
+        )
+
+    def imu(self) -> Imu | None:
+        table = self._table("imu", [*GYRO, *ACCEL])
+        if table is None:
+            return None
+        if not table.numbers:
+            raise self._error("imu", "no column beside t_s", f"give any of {', '.join([*GYRO, *ACCEL])}")
+        return Imu(self._t(table), table.stack(GYRO), table.stack(ACCEL))
+
+    def gnss(self) -> Gnss | None:
+        numeric = [*GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps"]
+        table = self._table("gnss", numeric, required=GNSS_POSITION, texts=("fix",))
+        if table is None:
+            return None
+        has = table.numbers.__contains__
+        if has("up_m") != has("sigma_u_m"):
+            raise self._error("gnss", "up_m and sigma_u_m must come together", "add the missing one")
+        if has("v_e_mps") != has("v_n_mps") or (has("v_u_mps") and not has("v_e_mps")):
+            raise self._error(
+                "gnss", "the velocity is incomplete", "give v_e_mps and v_n_mps, or no velocity column"
+            )
+        return Gnss(
+            self._t(table),
+            table.stack(("east_m", "north_m", "up_m")),
+            table.stack(("sigma_e_m", "sigma_n_m", "sigma_u_m")),
+            self._fix(table),
+            table.stack(GNSS_VELOCITY) if has("v_e_mps") else None,
+            table.numbers.get("sigma_v_mps"),
+        )
+
+    def _fix(self, table: Table) -> NDArray[np.uint8]:
+        if "fix" not in table.texts:
+            self.notes.append("gnss: the log has no fix class; all fixes are taken as 'single'")
+            return np.full(len(table.t_ns), Fix.SINGLE, dtype=np.uint8)
+        codes = {fix.name.lower(): fix for fix in Fix} | {"": Fix.SINGLE}
+        words, inverse = np.unique(table.texts["fix"].astype(str), return_inverse=True)
+        for k, word in enumerate(words):
+            if word not in codes:
+                i = int(np.flatnonzero(inverse == k)[0])
+                raise self._error(
+                    "gnss",
+                    f"column 'fix' is '{word}' at data row {i + 1}",
+                    f"give one of {', '.join(fix.name.lower() for fix in Fix)}",
+                    time_s=float(table.t_ns[i]) * 1e-9,
+                )
+        unsaid = int((table.texts["fix"] == "").sum())
+        if unsaid:
+            self.notes.append(f"gnss: {unsaid} rows have no fix class; taken as 'single'")
+        return np.array([codes[word] for word in words], dtype=np.uint8)[inverse]
+
+    def motor(self) -> Motor | None:
+        names = ("left_a", "right_a", "left_v", "right_v")
+        table = self._table("motor", names, required=names[:2])
+        if table is None:
+            return None
+        voltages = [name for name in names[2:] if name in table.numbers]
+        if len(voltages) == 1:
+            raise self._error("motor", f"'{voltages[0]}' comes alone", "give both voltages or none")
+        return Motor(self._t(table), table.stack(names[:2]), table.stack(names[2:]) if voltages else None)
+
+    def terrain(self) -> Terrain | None:
+        table = self._table("terrain", (), texts=("label",), prefixes=("p_",), required=("label",))
+        if table is None:
+            return None
+        return Terrain(
+            self._t(table),
+            table.texts["label"],
+            self.meta.texts.get("terrain_source", "annotation"),
+            tuple(name.removeprefix("p_") for name in table.numbers),
+            table.stack(list(table.numbers)) if table.numbers else None,
+        )
+
+    def truth(self) -> Trajectory | None:
+        names = ["x_m", "y_m", "z_m", *QUATERNION, *TRUTH_TWIST, *COVARIANCE]
+        table = self._table("truth", names, required=("x_m", "y_m"))
+        if table is None:
+            return None
+        quaternion = self._quaternion(table)
+        twist = None
+        if any(name in table.numbers for name in TRUTH_TWIST):
+            twist = np.full((len(table.t_ns), 6), np.nan)
+            for name, k in TRUTH_TWIST.items():
+                twist[:, k] = table.numbers.get(name, twist[:, k])
+        try:
+            position = table.stack(("x_m", "y_m", "z_m"))
+            return Trajectory(self._t(table), position, quaternion, twist, self._covariance(table))
+        except DataError as error:
+            raise self._error("truth", error.what, error.remedy or "", time_s=error.time_s) from None
+
+    def _quaternion(self, table: Table) -> NDArray[np.float64] | None:
+        present = [name for name in QUATERNION if name in table.numbers]
+        if not present:
+            return None
+        if len(present) < 4:
+            raise self._error(
+                "truth", f"only {', '.join(present)} of the quaternion", "give qx, qy, qz and qw, or none"
+            )
+        q = table.stack(QUATERNION)
+        off = np.flatnonzero(np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01)
+        if off.size:
+            i = int(off[0])
+            raise self._error(
+                "truth",
+                f"the quaternion has norm {np.linalg.norm(q[i]):.3g} at data row {i + 1}",
+                "give unit quaternions x, y, z, w",
+                time_s=float(table.t_ns[i]) * 1e-9,
+            )
+        return q
+
+    def _covariance(self, table: Table) -> NDArray[np.float64] | None:
+        """(N, 6, 6); what is missing below the diagonal is taken from above it."""
+        present = [name for name in COVARIANCE if name in table.numbers]
+        if not present:
+            return None
+        out = np.empty((len(table.t_ns), 6, 6))
+        for name, (i, j) in COVARIANCE.items():
+            if i <= j and name not in table.numbers:
+                raise self._error("truth", f"column '{name}' is missing beside '{present[0]}'", "add it")
+            mirrored = f"cov_{_POSE[j]}_{_POSE[i]}"
+            out[:, i, j] = table.numbers[name if name in table.numbers else mirrored]
+        return out
+
+    def _t(self, table: Table) -> NDArray[np.int64]:
+        return table.t_ns + np.int64(self.meta.start_ns)
+
+    def _table(
+        self,
+        channel: str,
+        known: Sequence[str],
+        *,
+        required: Sequence[str] = (),
+        texts: Sequence[str] = (),
+        prefixes: Sequence[str] = (),
+    ) -> Table | None:
+        """The channel's rows that hold a value, or None when the file is absent or has none."""
+        table = self.source.table(channel, known, texts, prefixes)
+        if table is None:
+            return None
+        self.notes.extend(table.notes)
+        for name in required:
+            if name not in table.numbers and name not in table.texts:
+                raise self._error(
+                    channel, f"column '{name}' is missing", f"needed: t_s, {', '.join(required)}"
+                )
+        return table if self.meta.keep_empty else self._with_values(channel, table)
+
+    def _with_values(self, channel: str, table: Table) -> Table | None:
+        held = rows_with_values(table.numbers, len(table.t_ns))
+        if channel == "terrain":
+            held = table.texts["label"] != ""
+        empty = int(np.count_nonzero(~held))
+        if empty:
+            self.notes.append(f"{channel}: {empty} of {len(held)} rows hold no value and were left out")
+        if not held.any() and (table.numbers or table.texts):
+            name = self.source.place(channel).name
+            self.notes.append(f"{channel}: {name} holds no sample; the channel is absent")
+            return None
+        return table.select(held) if empty else table
+
+    def _error(self, channel: str, what: str, remedy: str, *, time_s: float | None = None) -> DataError:
+        return DataError(what, file=self.source.place(channel), time_s=time_s, remedy=remedy)
+
+
+def rows_with_values(numbers: Mapping[str, NDArray[np.float64]], n: int) -> NDArray[np.bool_]:
+    """Mask (n,) of the rows in which at least one of the columns (n,) is not NaN."""
+    held = np.zeros(n, dtype=bool)
+    for column in numbers.values():
+        held |= ~np.isnan(column)
+    return held
