@@ -70,6 +70,7 @@ FORMATS: tuple[Format, ...] = (
     Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros1"),
     Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros2"),
     Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.umich_text"),
+    Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.norlab_pickle"),
     Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.borealtc_csv"),
 )
 """In the order in which they are asked; the first that claims a file reads it."""
