@@ -19,8 +19,11 @@ GAP_PERIODS, GAP_S = 5.0, 0.2
 """Longer intervals between samples are gaps: what lies inside is not known."""
 WIDEST_MEAN_S = 1.0
 """Both signals are averaged over the period of the slower one, but no longer than this."""
-PEAK_SHARE, PEAK_LAGS = 0.3, 10
-"""A parabola is fitted to this upper share of the peak, at so many lags on each side."""
+PEAK_SHARES, PEAK_LAGS = (0.3, 0.1, 0.03), 10
+"""Parabolas are fitted to these upper shares of the peak, at so many lags on each side; the one that
+the blocks agree on best is taken: wide against noise, narrow where the signal moves seldom."""
+CHOICE = 1.15
+"""By which the interval is widened because the best of several was taken."""
 RESAMPLES, LEAST_BLOCKS, MOST_BLOCKS, BLOCK_S = 400, 10, 60, 3.0
 SEED = 20_240_607
 RESOLUTION_S = 0.001
@@ -70,19 +73,14 @@ def lag_between(t_a_s: Array, a: Array, t_b_s: Array, b: Array, *, reach_s: floa
         return None
     reach = max(int(min(reach_s, common_s / 4) / step), 2)
     r = _correlation(_at_all_lags(*moments, reach))
-    peak = _peak(r)
-    if peak is None:
-        return None
-    centre, lags = peak
-    lags = lags + centre - reach
     blocks = int(np.clip(common_s / BLOCK_S, LEAST_BLOCKS, MOST_BLOCKS))
-    parts = _in_blocks(*moments, lags, blocks)
-    r_about = _correlation(parts.sum(axis=1))
-    vertex, spread = float(_vertex(lags, r_about)), _spread(lags, parts)
-    if spread is None or not np.isfinite(vertex):
+    fits = [_fit(*moments, lags, blocks) for lags in _peaks(r)]
+    sharp = [fit for fit in fits if fit is not None]
+    if not sharp:
         return None
-    lag_s, spread_s = vertex * step, spread * step + RESOLUTION_S
-    return Lag(lag_s, lag_s - spread_s, lag_s + spread_s, min(float(r_about.max()), 1.0))
+    vertex, spread, r_peak = min(sharp, key=lambda fit: fit[1])
+    lag_s, spread_s = vertex * step, CHOICE * spread * step + RESOLUTION_S
+    return Lag(lag_s, lag_s - spread_s, lag_s + spread_s, min(r_peak, 1.0))
 
 
 def _cleaned(t_s: Array, values: Array) -> tuple[Array, Array]:
@@ -191,21 +189,27 @@ def _correlation(sums: Array) -> Array:
     return np.asarray((ab - a * b / n) / np.sqrt(np.maximum(spread, 1e-300)))
 
 
-def _peak(r: Array) -> tuple[int, NDArray[np.int64]] | None:
-    """Index of the highest r and the lags about it to fit; None at the edge or where r is flat."""
-    centre = int(np.argmax(r))
-    level = r[centre] - PEAK_SHARE * (r[centre] - r.min())
-    below = np.flatnonzero(r < level)
-    if not r[centre] > 0.0 or not below.size:
-        return None
-    left, right = below[below < centre], below[below > centre]
+def _peaks(r: Array) -> list[NDArray[np.int64]]:
+    """Lags about the highest r to fit, wider and narrower; none at the edge or where r is flat."""
+    centre, reach = int(np.argmax(r)), len(r) // 2
     room = min(centre, len(r) - 1 - centre)
-    if room < 2:
-        return None
-    half = min(centre - left[-1] if left.size else room, right[0] - centre if right.size else room, room)
-    half = max(int(half), 2)
-    lags = np.unique(np.rint(np.linspace(-half, half, 2 * PEAK_LAGS + 1)).astype(np.int64))
-    return centre, lags
+    if not r[centre] > 0.0 or room < 2:
+        return []
+    found = []
+    for share in PEAK_SHARES:
+        below = np.flatnonzero(r < r[centre] - share * (r[centre] - r.min()))
+        half = max(int(np.abs(below - centre).min(initial=room)), 2)
+        lags = np.unique(np.rint(np.linspace(-half, half, 2 * PEAK_LAGS + 1)).astype(np.int64))
+        found.append(lags + centre - reach)
+    return found
+
+
+def _fit(a: Array, b: Array, lags: NDArray[np.int64], blocks: int) -> tuple[float, float, float] | None:
+    """Vertex and half of its interval, in steps, and the highest r; None where the blocks see no peak."""
+    parts = _in_blocks(a, b, lags, blocks)
+    r = _correlation(parts.sum(axis=1))
+    vertex, spread = float(_vertex(lags, r)), _spread(lags, parts)
+    return (vertex, spread, float(r.max())) if spread is not None and np.isfinite(vertex) else None
 
 
 def _vertex(lags: NDArray[np.int64], r: Array) -> Array:
