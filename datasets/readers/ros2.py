@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros_bag import read_bag
 from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.sensors import Rig
 
 REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
 
@@ -20,24 +18,17 @@ def claims(path: Path, head: bytes) -> bool:
 
 
 def read(request: Request) -> list[Recording]:
-    """The one recording of a ROS 2 bag."""
-    return [read_ros2(request.path, rig=request.rig, topics=request.topics, stamps=request.stamps)]
-
-
-def read_ros2(
-    path: Path, *, rig: Rig | None = None, topics: Mapping[str, str] | None = None, stamps: str = "header"
-) -> Recording:
-    """Read a ROS 2 bag; arguments and errors as in `open_recording`.
+    """The one recording of a ROS 2 bag.
 
     Bags that carry no message definitions (SQLite before ROS 2 Iron) are read with those of Humble.
     """
     from rosbags.typesys import Stores, get_typestore
 
+    path = request.path
     for part in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
         if part.suffix == ".db3":
             _refuse_cut_database(part)
-    typestore = get_typestore(Stores.ROS2_HUMBLE)
-    return read_bag(path, rig=rig, topics=topics, stamps=stamps, typestore=typestore, remedy=REMEDY)
+    return [read_bag(request, typestore=get_typestore(Stores.ROS2_HUMBLE), remedy=REMEDY)]
 
 
 def _refuse_cut_database(path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from terrafusion.datasets.errors import DataError, TerrafusionError
@@ -17,23 +16,14 @@ if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys.store import Typestore
 
-    from terrafusion.datasets.sensors import Rig
+    from terrafusion.datasets.readers.formats import Request
 
 
-def read_bag(
-    path: Path,
-    *,
-    rig: Rig | None,
-    topics: Mapping[str, str] | None,
-    stamps: str,
-    typestore: Typestore | None,
-    remedy: str,
-) -> Recording:
+def read_bag(request: Request, *, typestore: Typestore | None, remedy: str) -> Recording:
     """Read a bag through rosbags' `AnyReader`.
 
     Args:
-        path: the bag.
-        rig, topics, stamps: as in `open_recording`.
+        request: the bag, the robot, topics and stamps.
         typestore: message definitions for bags that do not carry their own.
         remedy: what to do about a bag that does not open.
 
@@ -42,6 +32,7 @@ def read_bag(
     """
     from rosbags.highlevel import AnyReader
 
+    path = request.path
     # Any exception of the parser means a broken bag: it reads bytes of unknown origin.
     try:
         reader = AnyReader([path], default_typestore=typestore)
@@ -49,7 +40,7 @@ def read_bag(
     except Exception as error:
         raise DataError(f"cannot be read as a ROS bag: {_reason(error)}", file=path, remedy=remedy) from None
     try:
-        return _assemble(reader, path, rig, topics, stamps)
+        return _assemble(reader, request)
     except TerrafusionError:
         raise
     except _ParseError as error:
@@ -72,9 +63,8 @@ def _reason(error: Exception) -> str:
     return f"{type(error).__name__}: {error}" if not str(error) else str(error).rstrip(".")
 
 
-def _assemble(
-    reader: AnyReader, path: Path, rig: Rig | None, topics: Mapping[str, str] | None, stamps: str
-) -> Recording:
+def _assemble(reader: AnyReader, request: Request) -> Recording:
+    path, rig, topics = request.path, request.rig, request.topics
     joints = joint_names(topics)
     bag = _topics_of(reader)
     chosen, notes = choose_topics(
@@ -95,9 +85,9 @@ def _assemble(
         )
     streams = _streams(reader, {topic.name for topic in chosen.values()})
     by_kind = {kind: streams[topic.name] for kind, topic in chosen.items()}
-    times, clock = times_of([s for kind, s in by_kind.items() if kind != "datum"], stamps, path)
+    times, clock = times_of([s for kind, s in by_kind.items() if kind != "datum"], request.stamps, path)
     start_ns = min(int(t[0]) for t in times.values())
-    builder = Builder(path, rig, start_ns, joints, [*notes, *clock])
+    builder = Builder(path, rig, request.conventions, start_ns, joints, [*notes, *clock])
     return _build(builder, by_kind, times)
 
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import geodetic_to_enu
 from terrafusion.datasets.readers import ros_topics
@@ -39,10 +40,15 @@ MOVING_MPS = 0.05
 
 @dataclass
 class Builder:
-    """Turns streams into channels; `notes` gathers what a user should know."""
+    """Turns streams into channels; `notes` gathers what a user should know.
+
+    `known` are the conventions of a catalogued bag: its track makes the side speeds where there is
+    no rig, and its IMU's axes are left to whoever applies the conventions.
+    """
 
     file: Path
     rig: Rig | None
+    known: Conventions
     start_ns: int
     joints: dict[str, str]
     notes: list[str] = field(default_factory=list)
@@ -71,9 +77,10 @@ class Builder:
         frames = sorted(set(stream.frame_ids))
         said = ", ".join(f"'{name}'" for name in frames)
         if self.rig is None:
-            self.notes.append(
-                f"imu: no vehicle given: {stream.topic} (frame {said}) taken as x forward, y left, z up"
-            )
+            if self.known.imu_axes == BODY_AXES:
+                self.notes.append(
+                    f"imu: no vehicle given: {stream.topic} (frame {said}) taken as x forward, y left, z up"
+                )
             return gyro, accel
         spec = self.rig.sensors.imu
         wanted = spec.frame_id.lstrip("/")
@@ -109,8 +116,8 @@ class Builder:
         if self._says_no_yaw(stream, rate, variance[:, 5], v, imu):
             return Wheels(t_ns, v[:, None], ("speed",), "mps"), None
         self._refuse_nan(rate[:, None], t_ns, stream.topic, "yaw rate")
-        assumed = None if self.rig else NOMINAL_TRACK_M
-        track = self.rig.track_m if self.rig else NOMINAL_TRACK_M
+        track = self.rig.track_m if self.rig else self.known.track_m or NOMINAL_TRACK_M
+        assumed = None if self.rig or self.known.track_m else NOMINAL_TRACK_M
         if assumed:
             self.notes.append(
                 f"wheels: no vehicle given: side speeds of {stream.topic} are for a nominal track of "
