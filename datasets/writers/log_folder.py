@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
 import tempfile
 from collections.abc import Sequence
-from io import StringIO
 from pathlib import Path
 from typing import Any
 
@@ -171,18 +172,18 @@ def _seconds(t_ns: NDArray[np.int64]) -> list[str]:
     return [f"{sign}{seconds}.{nanos:09d}" for sign, seconds, nanos in rows]
 
 
-def _meta_text(meta: dict[str, Any], folder: Path) -> str:
-    from ruamel.yaml import YAML
+_UNPRINTABLE = re.compile("[^\t\n -~\xa0-\u2027\u202a-\ud7ff\ue000-\ufefe\uff00-\ufffd\U00010000-\U0010ffff]")
+"""Characters that YAML does not take as they are, or takes for the end of a line."""
 
-    yaml = YAML(typ="safe", pure=True)
-    yaml.default_flow_style = None
-    yaml.sort_base_mapping_type_on_output = False  # type: ignore[assignment]
-    out = StringIO()
-    yaml.dump(meta, out)
-    if len(out.getvalue()) * 4 > MAX_BYTES and len(out.getvalue().encode(errors="replace")) > MAX_BYTES:
+
+def _meta_text(meta: dict[str, Any], folder: Path) -> str:
+    """One key a line, its value in JSON, which is YAML too."""
+    text = "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}" + "\n" for key, value in meta.items())
+    text = _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
+    if len(text.encode()) > MAX_BYTES:
         raise DataError(
             f"its texts take more than {MAX_BYTES // 1024} KiB",
             file=folder / META,
             remedy="shorten the notes",
         )
-    return out.getvalue()
+    return text

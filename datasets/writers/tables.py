@@ -84,6 +84,7 @@ def meta_of(recording: Recording, file: Path, name: str) -> dict[str, Any]:
         ConfigError: a value that the format does not take; the message is about `file`.
     """
     r, o = recording, recording.overrides
+    source = r.terrain.source if r.terrain is not None else "annotation"
     meta: dict[str, Any] = {
         "name": r.name if r.name != name else None,
         "start_ns": int(r.start_ns),
@@ -99,7 +100,7 @@ def meta_of(recording: Recording, file: Path, name: str) -> dict[str, Any]:
         "datum": r.datum and [float(x) for x in r.datum],
         "truth_channels": list(r.truth_channels) if r.truth is not None or r.truth_channels else None,
         "truth_frame": r.truth_frame if r.truth_frame != "base" else None,
-        "terrain_source": r.terrain.source if r.terrain and r.terrain.source != "annotation" else None,
+        "terrain_source": source if source != "annotation" else None,
         "imu_frame_id": r.imu_frame_id or None,
         "notes": list(r.notes) or None,
         "clock_jumps": [

@@ -1,0 +1,156 @@
+"""Any recording -> log folder or MCAP -> the same recording, to the bit."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.recording import (
+    ClockJump,
+    Command,
+    Gnss,
+    Imu,
+    Motor,
+    Overrides,
+    Recording,
+    Terrain,
+    Wheels,
+    differences,
+)
+from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.writers import write_log_folder
+
+S = 10**9
+NUMBERS = st.one_of(
+    st.just(float("nan")),
+    st.floats(allow_nan=False, allow_infinity=False),
+    st.sampled_from([0.0, -0.0, 5e-324, -1.7976931348623157e308, 1e6, 9.81]),
+)
+TEXTS = st.text(st.characters(exclude_characters="\0", exclude_categories=("Cs",)), max_size=20)
+LABELS = st.one_of(st.sampled_from(["mud", "snow", "", " wet sand ", 'a "b", c', "1e3", "nan"]), TEXTS)
+CLASSES = st.sampled_from([(), ("mud",), ("loose sand", "Schnee, naß"), ("0", "1", "2")])
+
+
+def table(*columns: int) -> st.SearchStrategy[np.ndarray]:
+    """(n, *columns) doubles; sometimes NaN throughout, or in a whole column."""
+
+    @st.composite
+    def draw_table(draw: st.DrawFn, n: int) -> np.ndarray:
+        values = draw(hnp.arrays(float, (n, *columns), elements=NUMBERS))
+        for axis in draw(st.sets(st.integers(0, values.shape[1] - 1))) if values.ndim > 1 else ():
+            values[:, axis] = np.nan
+        return values
+
+    return draw_table  # type: ignore[return-value]
+
+
+@st.composite
+def channels(draw: st.DrawFn, start_ns: int, far_ns: int) -> dict[str, Any]:
+    """Any subset of the channels, each with its own times; empty ones too."""
+
+    def times() -> np.ndarray:
+        steps = st.one_of(st.integers(-S, 100 * S), st.integers(-start_ns, far_ns))
+        near = draw(st.lists(steps, max_size=6).map(sorted))
+        return np.array([max(start_ns + t, 0) for t in near], dtype=np.int64)
+
+    def some(*columns: int) -> np.ndarray:
+        return draw(table(*columns)(n))  # type: ignore[operator]
+
+    def perhaps(*columns: int) -> np.ndarray | None:
+        return some(*columns) if draw(st.booleans()) else None
+
+    found: dict[str, Any] = {}
+    for name in draw(st.sets(st.sampled_from([*Recording.CHANNELS, "truth"]), min_size=1)):
+        t = times() if name != "truth" else np.unique(times())
+        n = len(t)
+        if name == "command":
+            found[name] = Command(t, some(), some())
+        elif name == "wheels":
+            layouts = [(Wheels.LAYOUTS[0], "radps"), (Wheels.LAYOUTS[1], "radps")]
+            layouts += [(Wheels.LAYOUTS[0], "mps"), (Wheels.LAYOUTS[2], "mps")]
+            names, unit = draw(st.sampled_from(layouts))
+            angle = perhaps(len(names)) if names != ("speed",) else None
+            found[name] = Wheels(t, some(len(names)), names, unit, angle)
+        elif name == "imu":
+            found[name] = Imu(t, some(3), some(3))
+        elif name == "gnss":
+            fix = draw(hnp.arrays(np.uint8, n, elements=st.integers(0, 4)))
+            found[name] = Gnss(t, some(3), some(3), fix, perhaps(3), perhaps())
+        elif name == "motor":
+            found[name] = Motor(t, some(2), perhaps(2))
+        elif name == "terrain":
+            label = np.array(draw(st.lists(LABELS, min_size=n, max_size=n)), dtype=object)
+            classes = draw(CLASSES)
+            source = draw(st.sampled_from(["annotation", "camera", "detector", "Gerät"]))
+            found[name] = Terrain(t, label, source, classes, some(len(classes)) if classes else None)
+        else:
+            found[name] = draw(truths(t))
+    return found
+
+
+@st.composite
+def truths(draw: st.DrawFn, t_ns: np.ndarray) -> Trajectory:
+    n = len(t_ns)
+    quaternion = None
+    if draw(st.booleans()):
+        q = draw(hnp.arrays(float, (n, 4), elements=st.floats(-1.0, 1.0)))
+        norm = np.linalg.norm(q, axis=1, keepdims=True)
+        quaternion = np.where(norm > 0.1, q / np.where(norm > 0.1, norm, 1.0), [0.0, 0.0, 0.0, 1.0])
+        quaternion[draw(hnp.arrays(bool, n))] = np.nan
+    twist = draw(table(6)(n)) if draw(st.booleans()) else None  # type: ignore[operator]
+    covariance = draw(table(6, 6)(n)) if draw(st.booleans()) else None  # type: ignore[operator]
+    if covariance is not None and draw(st.booleans()):
+        covariance = np.triu(covariance) + np.triu(covariance, 1).transpose(0, 2, 1)
+    return Trajectory(t_ns, draw(table(3)(n)), quaternion, twist, covariance)  # type: ignore[operator]
+
+
+@st.composite
+def recordings(draw: st.DrawFn, latest_ns: int, far_ns: int) -> Recording:
+    """Recordings with at least one sample."""
+    start_ns = draw(st.one_of(st.just(0), st.integers(0, latest_ns)))
+    found = draw(
+        channels(start_ns, min(far_ns, latest_ns - start_ns)).filter(lambda c: any(map(len, c.values())))
+    )
+    positive = st.floats(0.05, 2.0)
+    place = st.none() | st.tuples(*[st.floats(-20.0, 20.0)] * 3)
+    truth = st.lists(st.sampled_from(["position", "yaw", "orientation", "velocity"]), max_size=4).map(tuple)
+    jumps = st.builds(ClockJump, TEXTS, st.integers(-(2**62), 2**62), st.floats(-1e9, 1e9))
+    return Recording(
+        name=draw(TEXTS.filter(bool)),
+        start_ns=start_ns,
+        vehicle=draw(st.none() | TEXTS),
+        **found,
+        datum=draw(
+            st.none() | st.tuples(st.floats(-90.0, 90.0), st.floats(-180.0, 180.0), st.floats(-1e3, 2e4))
+        ),
+        truth_channels=draw(truth),
+        truth_frame=draw(st.sampled_from(["base", "antenna"])),
+        overrides=Overrides(draw(st.none() | positive), draw(st.none() | positive), draw(place), draw(place)),
+        description=draw(TEXTS),
+        terrain_name=draw(TEXTS),
+        licence=draw(TEXTS),
+        source=draw(TEXTS),
+        notes=tuple(draw(st.lists(TEXTS, max_size=3))),
+        clock_jumps=tuple(draw(st.lists(jumps, max_size=2))),
+        imu_frame_id=draw(TEXTS),
+    )
+
+
+CHECKED = settings(
+    deadline=None, max_examples=150, suppress_health_check=[HealthCheck.too_slow, HealthCheck.data_too_large]
+)
+
+
+@CHECKED
+@given(recordings(latest_ns=2**62, far_ns=10**18))
+def test_any_recording_survives_the_log_folder(recording: Recording) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        back = open_recording(write_log_folder(recording, Path(scratch) / "log"))
+    assert differences(recording, back) == []
