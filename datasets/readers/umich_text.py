@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,7 +36,7 @@ NAMES = {
     "center": re.compile(r"(?P<stem>.+?)_center\.txt"),
     "front": re.compile(r"(?P<stem>.+?)_front\.txt"),
 }
-"""`trial1_wheel_imu.txt`, `2_test_imu.txt`, `slip_detect1__wheel_vel_input.txt`, `trial1_rectangle_front.txt`."""
+"""Such as `trial1_wheel_imu.txt`, `2_test_imu.txt`, `hill1__wheel_vel_input.txt`, `trial1_loop_front.txt`."""
 NUMBERED = re.compile(r"0*(\d+)_test")
 """`2_test` is another name of `trial2`."""
 NORM_TOLERANCE = 1e-3
@@ -85,7 +85,9 @@ def read(request: Request) -> list[Recording]:
         imu=_imu(rows["imu"]) if "imu" in rows else None,
         truth=truth,
         truth_channels=_truth_channels(rows, truth),
-        clock_jumps=jumps,
+        clock_jumps=tuple(
+            replace(jump, channel="truth") if jump.channel == "center" else jump for jump in jumps
+        ),
         notes=(*notes, *said),
     )
     return [recording]
