@@ -149,35 +149,11 @@ def read_tum(path: Path) -> Trajectory:
     Raises:
         DataError: missing file, a line that is not eight finite numbers, or time not increasing.
     """
-    times: list[int] = []
-    rows: list[list[float]] = []
+    from terrafusion.datasets.readers.tum import tum_rows
+
+    t_ns, table, _ = tum_rows(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise DataError("no such file", file=path, remedy="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise DataError(f"cannot be read: {error}", file=path) from None
-    for number, line in enumerate(text.splitlines(), 1):
-        words = line.replace(",", " ").split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            values = [float(word) for word in words[1:]]
-            times.append(seconds_to_ns(words[0]))
-        except (ValueError, ArithmeticError):
-            values = []
-        if len(values) != 7 or not np.isfinite(values).all():
-            raise DataError(
-                f"line {number} is not eight finite numbers",
-                file=path,
-                remedy="a line is: t x y z qx qy qz qw",
-            )
-        rows.append(values)
-    if not rows:
-        raise DataError("no poses", file=path, remedy="a line is: t x y z qx qy qz qw")
-    table = np.array(rows)
-    try:
-        return Trajectory(np.array(times, dtype=np.int64), table[:, :3], table[:, 3:])
+        return Trajectory(t_ns, table[:, :3], table[:, 3:])
     except DataError as error:
         raise DataError(error.what, file=path, time_s=error.time_s, remedy=error.remedy) from None
 

@@ -71,7 +71,12 @@ FORMATS: tuple[Format, ...] = (
     Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros2"),
     Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.umich_text"),
     Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.norlab_pickle"),
+    Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.pathfinder_mat"),
     Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.borealtc_csv"),
+    Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.xsens_text"),
+    Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.rtklib_pos"),
+    Format("nmea", "an NMEA 0183 log", f"{_READERS}.nmea"),
+    Format("tum", "a TUM trajectory", f"{_READERS}.tum"),
 )
 """In the order in which they are asked; the first that claims a file reads it."""
 

@@ -1,0 +1,308 @@
+"""Columns of a delimited text file, whatever its separator: strict about cells, exact about times.
+
+The parsing is pandas' C parser; every line's cells are counted first, since that parser fills short
+lines up and cuts long ones without a word.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.config import shown
+from terrafusion.datasets.decimals import NotADecimal, to_ns
+from terrafusion.datasets.errors import DataError
+
+Array = NDArray[np.float64]
+
+MAX_BYTES = 2**29
+MAX_LINE = 2**16
+BLANKS = r"\s+"
+"""The separator that stands for any run of blanks and tabs."""
+
+MISSING = ("", "NaN", "nan", "NAN", "-nan")
+"""Cells of a numeric column that stand for no value."""
+
+_CHUNK = 2**24
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How the rows of a text file stand.
+
+    Attributes:
+        names: columns in the order of the file.
+        separator: one character, or `BLANKS`.
+        first_line: number, from 1, of the first line that may hold a row.
+        comment: character that begins lines which are no rows; "" for none.
+    """
+
+    names: tuple[str, ...]
+    separator: str
+    first_line: int
+    comment: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """Columns read from a file: `numbers` (N,) float, NaN where missing; `texts` (N,) str."""
+
+    path: Path
+    layout: Layout
+    data: bytes
+    numbers: dict[str, Array]
+    texts: dict[str, NDArray[Any]]
+    notes: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(next(iter([*self.numbers.values(), *self.texts.values()]), ()))
+
+    def stack(self, names: Sequence[str]) -> Array:
+        """Columns `names` side by side (N, k); a column the file does not have is NaN."""
+        missing = np.full(len(self), np.nan)
+        return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
+
+    def times_ns(self, name: str, unit: str = "s") -> NDArray[np.int64]:
+        """A text column of decimal times as nanoseconds (N,).
+
+        Raises:
+            DataError: a cell is no number; the message names the line.
+        """
+        try:
+            return to_ns(self.texts[name].tolist(), unit)
+        except NotADecimal as bad:
+            raise self.bad_cell(name, bad.row, f"give a time in {unit}") from None
+
+    def bad_cell(self, name: str, row: int, remedy: str) -> DataError:
+        """The error for what stands in column `name` of data row `row` (from 0)."""
+        line, cells = next(islice(_rows(self.data, self.layout), row, None), (0, []))
+        cell = dict(zip(self.layout.names, cells, strict=False)).get(name, "")
+        what = f"line {line} has no '{name}'" if not cell.strip() else _cell_is(name, cell, line)
+        return DataError(what, file=self.path, remedy=remedy)
+
+
+def read_text(path: Path) -> bytes:
+    """The bytes of a text file, without a byte order mark.
+
+    Raises:
+        DataError: unreadable, empty, over 512 MB, or no UTF-8 text.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise DataError(
+                f"has more than {MAX_BYTES // 2**20} MB",
+                file=path,
+                remedy="split it, or convert it to Parquet",
+            )
+        data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+    except OSError as error:
+        raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
+    if not data or data.isspace():
+        raise DataError("the file is empty", file=path, remedy="record or copy it again")
+    try:
+        data.isascii() or data.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"not UTF-8 at byte {error.start}", file=path, remedy="save it as UTF-8") from None
+    if b"\0" in data:
+        raise DataError("holds zero bytes: not a text file", file=path, remedy="copy it again")
+    return data
+
+
+def head_lines(data: bytes, count: int = 1000) -> Iterator[tuple[int, str]]:
+    """Number, from 1, and text of the first lines; one that is too long for a line of a table ends them."""
+    begin = 0
+    for number in range(1, count + 1):
+        end = data.find(b"\n", begin, begin + MAX_LINE)
+        if end < 0:
+            if begin < len(data) <= begin + MAX_LINE:
+                yield number, data[begin:].decode("utf-8", "replace").rstrip("\r")
+            return
+        yield number, data[begin:end].decode("utf-8", "replace").rstrip("\r")
+        begin = end + 1
+
+
+def separator_of(line: str) -> str:
+    """The separator of a header line: tab, semicolon, comma, or blanks."""
+    return next((mark for mark in "\t;," if mark in line), BLANKS)
+
+
+def split(line: str, separator: str) -> list[str]:
+    """The cells of a line."""
+    if separator == BLANKS:
+        return line.split()
+    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+
+
+def read_columns(
+    path: Path, data: bytes, layout: Layout, numbers: Sequence[str], texts: Sequence[str] = ()
+) -> Columns:
+    """Parse the columns that are asked for.
+
+    Args:
+        path: the file, for messages.
+        data: its bytes, of `read_text`.
+        layout: what stands where.
+        numbers: columns of numbers; empty and NaN cells are missing values.
+        texts: columns that are kept as text.
+
+    Raises:
+        DataError: no rows, a line with too few or too many cells, a cell that is no finite number.
+            A last line that was cut off (short, and without a line end) is left out with a note.
+    """
+    cut, notes = _cut_off(path, data, layout)
+    data = data[:cut]
+    _check_counts(path, data, layout)
+    table = _parse(data, layout, numbers, texts)
+    if table is None or any(np.isinf(table[name]).any() for name in numbers):
+        _check_cells(path, data, layout, set(numbers))
+    if table is None:
+        raise DataError("cannot be read as a table", file=path, remedy="write plain separated numbers")
+    columns = Columns(path, layout, data, {n: table[n] for n in numbers}, {n: table[n] for n in texts}, notes)
+    if not len(columns):
+        raise DataError("holds a header but no rows", file=path, remedy="record or copy it again")
+    return columns
+
+
+def _cut_off(path: Path, data: bytes, layout: Layout) -> tuple[int, tuple[str, ...]]:
+    """Bytes up to where complete lines end, and what is to be noted."""
+    if data.endswith((b"\n", b"\r")):
+        return len(data), ()
+    begin = data.rfind(b"\n") + 1
+    last = data[begin : begin + MAX_LINE].decode("utf-8", "replace")
+    long = len(data) - begin > MAX_LINE
+    first = data.count(b"\n", 0, begin) + 1 < layout.first_line
+    if not long and not first and len(split(last, layout.separator)) < len(layout.names):
+        return begin, (f"{path.name}: the last line was cut off and is left out",)
+    return len(data), (f"{path.name}: the last line has no line end; was it cut off?",)
+
+
+def _check_counts(path: Path, data: bytes, layout: Layout) -> None:
+    """Refuse the first line that has not as many cells as there are columns."""
+    quoted = layout.separator != BLANKS and b'"' in data
+    suspects = _quoted_misfits(path, data, layout) if quoted else _misfits(data, layout)
+    for line, text, count in suspects:
+        if line < layout.first_line or not text.strip() or (layout.comment and text[0] == layout.comment):
+            continue
+        raise DataError(
+            f"line {line} has {count} cells for {len(layout.names)} columns",
+            file=path,
+            remedy="is it cut off, or of another table?",
+        )
+
+
+def _misfits(data: bytes, layout: Layout) -> Iterator[tuple[int, str, int]]:
+    """Line number, beginning and cells of lines with another number of cells than columns."""
+    blanks = np.zeros(256, dtype=bool)
+    blanks[[9, 10, 13, 32]] = True
+    begin, line = 0, 1
+    while begin < len(data):
+        end = len(data) if len(data) - begin <= _CHUNK else data.rfind(b"\n", begin, begin + _CHUNK) + 1
+        end = end or data.find(b"\n", begin) + 1 or len(data)  # a line longer than the chunk
+        chunk = np.frombuffer(data, np.uint8, end - begin, begin)
+        ends = np.flatnonzero(chunk == 10)
+        if not ends.size or ends[-1] != len(chunk) - 1:
+            ends = np.append(ends, len(chunk))
+        if layout.separator == BLANKS:
+            inside = ~blanks[chunk]
+            marks = np.flatnonzero(inside & np.concatenate([[True], ~inside[:-1]]))
+            extra = 0
+        else:
+            marks = np.flatnonzero(chunk == ord(layout.separator))
+            extra = 1
+        counts = np.diff(np.searchsorted(marks, ends), prepend=0) + extra
+        for i in np.flatnonzero(counts != len(layout.names)).tolist():
+            start = begin + (int(ends[i - 1]) + 1 if i else 0)
+            text = data[start : min(begin + int(ends[i]), start + 80)].decode("utf-8", "replace")
+            yield line + i, text, int(counts[i])
+        begin, line = end, line + len(ends)
+
+
+def _quoted_misfits(path: Path, data: bytes, layout: Layout) -> Iterator[tuple[int, str, int]]:
+    try:
+        for line, cells in _rows(data, layout):
+            if len(cells) != len(layout.names):
+                yield line, cells[0] or ".", len(cells)
+    except csv.Error as error:
+        raise DataError(f"not a table: {error}", file=path, remedy="write plain separated numbers") from None
+
+
+def _parse(
+    data: bytes, layout: Layout, numbers: Sequence[str], texts: Sequence[str]
+) -> dict[str, NDArray[Any]] | None:
+    """The columns by pandas' C parser, bit-exact; None when a cell does not parse."""
+    import pandas as pd
+
+    positions = {name: i for i, name in enumerate(layout.names)}
+    asked = [*numbers, *texts]
+    # pandas before 3.1 rounds its default floats; from 3.1 on they are exact and the option is deprecated.
+    old = tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1)
+    options: dict[str, Any] = {"float_precision": "round_trip"} if old else {}
+    options["dtype"] = {positions[name]: "float64" if name in numbers else "object" for name in asked}
+    options["na_values"] = {positions[name]: list(MISSING) for name in numbers}
+    if layout.comment:
+        options["comment"] = layout.comment
+    try:
+        frame = pd.read_csv(
+            io.BytesIO(data),
+            engine="c",
+            sep=layout.separator,
+            header=None,
+            skiprows=layout.first_line - 1,
+            usecols=sorted(positions[name] for name in asked),
+            keep_default_na=False,
+            skipinitialspace=True,
+            **options,
+        )
+    except pd.errors.EmptyDataError:
+        return {name: np.zeros(0, dtype=float if name in numbers else object) for name in asked}
+    except (ValueError, OverflowError, pd.errors.ParserError):
+        return None
+    return {name: frame[positions[name]].to_numpy() for name in asked}
+
+
+def _check_cells(path: Path, data: bytes, layout: Layout, numbers: set[str]) -> None:
+    """Raise for the first cell of a numeric column that is neither finite nor missing."""
+    for line, cells in _rows(data, layout):
+        for name, cell in zip(layout.names, cells, strict=False):
+            if name in numbers and cell.strip() not in MISSING and not _is_finite(cell):
+                raise DataError(
+                    _cell_is(name, cell, line),
+                    file=path,
+                    remedy="give a finite number, or leave the cell empty where the value is missing",
+                )
+
+
+def _rows(data: bytes, layout: Layout) -> Iterator[tuple[int, list[str]]]:
+    """Line number and cells of every row."""
+    text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", newline="")
+    if layout.separator == BLANKS:
+        for number, line in enumerate(text, 1):
+            if number >= layout.first_line and line.strip() and line[0] != layout.comment:
+                yield number, line.split()
+        return
+    for _ in range(layout.first_line - 1):
+        text.readline()
+    lines = ("\n" if layout.comment and line.startswith(layout.comment) else line for line in text)
+    reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=True)
+    for cells in reader:
+        if cells:
+            yield reader.line_num + layout.first_line - 1, cells
+
+
+def _is_finite(cell: str) -> bool:
+    try:
+        return bool(np.isfinite(float(cell))) and "_" not in cell
+    except ValueError:
+        return False
+
+
+def _cell_is(name: str, cell: str, line: int) -> str:
+    return f"column '{name}' is '{shown(cell.strip())}' at line {line}"

@@ -1,0 +1,63 @@
+"""Times of the rows of a file: in order, or repaired where that was asked for, else refused."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.clock import in_order, repair
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.recording import ClockJump
+
+TimesNs = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class RowTimes:
+    """Times that never decrease.
+
+    Attributes:
+        t_ns: (N,) int64.
+        order: rows of the file in the order of `t_ns`, a slice where nothing changed places.
+        jumps, notes: what was repaired.
+    """
+
+    t_ns: TimesNs
+    order: Any = field(default_factory=lambda: slice(None))
+    jumps: tuple[ClockJump, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
+    """The times of a file's rows as a recording needs them.
+
+    Args:
+        request: tells the file, and whether clocks are to be repaired.
+        channel: name of the channel or clock, for errors and jumps.
+        t_ns: (N,) int64 in the order of the rows.
+
+    Raises:
+        DataError: time runs backwards, and no repair was asked for or none is possible.
+    """
+    back = np.flatnonzero(t_ns[1:] < t_ns[:-1])
+    if not back.size:
+        return RowTimes(t_ns)
+    if not request.repair_clock:
+        i = int(back[0])
+        raise DataError(
+            f"time runs backwards by {(int(t_ns[i]) - int(t_ns[i + 1])) * 1e-9:.6f} s after row {i + 1}",
+            file=request.path,
+            channel=channel,
+            time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9,
+            remedy="sort the rows, split the log there, or ask for the clock to be repaired",
+        )
+    repaired, jumps = repair(t_ns, channel)
+    order = in_order(repaired)
+    if order is None:
+        return RowTimes(repaired, jumps=jumps)
+    moved = int((order != np.arange(len(order))).sum())
+    return RowTimes(repaired[order], order, jumps, (f"{channel}: {moved} rows out of order were sorted",))
