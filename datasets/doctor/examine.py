@@ -4,7 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
-from terrafusion.datasets.doctor import gnss, inertial, signals, timing, wheels
+from terrafusion.datasets.doctor import (
+    gnss,
+    gnss_frame,
+    inertial,
+    mounting,
+    scale,
+    signals,
+    timing,
+    turns,
+    wheels,
+)
 from terrafusion.datasets.doctor.finding import Finding, Patient
 from terrafusion.datasets.doctor.magnitude import check_magnitude
 from terrafusion.datasets.recording import Recording
@@ -19,12 +29,22 @@ CHECKS: tuple[Check, ...] = (
     timing.check_duplicates,
     signals.check_held,
     inertial.check_gravity,
-    inertial.check_yaw_sign,
+    mounting.check_axes,
+    wheels.check_each_wheel,
     wheels.check_wheel_signs,
-    wheels.check_speed_scale,
+    wheels.check_direction,
+    turns.check_gyro_unit,
+    turns.check_turns,
+    turns.check_unrelated,
+    inertial.check_bias,
+    gnss_frame.check_degrees,
+    gnss.check_classes,
     gnss.check_sigma,
+    gnss.check_frozen,
     gnss.check_jumps,
-    gnss.check_course,
+    gnss.check_scatter,
+    gnss_frame.check_velocity,
+    scale.check_speed_scale,
 )
 
 MAX_ROUNDS = 20

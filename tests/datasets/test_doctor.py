@@ -107,7 +107,7 @@ FAULTS: list[tuple[Callable[[Recording], Recording], str, str, str]] = [
     (accel_in_g, "error", "imu", "looks like g"),
     (no_gravity, "error", "imu", "not 9.8"),
     (gyro_flipped, "error", "imu", "against the wheels"),
-    (left_negative, "warning", "wheels", "against each other"),
+    (left_negative, "error", "wheels", "against each other"),
     (zero_sigma, "error", "gnss", "3 of 300 fixes"),
     (gnss_jump, "warning", "gnss", "1 jump"),
     (wrong_radius, "warning", "wheels", "times the wheel speed"),
@@ -123,9 +123,7 @@ def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Record
     found = next(f for f in findings if f.channel == channel and what in f.what)
     assert found.evidence
     assert found.fix
-    assert set(found.to_dict()) == {
-        "code", "severity", "channel", "what", "evidence", "fix", "repairable"
-    }
+    assert set(found.to_dict()) == {"code", "severity", "channel", "what", "evidence", "fix", "repairable"}
 
 
 def test_held_value_count_is_told(drive: Recording) -> None:

@@ -1,0 +1,178 @@
+"""Gyro, wheels, fixes, truth and command must turn alike: who contradicts the others?"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import numpy as np
+
+from terrafusion.datasets.conventions import Conventions, apply
+from terrafusion.datasets.doctor.directions import runs_backwards, sides_opposed
+from terrafusion.datasets.doctor.finding import Finding, Patient, Repair
+from terrafusion.datasets.doctor.gnss_frame import reflection
+from terrafusion.datasets.doctor.mounting import heading, stands_up
+from terrafusion.datasets.doctor.turning import SURE_R, Agreement, agreements, contradictors
+from terrafusion.datasets.recording import Recording
+
+Pairs = dict[tuple[str, str], Agreement]
+
+DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
+"""Gyro rate over another's: the inverse track, 0.3 to 4 1/m, for the wheels, else 1; above these in deg/s."""
+UNRELATED_R, LIVELY = 0.3, 0.05
+NAMES = {
+    "gyro": "gyro z",
+    "wheels": "the wheels",
+    "gnss": "the path of the fixes",
+    "truth": "the truth's yaw",
+    "command": "the command",
+    "accelerometer": "the accelerometer",
+}
+CHANNELS = {"gyro": "imu"}
+CODES = {"gyro": "yaw-sign", "wheels": "wheel-swap", "gnss": "gnss-course", "truth": "truth-yaw"}
+
+
+def check_gyro_unit(patient: Patient) -> Iterator[Finding]:
+    """The gyro must be in rad/s."""
+    found = _pairs(patient)
+    for other, limit in DEGREES_SLOPE.items():
+        both = found.get(("gyro", other))
+        if both is None or abs(both.r) < SURE_R or abs(both.slope) < limit:
+            continue
+        unit = (
+            "rad/s for each m/s between the sides"
+            if other == "wheels"
+            else f"times the turn of {NAMES[other]}"
+        )
+        yield Finding(
+            "gyro-in-degrees",
+            "error",
+            "imu",
+            f"gyro z is far larger than the turn of {NAMES[other]}: it looks like deg/s",
+            f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}",
+            "multiply by pi / 180",
+            _to_radians,
+        )
+        return
+
+
+def check_turns(patient: Patient) -> Iterator[Finding]:
+    """All channels must turn to the same side; the fewest that contradict are at fault."""
+    found = _pairs(patient)
+    signs = {pair: float(np.sign(both.r)) for pair, both in found.items() if abs(both.r) > SURE_R}
+    pressed = heading(patient)
+    if pressed is not None and pressed.turn and ("gyro", "wheels") in signs:
+        signs["gyro", "accelerometer"] = pressed.turn
+    blamed = contradictors(signs)
+    against = [pair for pair, sign in signs.items() if sign < 0.0]
+    if not against:
+        return
+    if not blamed:
+        yield Finding(
+            "yaw-contradiction",
+            "warning",
+            "imu",
+            f"{NAMES[against[0][0]]} turns against {NAMES[against[0][1]]}",
+            _told(against, found) + "; no single sign explains all",
+            "check the axes and signs of all of them",
+        )
+        return
+    if frozenset({"wheels"}) in blamed and runs_backwards(patient) is not None:
+        return  # one fault explains both: see wheels.check_direction
+    for name in sorted(blamed[0], key=lambda name: name == "command"):
+        others = [pair for pair in against if name in pair]
+        if others and name != "accelerometer":
+            yield _contradiction(patient, name, others, found, sure=len(blamed) == 1)
+
+
+def _contradiction(
+    patient: Patient, name: str, against: list[tuple[str, str]], found: Pairs, *, sure: bool
+) -> Finding:
+    fix, repair = _remedy(patient, name)
+    if not sure:
+        rivals = [NAMES[other] for pair in against for other in pair if other != name]
+        fix += f" (assumed: no third channel tells whether {NAMES[name]} or {', '.join(rivals)} is wrong)"
+    other = next(one for one in against[0] if one != name)
+    return Finding(
+        CODES.get(name, "command-sign"),
+        "warning" if name in ("truth", "command") else "error",
+        CHANNELS.get(name, name),
+        f"{NAMES[name]} turns against {NAMES[other]}",
+        _told(against, found),
+        fix,
+        repair,
+    )
+
+
+def _told(against: list[tuple[str, str]], found: Pairs) -> str:
+    parts = [
+        f"correlation {found[pair].r:.2f} of {NAMES[pair[0]]} with {NAMES[pair[1]]}"
+        if pair in found
+        else "in turns the accelerometer is pressed the other way"
+        for pair in against
+    ]
+    return ", ".join(parts)
+
+
+def _remedy(patient: Patient, name: str) -> tuple[str, Repair | None]:
+    """What to do where one channel turns the wrong way."""
+    if name == "gyro":
+        if not stands_up(patient):
+            return "turn the IMU to z up first, then look again", None
+        return "change the sign of gyro z (left turn positive)", _gyro_sign
+    if name == "wheels":
+        return "swap left and right wheels", _swap_sides
+    if name == "gnss":
+        return reflection(patient.recording)
+    if name == "truth":
+        return "check the truth's frame: its yaw must grow to the left", None
+    return "change the sign of the commanded yaw rate (left turn positive)", _command_sign
+
+
+def check_unrelated(patient: Patient) -> Iterator[Finding]:
+    """Gyro z must follow the wheels, whatever its sign."""
+    both = _pairs(patient).get(("gyro", "wheels"))
+    if both is None or min(both.spread) < LIVELY or not -SURE_R <= both.r < UNRELATED_R:
+        return
+    yield Finding(
+        "yaw-unrelated",
+        "warning",
+        "imu",
+        "gyro z does not follow the wheels",
+        f"correlation {both.r:.2f} of the half-second means",
+        "check the IMU's axes and the two clocks; on slippery ground it may be real",
+    )
+
+
+def _pairs(patient: Patient) -> Pairs:
+    """What can be compared, without wheels of which one side has the wrong sign: they tell no turn."""
+    found = agreements(patient)
+    if any("wheels" in pair for pair in found) and sides_opposed(patient) is not None:
+        found = {pair: both for pair, both in found.items() if "wheels" not in pair}
+    return found
+
+
+def _to_radians(recording: Recording) -> Recording:
+    assert recording.imu is not None
+    imu = dataclasses.replace(recording.imu, gyro_radps=np.radians(recording.imu.gyro_radps))
+    return dataclasses.replace(recording, imu=imu)
+
+
+def _gyro_sign(recording: Recording) -> Recording:
+    return apply(recording, Conventions(gyro_z_sign=-1.0))
+
+
+def _swap_sides(recording: Recording) -> Recording:
+    wheels = recording.wheels
+    assert wheels is not None
+    other = [0] if len(wheels.names) == 1 else [k ^ 1 for k in range(len(wheels.names))]
+    angle = None if wheels.angle_rad is None else wheels.angle_rad[:, other]
+    swapped = dataclasses.replace(wheels, speed=wheels.speed[:, other], angle_rad=angle)
+    return dataclasses.replace(recording, wheels=swapped)
+
+
+def _command_sign(recording: Recording) -> Recording:
+    command = recording.command
+    assert command is not None
+    turned = dataclasses.replace(command, yaw_rate_radps=-command.yaw_rate_radps)
+    return dataclasses.replace(recording, command=turned)
