@@ -6,29 +6,28 @@ samples are put together, which tells of windows of 2 s what none of them tells 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.conventions import true_updates
+from terrafusion.datasets.doctor.accounts import speeds, yaw_rates
 from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.magnitude import check_magnitude
-from terrafusion.datasets.doctor.motion import speed_ratios
+from terrafusion.datasets.doctor.path import Places, Windows, compare, dead_reckoned, places, scale_of
+from terrafusion.datasets.doctor.turning import LEAST_WINDOWS, WINDOW_S, accounts
 from terrafusion.datasets.lag import held_rows, lag_between
-from terrafusion.datasets.recording import Fix, Gnss, Recording
+from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.sensors import Rig
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
-Signal = tuple[TimesNs, Array]
 
-STRAIGHT_S = 10.0
-"""Length of the stretches over which speeds are compared; shorter in recordings that are shorter."""
-YAW_GRID_S = 0.5
-CHORD_S = 0.5
-"""Half the time over which positions are differenced to a speed."""
+LEAST_SPREAD_M = 0.1
+"""Root mean square way from its middle that a recording too short for windows must go."""
 LAG_PAIRS = {
     "yaw rate": (("imu", "wheels"), ("imu", "truth"), ("command", "wheels")),
     "speed": (("wheels", "gnss"), ("wheels", "truth"), ("command", "wheels")),
@@ -55,7 +54,8 @@ class YawFit:
     """Gyro z beside the wheels: correlation of half-second means, and the track that makes them equal.
 
     The effective track (left and right speed apart by track times yaw rate) of a robot that skids
-    is wider than the one it was built with. None where the wheel radius is unknown.
+    is wider than the one it was built with. None where the wheel radius is unknown. A lag is taken
+    out first.
     """
 
     r: float
@@ -65,9 +65,9 @@ class YawFit:
 
 @dataclass(frozen=True)
 class Ratio:
-    """Speed of the ground over speed of the wheels: median of straight stretches, its 95 % interval."""
+    """Path over ground over path by wheels and gyro, with its 95 % interval, from so many stretches."""
 
-    median: float
+    ratio: float
     low: float
     high: float
     stretches: int
@@ -132,11 +132,13 @@ def measure(recordings: Sequence[Recording], rig: Rig | None = None) -> Measures
     patients = [patient for patient in patients if not list(check_magnitude(patient))]
     if not patients:
         return Measures()  # numbers beyond anything possible are not computed with
+    lags = tuple(_lags(patients[0])) if len(recordings) == 1 else ()
+    together = [_brought_together(patient, lags) for patient in patients]
     return Measures(
         gravity=_gravity(patients),
-        yaw=_yaw(patients),
-        speed_ratio=_speed_ratios(patients),
-        lags=tuple(_lags(patients[0])) if len(recordings) == 1 else (),
+        yaw=_yaw(together),
+        speed_ratio=_speed_ratios(together),
+        lags=lags,
         path_m=_paths(patients),
         sigma_m=_sigma(patients),
         held=_held(patients),
@@ -163,89 +165,77 @@ def _yaw(patients: Sequence[Patient]) -> YawFit | None:
     if not pairs:
         return None
     turn, rate = (np.concatenate([pair[k] for pair in pairs]) for k in range(2))
-    known = np.isfinite(turn) & np.isfinite(rate)
-    turn, rate = turn[known], rate[known]
-    if len(turn) < 20 or not min(turn.std(), rate.std()) > 1e-9:
+    if len(turn) < LEAST_WINDOWS or not min(turn.std(), rate.std()) > 0.0:
         return None
     covariance = np.cov(turn, rate)
     r = float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
     metric = all(patient.wheel_radius_m() is not None for patient in patients)
     track = float(covariance[0, 1] / covariance[1, 1]) if metric and abs(r) > LEAST_R else None
-    return YawFit(r, track, len(turn) * YAW_GRID_S)
+    return YawFit(r, track, len(turn) * WINDOW_S)
 
 
 def _yaw_pair(patient: Patient) -> tuple[Array, Array] | None:
-    """Half-second means of right less left wheel speed (m/s; rad/s without a radius) and of gyro z."""
-    wheels, imu = patient.recording.wheels, patient.recording.imu
-    if wheels is None or imu is None or not wheels.has_sides() or min(len(wheels), len(imu)) < 2:
+    """Half-second means of right less left wheel speed and of gyro z, each (N,)."""
+    known = accounts(patient)
+    if "wheels" not in known or "gyro" not in known:
         return None
-    sides = wheels.side_speeds_mps(patient.wheel_radius_m() or 1.0)
-    origin = max(wheels.t_ns[0], imu.t_ns[0])
-    common_s = float(min(wheels.t_ns[-1], imu.t_ns[-1]) - origin) * 1e-9
-    edges = np.arange(0.0, common_s + 1e-9, YAW_GRID_S)
-    if len(edges) < 2:
-        return None
-    turn = _means(edges, (wheels.t_ns - origin) * 1e-9, sides[:, 1] - sides[:, 0])
-    return turn, _means(edges, (imu.t_ns - origin) * 1e-9, imu.gyro_radps[:, 2])
-
-
-def _means(edges: Array, t_s: Array, values: Array) -> Array:
-    """Means of the samples between neighbouring edges, (len(edges) - 1,); NaN where there is none."""
-    known = np.isfinite(values)
-    counts, _ = np.histogram(t_s[known], edges)
-    sums, _ = np.histogram(t_s[known], edges, weights=values[known])
-    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+    wheels, gyro = known["wheels"], known["gyro"]
+    start, end = max(wheels.t_s[0], gyro.t_s[0]), min(wheels.t_s[-1], gyro.t_s[-1])
+    grid = np.arange(start, end + 1e-9, WINDOW_S)
+    return (wheels.rates(grid), gyro.rates(grid)) if len(grid) > 1 else None
 
 
 def _speed_ratios(patients: Sequence[Patient]) -> dict[str, Ratio]:
     found: dict[str, Ratio] = {}
-    for name, ground in (("gnss", _fixes), ("truth", _truth_as_fixes)):
-        ratios = np.concatenate([np.zeros(0), *(_ratios(patient, ground) for patient in patients)])
-        if len(ratios) >= 3:
-            low, high = _median_interval(ratios)
-            found[name] = Ratio(float(np.median(ratios)), low, high, len(ratios))
+    for source in ("gnss", "truth"):
+        parts = [
+            windows
+            for patient in patients
+            for true in places(patient.recording)
+            if true.source == source
+            and (windows := compare(patient, true) or _whole(patient, true)) is not None
+        ]
+        if not parts:
+            continue
+        fields = (f.name for f in dataclasses.fields(Windows))
+        together = Windows(
+            **{name: np.concatenate([getattr(part, name) for part in parts]) for name in fields}
+        )
+        scale = scale_of(together, source)
+        if scale is not None:
+            found[source] = Ratio(scale.ratio, scale.low, scale.high, scale.windows)
     return found
 
 
-def _ratios(patient: Patient, ground: Callable[[Recording], Gnss | None]) -> Array:
-    recording, radius = patient.recording, patient.wheel_radius_m()
-    fixes = ground(recording)
-    if recording.wheels is None or fixes is None or radius is None or len(fixes) < 2:
-        return np.zeros(0)
-    window_s = min(STRAIGHT_S, 0.9 * recording.duration_s())
-    return speed_ratios(recording.wheels, fixes, radius, window_s)
-
-
-def _fixes(recording: Recording) -> Gnss | None:
-    gnss = recording.gnss
-    return gnss if gnss is not None and np.isfinite(gnss.sigma_enu_m[:, :2]).any() else None
-
-
-def _truth_as_fixes(recording: Recording) -> Gnss | None:
-    truth = recording.truth
-    if truth is None or len(truth) < 2:
+def _whole(patient: Patient, true: Places) -> Windows | None:
+    """A recording too short for windows as one window; see `path.compare`."""
+    reckoned = dead_reckoned(patient)
+    if reckoned is None:
         return None
-    n = len(truth)
-    return Gnss(truth.t_ns, truth.position_m, np.full((n, 3), 0.01), np.full(n, Fix.FIXED, dtype=np.uint8))
-
-
-def _median_interval(values: Array) -> tuple[float, float]:
-    """95 % interval of the median by order statistics; neighbours overlap by half and count as one."""
-    ordered, n = np.sort(values), len(values)
-    reach = 1.96 * 0.5 * np.sqrt(n * 2.0)
-    low, high = (int(np.clip(round(0.5 * (n - 1) + s * reach), 0, n - 1)) for s in (-1, 1))
-    return float(ordered[low]), float(ordered[high])
+    t, v, path = reckoned
+    inside = (true.t_s >= t[0]) & (true.t_s <= t[-1])
+    n = int(inside.sum())
+    if n < 3:
+        return None
+    p, g = np.interp(true.t_s[inside], t, path), true.place[inside]
+    p, g = p - p.mean(), g - g.mean()
+    pp, gg, pg = np.vdot(p, p).real, np.vdot(g, g).real, abs(np.vdot(p, g))
+    if min(pp, gg) <= n * max(LEAST_SPREAD_M, 3.0 * true.sigma_m) ** 2:
+        return None
+    residual = np.sqrt(max(gg - pg**2 / pp, 0.0) / max(2 * n - 4, 1))
+    row = (pg / pp, pg / np.sqrt(pp * gg), np.abs(v).mean(), pp, residual)
+    return Windows(*(np.array([float(value)]) for value in row))
 
 
 def _lags(patient: Patient) -> Iterator[PairLag]:
     """Lags between the channels of `LAG_PAIRS` that are there."""
     radius = patient.wheel_radius_m() or 1.0
-    accounts = {
-        "yaw rate": _yaw_rates(patient.recording, radius),
-        "speed": _speeds(patient.recording, radius),
+    told = {
+        "yaw rate": yaw_rates(patient.recording, radius),
+        "speed": speeds(patient.recording, radius),
     }
     for quantity, pairs in LAG_PAIRS.items():
-        signals = accounts[quantity]
+        signals = told[quantity]
         for one, other in pairs:
             if one not in signals or other not in signals:
                 continue
@@ -260,52 +250,17 @@ def _lags(patient: Patient) -> Iterator[PairLag]:
                 yield PairLag(quantity, other, one, -late, -high, -low, lag.r)
 
 
-def _yaw_rates(recording: Recording, radius: float) -> dict[str, Signal]:
-    """Every channel's account of the yaw rate; that of the wheels up to the track."""
-    found: dict[str, Signal] = {}
-    if recording.imu is not None:
-        found["imu"] = recording.imu.t_ns, recording.imu.gyro_radps[:, 2]
-    wheels, truth, command = recording.wheels, recording.truth, recording.command
-    if wheels is not None and wheels.has_sides():
-        sides = wheels.side_speeds_mps(radius)
-        found["wheels"] = wheels.t_ns, sides[:, 1] - sides[:, 0]
-    if truth is not None and truth.quaternion is not None and len(truth) > 2:
-        found["truth"] = truth.t_ns, np.gradient(np.unwrap(truth.yaw_rad()), truth.t_ns * 1e-9)
-    if command is not None:
-        found["command"] = command.t_ns, command.yaw_rate_radps
-    return {name: signal for name, signal in found.items() if np.isfinite(signal[1]).sum() > 1}
-
-
-def _speeds(recording: Recording, radius: float) -> dict[str, Signal]:
-    """Every channel's account of the speed, without sign: fixes do not know it."""
-    found: dict[str, Signal] = {}
-    wheels, gnss, truth, command = recording.wheels, recording.gnss, recording.truth, recording.command
-    if wheels is not None:
-        found["wheels"] = wheels.t_ns, np.abs(wheels.side_speeds_mps(radius).mean(axis=1))
-    if gnss is not None and len(gnss) > 2:
-        known = gnss.velocity_enu_mps is not None and np.isfinite(gnss.velocity_enu_mps[:, :2]).any()
-        velocity = gnss.velocity_enu_mps if known else None
-        by_chord = _chord_speeds(gnss.t_ns, gnss.enu_m)
-        found["gnss"] = gnss.t_ns, by_chord if velocity is None else np.hypot(*velocity[:, :2].T)
-    if truth is not None and len(truth) > 2:
-        found["truth"] = truth.t_ns, _chord_speeds(truth.t_ns, truth.position_m)
-    if command is not None:
-        found["command"] = command.t_ns, np.abs(command.v_mps)
-    return {name: signal for name, signal in found.items() if np.isfinite(signal[1]).sum() > 1}
-
-
-def _chord_speeds(t_ns: TimesNs, position_m: Array) -> Array:
-    """Speed (N,) from the places half a second before and after; NaN near the ends."""
-    t = (t_ns - t_ns[0]) * 1e-9
-    known = np.isfinite(position_m[:, :2]).all(axis=1)
-    speed = np.full(len(t), np.nan)
-    if known.sum() < 2:
-        return speed
-    ends = np.stack([t - CHORD_S, t + CHORD_S])
-    steps = [np.diff(np.interp(ends, t[known], position_m[known, k]), axis=0)[0] for k in range(2)]
-    inside = (ends[0] >= t[known][0]) & (ends[1] <= t[known][-1])
-    speed[inside] = (np.hypot(*steps) / (2.0 * CHORD_S))[inside]
-    return speed
+def _brought_together(patient: Patient, lags: Sequence[PairLag]) -> Patient:
+    """The patient with the wheels' times brought onto the clock that their lag was measured against."""
+    wheels = patient.recording.wheels
+    lag = next(
+        (lag for lag in lags if "wheels" in (lag.earlier, lag.later) and lag.earlier != "command"), None
+    )
+    if wheels is None or lag is None:
+        return patient
+    late_ns = round((lag.seconds if lag.later == "wheels" else -lag.seconds) * 1e9)
+    moved = dataclasses.replace(wheels, t_ns=wheels.t_ns - late_ns)
+    return dataclasses.replace(patient, recording=dataclasses.replace(patient.recording, wheels=moved))
 
 
 def _paths(patients: Sequence[Patient]) -> dict[str, float]:

@@ -162,7 +162,9 @@ def _grouped_notes(each: Iterable[Sequence[str]]) -> list[dict[str, Any]]:
     groups: dict[str, dict[str, Any]] = {}
     for notes in each:
         for key, note in {re.sub(r"\d+(\.\d+)?", "#", note): note for note in notes}.items():
-            groups.setdefault(key, {"note": note, "recordings": 0})["recordings"] += 1
+            group = groups.setdefault(key, {"note": note, "recordings": 0, "numbers_vary": False})
+            group["recordings"] += 1
+            group["numbers_vary"] |= note != group["note"]
     return list(groups.values())
 
 

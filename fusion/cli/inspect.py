@@ -74,4 +74,6 @@ def examined(
     measures = measure(recordings, rig_of(recordings[0], rig))
     if len(recordings) == 1:
         return summarise(recordings[0], measures, findings[0])
-    return summarise_all(Path(log).name, recordings, measures, findings)
+    names = {recording.name.rpartition("#")[0] for recording in recordings}
+    name = names.pop() if len(names) == 1 else ""
+    return summarise_all(name or Path(log).name, recordings, measures, findings)

@@ -128,8 +128,8 @@ def _scales(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield (
             "speed",
             (
-                f"{name} over wheels {ratio['median']:.3f} ({ratio['low']:.3f} to {ratio['high']:.3f}; "
-                f"{ratio['stretches']} straight stretches)"
+                f"{name} over wheels {ratio['ratio']:.3f} ({ratio['low']:.3f} to {ratio['high']:.3f}; "
+                f"{ratio['stretches']} stretches)"
             ),
         )
     if measured["path_m"]:
@@ -164,8 +164,9 @@ def _times(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _note(note: str | dict[str, Any], recordings: int) -> str:
     if isinstance(note, str):
         return note
-    count = note["recordings"]
-    return note["note"] if recordings == count else f"{note['note']} ({count} of {recordings})"
+    remarks = ["numbers vary"] if note["numbers_vary"] else []
+    remarks += [f"{note['recordings']} of {recordings}"] if note["recordings"] < recordings else []
+    return f"{note['note']} ({_glued(', '.join(remarks))})" if remarks else str(note["note"])
 
 
 def _findings(page: dict[str, Any]) -> Iterator[Line]:

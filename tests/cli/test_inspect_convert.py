@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 import typer
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers import formats, open_recording
+from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.cli import convert, inspect
 
 FILES = {
@@ -85,6 +88,151 @@ def test_inspect_tells_a_gap(log: Path, capsys: pytest.CaptureFixture[str]) -> N
     row = next(line for line in out.splitlines() if line.startswith("imu "))
     assert row.split()[-2:] == ["1", "2"]  # gaps, and the longest in s
     assert "imu: 1 gap [gaps]" in out
+
+
+def fill(path: Path, rows: dict[str, np.ndarray]) -> None:
+    """A table of the log folder."""
+    lines = (",".join(f"{value:.6f}" for value in row) for row in zip(*rows.values(), strict=True))
+    path.write_text("\n".join([",".join(rows), *lines, ""]))
+
+
+@pytest.fixture
+def known_log(tmp_path: Path) -> Path:
+    """A minute with turns whose measures are known: track 0.8 m, GNSS 4 % slower than the wheels,
+    wheels 0.3 s late, gravity on +y, wheels held for four rows."""
+    folder = tmp_path / "known"
+    folder.mkdir()
+    (folder / "meta.yaml").write_text("start_ns: 0\nlicence: MIT\nsource: a test\n")
+    fine = np.arange(0.0, 60.0, 0.01)
+    v = 0.96 * (1.0 + 0.3 * np.sin(0.5 * fine))
+    rate = 0.3 * np.sin(fine) * (fine > 30.0)
+    yaw = np.cumsum(rate) * 0.01
+    east, north = np.cumsum(v * np.cos(yaw)) * 0.01, np.cumsum(v * np.sin(yaw)) * 0.01
+    zero, t_w, t_g = 0.0 * fine, np.arange(0.0, 59.9, 0.05), np.arange(0.0, 59.0, 0.2)
+    at_w = np.maximum(np.floor(t_w / 0.2) * 0.2 - 0.3, 0.0)
+    speed, turn = np.interp(at_w, fine, v) / 0.96, np.interp(at_w, fine, rate)
+    fill(folder / "imu.csv", {
+        "t_s": fine, "gyro_x_radps": zero, "gyro_y_radps": zero, "gyro_z_radps": rate,
+        "accel_x_mps2": zero, "accel_y_mps2": zero + 9.81, "accel_z_mps2": zero,
+    })  # fmt: skip
+    fill(folder / "wheels.csv", {"t_s": t_w, "left_mps": speed - 0.4 * turn, "right_mps": speed + 0.4 * turn})
+    sigma = 0.02 + 0.0 * t_g
+    fill(folder / "gnss.csv", {
+        "t_s": t_g, "east_m": np.interp(t_g, fine, east), "north_m": np.interp(t_g, fine, north),
+        "sigma_e_m": sigma, "sigma_n_m": sigma,
+    })  # fmt: skip
+    return folder
+
+
+def test_inspect_measures(known_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "inspect", known_log, "--json")
+    assert status == 0
+    page = json.loads(out)
+    measured = page["measured"]
+    assert (page["licence"], page["source"], page["recordings"]) == ("MIT", "a test", 1)
+    assert measured["gravity"]["axis"] == "+y"
+    assert measured["gravity"]["size_mps2"] == pytest.approx(9.81)
+    assert measured["yaw"]["r"] > 0.9
+    assert measured["yaw"]["effective_track_m"] == pytest.approx(0.8, rel=0.1)
+    assert measured["speed_ratio"]["gnss"]["ratio"] == pytest.approx(0.96, rel=0.01)
+    late = next(lag for lag in measured["lags"] if lag["quantity"] == "yaw rate")
+    assert (late["later"], late["earlier"]) == ("wheels", "imu")
+    assert late["low_s"] < 0.3 < late["high_s"]
+    assert late["seconds"] == pytest.approx(0.3, abs=0.03)
+    assert measured["path_m"]["wheels"] == pytest.approx(60.0, rel=0.02)
+    assert measured["path_m"]["gnss"] == pytest.approx(0.96 * 59.0, rel=0.02)
+    assert measured["held"]["wheels"]["update_hz"] == pytest.approx(5.0, rel=0.05)
+    assert measured["sigma_m"] == {"min": 0.02, "median": 0.02, "max": 0.02}
+
+
+def test_page_tells_the_same_and_fits(known_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, out, _ = run(capsys, "inspect", known_log)
+    assert max(len(line) for line in out.splitlines()) <= 100
+    text = " ".join(out.split())
+    for word in (
+        "licence MIT; a test",
+        "along +y",
+        "effective track 0.79",
+        "gnss over wheels 0.96",
+        "wheels after imu by 0.",
+        "wheels: 5",
+        "[imu-axes]",
+    ):
+        assert word in text, out
+
+
+class Windows(formats.Format):
+    """A file of three recordings: a drive, the same with its IMU upside down, and one without GNSS."""
+
+    def claims(self, path: Path, head: bytes) -> bool:
+        return path.suffix == ".windows"
+
+    def read(self, request: formats.Request) -> list[Recording]:
+        drive = open_recording(request.path.read_text())
+        assert drive.imu is not None
+        down = dataclasses.replace(drive.imu, accel_mps2=-drive.imu.accel_mps2)
+        return [
+            drive.with_notes("7 rows dropped"),
+            dataclasses.replace(drive, imu=down).with_notes("8 rows dropped"),
+            dataclasses.replace(drive, gnss=None),
+        ]
+
+
+@pytest.fixture
+def windows(known_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setattr(formats, "FORMATS", (Windows("windows", "windows", ""), *formats.FORMATS))
+    (tmp_path / "some.windows").write_text(str(known_log))
+    return tmp_path / "some.windows"
+
+
+def test_inspect_several(windows: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page = json.loads(run(capsys, "inspect", windows, "--json")[1])
+    assert (page["name"], page["recordings"]) == ("some.windows", 3)
+    assert page["duration_s"]["total"] == pytest.approx(3 * page["duration_s"]["median"])
+    assert page["channels"]["imu"]["samples"] == 3 * 6000
+    assert page["channels"]["imu"]["ranges"]["accel_y_mps2"] == [-9.81, 9.81]
+    assert page["channels"]["gnss"]["recordings"] == 2
+    assert {"note": "7 rows dropped", "recordings": 2, "numbers_vary": True} in page["notes"]
+    axes = next(f for f in page["findings"] if f["code"] == "imu-axes")
+    assert (axes["recordings"], axes["first"]) == (3, 0)
+    assert page["measured"]["yaw"]["seconds"] == pytest.approx(3 * 59.5)
+    assert page["measured"]["path_m"]["gnss"] == pytest.approx(2 * 0.96 * 59.0, rel=0.02)
+    _, out, _ = run(capsys, "inspect", windows)
+    assert "3 recordings of" in out
+    assert max(len(line) for line in out.splitlines()) <= 100
+
+
+def test_number_chooses_one_of_several(
+    windows: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    alone = json.loads(run(capsys, "inspect", f"{windows}#2", "--json")[1])
+    assert alone["recordings"] == 1
+    assert "gnss" not in alone["channels"]
+    status, _, err = run(capsys, "convert", windows, tmp_path / "out")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "holds 3 recordings" in err
+    assert f"{windows}#0" in err
+    assert run(capsys, "convert", f"{windows}#2", tmp_path / "out")[0] == 0
+    status, _, err = run(capsys, "inspect", f"{windows}#3")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "numbered from 0" in err
+
+
+def test_catalogue_name(husky_bag: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert husky_bag.is_file()
+    page = json.loads(run(capsys, "inspect", "husky_parkinglot/test1", "--json")[1])
+    assert page["licence"] == "BSD-3-Clause"
+    assert page["channels"]["gnss"]["samples"] == 989
+
+
+def test_absent_catalogue_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TERRAFUSION_DATA", str(tmp_path))
+    monkeypatch.setattr("terrafusion.datasets.catalog.cache_folder", lambda: tmp_path)
+    status, _, err = run(capsys, "inspect", "husky_parkinglot/test1")
+    assert (status, err.count("\n")) == (1, 1)
+    assert "terrafusion fetch husky_parkinglot" in err
 
 
 def test_convert_to_mcap_and_back(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
