@@ -72,6 +72,7 @@ FORMATS: tuple[Format, ...] = (
     Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.umich_text"),
     Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.norlab_pickle"),
     Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.pathfinder_mat"),
+    Format("single_wheel_mat", "trials of a single wheel (MATLAB v5)", f"{_READERS}.single_wheel_mat"),
     Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.borealtc_csv"),
     Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.xsens_text"),
     Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.rtklib_pos"),
