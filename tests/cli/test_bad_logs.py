@@ -112,7 +112,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         without(*(f"{c}.csv" for c in ("command", "wheels", "imu", "gnss", "motor", "terrain", "truth"))),
         ("no channel", "add at least one"),
     ),
-    "one second": (only_first_second, ("log", "at least")),
+    "one second": (only_first_second, ("overlap for 1.0 s", "at least")),
     "nan text": (
         cells("imu.csv", "gyro_z_radps", "nan"),
         ("imu.csv", "gyro_z_radps", "'nan'", "line 52", "leave the cell empty"),
@@ -147,7 +147,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "missing gyro axis": (drop_column("imu.csv", "gyro_x_radps"), ("no six-axis IMU", "three gyro")),
     "axes swapped": (
         swap("imu.csv", "accel_x_mps2", "accel_z_mps2"),
-        ("imu", "gravity stands on +x", "rotate the IMU"),
+        ("imu", "gravity stands on +x", "turn the accelerometer", "--apply-fixes"),
     ),
     "sides swapped": (
         lambda log: [
@@ -155,18 +155,18 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
             for end in ("front", "rear")
             for unit in ("radps", "rad")
         ],
-        ("imu", "gyro z turns against the wheels", "swap left and right"),
+        ("wheels", "against gyro z", "swap left and right wheels", "--apply-fixes"),
     ),
     "east and north swapped": (
         lambda log: [
             swap("gnss.csv", "east_m", "north_m")(log),
             swap("gnss.csv", "v_e_mps", "v_n_mps")(log),
         ],
-        ("log", "gnss", "turns against the gyro", "east and north may be swapped"),
+        ("log", "gnss", "turns against gyro z", "swap east and north", "--apply-fixes"),
     ),
     "north upside down": (
         scaled("gnss.csv", ("north_m", "v_n_mps"), -1.0),
-        ("log", "gnss", "turns against the gyro"),
+        ("log", "gnss", "turns against gyro z"),
     ),
     "gyro upside down": (
         scaled("imu.csv", ("gyro_z_radps",), -1.0),
@@ -177,7 +177,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "gyro in deg/s": (scaled("imu.csv", SIX[:3], 57.29578), ("imu", "gyro", "deg/s")),
     "sigma zero": (
         cells("gnss.csv", "sigma_e_m", "0", ALL),
-        ("gnss", "sigma that is zero", "give the receiver's accuracy"),
+        ("gnss", "sigma that is zero", "a cautious value"),
     ),
     "one sigma negative": (
         cells("gnss.csv", "sigma_n_m", "-1"),
