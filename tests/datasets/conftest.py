@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import csv
+import itertools
 import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from ruamel.yaml import YAML
 
+from terrafusion.datasets.catalog import CATALOG_VARIABLE, FILE_COLUMNS, HERE, sha256_of
+from terrafusion.datasets.config import read_yaml
 from terrafusion.datasets.frames import rpy_to_quaternion
 from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Motor, Recording, Terrain, Wheels
 from terrafusion.datasets.sensors import GnssSpec, ImuSpec, Rig, SensorSuite, WheelSpec
@@ -124,3 +131,57 @@ def field_logs() -> Path:
     if not folder.is_dir():
         pytest.skip("TERRAFUSION_DATA holds no husky_parkinglot")
     return folder
+
+
+@pytest.fixture
+def published() -> Path:
+    """Folder of all public field logs, where the environment names one."""
+    root = os.environ.get("TERRAFUSION_DATA")
+    if not root:
+        pytest.skip("TERRAFUSION_DATA is not set: the field logs are not at hand")
+    return Path(root)
+
+
+CatalogWith = Callable[..., None]
+"""`catalog_with("norlab_drive", files={path: "grass/raw"}, gyro_z_sign=-1.0)`."""
+
+
+@pytest.fixture
+def catalog_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CatalogWith:
+    """Puts a catalogue of one's own in force: a set of the library's with conventions changed and files added."""
+    count = itertools.count()
+
+    def put(set_name: str, files: dict[Path, str] | None = None, **conventions: Any) -> None:
+        folder = tmp_path / f"catalog{next(count)}"
+        folder.mkdir()
+        own = read_yaml(HERE / "catalog.yaml")[set_name]
+        for group in (own, *(own.get("cases") or {}).values()):
+            kept = {k: v for k, v in (group.get("conventions") or {}).items() if k not in conventions}
+            group["conventions"] = kept
+        own["conventions"] |= {name: _sourced(value) for name, value in conventions.items()}
+        with (folder / "catalog.yaml").open("w", encoding="utf-8") as text:
+            YAML(typ="safe").dump({set_name: own}, text)
+        rows = [FILE_COLUMNS] + [
+            (
+                set_name,
+                name,
+                path.name,
+                "https://example.org",
+                "",
+                path.name,
+                sha256_of(path),
+                path.stat().st_size,
+            )
+            for path, name in (files or {}).items()
+        ]
+        with (folder / "catalog_files.csv").open("w", encoding="utf-8", newline="") as text:
+            csv.writer(text).writerows(rows)
+        monkeypatch.setenv(CATALOG_VARIABLE, str(folder))
+
+    return put
+
+
+def _sourced(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {name: _sourced(item) for name, item in value.items()}
+    return {"value": value, "source": "the test"} if isinstance(value, float) else value
