@@ -1,0 +1,226 @@
+"""One small valid log of every format, for the fuzzer: a folder each, whose `.open` names what to open."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+START_NS = 1_700_000_000_000_000_000
+RADIUS_M, TRACK_M, SECONDS = 0.165, 0.55, 20.0
+
+
+def _drive(rate_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Times (s), speed, yaw rate and position (N, 2) of a winding drive."""
+    t = np.arange(0.0, SECONDS, 1.0 / rate_hz)
+    v, rate = 1.0 + 0.3 * np.sin(0.5 * t), 0.3 * np.sin(0.4 * t)
+    yaw = np.cumsum(rate) / rate_hz
+    place = np.cumsum(np.stack([v * np.cos(yaw), v * np.sin(yaw)], axis=1), axis=0) / rate_hz
+    return t, v, rate, place
+
+
+def _ns(t_s: np.ndarray) -> np.ndarray:
+    return START_NS + np.rint(t_s * 1e9).astype(np.int64)
+
+
+def _inertial(rate_hz: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    t, _, rate, _ = _drive(rate_hz)
+    gyro = rng.normal(0.0, 0.01, (len(t), 3)) + np.outer(rate, (0.0, 0.0, 1.0))
+    return t, gyro, rng.normal((0.0, 0.0, 9.81), 0.2, (len(t), 3))
+
+
+def _sides(v: np.ndarray, rate: np.ndarray) -> np.ndarray:
+    return np.stack([v - rate * TRACK_M / 2, v + rate * TRACK_M / 2], axis=1)
+
+
+def _recording() -> Any:
+    from terrafusion.datasets.frames import rpy_to_quaternion
+    from terrafusion.datasets.recording import (
+        Command,
+        Gnss,
+        Imu,
+        Motor,
+        Overrides,
+        Recording,
+        Terrain,
+        Wheels,
+    )
+    from terrafusion.datasets.trajectory import Trajectory
+
+    t_imu, gyro, accel = _inertial(50)
+    t, v, rate, place = _drive(10)
+    t_ns, flat = _ns(t), np.hstack([place, np.zeros((len(t), 1))])
+    yaw = np.cumsum(rate) / 10
+    truth = Trajectory(t_ns, flat, rpy_to_quaternion(np.stack([0 * yaw, 0 * yaw, yaw], axis=1)))
+    fix = np.full(len(t), 1, dtype=np.uint8)
+    return Recording(
+        "sample", START_NS, vehicle="husky",
+        command=Command(t_ns, v, rate),
+        wheels=Wheels(t_ns, _sides(v, rate) / RADIUS_M, ("left", "right"), "radps"),
+        imu=Imu(_ns(t_imu), gyro, accel),
+        gnss=Gnss(t_ns, flat, np.full((len(t), 3), 0.1), fix),
+        motor=Motor(t_ns, np.full((len(t), 2), 3.0)),
+        terrain=Terrain(t_ns[:1], np.array(["gravel"], dtype=object)),
+        truth=truth, truth_channels=("position", "yaw"), datum=(46.8, -71.2, 90.0),
+        overrides=Overrides(RADIUS_M, TRACK_M),
+    )  # fmt: skip
+
+
+def write_samples(folder: Path) -> list[Path]:
+    """Write all samples into `folder`; returns their folders, sorted."""
+    for write in (_log_folder, _bags, _pickles, _matlab, _umich, _borealtc, _tum):
+        write(folder)
+    return sorted(path for path in folder.iterdir())
+
+
+def _sample(folder: Path, name: str, opened: str) -> Path:
+    """The folder of a sample, made; `opened` is what of it is to be opened ("" for itself)."""
+    sample = folder / name
+    sample.mkdir(parents=True)
+    (sample / ".open").write_text(opened)
+    return sample
+
+
+def _log_folder(folder: Path) -> None:
+    from terrafusion.datasets.writers import write_log_folder
+
+    write_log_folder(_recording(), _sample(folder, "log_folder", "log") / "log")
+
+
+def _bags(folder: Path) -> None:
+    from rosbags.convert.converter import convert
+    from rosbags.typesys import Stores, get_typestore
+
+    from terrafusion.datasets.writers import write_mcap
+
+    mcap = _sample(folder, "mcap", "drive.mcap") / "drive.mcap"
+    write_mcap(_recording(), mcap)
+    everything: tuple[list[str], ...] = ([], [], [], [])
+    ros1, ros2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
+    bag = _sample(folder, "ros1", "drive.bag") / "drive.bag"
+    convert([mcap], bag, "", 0, None, "", ros2, ros1, *everything)
+    database = _sample(folder, "db3", "drive/drive.db3") / "drive"
+    convert([mcap], database, "sqlite3", 8, None, "", ros2, ros2, *everything)
+
+
+def _pickles(folder: Path) -> None:
+    import pandas as pd
+
+    t, v, rate, place = _drive(20)
+    _, gyro, accel = _inertial(20)
+    sides = _sides(v, rate) / 0.3
+    held = np.repeat(sides[::4], 4, axis=0)[: len(t)]
+    yaw = np.cumsum(rate) / 20
+    raw: dict[str, Any] = {
+        "ros_time": _ns(t), "joy_switch": False, "icp_index": np.arange(len(t)) // 2, "calib_state": "",
+        "calib_step": 0, "meas_left_vel": held[:, 0], "meas_right_vel": held[:, 1], "cmd_vel_x": v,
+        "cmd_vel_omega": rate, "icp_pos_x": place[:, 0], "icp_pos_y": place[:, 1], "icp_pos_z": 0.0,
+        "icp_quat_x": 0.0, "icp_quat_y": 0.0, "icp_quat_z": np.sin(yaw / 2), "icp_quat_w": np.cos(yaw / 2),
+        **{f"imu_{axis}": gyro[:, k] for k, axis in enumerate("xyz")},
+        **{f"imu_acceleration_{axis}": accel[:, k] for k, axis in enumerate("xyz")},
+        **{f"{side}_wheel_{what}": 0.0 for what in ("voltage", "current") for side in ("left", "right")},
+    }  # fmt: skip
+    pd.DataFrame(raw).to_pickle(_sample(folder, "pickle_raw", "raw_dataframe.pkl") / "raw_dataframe.pkl")
+    signals = {
+        "cmd_left": sides[:, 0], "cmd_right": sides[:, 1], "left_wheel_vel": sides[:, 0],
+        "right_wheel_vel": sides[:, 1], "icp_x": place[:, 0], "icp_y": place[:, 1], "icp_z": 0 * t,
+        "icp_roll": 0 * t, "icp_pitch": 0 * t, "icp_yaw": yaw, "imu_yaw": rate,
+        **{f"imu_acceleration_{axis}": accel[:, k] for k, axis in enumerate("xyz")},
+    }  # fmt: skip
+    columns = {
+        f"{name}_{k}": x[: len(t) // 40 * 40].reshape(-1, 40)[:, k]
+        for name, x in signals.items()
+        for k in range(40)
+    }
+    windows = pd.DataFrame(columns)
+    windows = windows.assign(
+        calib_step=np.arange(len(windows)) // 3, steady_state_mask=True, transitory_state_mask=False
+    )
+    windows.to_pickle(_sample(folder, "pickle_windows", "slip_dataset_all.pkl") / "slip_dataset_all.pkl")
+
+
+def _matlab(folder: Path) -> None:
+    import h5py
+    import scipy.io
+
+    t, v, rate, place = _drive(10)
+    t_imu, gyro, accel = _inertial(100)
+    sides = _sides(v, rate) / 0.11
+    wheels = {
+        "frontLeft": -sides[:, 0],
+        "rearLeft": -sides[:, 0],
+        "frontRight": sides[:, 1],
+        "rearRight": sides[:, 1],
+    }
+    llh = np.stack([0.69 + place[:, 1] / 6.37e6, -1.39 + place[:, 0] / 4.9e6, 300.0 + 0 * t], axis=1)
+    down = (1, -1, -1)
+    rows: dict[str, Any] = {
+        "tTimu": START_NS * 1e-9 + t_imu, "tTodom": START_NS * 1e-9 + t, "tTGPS": START_NS * 1e-9 + t,
+        **{f"{name}Vel": w for name, w in wheels.items()},
+        **{f"{name}Pos": np.cumsum(w) / 10 for name, w in wheels.items()},
+        **{f"A{axis}": accel[:, k] * down[k] for k, axis in enumerate("xyz")},
+        **{f"G{axis}": gyro[:, k] * down[k] for k, axis in enumerate("xyz")},
+        "lin_x": v, "lin_y": 0 * v, "ang_z": rate, "Pos_x": place[:, 0], "Pos_y": place[:, 1],
+        "LatSigma": 0 * t + 2.0, "LonSigma": 0 * t + 2.0, "HeightSigma": 0 * t + 4.0,
+    }  # fmt: skip
+    with h5py.File(_sample(folder, "matlab73", "run.mat") / "run.mat", "w", userblock_size=512) as file:
+        for name, values in rows.items():
+            file[name] = np.asarray(values)[None, :]
+        file["llhGPS"] = llh
+        file["ENUGPS"] = np.stack([place[:, 0], place[:, 1], 0 * t], axis=1)
+    names = (
+        "avg_Fx",
+        "std_Fx",
+        "avg_Fy",
+        "std_Fy",
+        "avg_Fz",
+        "std_Fz",
+        "avg_Vx",
+        "std_Vx",
+        "avg_Vry",
+        "std_Vry",
+    )
+    names = (*names, "avg_angle", "std_angle", "avg_Z", "std_Z", "Vry", "beta", "trial_num", "slip")
+    trials = np.zeros((5, 1), dtype=[(name, "O") for name in names])
+    for k in range(5):
+        for name in names:
+            trials[name][k, 0] = np.array([[0.1 * k]])
+    scipy.io.savemat(_sample(folder, "matlab5", "trials.mat") / "trials.mat", {"all_results": trials})
+
+
+def _text(path: Path, table: np.ndarray, mark: str = " ", header: str = "") -> None:
+    lines = [mark.join(repr(float(x)) for x in row) for row in table]
+    path.write_text("\n".join([header, *lines] if header else lines) + "\n")
+
+
+def _umich(folder: Path) -> None:
+    sample = _sample(folder, "umich", "trial9_wheel_imu.txt")
+    t, gyro, accel = _inertial(50)
+    origin = START_NS * 1e-9
+    _text(sample / "trial9_wheel_imu.txt", np.column_stack([origin + t, gyro, accel]))
+    t, v, rate, place = _drive(10)
+    _text(sample / "trial9_wheel_vel.txt", np.column_stack([origin + t, v, 0 * v, 0 * v]))
+    _text(sample / "trial9_oval_center.txt", _poses(origin + t, place, np.cumsum(rate) / 10))
+
+
+def _poses(t: np.ndarray, place: np.ndarray, yaw: np.ndarray) -> np.ndarray:
+    zero = 0 * t
+    return np.column_stack([t, place, zero, zero, zero, np.sin(yaw / 2), np.cos(yaw / 2)])
+
+
+def _borealtc(folder: Path) -> None:
+    sample = _sample(folder, "borealtc", "SNOW/imu_00.csv")
+    (sample / "SNOW").mkdir()
+    t, gyro, accel = _inertial(100)
+    _text(sample / "SNOW" / "imu_00.csv", np.column_stack([t, gyro, accel]), ",", "time,wx,wy,wz,ax,ay,az")
+    t, v, rate, _ = _drive(6.5)
+    table = np.column_stack([t, 3 + 0 * t, 3 + 0 * t, _sides(v, rate)])
+    _text(sample / "SNOW" / "pro_00.csv", table, ",", "time,curL,curR,velL,velR")
+
+
+def _tum(folder: Path) -> None:
+    sample = _sample(folder, "tum", "poses.tum")
+    t, _, rate, place = _drive(10)
+    _text(sample / "poses.tum", _poses(START_NS * 1e-9 + t, place, np.cumsum(rate) / 10))
