@@ -107,6 +107,18 @@ def reading(
     }
 
 
+def clock_accepted(recording: Recording) -> Recording:
+    """The recording whose clock was repaired as asked: the steps become notes, and no finding any more."""
+    import dataclasses
+
+    notes = [
+        f"{jump.channel}: its clock stood {jump.step_s:+.3f} s off from "
+        f"t = {(jump.t_ns - recording.start_ns) * 1e-9:.2f} s on; taken out (--repair-clock)"
+        for jump in recording.clock_jumps
+    ]
+    return dataclasses.replace(recording, clock_jumps=()).with_notes(*notes)
+
+
 def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> None:
     """Refuse a log whose numbers would mislead: what the input doctor calls an error.
 

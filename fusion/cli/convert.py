@@ -14,6 +14,7 @@ from terrafusion.fusion.cli.common import (
     StampsOption,
     TopicOption,
     VehicleOption,
+    clock_accepted,
     load_rig,
     reading,
     refuse_impossible,
@@ -60,6 +61,8 @@ def convert(
 
     rig = load_rig(vehicle)
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock or apply_fixes))
+    if repair_clock:
+        recording = clock_accepted(recording)
     rig = rig_of(recording, rig)
     if vehicle is not None:
         recording = dataclasses.replace(recording, vehicle=vehicle)

@@ -15,6 +15,7 @@ from terrafusion.fusion.cli.common import (
     StampsOption,
     TopicOption,
     VehicleOption,
+    clock_accepted,
     load_rig,
     progress_bar,
     reading,
@@ -75,6 +76,8 @@ def replay(
     outages = [parse_outage(text) for text in gnss_outage or []]
     rig = load_rig(vehicle)
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
+    if repair_clock:
+        recording = clock_accepted(recording)
     refuse_errors(log, recording, rig)
     with progress_bar(f"{mode} {recording.name}") as progress:
         result = run(
