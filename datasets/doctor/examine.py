@@ -9,6 +9,7 @@ from terrafusion.datasets.doctor import (
     gnss_frame,
     inertial,
     mounting,
+    offsets,
     scale,
     signals,
     timing,
@@ -24,9 +25,11 @@ Check = Callable[[Patient], Iterator[Finding]]
 
 CHECKS: tuple[Check, ...] = (
     timing.check_spans,
+    timing.check_steps,
+    timing.check_coarse,
     timing.check_jitter,
-    timing.check_gaps,
     timing.check_duplicates,
+    offsets.check_clocks,
     signals.check_held,
     inertial.check_gravity,
     mounting.check_axes,
