@@ -48,13 +48,16 @@ def repair(t_ns: TimesNs, channel: str, *, forwards: bool = False) -> tuple[Time
     Raises:
         DataError: more than 1000 steps, or steps too large for 64 bits.
     """
-    t_ns, steps = np.asarray(t_ns), _steps(t_ns, channel, forwards)
+    t_ns, steps = np.asarray(t_ns), _steps(t_ns, channel, forwards, None)
     repaired = _shifted(t_ns, steps, channel)
     return repaired, _jumps(channel, repaired, steps)
 
 
 def repair_together(
-    times: Mapping[str, TimesNs], *, forwards: bool = False
+    times: Mapping[str, TimesNs],
+    *,
+    forwards: bool = False,
+    beside: Mapping[str, TimesNs] | None = None,
 ) -> tuple[dict[str, TimesNs], tuple[ClockJump, ...]]:
     """Take the steps out of channels that may share a clock.
 
@@ -65,6 +68,8 @@ def repair_together(
     Args:
         times: (N,) int64 by channel, in the order of the rows.
         forwards: as in `repair`.
+        beside: times of the same rows on another clock of the same rate. What leaps ahead on the
+            first and not on this one is a step and no gap in the data, and is taken out too.
 
     Returns:
         Repaired times by channel (the same arrays where nothing changed), and all jumps.
@@ -72,7 +77,8 @@ def repair_together(
     Raises:
         DataError: as `repair`.
     """
-    steps = {name: _steps(t, name, forwards) for name, t in times.items()}
+    other_clock = beside or {}
+    steps = {name: _steps(t, name, forwards, other_clock.get(name)) for name, t in times.items()}
     fixed = {name: _shifted(t, steps[name], name) for name, t in times.items()}
     fastest_first = sorted(times, key=lambda name: _period_ns(np.diff(times[name]), len(times[name]) // 2))
     for i, name in enumerate(fastest_first):
@@ -107,12 +113,13 @@ def _shifted(t_ns: TimesNs, steps: list[Step], channel: str) -> TimesNs:
     return np.asarray(t_ns + np.cumsum(lacks))
 
 
-def _steps(t_ns: TimesNs, channel: str, forwards: bool) -> list[Step]:
+def _steps(t_ns: TimesNs, channel: str, forwards: bool, beside: TimesNs | None) -> list[Step]:
     interval = np.diff(t_ns)
     suspects = np.flatnonzero(interval < 0)
-    if forwards and (interval > 0).any():
+    if (forwards or beside is not None) and (interval > 0).any():
         leap = max(LEAP_PERIODS * float(np.median(interval[interval > 0])), LEAP_S * 1e9)
-        suspects = np.union1d(suspects, np.flatnonzero(interval > leap))
+        ahead = interval if forwards or beside is None else interval - np.diff(beside)
+        suspects = np.union1d(suspects, np.flatnonzero(ahead > leap))
     steps: list[Step] = []
     for row in (suspects + 1).tolist():
         period = _period_ns(interval, row)
@@ -147,6 +154,8 @@ def _is_disorder(t_ns: TimesNs, row: int, period: float) -> bool:
     has_earlier, has_later = bool((t[:at] < 0).any()), bool((t[at:] > high).any())
     if (not has_earlier and start > 0) or (not has_later and stop < len(t_ns)):
         return False  # time does not come back to where it was, not within a few rows
+    if not has_earlier and not has_later:
+        return False  # all rows before are later than all rows after
     step = high + period
     if not has_earlier:  # the rows before are all that could tell
         step = min(step, at * period)

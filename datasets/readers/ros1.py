@@ -18,4 +18,6 @@ def claims(path: Path, head: bytes) -> bool:
 
 def read(request: Request) -> list[Recording]:
     """The one recording of a ROS 1 bag."""
-    return [read_bag(request, typestore=None, remedy=REMEDY)]
+    from terrafusion.datasets.readers.ros1_file import Ros1File
+
+    return [read_bag(request, Ros1File, REMEDY)]

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros_bag import read_bag
+from terrafusion.datasets.readers.ros_raw import Container
 from terrafusion.datasets.recording import Recording
 
 REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
@@ -22,28 +22,19 @@ def read(request: Request) -> list[Recording]:
 
     Bags that carry no message definitions (SQLite before ROS 2 Iron) are read with those of Humble.
     """
-    from rosbags.typesys import Stores, get_typestore
-
-    path = request.path
-    for part in sorted(path.glob("*.db3")) if path.is_dir() else [path]:
-        if part.suffix == ".db3":
-            _refuse_cut_database(part)
-    return [read_bag(request, typestore=get_typestore(Stores.ROS2_HUMBLE), remedy=REMEDY)]
+    return [read_bag(request, open_container, REMEDY)]
 
 
-def _refuse_cut_database(path: Path) -> None:
-    """SQLite reads a file that lost its tail without a word: compare its size with its header.
+def open_container(path: Path) -> Container:
+    """The container of a ROS 2 bag.
 
-    Page size at byte 16 (1 means 65536) and page count at byte 28, which holds when the counters
-    at bytes 24 and 92 agree: SQLite file format, sec. 1.3.
+    Raises:
+        BagError: it is broken.
     """
-    try:
-        with path.open("rb") as file:
-            header = file.read(100)
-        size = path.stat().st_size
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
-    page = int.from_bytes(header[16:18], "big")
-    wanted = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
-    if len(header) < 100 or (header[24:28] == header[92:96] and size < wanted):
-        raise DataError(f"the database is cut off: {size} of {wanted} bytes", file=path, remedy=REMEDY)
+    from terrafusion.datasets.readers.db3_file import Db3File
+    from terrafusion.datasets.readers.mcap_file import McapFile
+    from terrafusion.datasets.readers.ros2_folder import Ros2Folder
+
+    if path.is_dir():
+        return Ros2Folder(path)
+    return McapFile(path) if path.suffix == ".mcap" else Db3File(path)

@@ -2,105 +2,113 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+import functools
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from terrafusion.datasets.errors import DataError, TerrafusionError
+import numpy as np
+
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros_channels import Builder
-from terrafusion.datasets.readers.ros_messages import Stream, make_stream, times_of, wheel_joints
-from terrafusion.datasets.readers.ros_topics import TYPES, Topic, choose_topics, joint_names
+from terrafusion.datasets.readers.ros_joints import joint_names, wheel_joints
+from terrafusion.datasets.readers.ros_layout import Block, Decoder
+from terrafusion.datasets.readers.ros_messages import Stream, wanted_fields
+from terrafusion.datasets.readers.ros_raw import BagError, Container, Source
+from terrafusion.datasets.readers.ros_recording import META, restore
+from terrafusion.datasets.readers.ros_times import Timing, timing_of
+from terrafusion.datasets.readers.ros_topics import JOINTS, Topic, choose_topics, said_joints
+from terrafusion.datasets.readers.ros_types import types_of
 from terrafusion.datasets.recording import Overrides, Recording
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys.store import Typestore
-
     from terrafusion.datasets.readers.formats import Request
 
+Key = tuple[str, str]
+"""Name and type of a topic."""
+LOOK_AT_MESSAGES = 20
+"""Enough messages of a JointState to learn its joints."""
 
-def read_bag(request: Request, *, typestore: Typestore | None, remedy: str) -> Recording:
-    """Read a bag through rosbags' `AnyReader`.
+
+def read_bag(request: Request, open_container: Callable[[Path], Container], remedy: str) -> Recording:
+    """Read a bag of either ROS.
 
     Args:
         request: the bag, the robot, topics and stamps.
-        typestore: message definitions for bags that do not carry their own.
+        open_container: opens the file or folder.
         remedy: what to do about a bag that does not open.
 
     Raises:
         DataError: a broken bag, no usable topic, or what the channels refuse.
     """
-    from rosbags.highlevel import AnyReader
-
     path = request.path
-    # Any exception of the parser means a broken bag: it reads bytes of unknown origin.
     try:
-        reader = AnyReader([path], default_typestore=typestore)
-        reader.open()
-    except Exception as error:
-        raise DataError(f"cannot be read as a ROS bag: {_reason(error)}", file=path, remedy=remedy) from None
+        with _foreign():
+            container = open_container(path)
+    except BagError as error:
+        raise DataError(f"cannot be read as a ROS bag: {error}", file=path, remedy=remedy) from None
     try:
-        return _assemble(reader, request)
-    except TerrafusionError:
-        raise
-    except _ParseError as error:
+        return _assemble(container, request)
+    except BagError as error:
         raise DataError(
             f"the bag breaks off: {error}", file=path, channel=error.topic, remedy=remedy
         ) from None
     finally:
-        reader.close()
+        container.close()
 
 
-class _ParseError(Exception):
-    """A message that the parser could not read."""
-
-    def __init__(self, topic: str | None, error: Exception) -> None:
-        super().__init__(_reason(error))
-        self.topic = topic
-
-
-def _reason(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}" if not str(error) else str(error).rstrip(".")
+@contextmanager
+def _foreign(topic: str | None = None) -> Iterator[None]:
+    """Around parsers: the bytes are of unknown origin, so whatever they raise, the bag is broken."""
+    try:
+        yield
+    except Exception as error:
+        raise BagError(str(error).rstrip(".") or type(error).__name__, topic) from None
 
 
-def _assemble(reader: AnyReader, request: Request) -> Recording:
-    path, rig, topics = request.path, request.rig, request.topics
-    joints = joint_names(topics)
-    bag = _topics_of(reader)
+def _assemble(container: Container, request: Request) -> Recording:
+    path, rig = request.path, request.rig
+    there = {(source.topic, source.msgtype) for source in container.sources}
+    if META in there and not request.topics and request.stamps == "header":
+        return restore(functools.partial(_read, container), there, path)
+    joints = said_joints(request.topics)
+    topics = _topics_of(container)
     chosen, notes = choose_topics(
-        bag,
+        topics,
         file=path,
-        user=topics,
+        user=request.topics,
         usual=rig.topics if rig else None,
-        is_wheel_joints=lambda topic: _has_wheels(reader, topic, joints),
+        is_wheel_joints=lambda topic: _has_wheels(container, topic, joints),
     )
-    if "gnss" not in chosen:
-        chosen.pop("gnss_velocity", None)
-    if not set(chosen) - {"datum", "gnss_velocity"}:
-        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in bag) or "none"
+    streams = _streams(container, chosen)
+    notes += [f"{kind}: {chosen[kind].name} is empty after all" for kind in chosen.keys() - streams.keys()]
+    if "gnss" not in streams:
+        streams.pop("gnss_velocity", None)
+    if not set(streams) - {"datum", "gnss_velocity"}:
+        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in topics) or "none"
         raise DataError(
             f"no topic of a type this library uses; topics here: {seen}",
             file=path,
             remedy="name one with --topic, such as --topic imu=/imu/data",
         )
-    streams = _streams(reader, {topic.name for topic in chosen.values()})
-    by_kind = {kind: streams[topic.name] for kind, topic in chosen.items()}
-    times, clock = times_of([s for kind, s in by_kind.items() if kind != "datum"], request.stamps, path)
-    start_ns = min(int(t[0]) for t in times.values())
-    builder = Builder(path, rig, request.conventions, start_ns, joints, [*notes, *clock])
-    return _build(builder, by_kind, times)
+    datum = streams.pop("datum", None)
+    timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock, file=path)
+    start_ns = min(int(t[0]) for t in timing.times.values())
+    builder = Builder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
+    return _build(builder, timing, datum)
 
 
-def _build(builder: Builder, streams: dict[str, Stream], times: Mapping[str, Any]) -> Recording:
+def _build(builder: Builder, timing: Timing, datum_stream: Stream | None) -> Recording:
     """One channel after the other; the order matters where one looks at another."""
-    t = {kind: times[stream.topic] for kind, stream in streams.items() if kind != "datum"}
+    streams, t = timing.streams, timing.times
     imu = builder.imu(streams["imu"], t["imu"]) if "imu" in streams else None
     wheels, track = None, None
     if "wheels" in streams:
         wheels, track = builder.wheels(streams["wheels"], t["wheels"], imu)
-    gnss, datum = None, None
-    if "datum" in streams:
-        datum = builder.datum(streams["datum"])
+    gnss, datum = None, builder.datum(datum_stream) if datum_stream is not None else None
     if "gnss" in streams:
         gnss, datum = builder.gnss(streams["gnss"], t["gnss"], datum)
         if gnss is not None and "gnss_velocity" in streams:
@@ -108,7 +116,6 @@ def _build(builder: Builder, streams: dict[str, Stream], times: Mapping[str, Any
     truth, frame = None, "base"
     if "truth" in streams:
         truth, frame = builder.truth(streams["truth"], t["truth"])
-    topics = ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items())
     return Recording(
         name=builder.file.stem,
         start_ns=builder.start_ns,
@@ -122,56 +129,92 @@ def _build(builder: Builder, streams: dict[str, Stream], times: Mapping[str, Any
         truth_channels=truth_contents(truth) if truth is not None else (),
         truth_frame=frame,
         overrides=Overrides(track_m=track),
-        source=f"topics: {topics}",
+        source="topics: " + ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items()),
         notes=tuple(builder.notes),
+        clock_jumps=timing.jumps,
+        imu_frame_id=_usual_frame(streams["imu"]) if "imu" in streams else "",
     )
 
 
-def _topics_of(reader: AnyReader) -> list[Topic]:
-    counts: dict[tuple[str, str], int] = {}
-    for connection in reader.connections:
-        key = (connection.topic, connection.msgtype)
-        counts[key] = counts.get(key, 0) + connection.msgcount
+def _usual_frame(stream: Stream) -> str:
+    """The frame of most messages."""
+    return str(Counter(stream.frame_ids.tolist()).most_common(1)[0][0]) if len(stream.frame_ids) else ""
+
+
+def _topics_of(container: Container) -> list[Topic]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for source in container.sources:
+        counts[source.topic, source.msgtype] += source.count
     return [Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items()) if count]
 
 
-def _has_wheels(reader: AnyReader, topic: str, joints: dict[str, str]) -> bool:
+def _has_wheels(container: Container, topic: str, joints: dict[str, str]) -> bool:
     """Whether the first messages of a JointState topic name wheels."""
-    connections = [c for c in reader.connections if c.topic == topic]
-    names: list[str] = []
-    for seen, (connection, _, raw) in enumerate(_raw_messages(reader, connections)):
-        names += list(_decode(reader, connection, raw).name)
-        if seen >= 20:
-            break
-    return bool(wheel_joints(names, joints))
+    key = topic, JOINTS
+    stream = _read(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
+    return bool(wheel_joints(joint_names(stream), joints))
 
 
-def _streams(reader: AnyReader, topics: set[str]) -> dict[str, Stream]:
-    known = {msgtype for types in TYPES.values() for msgtype in types}
-    connections = [c for c in reader.connections if c.topic in topics and c.msgtype in known]
-    receipts: dict[str, list[int]] = {topic: [] for topic in topics}
-    messages: dict[str, list[Any]] = {topic: [] for topic in topics}
-    for connection, receipt_ns, raw in _raw_messages(reader, connections):
-        receipts[connection.topic].append(receipt_ns)
-        messages[connection.topic].append(_decode(reader, connection, raw))
-    types = {c.topic: c.msgtype for c in connections}
-    return {t: make_stream(t, types[t], receipts[t], messages[t]) for t in sorted(topics)}
+def _streams(container: Container, chosen: Mapping[str, Topic]) -> dict[str, Stream]:
+    """The streams of the chosen topics that do hold messages, by channel."""
+    asked: dict[Key, tuple[str, ...]] = {}
+    for kind, topic in chosen.items():
+        key, fields = (topic.name, topic.msgtype), wanted_fields(kind, topic.msgtype)
+        asked[key] = (*asked.get(key, ()), *fields)
+    streams = _read(container, asked)
+    found = {kind: streams[topic.name, topic.msgtype] for kind, topic in chosen.items()}
+    return {kind: stream for kind, stream in found.items() if len(stream)}
 
 
-def _raw_messages(reader: AnyReader, connections: list[Any]) -> Any:
-    iterator = reader.messages(connections=connections)
+def _read(
+    container: Container, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
+) -> dict[Key, Stream]:
+    """The streams of topics, in one go over the file.
+
+    Args:
+        container: the bag.
+        asked: paths of the wanted fields by topic and type.
+        enough: stop when one topic has so many messages.
+    """
+    decoders: list[tuple[Key, Decoder]] = []
+    groups: list[list[int]] = []
+    for key, fields in asked.items():
+        alike: dict[tuple[str, str, str], list[Source]] = {}
+        for source in container.sources:
+            if (source.topic, source.msgtype) == key:
+                alike.setdefault((source.definition, source.language, source.encoding), []).append(source)
+        for sources in alike.values():
+            with _foreign(key[0]):
+                decoders.append((key, Decoder(key[1], types_of(sources[0]), fields, _is_cdr(sources[0]))))
+            groups.append([source.id for source in sources])
+    batches = container.batches(groups)
     while True:
-        try:
-            item = next(iterator)
-        except StopIteration:
-            return
-        except Exception as error:
-            raise _ParseError(None, error) from None
-        yield item
+        with _foreign():
+            batch = next(batches, None)
+        if batch is None:
+            break
+        key, decoder = decoders[batch.group]
+        with _foreign(key[0]):
+            decoder.add(batch)
+        if enough is not None and decoder.count >= enough:
+            break
+    return {key: _stream(key, [decoder for other, decoder in decoders if other == key]) for key in asked}
 
 
-def _decode(reader: AnyReader, connection: Any, raw: bytes) -> Any:
-    try:
-        return reader.deserialize(raw, connection.msgtype)
-    except Exception as error:
-        raise _ParseError(connection.topic, error) from None
+def _is_cdr(source: Source) -> bool:
+    if source.encoding not in ("ros1", "cdr"):
+        raise BagError(f"its messages are encoded as '{source.encoding[:20]}', which is not supported")
+    return source.encoding == "cdr"
+
+
+def _stream(key: Key, decoders: list[Decoder]) -> Stream:
+    """What the decoders of one topic gathered; there are several where its definition changes."""
+    receipts, blocks = [], []
+    count = 0
+    for decoder in decoders:
+        receipt_ns, found = decoder.result()
+        receipts.append(receipt_ns)
+        blocks += [Block(block.rows + count, block.columns) for block in found]
+        count += len(receipt_ns)
+    stream = Stream(*key, np.concatenate(receipts), tuple(blocks))
+    return stream if len(decoders) == 1 else stream.select(np.argsort(stream.receipt_ns, kind="stable"))

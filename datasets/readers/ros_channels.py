@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,14 +13,8 @@ from terrafusion.datasets.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import geodetic_to_enu
 from terrafusion.datasets.readers import ros_topics
-from terrafusion.datasets.readers.ros_messages import (
-    UNKNOWN_VARIANCE,
-    Stream,
-    poses,
-    twists,
-    vectors,
-    wheel_joints,
-)
+from terrafusion.datasets.readers.ros_joints import holding, joint_names, joint_values, wheel_joints
+from terrafusion.datasets.readers.ros_messages import UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Terrain, Wheels
 from terrafusion.datasets.sensors import Rig
 from terrafusion.datasets.trajectory import Trajectory
@@ -61,10 +54,9 @@ class Builder:
 
     def imu(self, stream: Stream, t_ns: TimesNs) -> Imu:
         """Rates and specific forces in body axes; rotated only where the frame is the rig's."""
-        gyro = vectors([m.angular_velocity for m in stream.messages])
-        accel = vectors([m.linear_acceleration for m in stream.messages])
-        gyro[[m.angular_velocity_covariance[0] == -1 for m in stream.messages]] = np.nan
-        accel[[m.linear_acceleration_covariance[0] == -1 for m in stream.messages]] = np.nan
+        gyro, accel = stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")
+        gyro[stream.column("angular_velocity_covariance.0") == -1] = np.nan
+        accel[stream.column("linear_acceleration_covariance.0") == -1] = np.nan
         for what, values in (("angular velocity", gyro), ("linear acceleration", accel)):
             known = ~np.isnan(values).all(axis=0)
             if not known.any():
@@ -74,7 +66,7 @@ class Builder:
         return Imu(t_ns, gyro, accel)
 
     def _to_body(self, stream: Stream, gyro: Array, accel: Array) -> tuple[Array, Array]:
-        frames = sorted(set(stream.frame_ids))
+        frames = sorted(set(stream.frame_ids.tolist()))
         said = ", ".join(f"'{name}'" for name in frames)
         if self.rig is None:
             if self.known.imu_axes == BODY_AXES:
@@ -84,7 +76,7 @@ class Builder:
             return gyro, accel
         spec = self.rig.sensors.imu
         wanted = spec.frame_id.lstrip("/")
-        turn = np.array([name == wanted for name in stream.frame_ids], dtype=bool)
+        turn = np.asarray(stream.frame_ids == wanted, dtype=bool)
         if not turn.any():
             self.notes.append(
                 f"imu: {stream.topic} is in frame {said}, not '{wanted}' of the vehicle: not rotated"
@@ -139,17 +131,16 @@ class Builder:
         return bool(why)
 
     def _wheels_of_joints(self, stream: Stream, t_ns: TimesNs) -> Wheels | None:
-        lists = [list(m.name) for m in stream.messages]
-        joints = wheel_joints(list(dict.fromkeys(n for names in lists for n in names)), self.joints)
+        names = joint_names(stream)
+        joints = wheel_joints(names, self.joints)
         if not joints:
-            seen = ", ".join(dict.fromkeys(n for names in lists for n in names))
             raise DataError(
-                f"joints {seen or '(none)'} name no wheels",
+                f"joints {', '.join(names) or '(none)'} name no wheels",
                 file=self.file,
                 channel=stream.topic,
                 remedy="name them with --topic joint.left=NAME --topic joint.right=NAME",
             )
-        held = np.array([all(j in names for j in joints.values()) for names in lists], dtype=bool)
+        held = holding(stream, [*joints.values()])
         if not held.any():
             raise DataError(
                 f"no message holds all of the joints {', '.join(joints.values())}",
@@ -157,9 +148,9 @@ class Builder:
                 channel=stream.topic,
                 remedy="name the wheel joints with --topic joint.left=NAME --topic joint.right=NAME",
             )
-        messages = [m for m, keep in zip(stream.messages, held, strict=True) if keep]
-        t_ns = t_ns[held]
-        speed, angle = self._joint_columns(messages, [*joints.values()])
+        stream, t_ns = stream.select(held), t_ns[held]
+        speed = joint_values(stream, [*joints.values()], "velocity")
+        angle = joint_values(stream, [*joints.values()], "position")
         said = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
         self.notes.append(f"wheels: joints of {stream.topic}: {said}")
         if speed is None and angle is not None and len(t_ns) > 1:
@@ -176,22 +167,10 @@ class Builder:
         self._refuse_nan(speed, t_ns, stream.topic, "wheel speed")
         return Wheels(t_ns, speed, tuple(joints), "radps", angle)
 
-    def _joint_columns(self, messages: list[Any], joints: list[str]) -> tuple[Array | None, Array | None]:
-        """Velocities and positions (N, k) of the joints; None where the messages do not hold them."""
-        out: list[Array | None] = []
-        for name in ("velocity", "position"):
-            if all(len(getattr(m, name)) == len(m.name) for m in messages):
-                rows = [[getattr(m, name)[list(m.name).index(j)] for j in joints] for m in messages]
-                values = np.array(rows, dtype=float)
-                out.append(None if np.isnan(values).all() else values)
-            else:
-                out.append(None)
-        return out[0], out[1]
-
     def gnss(self, stream: Stream, t_ns: TimesNs, datum: Datum | None) -> tuple[Gnss | None, Datum | None]:
         """Fixes as ENU about `datum`, or about the first valid fix."""
-        llh = np.array([(m.latitude, m.longitude, m.altitude) for m in stream.messages], dtype=float)
-        status = np.array([m.status.status for m in stream.messages])
+        llh = self._llh(stream)
+        status = stream.column("status.status")
         valid = np.isfinite(llh[:, :2]).all(axis=1) & (status >= 0)
         null = (llh[:, 0] == 0.0) & (llh[:, 1] == 0.0)
         if valid.any() and np.abs(np.median(llh[valid, :2], axis=0)).max() > 0.1:
@@ -214,9 +193,15 @@ class Builder:
         flat = np.isnan(llh[:, 2])
         enu = geodetic_to_enu(np.where(flat[:, None] & [False, False, True], datum[2], llh), datum)
         enu[flat, 2] = np.nan
-        messages = [m for m, keep in zip(stream.messages, valid, strict=True) if keep]
-        codes = [FIX_OF_STATUS.get(int(s), Fix.SINGLE) for s in status]
-        return Gnss(t_ns, enu, self._sigma(messages), np.array(codes, dtype=np.uint8)), datum
+        codes = np.full(len(status), Fix.SINGLE, dtype=np.uint8)
+        for number, fix in FIX_OF_STATUS.items():
+            codes[status == number] = fix
+        return Gnss(t_ns, enu, self._sigma(stream.select(valid)), codes), datum
+
+    def _llh(self, stream: Stream) -> Array:
+        """Latitude, longitude (deg) and height (m), (N, 3)."""
+        names = ("latitude", "longitude", "altitude")
+        return np.stack([stream.column(name).astype(float) for name in names], axis=1)
 
     def _check_range(self, llh: Array, valid: NDArray[np.bool_], t_ns: TimesNs, topic: str) -> None:
         bad = valid & ((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
@@ -230,9 +215,10 @@ class Builder:
                 remedy="NavSatFix wants degrees",
             )
 
-    def _sigma(self, messages: list[Any]) -> Array:
-        variance = np.array([m.position_covariance[::4] for m in messages], dtype=float).reshape(-1, 3)
-        unknown = np.array([m.position_covariance_type == 0 for m in messages], dtype=bool)
+    def _sigma(self, stream: Stream) -> Array:
+        diagonal = [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)]
+        variance = np.stack(diagonal, axis=1)
+        unknown = stream.column("position_covariance_type") == 0
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(variance)
         if unknown.any():
@@ -272,20 +258,20 @@ class Builder:
 
     def datum(self, stream: Stream) -> Datum:
         """The ENU origin that a bag written by this library carries."""
-        first = stream.messages[0]
         self.notes.append(f"gnss: datum from {stream.topic}")
-        return float(first.latitude), float(first.longitude), float(first.altitude)
+        latitude, longitude, height = self._llh(stream)[0].tolist()
+        return latitude, longitude, height
 
     def terrain(self, stream: Stream, t_ns: TimesNs) -> Terrain:
         """Labels as they were published."""
-        return Terrain(t_ns, np.array([m.data for m in stream.messages], dtype=object), stream.topic)
+        return Terrain(t_ns, stream.column("data"), stream.topic)
 
     def truth(self, stream: Stream, t_ns: TimesNs) -> tuple[Trajectory, str]:
         """Ground truth, and which point it is of: "base" or "antenna"."""
         position, quaternion, covariance = poses(stream)
         self._refuse_nan(position[:, :2], t_ns, stream.topic, "position")
         orientation: Array | None = quaternion
-        if np.abs(np.linalg.norm(quaternion, axis=1) - 1.0).max(initial=0.0) > 0.01:
+        if not np.abs(np.linalg.norm(quaternion, axis=1) - 1.0).max(initial=0.0) <= 0.01:
             self.notes.append(f"truth: {stream.topic} has no valid quaternions; only the position is used")
             orientation = None
         if covariance is not None:
@@ -295,7 +281,7 @@ class Builder:
             if not covariance.any() or covariance.diagonal(axis1=1, axis2=2).max() >= UNKNOWN_VARIANCE:
                 covariance = None
         twist = self._truth_twist(stream)
-        child = getattr(stream.messages[0], "child_frame_id", "")
+        child = str(stream.column("child_frame_id")[0]) if stream.has("child_frame_id") else ""
         frame = "antenna" if any(word in child.lower() for word in ("antenna", "gps", "gnss")) else "base"
         fresh = np.concatenate([[True], np.diff(t_ns) > 0])
         if not fresh.all():

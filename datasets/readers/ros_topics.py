@@ -126,7 +126,7 @@ def choose_topics(
     return chosen, notes
 
 
-def joint_names(user: Mapping[str, str] | None) -> dict[str, str]:
+def said_joints(user: Mapping[str, str] | None) -> dict[str, str]:
     """Wheel -> joint name from the entries `joint.<wheel>`."""
     entries = (user or {}).items()
     return {key.removeprefix(JOINT_PREFIX): name for key, name in entries if key.startswith(JOINT_PREFIX)}

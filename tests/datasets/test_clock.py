@@ -152,6 +152,14 @@ def test_a_clock_of_its_own_steps_alone() -> None:
     assert repaired["gnss"] is truth["gnss"]
 
 
+def test_another_clock_tells_a_leap_from_a_gap() -> None:
+    t = np.delete(ticks(3000), range(1000, 1500))
+    leapt = stepped(t, (2000, 60.0))
+    repaired, jumps = repair_together({"imu": leapt}, beside={"imu": t + 3 * MS})
+    np.testing.assert_array_equal(repaired["imu"], t)
+    assert jumps == (ClockJump("imu", int(t[2000]), 60.0),)
+
+
 def test_no_clock_at_all_is_refused() -> None:
     noise = np.random.default_rng(0).integers(0, 2**60, 100_000)
     with pytest.raises(DataError, match=r"imu: time jumps more than 1000 times.*receipt"):

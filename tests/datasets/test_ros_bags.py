@@ -17,7 +17,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.ros_messages import wheel_of_joint
+from terrafusion.datasets.readers.ros_joints import wheel_of_joint
 from terrafusion.datasets.recording import Fix, Recording
 from terrafusion.datasets.sensors import Rig
 
@@ -420,7 +420,7 @@ def test_garbled_bag_never_escapes(tmp_path: Path, suffix: str, seed: int) -> No
 @pytest.mark.parametrize(
     ("name", "content", "word"),
     [("a.bag", b"", "empty"), ("a.mcap", b"", "empty"), ("a.bag", b"#ROSBAG V2.0\n", "cannot be read"),
-     ("a.txt", b"x", "unknown kind"), ("meta.yaml", b"start_ns: 1\n", "unknown kind")],
+     ("a.xyz", b"x", "unknown kind"), ("meta.yaml", b"start_ns: 1\n", "unknown kind")],
 )  # fmt: skip
 def test_other_files(tmp_path: Path, name: str, content: bytes, word: str) -> None:
     (tmp_path / name).write_bytes(content)

@@ -1,0 +1,157 @@
+"""Raw messages of a bag, whatever its container: who sent them, and where their bytes lie.
+
+A container (`ros1_file`, `mcap_file`, `db3_file`) gives its `Source`s and yields `Batch`es: the bytes of a
+chunk and the places of one source's messages in it. No message becomes a Python object of its own.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+Bytes = NDArray[np.uint8]
+Places = NDArray[np.int64]
+
+Groups = Sequence[Collection[int]]
+"""Ids of sources whose messages are wanted together."""
+
+MAX_CHUNK_BYTES = 1 << 28
+"""A chunk that claims to hold more is not believed: recorders write chunks of a few MB."""
+
+
+class BagError(Exception):
+    """A bag that breaks its format; `topic` where it is known."""
+
+    def __init__(self, what: str, topic: str | None = None) -> None:
+        super().__init__(what)
+        self.topic = topic
+
+
+@dataclass(frozen=True)
+class Source:
+    """Who sent messages of one kind: a connection (ROS 1) or a channel (MCAP).
+
+    Attributes:
+        id: as batches name it.
+        topic: its name.
+        msgtype: type, as `package/msg/Type`.
+        definition: text of the type's definition, "" where the bag has none.
+        language: of the definition: "msg" or "idl".
+        encoding: of the messages: "ros1" or "cdr".
+        count: number of messages.
+    """
+
+    id: int
+    topic: str
+    msgtype: str
+    definition: str
+    language: str
+    encoding: str
+    count: int
+
+
+class Batch(NamedTuple):
+    """Some messages of a group of sources, in the order of the file.
+
+    Attributes:
+        group: place of the group among those that were asked for.
+        data: bytes that hold the messages, among others.
+        starts, sizes: (n,) where in `data` each message begins, and its length.
+        receipt_ns: (n,) when the recorder got it.
+    """
+
+    group: int
+    data: Bytes
+    starts: Places
+    sizes: Places
+    receipt_ns: NDArray[np.int64]
+
+
+class Container(Protocol):
+    """An open bag file."""
+
+    sources: list[Source]
+
+    def batches(self, wanted: Groups) -> Iterator[Batch]:
+        """The messages of the wanted groups of sources."""
+        ...
+
+    def close(self) -> None:
+        """Give the file back."""
+        ...
+
+
+def grouped(numbers: NDArray[Any], wanted: Groups) -> Iterator[tuple[int, Places]]:
+    """The rows of each group that has some, by the number (n,) of each row's source."""
+    for group, ids in enumerate(wanted):
+        rows = np.flatnonzero(np.isin(numbers, list(ids)) if len(ids) > 1 else numbers == next(iter(ids)))
+        if rows.size:
+            yield group, rows
+
+
+def normal_type(name: str) -> str:
+    """`package/msg/Type` of a type's name in either ROS."""
+    parts = name.split("/")
+    return f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else name
+
+
+def numbers_at(data: Bytes, places: Places, dtype: str) -> NDArray[Any]:
+    """Numbers of a dtype that lie at any, also uneven, places (n,).
+
+    Raises:
+        BagError: a place outside the data.
+    """
+    kind = np.dtype(dtype)
+    inside = len(data) - kind.itemsize + 1
+    if places.size and (int(places.min()) < 0 or int(places.max()) >= inside):
+        raise BagError("a record reaches past its chunk")
+    return np.asarray(np.ndarray((max(inside, 0),), kind, data, strides=(1,))[places])
+
+
+def rows_at(data: Bytes, starts: Places, size: int) -> Bytes:
+    """The bytes (n, size) of messages of one size."""
+    if not size:
+        return np.zeros((len(starts), 0), dtype=np.uint8)
+    return numbers_at(data, starts, f"V{size}").view(np.uint8).reshape(len(starts), size)
+
+
+def decompress(data: bytes, compression: str, size: int) -> bytes:
+    """The `size` bytes of a chunk; never more memory than it claims and may claim.
+
+    Raises:
+        BagError: too large, of another size than claimed, or compressed in an unknown way.
+    """
+    if size > MAX_CHUNK_BYTES:
+        raise BagError(f"a chunk claims to hold {size} bytes")
+    out = data
+    if compression not in ("", "none"):
+        parts: list[bytes] = []
+        while data and sum(map(len, parts)) <= size:
+            decoder = _decoder(compression)
+            parts.append(decoder.decompress(data, max_length=size + 1 - sum(map(len, parts))))
+            data = decoder.unused_data if decoder.eof else b""
+        out = b"".join(parts)
+    if len(out) != size:
+        raise BagError(f"a chunk claims {size} bytes and holds {len(out) if len(out) < size else 'more'}")
+    return out
+
+
+def _decoder(compression: str) -> Any:
+    if compression == "lz4":
+        return import_module("lz4.frame").LZ4FrameDecompressor()
+    if compression == "bz2":
+        return import_module("bz2").BZ2Decompressor()
+    if compression == "zstd":
+        return zstd().ZstdDecompressor()
+    raise BagError(f"chunks are compressed by '{compression[:20]}', which is not supported")
+
+
+def zstd() -> Any:
+    """The zstd module: Python's own from 3.14 on, before that its backport, which rosbags brings."""
+    return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
