@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAX_CELLS = 20_000_000
-"""Cells of a frame; the largest published table has 230 000."""
+"""Values of all that is built for a frame; the largest published table has 370 000."""
 
 
 class StandIn:
@@ -27,6 +27,10 @@ class StandIn:
     def set_state(self, state: Any) -> None:
         """Take the state that the pickle hands over."""
         raise ValueError(f"{type(self).__name__} takes no state")
+
+    def cells(self) -> int:
+        """Values that it holds: a pickle can name the same list again and again, each time to be copied."""
+        return 0
 
 
 class Dtype(StandIn):
@@ -55,7 +59,7 @@ class Dtype(StandIn):
         kind = np.dtype(self.order + self.text)
         if not isinstance(data, bytes | bytearray) or len(data) != count * kind.itemsize:
             raise ValueError("an array whose bytes do not fill its shape")
-        return np.frombuffer(bytes(data), kind).reshape(shape, order="F" if order == "F" else "C")
+        return np.frombuffer(data, kind).reshape(shape, order="F" if order == "F" else "C")
 
 
 class Array(StandIn):
@@ -66,6 +70,9 @@ class Array(StandIn):
     def set_state(self, state: Any) -> None:
         _, shape, kind, fortran, data = state
         self.values = kind.numbers(data, shape, "F" if fortran else "C")
+
+    def cells(self) -> int:
+        return self.values.size
 
 
 def reconstruct(*_: Any) -> Array:
@@ -109,7 +116,9 @@ def named(*names: Any) -> tuple[Any, ...]:
 
 
 def buffer(data: Any) -> bytes:
-    """`pyarrow.lib.py_buffer`."""
+    """`pyarrow.lib.py_buffer` and `bytearray`, of bytes only: a number would make room for as many."""
+    if not isinstance(data, bytes | bytearray):
+        raise ValueError("a buffer of something else than bytes")
     return bytes(data)
 
 
@@ -130,16 +139,21 @@ def arrow_array(data: tuple[Any, ...]) -> Array:
 def chunked(chunks: list[Array], *_: Any) -> Array:
     """`pyarrow.lib.chunked_array`."""
     array = Array()
+    if sum(chunk.cells() for chunk in chunks) > MAX_CELLS:
+        raise ValueError(f"more than {MAX_CELLS} cells")
     array.values = np.concatenate([chunk.values for chunk in chunks])
     return array
 
 
-class Labels:
+class Labels(StandIn):
     """An index: its labels, or None where it counts rows."""
 
     def __init__(self, _: Any, state: dict[str, Any]) -> None:
         data = state.get("data")
-        self.values = None if data is None else list(data.values)
+        self.values = None if data is None else data.values.tolist()
+
+    def cells(self) -> int:
+        return len(self.values or ())
 
 
 class Block:
@@ -231,6 +245,7 @@ ALLOWED: dict[tuple[str, str], Any] = {
     **_modules("numpy.core.numeric", "numpy._core.numeric", _frombuffer=from_buffer),
     **_modules("numpy.core.multiarray", "numpy._core.multiarray", _reconstruct=reconstruct, scalar=scalar),
     ("functools", "partial"): Partial,
+    ("builtins", "bytearray"): buffer,
     ("builtins", "slice"): slice,
 }
 """Every (module, name) that a pickle may ask for, and the stand-in that it gets."""

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.config import shown
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers.pickled_frame import ALLOWED, Frame, Partial, StandIn
+from terrafusion.datasets.readers.pickled_frame import ALLOWED, MAX_CELLS, Frame, Partial, StandIn
 
 MAX_BYTES = 32 * 2**20
 """A longer pickle is refused; two hours of a published log have 32 MiB."""
@@ -61,6 +61,7 @@ class _RefusedError(Exception):
 class _Machine(pickle._Unpickler):
     """The pickle machine in Python, not in C: its instructions can be taken away, and its memo is a dict."""
 
+    cells: int = 0
     stack: list[Any]
     read: Callable[[int], bytes]
     append: Callable[[Any], None]
@@ -77,7 +78,13 @@ class _Machine(pickle._Unpickler):
         known = isinstance(function, Partial) or any(function is stand_in for stand_in in ALLOWED.values())
         if not known or not isinstance(arguments, tuple):
             raise _RefusedError(f"to call {type(function).__name__}")
-        return function(*arguments)
+        return self._counted(function(*arguments))
+
+    def _counted(self, made: Any) -> Any:
+        self.cells += made.cells() if isinstance(made, StandIn) else 0
+        if self.cells > MAX_CELLS:
+            raise ValueError(f"more than {MAX_CELLS} cells")
+        return made
 
     def load_reduce(self) -> None:
         arguments = self.stack.pop()
@@ -88,6 +95,7 @@ class _Machine(pickle._Unpickler):
         if not isinstance(self.stack[-1], StandIn):
             raise _RefusedError(f"to change {type(self.stack[-1]).__name__}")
         self.stack[-1].set_state(state)
+        self._counted(self.stack[-1])
 
     def load_bytes8(self) -> None:
         """Reads at most what is there; the library's own makes room for what is claimed."""

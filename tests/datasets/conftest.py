@@ -148,7 +148,7 @@ CatalogWith = Callable[..., None]
 
 @pytest.fixture
 def catalog_with(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> CatalogWith:
-    """Puts a catalogue of one's own in force: a set of the library's with conventions changed and files added."""
+    """Puts a catalogue of one's own in force: a set of the library's, conventions changed and files added."""
     count = itertools.count()
 
     def put(set_name: str, files: dict[Path, str] | None = None, **conventions: Any) -> None:
