@@ -138,7 +138,11 @@ def split(line: str, separator: str) -> list[str]:
     """The cells of a line."""
     if separator == BLANKS:
         return line.split()
-    return [cell.strip() for cell in next(csv.reader([line], delimiter=separator), [])]
+    try:
+        cells = next(csv.reader([line], delimiter=separator), [])
+    except csv.Error:  # bytes that are no table
+        cells = line.split(separator)
+    return [cell.strip() for cell in cells]
 
 
 def read_columns(

@@ -78,6 +78,7 @@ FORMATS: tuple[Format, ...] = (
     Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.rtklib_pos"),
     Format("nmea", "an NMEA 0183 log", f"{_READERS}.nmea"),
     Format("tum", "a TUM trajectory", f"{_READERS}.tum"),
+    Format("table", "a table (.csv, .tsv, .txt, .parquet) with a column map", f"{_READERS}.table"),
 )
 """In the order in which they are asked; the first that claims a file reads it."""
 

@@ -47,6 +47,7 @@ ENU_SIGNS = {"ENU": (1, 1, 1), "NED": (1, 1, -1), "NWU": (-1, 1, 1)}
 
 GNSS_FIX_BIT, RTK_SHIFT = 0x4, 27
 """StatusWord: bit 2 is the GNSS fix, bits 27 and 28 the RTK state (1 float, 2 fixed)."""
+UNUSED_BITS = 1 << 7 | 1 << 17 | 0xE0000000
 
 
 def claims(path: Path, head: bytes) -> bool:
@@ -200,13 +201,7 @@ def _status_words(path: Path, name: str, words: NDArray[np.str_]) -> list[int]:
     """Status words written as 32 binary digits, in hexadecimal, or in decimal."""
     cells = [word.strip() for word in words]
     told = [cell for cell in cells if cell]
-    base = 10
-    if told and all(len(cell) == 32 and set(cell) <= {"0", "1"} for cell in told):
-        base = 2
-    elif any(re.search("[xXa-fA-F]", cell) for cell in told) or (
-        told and all(len(cell) == 8 for cell in told) and any(cell[0] == "0" for cell in told)
-    ):
-        base = 16
+    base = _base_of(told)
     try:
         return [int(cell, base) if cell else 0 for cell in cells]
     except ValueError:
@@ -214,6 +209,18 @@ def _status_words(path: Path, name: str, words: NDArray[np.str_]) -> list[int]:
         raise DataError(
             f"column '{name}' holds '{bad[:40]}'", file=path, remedy="it must be a number or hexadecimal"
         ) from None
+
+
+def _base_of(told: list[str]) -> int:
+    if told and all(len(cell) == 32 and set(cell) <= {"0", "1"} for cell in told):
+        return 2
+    if any(re.search("[xXa-fA-F]", cell) for cell in told):
+        return 16
+    if told and all(len(cell) == 8 and cell.isdigit() for cell in told):  # either, but for unused bits
+        padded = any(cell[0] == "0" for cell in told)
+        decimal, other = (any(int(cell, base) & UNUSED_BITS for cell in told) for base in (10, 16))
+        return 16 if padded or (decimal and not other) else 10
+    return 10
 
 
 def _class_of(status: int) -> Fix:

@@ -1,0 +1,118 @@
+"""Columns of a Parquet file, by pyarrow, which is an optional dependency."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.decimals import NS_PER
+from terrafusion.datasets.errors import DataError
+
+MAGIC = b"PAR1"
+MAX_VALUES = 2**27
+"""A gigabyte of numbers."""
+
+
+class ParquetColumns:
+    """Columns of one file; errors name the file and the column.
+
+    Raises:
+        DataError: pyarrow is not installed, or the file is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        try:
+            import pyarrow.parquet
+        except ImportError:
+            raise DataError(
+                "Parquet needs pyarrow, which is not installed",
+                file=path,
+                remedy='install it with: pip install "terrafusion[parquet]"',
+            ) from None
+        self.path = path
+        self._refused = (pyarrow.ArrowException, OSError, ValueError, OverflowError)
+        try:
+            self._file = pyarrow.parquet.ParquetFile(path)
+        except self._refused as error:
+            raise self._damaged(error) from None
+        self.names: list[str] = list(self._file.schema_arrow.names)
+        self.rows: int = self._file.metadata.num_rows
+        self._table: Any = None
+
+    def read(self, names: list[str]) -> None:
+        """Read these columns."""
+        if self.rows * len(names) > MAX_VALUES:
+            raise DataError(
+                f"has {self.rows} rows: too many to read at once", file=self.path, remedy="split it"
+            )
+        try:
+            self._table = self._file.read(columns=names)
+        except self._refused as error:
+            raise self._damaged(error) from None
+
+    def numbers(self, name: str) -> NDArray[np.float64]:
+        """A column of numbers (N,), NaN where it is null."""
+        import pyarrow as pa
+
+        column = self._table.column(name)
+        kind = column.type
+        if not (pa.types.is_integer(kind) or pa.types.is_floating(kind) or pa.types.is_boolean(kind)):
+            raise DataError(
+                f"column '{name}' holds {kind}, no numbers", file=self.path, remedy="write it as double"
+            )
+        values = np.asarray(column.cast(pa.float64(), safe=False).to_numpy(zero_copy_only=False), dtype=float)
+        if np.isinf(values).any():
+            row = int(np.flatnonzero(np.isinf(values))[0])
+            raise DataError(
+                f"column '{name}' is infinite in row {row + 1}", file=self.path, remedy="leave it null"
+            )
+        return values
+
+    def texts(self, name: str) -> NDArray[Any]:
+        """A column as texts (N,), "" where it is null."""
+        return np.array(
+            ["" if x is None else str(x) for x in self._table.column(name).to_pylist()], dtype=object
+        )
+
+    def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None:
+        """A column of times in ns (N,); None where it holds texts.
+
+        Numbers are in `unit`; typed time stamps carry their own, and are in UTC.
+        """
+        import pyarrow as pa
+
+        column = self._table.column(name)
+        kind = column.type
+        if column.null_count:
+            raise DataError(
+                f"{column.null_count} rows have no '{name}'", file=self.path, remedy="remove them"
+            )
+        try:
+            if pa.types.is_timestamp(kind):
+                return np.asarray(column.cast(pa.timestamp("ns", kind.tz)).cast(pa.int64()).to_numpy())
+            if pa.types.is_integer(kind):
+                whole = column.cast(pa.int64()).to_numpy()
+                if np.abs(whole).max(initial=0) < 2**63 // NS_PER.get(unit, 1):
+                    return np.asarray(whole * NS_PER.get(unit, 1))
+                raise OverflowError
+        except self._refused:
+            raise self._no_time(name, unit) from None
+        if not pa.types.is_floating(kind):
+            return None
+        with np.errstate(over="ignore"):
+            ns = self.numbers(name) * NS_PER.get(unit, 1)
+        if not (np.abs(ns) < 9e18).all():
+            raise self._no_time(name, unit)
+        return np.rint(ns).astype(np.int64)
+
+    def _no_time(self, name: str, unit: str) -> DataError:
+        return DataError(
+            f"column '{name}' holds times that do not fit into 64 bits of ns", file=self.path,
+            remedy=f"is the unit {unit}?",
+        )  # fmt: skip
+
+    def _damaged(self, error: BaseException) -> DataError:
+        return DataError(f"no readable Parquet: {error}"[:200], file=self.path, remedy="write it again")
