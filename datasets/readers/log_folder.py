@@ -7,7 +7,7 @@ else that is not a number is an error: this reader never guesses.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -55,16 +55,22 @@ def read_log_folder(folder: Path) -> Recording:
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = read_meta(meta_path)
     source = _Folder(folder)
-    recording = recording_of(ChannelReader(source, meta), meta, folder.resolve().name)
-    if not recording.channels() and not (recording.truth is not None and len(recording.truth)):
+    reader = ChannelReader(source, meta)
+    channels = {name: getattr(reader, name)() for name in CHANNELS}
+    if not any(channel is not None and len(channel) for channel in channels.values()):
         names = ", ".join(f"{name}.csv" for name in CHANNELS)
         raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
-    return recording.with_notes(*(note for note in source.strangers() if note not in meta.notes))
+    return recording_of(channels, meta, folder.resolve().name, [*reader.notes, *source.strangers()])
 
 
-def recording_of(reader: ChannelReader, meta: Meta, name: str) -> Recording:
-    """The recording of all tables; `name` unless `meta` gives one, new notes after those of `meta`."""
-    channels: dict[str, Any] = {channel: getattr(reader, channel)() for channel in CHANNELS}
+def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequence[str]) -> Recording:
+    """The recording of its channels and `meta`.
+
+    Args:
+        channels: by field of `Recording`, the truth among them.
+        name: of the recording where `meta` gives none.
+        notes: of the reader; those that the log already has are not repeated.
+    """
     return Recording(
         name=meta.texts.get("name", name),
         start_ns=meta.start_ns,
@@ -78,7 +84,7 @@ def recording_of(reader: ChannelReader, meta: Meta, name: str) -> Recording:
         terrain_name=meta.texts.get("terrain", ""),
         licence=meta.texts.get("licence", ""),
         source=meta.texts.get("source", ""),
-        notes=(*meta.notes, *(note for note in reader.notes if note not in meta.notes)),
+        notes=(*meta.notes, *(note for note in notes if note not in meta.notes)),
         clock_jumps=meta.clock_jumps,
         imu_frame_id=meta.texts.get("imu_frame_id", ""),
     )

@@ -1,19 +1,23 @@
-"""Write a recording, and an estimate beside it, as one ROS 2 MCAP file."""
+"""Write a recording, and an estimate beside it, as one ROS 2 MCAP file; reading it back loses nothing."""
 
 from __future__ import annotations
 
-import shutil
+import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.readers.ros_recording import META
+from terrafusion.datasets.recording import Fix, Gnss, Imu, Recording, Wheels
 from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.datasets.writers.ros_messages import Composer, Stamped
+from terrafusion.datasets.writers import ros_messages as ros
+from terrafusion.datasets.writers.mcap_file import Definition, Topic, write_mcap_file
+from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of
 
 if TYPE_CHECKING:
     from terrafusion.datasets.sensors import Rig
@@ -21,8 +25,8 @@ if TYPE_CHECKING:
 NOMINAL_DATUM = (0.0, 0.0, 0.0)
 """ENU origin of a recording that has none: latitude, longitude (deg), height (m)."""
 
-Part = tuple[str, str, Iterator[Stamped]]
-"""Topic, message type, stamped messages."""
+END_NS = 2**31 * 10**9
+"""The stamp of a ROS message ends here, in the year 2038."""
 
 
 def write_mcap(
@@ -38,98 +42,197 @@ def write_mcap(
     Topics: `/imu/data` Imu, `/joint_states` JointState (wheels in rad/s) or `/wheel/odom` Odometry
     (in m/s), `/fix` NavSatFix, `/fix_velocity` TwistWithCovarianceStamped (east, north, up),
     `/datum` NavSatFix (the ENU origin, once), `/cmd_vel` TwistStamped, `/terrain` String,
-    `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link.
-    Log times are the stamps.
+    `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link,
+    `/tf_static` (positions of IMU and antenna where known). Log times are the stamps. What these
+    cannot hold to the bit stands on topics of their own, see `readers/ros_recording.py`.
 
     Args:
         recording: the drive.
-        path: the file to write.
-        estimate: poses to write beside it, with covariance in ROS order where known.
-        rig: gives the track that turns side speeds in m/s into a yaw rate; the recording's own
-            `overrides.track_m` goes first.
+        path: the file to write; it appears when it is whole.
+        estimate: poses to write beside it, with covariance in ROS order where known; it is not
+            part of the recording and not read back.
+        rig: gives the track that turns side speeds in m/s into a yaw rate, and the positions of
+            the sensors; the recording's own `overrides` go first.
         overwrite: replace a file that exists.
 
     Returns:
-        Sentences on what the message types could not hold and was left out.
+        Sentences on what is not in standard messages, and so only seen by this library.
 
     Raises:
-        DataError: the file exists, cannot be written, a time before 1970, or no track is known.
+        DataError: the file exists, cannot be written, or a time outside 1970 to 2038. ConfigError:
+            a text, position or datum that the log folder would not take either.
     """
     path = Path(path)
     if path.is_dir() or (path.exists() and not overwrite):
         raise DataError("exists already", file=path, remedy="remove it or give another name")
-    if recording.start_ns < 0:
-        raise DataError(f"start_ns is {recording.start_ns}", file=path, remedy="ROS has no time before 1970")
-    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-    from rosbags.typesys import Stores, get_typestore
-
-    store = get_typestore(Stores.ROS2_HUMBLE)
-    composer = Composer(dict(store.types))
-    packed: list[tuple[int, int, bytes]] = []
+    parts = _Parts(recording, rig)
+    topics = list(parts.standard())
+    if estimate is not None:
+        topics.append(ros.trajectory("/odometry/filtered", estimate, "base_link"))
+    saved = {**meta_of(recording, path, path.stem), **parts.saved()}
+    start_ns = min([recording.start_ns, *(int(t.t_ns[0]) for t in topics if len(t.t_ns))])
+    topics = [ros.text(META[0], start_ns, json.dumps(saved)), *parts.once(start_ns), *topics]
+    for topic in topics:
+        _check_times(topic, path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap-") as scratch:
-            bag = Path(scratch) / "bag"
-            writer = Writer(bag, version=8, storage_plugin=StoragePlugin.MCAP)
-            writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-            with writer:
-                connections: list[Any] = []
-                for topic, msgtype, messages in _parts(recording, estimate, composer, path, rig):
-                    index = len(connections)
-                    connections.append(writer.add_connection(topic, msgtype, typestore=store))
-                    packed += [(t, index, bytes(store.serialize_cdr(m, msgtype))) for t, m in messages]
-                packed.sort(key=lambda item: item[:2])
-                for t, index, raw in packed:
-                    writer.write(connections[index], t, raw)
-            shutil.move(next(bag.glob("*.mcap")), path)
+            whole = Path(scratch) / path.name
+            write_mcap_file(whole, topics, _definitions(topics), "terrafusion")
+            whole.replace(path)
     except OSError as error:
         raise DataError(
             f"cannot be written: {error.strerror or error}",
             file=path,
             remedy="choose a folder you may write to, with room on the disk",
         ) from None
-    return tuple(composer.left_out)
+    return tuple(parts.unseen)
 
 
-def _parts(
-    recording: Recording, estimate: Trajectory | None, composer: Composer, path: Path, rig: Rig | None
-) -> Iterator[Part]:
-    wheels, gnss, truth = recording.wheels, recording.gnss, recording.truth
-    if recording.command is not None:
-        yield "/cmd_vel", "geometry_msgs/msg/TwistStamped", composer.command(recording.command)
-    if wheels is not None and wheels.unit == "radps":
-        yield "/joint_states", "sensor_msgs/msg/JointState", composer.joint_states(wheels)
-    elif wheels is not None:
-        track = recording.overrides.track_m or (rig.track_m if rig else None)
-        if track is None and wheels.has_sides():
+def _check_times(topic: Topic, path: Path) -> None:
+    for t in topic.t_ns[:1].tolist() + topic.t_ns[-1:].tolist():
+        if not 0 <= t < END_NS:
             raise DataError(
-                "side speeds in m/s need the track to become a yaw rate, and none is known",
-                file=path,
-                channel="wheels",
-                remedy="give the vehicle (--vehicle), or track_m in meta.yaml",
+                f"time {t} ns", file=path, channel=topic.name, remedy="ROS has times from 1970 to 2038"
             )
+
+
+def _definitions(topics: list[Topic]) -> dict[str, Definition]:
+    from rosbags.typesys import Stores, get_typestore
+
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    names = {topic.msgtype for topic in topics}
+    return {
+        name: Definition(store.generate_msgdef(name, ros_version=2)[0], store.hash_rihs01(name))
+        for name in names
+    }
+
+
+class _Parts:
+    """The topics of one recording; `unseen` gathers what only this library reads."""
+
+    def __init__(self, recording: Recording, rig: Rig | None) -> None:
+        self.recording = recording
+        self.rig = rig
+        self.tables = tables_of(recording)
+        self.words = {"fix": [fix.name.lower() for fix in Fix]}
+        if recording.terrain is not None:
+            self.words["label"] = sorted({str(label) for label in recording.terrain.label.tolist()})
+        self.unseen: list[str] = []
+        self.only_here: set[str] = {"gnss", "terrain", "motor"} & self.tables.keys()
+
+    def saved(self) -> dict[str, Any]:
+        """Columns and words of the tables that are written."""
+        tables = {name: list(self.tables[name].columns) for name in sorted(self.only_here)}
+        return {"tables": tables, "words": self.words}
+
+    def once(self, start_ns: int) -> Iterator[Topic]:
+        """Topics with one message at the start."""
+        positions = self._positions()
+        if positions:
+            yield ros.static_transforms(start_ns, positions)
+        if self.recording.gnss is not None:
+            yield ros.datum(start_ns, self.recording.datum or NOMINAL_DATUM)
+
+    def _positions(self) -> dict[str, tuple[float, ...]]:
+        own, sensors = self.recording.overrides, self.rig.sensors if self.rig else None
+        known = {
+            "imu_link": own.imu_m or (sensors.imu.position_m if sensors else None),
+            "gnss_antenna": own.antenna_m or (sensors.gnss.antenna_m if sensors else None),
+        }
+        return {frame: position for frame, position in known.items() if position is not None}
+
+    def standard(self) -> Iterator[Topic]:
+        """Topics of the channels: standard messages, then the tables of those they cannot hold."""
+        r = self.recording
+        if r.command is not None:
+            yield ros.command(self._complete("command", r.command, r.command.columns()))
+        if r.wheels is not None:
+            yield from self._wheels(r.wheels)
+        if r.imu is not None:
+            yield self._imu(r.imu)
+        if r.gnss is not None:
+            yield from self._gnss(r.gnss)
+        if r.terrain is not None:
+            yield ros.terrain(r.terrain)
+            if r.terrain.probabilities is not None:
+                self.unseen.append("terrain: class probabilities")
+        if r.motor is not None:
+            self.unseen.append("motor: currents and voltages")
+        if r.truth is not None:
+            yield self._truth(r.truth)
+        for name in sorted(self.only_here):
+            yield ros.table(name, self.tables[name].t_ns, self._numbers(self.tables[name]))
+
+    def _numbers(self, table: Columns) -> dict[str, NDArray[np.float64]]:
+        """The columns as doubles: a text is its place among the words."""
+        codes = {name: {word: k for k, word in enumerate(words)} for name, words in self.words.items()}
+        return {
+            name: np.array([codes[name][str(text)] for text in column.tolist()], dtype=float)
+            if name in codes
+            else column.astype(float)
+            for name, column in table.columns.items()
+        }
+
+    def _complete(self, name: str, channel: Any, values: dict[str, NDArray[Any]]) -> Any:
+        """The rows of a channel without missing values; where others are left out it gets a table."""
+        full = np.ones(len(channel), dtype=bool)
+        for column in values.values():
+            full &= np.isfinite(column)
+        if not full.all() or not len(channel):
+            self.only_here.add(name)
+        if not full.all():
+            self.unseen.append(f"{name}: {int((~full).sum())} rows with missing values")
+        return channel.select(full)
+
+    def _imu(self, imu: Imu) -> Topic:
+        frame = "imu_link" if "imu_link" in self._positions() else "base_link"
+        return ros.imu(self._complete("imu", imu, imu.columns()), frame)
+
+    def _wheels(self, wheels: Wheels) -> Iterator[Topic]:
+        complete: Wheels = self._complete("wheels", wheels, wheels.columns())
+        if wheels.unit == "radps" and wheels.has_sides():
+            yield ros.joint_states(complete)
+            return
+        self.only_here.add("wheels")
+        if wheels.unit == "radps":
+            self.unseen.append("wheels: a mean wheel speed in rad/s")
+            return
+        track = self.recording.overrides.track_m or (self.rig.track_m if self.rig else None)
+        if wheels.has_sides() and track is None:
+            self.unseen.append("wheels: side speeds (no track is known that makes a yaw rate of them)")
         if wheels.angle_rad is not None:
-            composer.left_out.append("wheels: wheel angles (Odometry has none)")
-        yield "/wheel/odom", "nav_msgs/msg/Odometry", composer.wheel_odometry(wheels, track or 1.0)
-    if recording.imu is not None:
-        yield "/imu/data", "sensor_msgs/msg/Imu", composer.imu(recording.imu)
-    if gnss is not None and len(gnss):
-        datum = recording.datum or NOMINAL_DATUM
-        if recording.datum is None:
-            composer.left_out.append("gnss: no datum is known; latitude and longitude are about 0, 0, 0 m")
-        start = min(int(gnss.t_ns[0]), recording.start_ns)
-        origin = composer.fix(start, datum, 0, np.zeros(3), 0)
-        yield "/datum", "sensor_msgs/msg/NavSatFix", iter([(start, origin)])
-        yield "/fix", "sensor_msgs/msg/NavSatFix", composer.fixes(gnss, datum)
+            self.unseen.append("wheels: wheel angles (Odometry has none)")
+        yield ros.wheel_odometry(complete, track)
+
+    def _gnss(self, gnss: Gnss) -> Iterator[Topic]:
+        if (gnss.fix == Fix.FLOAT).any():
+            self.unseen.append("gnss: the 'float' fix class (NavSatFix has none; written as augmented, SBAS)")
+        if self.recording.datum is None:
+            self.unseen.append("gnss: no datum is known; latitude and longitude are about 0, 0, 0 m")
+        yield ros.fixes(gnss, self.recording.datum or NOMINAL_DATUM)
         if gnss.velocity_enu_mps is not None:
-            kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
-            yield "/fix_velocity", kind, composer.gnss_velocity(gnss)
-    if recording.motor is not None:
-        composer.left_out.append("motor: currents and voltages (no standard message fits)")
-    if recording.terrain is not None:
-        yield "/terrain", "std_msgs/msg/String", composer.terrain(recording.terrain)
-    if truth is not None:
-        child = "base_link" if recording.truth_frame == "base" else "gnss_antenna"
-        yield "/ground_truth/odom", "nav_msgs/msg/Odometry", composer.trajectory(truth, child)
-    if estimate is not None:
-        yield "/odometry/filtered", "nav_msgs/msg/Odometry", composer.trajectory(estimate, "base_link")
+            yield ros.gnss_velocity(gnss.select(np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)))
+
+    def _truth(self, truth: Trajectory) -> Topic:
+        if not _odometry_holds(truth):
+            self.only_here.add("truth")
+        known = np.isfinite(truth.position_m[:, :2]).all(axis=1)
+        if truth.quaternion is not None:
+            known &= np.isfinite(truth.quaternion).all(axis=1)
+        if not known.all():
+            self.unseen.append(f"truth: {int((~known).sum())} poses with missing values")
+        child = "base_link" if self.recording.truth_frame == "base" else "gnss_antenna"
+        return ros.trajectory("/ground_truth/odom", truth.select(known), child)
+
+
+def _odometry_holds(truth: Trajectory) -> bool:
+    """Whether the reader of Odometry gets the same trajectory back to the bit."""
+    q, twist = truth.quaternion, truth.twist_body
+    return (
+        len(truth) > 0
+        and truth.covariance is None
+        and bool(np.isfinite(truth.position_m[:, :2]).all() and not np.isinf(truth.position_m).any())
+        and (q is None or bool((np.abs(np.linalg.norm(q, axis=1) - 1.0) < 0.01).all()))
+        and (twist is None or bool((np.nan_to_num(twist) != 0.0).any() and not np.isinf(twist).any()))
+    )

@@ -1,232 +1,215 @@
-"""Channels of a recording -> ROS 2 messages of the standard types (REP-103, REP-105 frames)."""
+"""Channels of a recording -> topics of ROS 2 messages of the standard types (REP-103, REP-105, REP-145).
+
+Every function takes rows that a message can hold: the caller leaves the others out.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.frames import enu_to_geodetic, rpy_to_quaternion
+from terrafusion.datasets.readers.ros_recording import PREFIX, ROW, STAMP
 from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.writers.cdr import Layout, split
+from terrafusion.datasets.writers.mcap_file import Topic
 
 Array = NDArray[np.float64]
-Stamped = tuple[int, Any]
-"""Time in ns and the message."""
+TimesNs = NDArray[np.int64]
 
 UNKNOWN_VARIANCE = 1e6
 """By ROS custom: a variance this large marks a quantity that is not known."""
 
 STATUS_OF_FIX = {Fix.NONE: -1, Fix.SINGLE: 0, Fix.DGPS: 1, Fix.FLOAT: 1, Fix.FIXED: 2}
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
+EARTH_M = 1e7
+"""ENU coordinates beyond this are nowhere on Earth."""
 
 
-@dataclass
-class Composer:
-    """Makes messages of one type store; `left_out` gathers what the types cannot hold."""
+def _topic(name: str, msgtype: str, layout: Layout, t_ns: TimesNs, **fields: Array) -> Topic:
+    """Messages with a header; `fields` (N, ...) go by the names of the layout."""
 
-    types: dict[str, Any]
-    left_out: list[str] = field(default_factory=list)
+    def encode(rows: slice) -> list[bytes]:
+        block = layout.stamped(t_ns[rows])
+        for key, values in fields.items():
+            block[key] = values[rows]
+        return split(block)
 
-    def _new(self, name: str, *values: Any) -> Any:
-        return self.types[name](*values)
+    return Topic(name, msgtype, t_ns, encode)
 
-    def header(self, t_ns: int, frame: str) -> Any:
-        """std_msgs/Header with the stamp in whole nanoseconds."""
-        stamp = self._new("builtin_interfaces/msg/Time", *divmod(t_ns, 1_000_000_000))
-        return self._new("std_msgs/msg/Header", stamp, frame)
 
-    def vector(self, xyz: Any) -> Any:
-        """geometry_msgs/Vector3."""
-        return self._new("geometry_msgs/msg/Vector3", *(float(v) for v in xyz))
+def text(name: str, t_ns: int, content: str) -> Topic:
+    """One latched std_msgs/String."""
+    message = split(Layout().string(content).rows(1))
+    return Topic(name, "std_msgs/msg/String", np.array([t_ns]), lambda rows: message[rows], latched=True)
 
-    def quaternion(self, xyzw: Any) -> Any:
-        """geometry_msgs/Quaternion."""
-        return self._new("geometry_msgs/msg/Quaternion", *(float(v) for v in xyzw))
 
-    def twist(self, six: Any) -> Any:
-        """geometry_msgs/Twist of linear then angular velocity."""
-        return self._new("geometry_msgs/msg/Twist", self.vector(six[:3]), self.vector(six[3:]))
+def imu(imu: Imu, frame: str) -> Topic:
+    """sensor_msgs/Imu; an absent group is zero under a covariance of -1, an absent axis is NaN."""
+    layout = Layout().header(frame).constant("d", *IDENTITY, -1.0, *[0.0] * 8)
+    fields = {}
+    for name, values in (("gyro", imu.gyro_radps), ("accel", imu.accel_mps2)):
+        absent = bool(np.isnan(values).all())
+        layout.field(name, count=3).constant("d", -1.0 if absent else 0.0, *[0.0] * 8)
+        fields[name] = np.nan_to_num(values) if absent else values
+    return _topic("/imu/data", "sensor_msgs/msg/Imu", layout, imu.t_ns, **fields)
 
-    def imu(self, imu: Imu) -> Iterator[Stamped]:
-        """sensor_msgs/Imu in base_link; an absent group is marked by covariance -1, an absent axis is NaN."""
-        present = ~np.isnan(np.hstack([imu.gyro_radps, imu.accel_mps2]))
-        full = present[:, present.any(axis=0)].all(axis=1)
-        if not full.all():
-            self.left_out.append(f"imu: {int((~full).sum())} samples with missing values")
-            imu = imu.select(full)
-        groups = []
-        for values in (imu.gyro_radps, imu.accel_mps2):
-            absent = bool(np.isnan(values).all())
-            covariance = np.zeros(9)
-            covariance[0] = -1.0 if absent else 0.0
-            groups.append((np.nan_to_num(values) if absent else values, covariance))
-        unknown = np.array([-1.0, *np.zeros(8)])
-        (gyro, gyro_covariance), (accel, accel_covariance) = groups
-        for t, w, f in zip(imu.t_ns.tolist(), gyro, accel, strict=True):
-            yield (
-                t,
-                self._new(
-                    "sensor_msgs/msg/Imu",
-                    self.header(t, "base_link"),
-                    self.quaternion(IDENTITY),
-                    unknown,
-                    self.vector(w),
-                    gyro_covariance,
-                    self.vector(f),
-                    accel_covariance,
-                ),
-            )
 
-    def joint_states(self, wheels: Wheels) -> Iterator[Stamped]:
-        """sensor_msgs/JointState with one joint a wheel, rad/s and rad."""
-        names = [f"{name}_wheel_joint" for name in wheels.names]
-        full = np.isfinite(wheels.speed).all(axis=1)
-        if wheels.angle_rad is not None:
-            full &= np.isfinite(wheels.angle_rad).all(axis=1)
-        if not full.all():
-            self.left_out.append(f"wheels: {int((~full).sum())} samples with missing values")
-            wheels = wheels.select(full)
-        none = np.zeros(0)
-        for i, t in enumerate(wheels.t_ns.tolist()):
-            angle = none if wheels.angle_rad is None else wheels.angle_rad[i]
-            header = self.header(t, "")
-            yield t, self._new("sensor_msgs/msg/JointState", header, names, angle, wheels.speed[i], none)
+def joint_states(wheels: Wheels) -> Topic:
+    """sensor_msgs/JointState with one joint a wheel, rad/s and rad."""
+    names = [f"{name}_wheel_joint" for name in wheels.names]
+    angle = wheels.angle_rad if wheels.angle_rad is not None else wheels.speed[:, :0]
+    layout = Layout().header("").strings(names)
+    layout.sequence("angle", angle.shape[1]).sequence("speed", len(names)).sequence("effort", 0)
+    fields = {"speed": wheels.speed} | ({"angle": angle} if angle.shape[1] else {})
+    return _topic("/joint_states", "sensor_msgs/msg/JointState", layout, wheels.t_ns, **fields)
 
-    def wheel_odometry(self, wheels: Wheels, track_m: float) -> Iterator[Stamped]:
-        """nav_msgs/Odometry of wheel speeds in m/s: body twist, and the pose by dead reckoning."""
-        full = np.isfinite(wheels.speed).all(axis=1)
-        if not full.all():
-            self.left_out.append(f"wheels: {int((~full).sum())} samples with missing values")
-            wheels = wheels.select(full)
-        sides = wheels.side_speeds_mps(1.0)
-        v, rate = sides.mean(axis=1), (sides[:, 1] - sides[:, 0]) / track_m
+
+def _odometry(
+    name: str, frames: tuple[str, str], t_ns: TimesNs, pose: Array, P: Array, twist: Array, Q: Array
+) -> Topic:
+    """nav_msgs/Odometry of `pose` (N, 7) and `twist` (N, 6); covariances (N, 36) in ROS order."""
+    layout = Layout().header(frames[0]).string(frames[1])
+    layout.field("pose", count=7).field("P", count=36).field("twist", count=6).field("Q", count=36)
+    return _topic(name, "nav_msgs/msg/Odometry", layout, t_ns, pose=pose, P=P, twist=twist, Q=Q)
+
+
+def wheel_odometry(wheels: Wheels, track_m: float | None) -> Topic:
+    """Wheel speeds in m/s as body twist, and the pose by dead reckoning.
+
+    Where sides or track are not known the yaw rate is zero under a variance of 1e6.
+    """
+    sides, n = wheels.side_speeds_mps(1.0), len(wheels)
+    with np.errstate(over="ignore", invalid="ignore"):
+        v = sides.mean(axis=1)
+        rate = (sides[:, 1] - sides[:, 0]) / track_m if track_m is not None else np.zeros(n)
         x, y, yaw = dead_reckoning(wheels.t_ns, v, rate)
-        q = rpy_to_quaternion(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
-        pose_covariance = np.diag([0.0, 0.0, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, 0.0])
-        twist_covariance = np.zeros((6, 6))
-        if not wheels.has_sides():
-            twist_covariance[5, 5] = UNKNOWN_VARIANCE
-        for i, t in enumerate(wheels.t_ns.tolist()):
-            yield (
-                t,
-                self.odometry(
-                    t,
-                    ("odom", "base_link"),
-                    (x[i], y[i], 0.0),
-                    q[i],
-                    pose_covariance,
-                    (v[i], 0.0, 0.0, 0.0, 0.0, rate[i]),
-                    twist_covariance,
-                ),
-            )
-
-    def odometry(
-        self,
-        t_ns: int,
-        frames: tuple[str, str],
-        position: Any,
-        quaternion: Any,
-        pose_covariance: Array,
-        twist: Any,
-        twist_covariance: Array,
-    ) -> Any:
-        """One nav_msgs/Odometry; covariances (6, 6) in ROS order."""
-        point = self._new("geometry_msgs/msg/Point", *(float(v) for v in position))
-        pose = self._new("geometry_msgs/msg/Pose", point, self.quaternion(quaternion))
-        return self._new(
-            "nav_msgs/msg/Odometry",
-            self.header(t_ns, frames[0]),
-            frames[1],
-            self._new("geometry_msgs/msg/PoseWithCovariance", pose, pose_covariance.ravel()),
-            self._new("geometry_msgs/msg/TwistWithCovariance", self.twist(twist), twist_covariance.ravel()),
-        )
-
-    def trajectory(self, trajectory: Trajectory, child: str) -> Iterator[Stamped]:
-        """nav_msgs/Odometry, map -> `child`; what is unknown is 0 under a variance of 1e6."""
-        n = len(trajectory)
-        twist = trajectory.twist_body if trajectory.twist_body is not None else np.full((n, 6), np.nan)
-        q = trajectory.quaternion if trajectory.quaternion is not None else np.tile(IDENTITY, (n, 1))
-        covariance = np.zeros((n, 6, 6)) if trajectory.covariance is None else trajectory.covariance
-        flat = np.isnan(trajectory.position_m[:, 2])
-        for i, t in enumerate(trajectory.t_ns.tolist()):
-            pose_covariance = covariance[i].copy()
-            if flat[i]:
-                pose_covariance[2, 2] = UNKNOWN_VARIANCE
-            if trajectory.quaternion is None:
-                pose_covariance[[3, 4, 5], [3, 4, 5]] = UNKNOWN_VARIANCE
-            yield (
-                t,
-                self.odometry(
-                    t,
-                    ("map", child),
-                    np.nan_to_num(trajectory.position_m[i]),
-                    q[i],
-                    pose_covariance,
-                    np.nan_to_num(twist[i]),
-                    np.diag(np.where(np.isnan(twist[i]), UNKNOWN_VARIANCE, 0.0)),
-                ),
-            )
-
-    def fixes(self, gnss: Gnss, datum: tuple[float, float, float]) -> Iterator[Stamped]:
-        """sensor_msgs/NavSatFix of the antenna."""
-        if (gnss.fix == Fix.FLOAT).any():
-            self.left_out.append("gnss: NavSatFix has no 'float' fix; written as augmented (SBAS)")
-        enu = np.where(np.isnan(gnss.enu_m) & [False, False, True], 0.0, gnss.enu_m)
-        llh = enu_to_geodetic(enu, datum)
-        llh[np.isnan(gnss.enu_m[:, 2]), 2] = np.nan
-        for i, t in enumerate(gnss.t_ns.tolist()):
-            variance = gnss.sigma_enu_m[i] ** 2
-            known = bool(np.isfinite(variance[:2]).all())
-            yield t, self.fix(t, llh[i], STATUS_OF_FIX[Fix(gnss.fix[i])], variance, 2 if known else 0)
-
-    def fix(self, t_ns: int, llh: Any, status: int, variance: Array, kind: int) -> Any:
-        """One sensor_msgs/NavSatFix; `kind` is its position_covariance_type."""
-        return self._new(
-            "sensor_msgs/msg/NavSatFix",
-            self.header(t_ns, "gnss_antenna"),
-            self._new("sensor_msgs/msg/NavSatStatus", status, 1),
-            *(float(v) for v in llh),
-            np.diag(variance).ravel(),
-            kind,
-        )
-
-    def gnss_velocity(self, gnss: Gnss) -> Iterator[Stamped]:
-        """geometry_msgs/TwistWithCovarianceStamped: east, north, up velocity of the antenna."""
-        assert gnss.velocity_enu_mps is not None
-        sigma = gnss.sigma_v_mps if gnss.sigma_v_mps is not None else np.zeros(len(gnss))
-        for i in np.flatnonzero(np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)).tolist():
-            t = int(gnss.t_ns[i])
-            velocity = gnss.velocity_enu_mps[i]
-            variance = np.where(np.isnan(velocity), UNKNOWN_VARIANCE, np.nan_to_num(sigma[i]) ** 2)
-            twist = self.twist([*np.nan_to_num(velocity), 0.0, 0.0, 0.0])
-            covariance = np.diag([*variance, *np.full(3, UNKNOWN_VARIANCE)]).ravel()
-            body = self._new("geometry_msgs/msg/TwistWithCovariance", twist, covariance)
-            yield t, self._new("geometry_msgs/msg/TwistWithCovarianceStamped", self.header(t, "map"), body)
-
-    def command(self, command: Command) -> Iterator[Stamped]:
-        """geometry_msgs/TwistStamped in base_link."""
-        full = np.isfinite(command.v_mps) & np.isfinite(command.yaw_rate_radps)
-        if not full.all():
-            self.left_out.append(f"command: {int((~full).sum())} samples with missing values")
-            command = command.select(full)
-        rows = zip(command.t_ns.tolist(), command.v_mps, command.yaw_rate_radps, strict=True)
-        for t, v, rate in rows:
-            twist = self.twist((v, 0.0, 0.0, 0.0, 0.0, rate))
-            yield t, self._new("geometry_msgs/msg/TwistStamped", self.header(t, "base_link"), twist)
-
-    def terrain(self, terrain: Terrain) -> Iterator[Stamped]:
-        """std_msgs/String with the label, at the time of the label."""
-        if terrain.probabilities is not None:
-            self.left_out.append("terrain: class probabilities (the label is kept)")
-        for t, label in zip(terrain.t_ns.tolist(), terrain.label.tolist(), strict=True):
-            yield t, self._new("std_msgs/msg/String", str(label))
+    q = rpy_to_quaternion(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
+    pose = np.hstack([np.stack([x, y, 0.0 * x], axis=1), q])
+    twist = np.zeros((n, 6))
+    twist[:, 0], twist[:, 5] = v, rate
+    unknown = 0.0 if wheels.has_sides() and track_m is not None else UNKNOWN_VARIANCE
+    P = np.diag([0.0, 0.0, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, UNKNOWN_VARIANCE, unknown])
+    Q = np.diag([0.0, 0.0, 0.0, 0.0, 0.0, unknown])
+    P_rows, Q_rows = (np.tile(covariance.ravel(), (n, 1)) for covariance in (P, Q))
+    return _odometry("/wheel/odom", ("odom", "base_link"), wheels.t_ns, pose, P_rows, twist, Q_rows)
 
 
-def dead_reckoning(t_ns: NDArray[np.int64], v_mps: Array, rate_radps: Array) -> tuple[Array, Array, Array]:
+def trajectory(name: str, trajectory: Trajectory, child: str) -> Topic:
+    """nav_msgs/Odometry, map -> `child`; what is unknown is 0 under a variance of 1e6."""
+    n = len(trajectory)
+    q = trajectory.quaternion if trajectory.quaternion is not None else np.tile(IDENTITY, (n, 1))
+    P = np.zeros((n, 6, 6)) if trajectory.covariance is None else trajectory.covariance.copy()
+    P[np.isnan(trajectory.position_m[:, 2]), 2, 2] = UNKNOWN_VARIANCE
+    if trajectory.quaternion is None:
+        P[:, [3, 4, 5], [3, 4, 5]] = UNKNOWN_VARIANCE
+    twist = trajectory.twist_body if trajectory.twist_body is not None else np.full((n, 6), np.nan)
+    Q = np.zeros((n, 6, 6))
+    Q[:, range(6), range(6)] = np.where(np.isnan(twist), UNKNOWN_VARIANCE, 0.0)
+    pose = np.hstack([_known(trajectory.position_m), q])
+    flat = (P.reshape(n, 36), Q.reshape(n, 36))
+    return _odometry(name, ("map", child), trajectory.t_ns, pose, flat[0], _known(twist), flat[1])
+
+
+def _known(values: Array) -> Array:
+    """The values with 0 for NaN."""
+    return np.where(np.isnan(values), 0.0, values)
+
+
+def fixes(gnss: Gnss, datum: tuple[float, float, float]) -> Topic:
+    """sensor_msgs/NavSatFix of the antenna; an unknown height is NaN, a place not on Earth is no fix."""
+    flat = np.isnan(gnss.enu_m[:, 2])
+    enu = np.where(flat[:, None] & [False, False, True], 0.0, gnss.enu_m)
+    lost = ~(np.abs(enu) < EARTH_M).all(axis=1)
+    llh = enu_to_geodetic(np.where(lost[:, None], 0.0, enu), datum)
+    llh[lost] = np.nan
+    llh[flat, 2] = np.nan
+    status = np.array([STATUS_OF_FIX[Fix(code)] for code in range(len(Fix))])[gnss.fix]
+    return _fix_topic("/fix", gnss.t_ns, llh, np.where(lost, -1, status), gnss.sigma_enu_m)
+
+
+def datum(t_ns: int, datum: tuple[float, float, float]) -> Topic:
+    """The origin of ENU, once, as sensor_msgs/NavSatFix."""
+    times, unknown = np.array([t_ns]), np.full((1, 3), np.nan)
+    topic = _fix_topic("/datum", times, np.array([datum]), np.zeros(1), unknown)
+    return Topic(topic.name, topic.msgtype, times, topic.encode, latched=True)
+
+
+def _fix_topic(name: str, t_ns: TimesNs, llh: Array, status: NDArray[Any], sigma: Array) -> Topic:
+    layout = Layout().header("gnss_antenna").field("status", "i1").constant("H", 1)
+    layout.field("llh", count=3).field("P", count=9).field("kind", "u1")
+    with np.errstate(over="ignore"):
+        variance = sigma**2
+    known = np.isfinite(variance[:, :2]).all(axis=1)
+    P = np.zeros((len(t_ns), 9))
+    P[:, ::4] = np.where(known[:, None], np.where(np.isfinite(variance), variance, UNKNOWN_VARIANCE), 0.0)
+    kind = np.where(known, 2, 0)
+    return _topic(name, "sensor_msgs/msg/NavSatFix", layout, t_ns, status=status, llh=llh, P=P, kind=kind)
+
+
+def gnss_velocity(gnss: Gnss) -> Topic:
+    """geometry_msgs/TwistWithCovarianceStamped: east, north, up velocity of the antenna."""
+    assert gnss.velocity_enu_mps is not None
+    sigma = gnss.sigma_v_mps if gnss.sigma_v_mps is not None else np.zeros(len(gnss))
+    with np.errstate(over="ignore"):
+        variance = np.where(np.isnan(gnss.velocity_enu_mps), UNKNOWN_VARIANCE, _known(sigma)[:, None] ** 2)
+    Q = np.zeros((len(gnss), 36))
+    Q[:, 0:21:7], Q[:, 21::7] = variance, UNKNOWN_VARIANCE
+    twist = np.hstack([_known(gnss.velocity_enu_mps), np.zeros((len(gnss), 3))])
+    layout = Layout().header("map").field("twist", count=6).field("Q", count=36)
+    kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
+    return _topic("/fix_velocity", kind, layout, gnss.t_ns, twist=twist, Q=Q)
+
+
+def command(command: Command) -> Topic:
+    """geometry_msgs/TwistStamped in base_link."""
+    twist = np.zeros((len(command), 6))
+    twist[:, 0], twist[:, 5] = command.v_mps, command.yaw_rate_radps
+    layout = Layout().header("base_link").field("twist", count=6)
+    return _topic("/cmd_vel", "geometry_msgs/msg/TwistStamped", layout, command.t_ns, twist=twist)
+
+
+def terrain(terrain: Terrain) -> Topic:
+    """std_msgs/String with the label, at the time of the label."""
+    labels = [str(label) for label in terrain.label.tolist()]
+    messages = {label: split(Layout().string(label).rows(1))[0] for label in set(labels)}
+    return Topic(
+        "/terrain", "std_msgs/msg/String", terrain.t_ns, lambda rows: [messages[x] for x in labels[rows]]
+    )
+
+
+def static_transforms(t_ns: int, positions_m: dict[str, Sequence[float]]) -> Topic:
+    """tf2_msgs/TFMessage, latched: base_link -> each frame, at its position and not turned."""
+    layout = Layout().constant("I", len(positions_m))
+    for frame, position in positions_m.items():
+        stamp = divmod(t_ns, 1_000_000_000)
+        layout.constant("I", *stamp).string("base_link").string(frame)
+        layout.constant("d", *position, *IDENTITY)
+    message = split(layout.rows(1))
+    return Topic("/tf_static", "tf2_msgs/msg/TFMessage", np.array([t_ns]), lambda r: message[r], latched=True)
+
+
+def table(channel: str, t_ns: TimesNs, columns: dict[str, Array]) -> Topic:
+    """std_msgs/Float64MultiArray: stamp (s, ns) and one row of the columns, which the label names."""
+    stamps = [part.astype(float) for part in np.divmod(t_ns, 1_000_000_000)]
+    values = np.stack([*stamps, *columns.values()], axis=1)
+    count = values.shape[1]
+    layout = Layout().constant("I", 1).string(",".join([*STAMP, *columns]))
+    layout.constant("I", count, count, 0).sequence("data", count)
+
+    def encode(rows: slice) -> list[bytes]:
+        block = layout.rows(len(t_ns[rows]))
+        block["data"] = values[rows]
+        return split(block)
+
+    return Topic(f"{PREFIX}{channel}", ROW, t_ns, encode)
+
+
+def dead_reckoning(t_ns: TimesNs, v_mps: Array, rate_radps: Array) -> tuple[Array, Array, Array]:
     """x, y (m) and yaw (rad), each (N,), from the origin, by the trapezoid rule."""
     dt = np.diff(t_ns) * 1e-9
 

@@ -25,7 +25,7 @@ from terrafusion.datasets.recording import (
     differences,
 )
 from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.datasets.writers import write_log_folder
+from terrafusion.datasets.writers import write_log_folder, write_mcap
 
 S = 10**9
 NUMBERS = st.one_of(
@@ -153,4 +153,13 @@ CHECKED = settings(
 def test_any_recording_survives_the_log_folder(recording: Recording) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         back = open_recording(write_log_folder(recording, Path(scratch) / "log"))
+    assert differences(recording, back) == []
+
+
+@CHECKED
+@given(recordings(latest_ns=2**31 * S - 1, far_ns=10**18))
+def test_any_recording_survives_the_mcap(recording: Recording) -> None:
+    with tempfile.TemporaryDirectory() as scratch:
+        write_mcap(recording, Path(scratch) / "log.mcap")
+        back = open_recording(Path(scratch) / "log.mcap")
     assert differences(recording, back) == []
