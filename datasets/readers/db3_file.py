@@ -11,7 +11,7 @@ import numpy as np
 from terrafusion.datasets.readers.ros_raw import BagError, Batch, Groups, Source, grouped, normal_type
 
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
-ROWS = 4096
+ROWS = 1024
 
 
 class Db3File:

@@ -4,31 +4,25 @@ from __future__ import annotations
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
-
-import numpy as np
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros_channels import Builder
 from terrafusion.datasets.readers.ros_joints import joint_names, wheel_joints
-from terrafusion.datasets.readers.ros_layout import Block, Decoder
 from terrafusion.datasets.readers.ros_messages import Stream, wanted_fields
-from terrafusion.datasets.readers.ros_raw import BagError, Container, Source
+from terrafusion.datasets.readers.ros_raw import BagError, Container
 from terrafusion.datasets.readers.ros_recording import META, restore
+from terrafusion.datasets.readers.ros_streams import Key, foreign, read_streams
 from terrafusion.datasets.readers.ros_times import Timing, timing_of
 from terrafusion.datasets.readers.ros_topics import JOINTS, Topic, choose_topics, said_joints
-from terrafusion.datasets.readers.ros_types import types_of
 from terrafusion.datasets.recording import Overrides, Recording
 
 if TYPE_CHECKING:
     from terrafusion.datasets.readers.formats import Request
 
-Key = tuple[str, str]
-"""Name and type of a topic."""
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
 
@@ -46,7 +40,7 @@ def read_bag(request: Request, open_container: Callable[[Path], Container], reme
     """
     path = request.path
     try:
-        with _foreign():
+        with foreign():
             container = open_container(path)
     except BagError as error:
         raise DataError(f"cannot be read as a ROS bag: {error}", file=path, remedy=remedy) from None
@@ -60,20 +54,11 @@ def read_bag(request: Request, open_container: Callable[[Path], Container], reme
         container.close()
 
 
-@contextmanager
-def _foreign(topic: str | None = None) -> Iterator[None]:
-    """Around parsers: the bytes are of unknown origin, so whatever they raise, the bag is broken."""
-    try:
-        yield
-    except Exception as error:
-        raise BagError(str(error).rstrip(".") or type(error).__name__, topic) from None
-
-
 def _assemble(container: Container, request: Request) -> Recording:
     path, rig = request.path, request.rig
     there = {(source.topic, source.msgtype) for source in container.sources}
     if META in there and not request.topics and request.stamps == "header":
-        return restore(functools.partial(_read, container), there, path)
+        return restore(functools.partial(read_streams, container), there, path)
     joints = said_joints(request.topics)
     topics = _topics_of(container)
     chosen, notes = choose_topics(
@@ -138,7 +123,8 @@ def _build(builder: Builder, timing: Timing, datum_stream: Stream | None) -> Rec
 
 def _usual_frame(stream: Stream) -> str:
     """The frame of most messages."""
-    return str(Counter(stream.frame_ids.tolist()).most_common(1)[0][0]) if len(stream.frame_ids) else ""
+    names = Counter(stream.frame_ids.tolist())
+    return str(names.most_common(1)[0][0]) if names else ""
 
 
 def _topics_of(container: Container) -> list[Topic]:
@@ -151,7 +137,7 @@ def _topics_of(container: Container) -> list[Topic]:
 def _has_wheels(container: Container, topic: str, joints: dict[str, str]) -> bool:
     """Whether the first messages of a JointState topic name wheels."""
     key = topic, JOINTS
-    stream = _read(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
+    stream = read_streams(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
     return bool(wheel_joints(joint_names(stream), joints))
 
 
@@ -161,60 +147,6 @@ def _streams(container: Container, chosen: Mapping[str, Topic]) -> dict[str, Str
     for kind, topic in chosen.items():
         key, fields = (topic.name, topic.msgtype), wanted_fields(kind, topic.msgtype)
         asked[key] = (*asked.get(key, ()), *fields)
-    streams = _read(container, asked)
+    streams = read_streams(container, asked)
     found = {kind: streams[topic.name, topic.msgtype] for kind, topic in chosen.items()}
     return {kind: stream for kind, stream in found.items() if len(stream)}
-
-
-def _read(
-    container: Container, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
-) -> dict[Key, Stream]:
-    """The streams of topics, in one go over the file.
-
-    Args:
-        container: the bag.
-        asked: paths of the wanted fields by topic and type.
-        enough: stop when one topic has so many messages.
-    """
-    decoders: list[tuple[Key, Decoder]] = []
-    groups: list[list[int]] = []
-    for key, fields in asked.items():
-        alike: dict[tuple[str, str, str], list[Source]] = {}
-        for source in container.sources:
-            if (source.topic, source.msgtype) == key:
-                alike.setdefault((source.definition, source.language, source.encoding), []).append(source)
-        for sources in alike.values():
-            with _foreign(key[0]):
-                decoders.append((key, Decoder(key[1], types_of(sources[0]), fields, _is_cdr(sources[0]))))
-            groups.append([source.id for source in sources])
-    batches = container.batches(groups)
-    while True:
-        with _foreign():
-            batch = next(batches, None)
-        if batch is None:
-            break
-        key, decoder = decoders[batch.group]
-        with _foreign(key[0]):
-            decoder.add(batch)
-        if enough is not None and decoder.count >= enough:
-            break
-    return {key: _stream(key, [decoder for other, decoder in decoders if other == key]) for key in asked}
-
-
-def _is_cdr(source: Source) -> bool:
-    if source.encoding not in ("ros1", "cdr"):
-        raise BagError(f"its messages are encoded as '{source.encoding[:20]}', which is not supported")
-    return source.encoding == "cdr"
-
-
-def _stream(key: Key, decoders: list[Decoder]) -> Stream:
-    """What the decoders of one topic gathered; there are several where its definition changes."""
-    receipts, blocks = [], []
-    count = 0
-    for decoder in decoders:
-        receipt_ns, found = decoder.result()
-        receipts.append(receipt_ns)
-        blocks += [Block(block.rows + count, block.columns) for block in found]
-        count += len(receipt_ns)
-    stream = Stream(*key, np.concatenate(receipts), tuple(blocks))
-    return stream if len(decoders) == 1 else stream.select(np.argsort(stream.receipt_ns, kind="stable"))

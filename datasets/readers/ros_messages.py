@@ -89,13 +89,17 @@ class Stream:
         """
         if not self.has(path):
             raise BagError(f"its messages have no '{path}', as {self.msgtype} should", self.topic)
-        if len(self.blocks) == 1 and (np.diff(self.blocks[0].rows) == 1).all():
+        if self._in_one_block:
             return self.blocks[0].columns[path]
         first = self.blocks[0].columns[path]
         out = np.empty((len(self), *first.shape[1:]), dtype=first.dtype)
         for block in self.blocks:
             out[block.rows] = block.columns[path]
         return out
+
+    @cached_property
+    def _in_one_block(self) -> bool:
+        return len(self.blocks) == 1 and bool((np.diff(self.blocks[0].rows) == 1).all())
 
     def vectors(self, path: str, axes: str = "xyz") -> Array:
         """(N, k) of a field's x, y, z (and w)."""

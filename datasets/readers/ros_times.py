@@ -174,7 +174,7 @@ def _same_rate(a_ns: TimesNs, b_ns: TimesNs) -> bool:
 
 def _offset_at(headed: Times, receipt: Times, t_ns: TimesNs) -> NDArray[np.float64]:
     """How many ns the header clock was behind the recorder's at these receipt times."""
-    best = max(headed, key=lambda kind: len(headed[kind]))
+    best = _most_frequent(headed)
     order = np.argsort(receipt[best], kind="stable")
     at, offset = receipt[best][order], (receipt[best] - headed[best])[order]
     return np.asarray(
@@ -182,12 +182,16 @@ def _offset_at(headed: Times, receipt: Times, t_ns: TimesNs) -> NDArray[np.float
     )
 
 
+def _most_frequent(times: Times) -> str:
+    return max(times, key=lambda kind: len(times[kind]))
+
+
 def _spread(headed: Times, receipt: Times) -> tuple[float, str]:
     """Largest distance (s) of a header clock to that of the most frequent one, and whose it is."""
-    far = {
-        kind: abs(float(np.median(receipt[kind] - t_ns - _offset_at(headed, receipt, receipt[kind])))) * 1e-9
-        for kind, t_ns in headed.items()
-    }
+    far = dict.fromkeys(headed, 0.0)
+    for kind in headed.keys() - {_most_frequent(headed)}:
+        apart = receipt[kind] - headed[kind] - _offset_at(headed, receipt, receipt[kind])
+        far[kind] = abs(float(np.median(apart))) * 1e-9
     worst = max(far, key=far.__getitem__)
     return far[worst], worst
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import cache
 
 from terrafusion.datasets.readers.ros_layout import Fields
 from terrafusion.datasets.readers.ros_raw import Source
@@ -16,11 +17,15 @@ def types_of(source: Source) -> Mapping[str, Fields]:
     What the bag does not define is taken from ROS 1 Noetic or ROS 2 Humble: SQLite bags before
     ROS 2 Iron carry no definitions.
     """
+    return _released(source.encoding) | (_parsed(source) if source.definition else {})
+
+
+@cache
+def _released(encoding: str) -> dict[str, Fields]:
     from rosbags.typesys import Stores, get_typestore
 
-    release = get_typestore(Stores.ROS1_NOETIC if source.encoding == "ros1" else Stores.ROS2_HUMBLE)
-    types: dict[str, Fields] = {name: fields for name, (_, fields) in release.fielddefs.items()}
-    return types | _parsed(source) if source.definition else types
+    release = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    return {name: fields for name, (_, fields) in release.fielddefs.items()}
 
 
 def _parsed(source: Source) -> dict[str, Fields]:
