@@ -26,6 +26,7 @@ from terrafusion.datasets.readers.column_map import (
     starter_map,
 )
 from terrafusion.datasets.readers.csv_table import Table
+from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
@@ -37,7 +38,7 @@ from terrafusion.datasets.recording import Fix, Gnss, Recording
 
 Array = NDArray[np.float64]
 
-SUFFIXES = (".csv", ".tsv", ".txt", ".dat")
+SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 MAP_SUFFIX = ".columns.yaml"
 
 FIX_WORDS = {
@@ -61,16 +62,21 @@ class AnyColumns(Protocol):
 
 
 def claims(path: Path, head: bytes) -> bool:
-    """Whether a file is Parquet, or text with the ending of a table."""
+    """Whether a file is Parquet, or text that ends as tables do (.txt, .dat: with rows of one length)."""
     if head.startswith(MAGIC):
         return True
-    if path.suffix.lower() not in SUFFIXES or b"\0" in head:
+    if path.suffix.lower() not in (*SUFFIXES, *LOOSE_SUFFIXES) or b"\0" in head:
         return False
     try:
         head.decode("utf-8")
     except UnicodeDecodeError as error:
-        return error.start > len(head) - 4  # cut inside a character
-    return True
+        if error.start < len(head) - 3:  # else the head ends inside a character
+            return False
+    if path.suffix.lower() in SUFFIXES or path.with_name(path.name + MAP_SUFFIX).is_file():
+        return True
+    lines = [line for _, line in head_lines(head, 20) if line.strip() and not line.startswith("#")]
+    lengths = {len(split(line, separator_of(lines[0]))) for line in lines[: max(len(lines) - 1, 2)]}
+    return len(lines) > 1 and len(lengths) == 1 and lengths.pop() > 1
 
 
 def read(request: Request) -> list[Recording]:

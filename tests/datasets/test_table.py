@@ -446,3 +446,11 @@ def test_a_quarter_of_a_million_rows_in_seconds(tmp_path: Path) -> None:
     assert time.perf_counter() - begun < 5.0
     assert recording.imu is not None
     assert len(recording.imu) == n
+
+
+@pytest.mark.parametrize("text", ["hello\n", "Dear reader,\nthis is a note.\n", "one two\n", "\xff\xfe\n"])
+def test_notes_are_no_tables(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "notes.txt"
+    path.write_bytes(text.encode("latin-1"))
+    with pytest.raises(DataError, match="unknown kind of file"):
+        open_recording(path)
