@@ -4,12 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+import numpy as np
+
 from terrafusion.datasets.doctor import (
     gnss,
     gnss_frame,
     inertial,
     mounting,
     offsets,
+    outliers,
     scale,
     signals,
     timing,
@@ -31,6 +34,11 @@ CHECKS: tuple[Check, ...] = (
     timing.check_duplicates,
     offsets.check_clocks,
     signals.check_held,
+    signals.check_stuck,
+    signals.check_dead,
+    signals.check_missing,
+    outliers.check_saturated,
+    outliers.check_spikes,
     inertial.check_gravity,
     mounting.check_axes,
     wheels.check_each_wheel,
@@ -50,6 +58,11 @@ CHECKS: tuple[Check, ...] = (
     scale.check_speed_scale,
 )
 
+UNIT_CHECKS: tuple[Check, ...] = (turns.check_gyro_unit, scale.check_speed_scale)
+UNIT_CODES = ("gyro-in-degrees", "wheel-unit")
+LARGEST = 1e6
+"""Numbers up to this may be small units (mm/s, deg/s); larger ones are not computed with."""
+
 MAX_ROUNDS = 20
 
 
@@ -64,7 +77,19 @@ def examine(recording: Recording, rig: Rig | None = None) -> list[Finding]:
     findings = list(check_magnitude(patient))
     if not findings:  # the others would compute with impossible numbers
         findings = [finding for check in CHECKS for finding in check(patient)]
+    elif _may_be_units(recording, findings):
+        units = [finding for check in UNIT_CHECKS for finding in check(patient) if finding.code in UNIT_CODES]
+        explained = {finding.channel for finding in units}
+        findings = units + [finding for finding in findings if finding.channel not in explained]
     return sorted(findings, key=lambda finding: finding.severity != "error")
+
+
+def _may_be_units(recording: Recording, impossible: list[Finding]) -> bool:
+    """Whether impossible numbers are those of wheels and IMU only, and no larger than a unit makes them."""
+    told = [] if recording.wheels is None else [recording.wheels.speed]
+    told += [] if recording.imu is None else [recording.imu.gyro_radps, recording.imu.accel_mps2]
+    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in told), default=0.0)
+    return {finding.channel for finding in impossible} <= {"wheels", "imu"} and largest < LARGEST
 
 
 def treat(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:

@@ -74,9 +74,9 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
 
 def _impossible(gnss: Gnss) -> Mask:
     """Mask (N, 3) of sigmas that are no positive number; heights count only where there are any."""
-    bad: Mask = np.asarray(~(gnss.sigma_enu_m > 0.0))
-    bad[:, 2] &= np.isfinite(gnss.enu_m[:, 2])
-    return np.asarray(bad & np.isfinite(gnss.enu_m[:, :2]).all(axis=1)[:, None])
+    placed = np.isfinite(gnss.enu_m[:, :2]).all(axis=1)
+    counts = np.column_stack([placed, placed, placed & np.isfinite(gnss.enu_m[:, 2])])
+    return np.asarray(counts & ~(gnss.sigma_enu_m > 0.0))
 
 
 def _with_usual_sigma(recording: Recording) -> Recording:

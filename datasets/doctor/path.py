@@ -160,7 +160,8 @@ def _fit(window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: floa
     g = g - np.repeat(np.add.reduceat(g, starts) / n, n)
     pp, gg = np.add.reduceat(np.abs(p) ** 2, starts), np.add.reduceat(np.abs(g) ** 2, starts)
     pg = np.add.reduceat(np.conj(p) * g, starts)
-    use = (n >= LEAST_FIXES) & (np.sqrt(pp / n) > least_spread_m) & (gg > 0.0)
+    far = np.sqrt(np.maximum(pp, gg) / n) > least_spread_m
+    use = far & (n >= LEAST_FIXES) & (pp > 0.0) & (gg > 0.0)
     if use.sum() < LEAST_WINDOWS:
         return None
     left = g - np.repeat(pg / np.where(pp > 0.0, pp, 1.0), n) * p

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -55,16 +56,18 @@ def check_speed_scale(patient: Patient) -> Iterator[Finding]:
     if scale.source == "truth":
         evidence += "; scores against this truth are then not independent of it"
     commanded = command_ratio(patient)
-    unit = _unit(patient, scale, float(np.std(windows.scale) / np.median(windows.scale)), commanded)
-    if unit is not None:
+    units = _units(patient, scale, float(np.std(windows.scale) / np.median(windows.scale)), commanded)
+    if units:
+        factor = units[0].factor
+        names = " or ".join(unit.name for unit in units)
         yield Finding(
             "wheel-unit",
             "error",
             "wheels",
-            f"the speeds look like {unit.name}: the ground goes {scale.ratio:.3g} times as fast",
+            f"the speeds look like {names}: the ground goes {scale.ratio:.3g} times as fast",
             evidence,
-            f"multiply them by {unit.factor:.6g}",
-            lambda recording: _scaled(recording, unit.factor),
+            f"multiply them by {factor:.6g}" if len(units) == 1 else "say which it is",
+            partial(_scaled, factor=factor) if len(units) == 1 else None,
         )
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
         yield _too_small(patient, scale, evidence, wheels.unit, radius)
@@ -88,10 +91,10 @@ def _too_small(patient: Patient, scale: Scale, evidence: str, unit: str, radius:
             ", or did it roll downhill on braked wheels?" if downhill else ""
         )
     elif unit == "mps":
-        repair = lambda recording: _scaled(recording, scale.ratio)  # noqa: E731
+        repair = partial(_scaled, factor=scale.ratio)
         fix = f"multiply the speeds by {scale.ratio:.3f}"
     else:
-        repair = lambda recording: apply(recording, Conventions(wheel_radius_m=mended))  # noqa: E731
+        repair = partial(apply, conventions=Conventions(wheel_radius_m=mended))
         fix = f"take {mended:.4f} m for the wheel radius instead of {radius:.4f} m"
     what = f"ground speed is {scale.ratio:.3f} times the wheel speed, which slip does not explain"
     return Finding("wheel-radius", "warning", "wheels", what, evidence, fix, repair)
@@ -114,25 +117,23 @@ def command_ratio(patient: Patient) -> float | None:
     return float(np.sqrt(power[1] / power[0])) if r > 0.8 else None
 
 
-def _unit(patient: Patient, scale: Scale, spread: float, commanded: float | None) -> Unit | None:
+def _units(patient: Patient, scale: Scale, spread: float, commanded: float | None) -> list[Unit]:
+    """The units that explain the ratio, where slip does not."""
     wheels, radius = patient.recording.wheels, patient.wheel_radius_m()
     assert wheels is not None
     assert radius is not None
-    units: tuple[Unit, ...] = UNITS[wheels.unit]
+    units = list(UNITS[wheels.unit])
     if wheels.unit == "radps":
-        units = (*units, Unit("m/s", 1.0 / radius))
+        units.append(Unit("m/s", 1.0 / radius))
     else:
-        own = patient.recording.overrides.wheel_radius_m or (
-            patient.rig.wheel_radius_m if patient.rig else None
-        )
-        units = (*units, Unit("rad/s", own)) if own is not None else units
+        rig = patient.rig
+        own = patient.recording.overrides.wheel_radius_m or (rig.wheel_radius_m if rig else None)
+        units += [Unit("rad/s", own)] if own is not None else []
     fitting = [unit for unit in units if abs(scale.ratio / unit.factor - 1.0) < UNIT_ERROR]
-    if len(fitting) != 1:
-        return None
     if commanded is not None:
-        return fitting[0] if abs(commanded / fitting[0].factor - 1.0) < 2.0 * UNIT_ERROR else None
+        return [unit for unit in fitting if abs(commanded / unit.factor - 1.0) < 2.0 * UNIT_ERROR]
     rated = float(np.nanpercentile(np.abs(wheels.side_speeds_mps(radius)), 95))
-    return fitting[0] if scale.ratio > 1.0 or (rated > FAST_MPS and spread < EVEN) else None
+    return fitting if scale.ratio > 1.0 or (rated > FAST_MPS and spread < EVEN) else []
 
 
 def _scaled(recording: Recording, factor: float) -> Recording:

@@ -22,6 +22,8 @@ LEAST_RATE = 0.02
 SURE_R = 0.5
 CHORDS_S = (1.0, 2.0, 4.0, 8.0)
 """Lengths of the chords whose course is compared; the shortest that the noise allows is taken."""
+FINE_S, REACH_S, LATE_GAIN = 0.1, 5.0, 0.1
+"""Step and reach of the search for a lag, and by how much it must correlate better than a changed sign."""
 STRIDES = 4
 """Chords overlap: a new one begins so many times in the length of one."""
 SUSPECTS = ("gyro", "wheels", "gnss", "truth", "command", "accelerometer")
@@ -97,6 +99,24 @@ def agreement(a: Account, b: Account, window_s: float = WINDOW_S) -> Agreement |
         return None
     r = float(np.corrcoef(rate_a, rate_b)[0, 1])
     return Agreement(r, r * spread[0] / spread[1], len(grid) - 1, spread)
+
+
+def is_late(a: Account, b: Account, r: float) -> bool:
+    """Whether two accounts that contradict each other (correlation `r` below 0) agree clearly better as they
+    are, if one of them is moved in time: then it is a clock, not a sign."""
+    start, end = max(a.t_s[0], b.t_s[0]), min(a.t_s[-1], b.t_s[-1])
+    grid = np.arange(start, end, FINE_S)
+    if len(grid) < 3:
+        return False
+    kernel = np.ones(round(WINDOW_S / FINE_S)) * FINE_S / WINDOW_S
+    one, other = (np.convolve(x.rates(grid), kernel, "valid") for x in (a, b))
+    reach = min(round(REACH_S / FINE_S), len(one) // 4)
+    if reach < 1 or min(one.std(), other.std()) <= 0.0:
+        return False
+    one, other = (one - one.mean()) / one.std(), (other - other.mean()) / other.std()
+    middle = one[reach:-reach]
+    best = float(np.correlate(other, middle, "valid").max()) / len(middle)
+    return best > LATE_GAIN - r
 
 
 def course_agreement(turned: Account, gnss: Gnss, start_ns: int) -> Agreement | None:

@@ -12,10 +12,18 @@ from terrafusion.datasets.doctor.directions import runs_backwards, sides_opposed
 from terrafusion.datasets.doctor.finding import Finding, Patient, Repair
 from terrafusion.datasets.doctor.gnss_frame import reflection
 from terrafusion.datasets.doctor.mounting import heading, stands_up
-from terrafusion.datasets.doctor.turning import SURE_R, Agreement, agreements, contradictors
+from terrafusion.datasets.doctor.turning import (
+    SURE_R,
+    Agreement,
+    accounts,
+    agreements,
+    contradictors,
+    is_late,
+)
 from terrafusion.datasets.recording import Recording
 
 Pairs = dict[tuple[str, str], Agreement]
+Signs = dict[tuple[str, str], float]
 
 DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
 """Gyro rate over another's: the inverse track, 0.3 to 4 1/m, for the wheels, else 1; above these in deg/s."""
@@ -26,10 +34,17 @@ NAMES = {
     "gnss": "the path of the fixes",
     "truth": "the truth's yaw",
     "command": "the command",
-    "accelerometer": "the accelerometer",
+    "accelerometer": "the specific force in turns",
 }
-CHANNELS = {"gyro": "imu"}
-CODES = {"gyro": "yaw-sign", "wheels": "wheel-swap", "gnss": "gnss-course", "truth": "truth-yaw"}
+CHANNELS = {"gyro": "imu", "accelerometer": "imu"}
+CODES = {
+    "gyro": "yaw-sign",
+    "wheels": "wheel-swap",
+    "gnss": "gnss-course",
+    "truth": "truth-turns",
+    "command": "command-sign",
+    "accelerometer": "accel-mirrored",
+}
 
 
 def check_gyro_unit(patient: Patient) -> Iterator[Finding]:
@@ -59,58 +74,68 @@ def check_gyro_unit(patient: Patient) -> Iterator[Finding]:
 def check_turns(patient: Patient) -> Iterator[Finding]:
     """All channels must turn to the same side; the fewest that contradict are at fault."""
     found = _pairs(patient)
-    signs = {pair: float(np.sign(both.r)) for pair, both in found.items() if abs(both.r) > SURE_R}
-    pressed = heading(patient)
-    if pressed is not None and pressed.turn and ("gyro", "wheels") in signs:
-        signs["gyro", "accelerometer"] = pressed.turn
-    blamed = contradictors(signs)
+    signs = _signs(patient, found)
     against = [pair for pair, sign in signs.items() if sign < 0.0]
     if not against:
         return
+    blamed = contradictors(signs)
     if not blamed:
+        one, other = against[0]
         yield Finding(
             "yaw-contradiction",
             "warning",
             "imu",
-            f"{NAMES[against[0][0]]} turns against {NAMES[against[0][1]]}",
-            _told(against, found) + "; no single sign explains all",
+            f"{NAMES[one]} {_verb(one)} against {NAMES[other]}",
+            _told(against, signs, found) + "; no single sign explains all",
             "check the axes and signs of all of them",
         )
         return
     if frozenset({"wheels"}) in blamed and runs_backwards(patient) is not None:
         return  # one fault explains both: see wheels.check_direction
-    for name in sorted(blamed[0], key=lambda name: name == "command"):
-        others = [pair for pair in against if name in pair]
-        if others and name != "accelerometer":
-            yield _contradiction(patient, name, others, found, sure=len(blamed) == 1)
+    for name in sorted(blamed[0]):
+        pairs = [pair for pair in against if name in pair]
+        if not pairs:
+            continue
+        fix, repair = _remedy(patient, name)
+        other = next(one for one in pairs[0] if one != name)
+        if len(blamed) > 1:
+            fix += f" (assumed: no third channel tells whether {NAMES[name]} or {NAMES[other]} is wrong)"
+        yield Finding(
+            CODES[name],
+            "error" if name in ("gyro", "wheels", "gnss") else "warning",
+            CHANNELS.get(name, name),
+            f"{NAMES[name]} {_verb(name)} against {NAMES[other]}",
+            _told(pairs, signs, found),
+            fix,
+            repair,
+        )
 
 
-def _contradiction(
-    patient: Patient, name: str, against: list[tuple[str, str]], found: Pairs, *, sure: bool
-) -> Finding:
-    fix, repair = _remedy(patient, name)
-    if not sure:
-        rivals = [NAMES[other] for pair in against for other in pair if other != name]
-        fix += f" (assumed: no third channel tells whether {NAMES[name]} or {', '.join(rivals)} is wrong)"
-    other = next(one for one in against[0] if one != name)
-    return Finding(
-        CODES.get(name, "command-sign"),
-        "warning" if name in ("truth", "command") else "error",
-        CHANNELS.get(name, name),
-        f"{NAMES[name]} turns against {NAMES[other]}",
-        _told(against, found),
-        fix,
-        repair,
-    )
+def _signs(patient: Patient, found: Pairs) -> Signs:
+    """By pair of channels 1 where they surely turn alike, -1 where they turn against each other."""
+    known = accounts(patient)
+    signs = {}
+    for (a, b), both in found.items():
+        late = both.r < 0.0 and a in known and b in known and is_late(known[a], known[b], both.r)
+        if abs(both.r) > SURE_R and not late:
+            signs[a, b] = float(np.sign(both.r))
+    pressed = heading(patient)
+    if pressed is not None and pressed.turn and ("gyro", "wheels") in signs:
+        signs["gyro", "accelerometer"] = pressed.turn
+    return signs
 
 
-def _told(against: list[tuple[str, str]], found: Pairs) -> str:
-    parts = [
-        f"correlation {found[pair].r:.2f} of {NAMES[pair[0]]} with {NAMES[pair[1]]}"
-        if pair in found
-        else "in turns the accelerometer is pressed the other way"
-        for pair in against
-    ]
+def _verb(name: str) -> str:
+    return "turn" if name == "wheels" else "turns"
+
+
+def _told(pairs: list[tuple[str, str]], signs: Signs, found: Pairs) -> str:
+    parts = [f"correlation {found[p].r:.2f} of {NAMES[p[0]]} and {NAMES[p[1]]}" for p in pairs if p in found]
+    pressed = signs.get(("gyro", "accelerometer"), 0.0)
+    if pressed:
+        parts.append(
+            f"the specific force in turns is {'as' if pressed > 0.0 else 'against what'} gyro z says"
+        )
     return ", ".join(parts)
 
 
@@ -126,6 +151,8 @@ def _remedy(patient: Patient, name: str) -> tuple[str, Repair | None]:
         return reflection(patient.recording)
     if name == "truth":
         return "check the truth's frame: its yaw must grow to the left", None
+    if name == "accelerometer":
+        return "check the accelerometer's axes: x, y and z must make a right-handed frame", None
     return "change the sign of the commanded yaw rate (left turn positive)", _command_sign
 
 

@@ -1,0 +1,327 @@
+"""Axes, signs, units, scales and frames: each fault is found by its physics, and mended where it can be."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.doctor import examine, treat
+from terrafusion.datasets.frames import enu_to_geodetic, rpy_to_quaternion
+from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Overrides, Recording, Wheels
+from terrafusion.datasets.sensors import Rig, axes_matrix
+from terrafusion.datasets.trajectory import Trajectory
+
+START_NS = 1_700_000_000_000_000_000
+SECONDS, REST_S = 90.0, 6.0
+RADIUS_M, TRACK_M, EFFECTIVE_TRACK_M = 0.1651, 0.555, 0.9
+DATUM = (48.1, 11.5, 520.0)
+FOUR = ("front_left", "front_right", "rear_left", "rear_right")
+Fault = Callable[[Recording], Recording]
+
+
+def lively_drive(seed: int = 0, speed_mps: float = 1.0) -> Recording:
+    """A rest, then a winding drive whose IMU feels what the wheels do; clean but for noise."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, SECONDS, 0.002)
+    going = np.clip((t - REST_S) / 2.0, 0.0, 1.0)
+    v = speed_mps * going * (1.0 + 0.4 * np.sin(0.7 * t) + 0.2 * np.sin(0.23 * t))
+    rate = going * (0.35 * np.sin(0.31 * t) + 0.2 * np.sin(0.83 * t))
+    yaw = 0.3 + np.cumsum(rate) * 0.002
+    place = np.cumsum(v * np.exp(1j * yaw)) * 0.002
+
+    def at(hz: float, *columns: np.ndarray) -> tuple[np.ndarray, ...]:
+        rows = slice(None, None, round(500.0 / hz))
+        return START_NS + np.rint(t[rows] * 1e9).astype(np.int64), *(column[rows] for column in columns)
+
+    t_imu, along, across, turn = at(50.0, np.gradient(v, t), v * rate, rate)
+    gyro = np.stack([0.0 * turn, 0.0 * turn, turn], axis=1) + rng.normal(0.0, 0.01, (len(turn), 3))
+    accel = np.stack([along, across, 0.0 * turn + 9.81], axis=1) + rng.normal(0.0, 0.3, (len(turn), 3))
+    t_wheels, v_w, rate_w = at(20.0, v, rate)
+    sides = np.stack([v_w - rate_w * EFFECTIVE_TRACK_M / 2, v_w + rate_w * EFFECTIVE_TRACK_M / 2], axis=1)
+    sides += rng.normal(0.0, 0.005, sides.shape) * (np.abs(v_w) > 0.0)[:, None]
+    t_gnss, east, north, v_g, yaw_g = at(5.0, place.real, place.imag, v, yaw)
+    n = len(t_gnss)
+    velocity = np.stack([v_g * np.cos(yaw_g), v_g * np.sin(yaw_g), 0.0 * v_g], axis=1)
+    t_true, x, y, yaw_t = at(20.0, place.real, place.imag, yaw)
+    zero = 0.0 * x
+    return Recording(
+        name="lively",
+        start_ns=START_NS,
+        command=Command(t_wheels, v_w, rate_w),
+        wheels=Wheels(t_wheels, sides / RADIUS_M, ("left", "right"), "radps"),
+        imu=Imu(t_imu, gyro, accel),
+        gnss=Gnss(
+            t_gnss,
+            np.stack([east, north, 0.0 * east], axis=1) + rng.normal(0.0, 0.05, (n, 3)),
+            np.full((n, 3), 0.05),
+            np.full(n, Fix.FIXED, dtype=np.uint8),
+            velocity + rng.normal(0.0, 0.02, (n, 3)),
+            np.full(n, 0.02),
+        ),
+        truth=Trajectory(
+            t_true, np.stack([x, y, zero], axis=1), rpy_to_quaternion(np.stack([zero, zero, yaw_t], axis=1))
+        ),
+        datum=DATUM,
+        truth_channels=("position", "yaw"),
+        terrain_name="gravel",
+        overrides=Overrides(wheel_radius_m=RADIUS_M),
+    )
+
+
+def four_wheels(r: Recording) -> Recording:
+    assert r.wheels is not None
+    noise = np.random.default_rng(5).normal(0.0, 0.02, (len(r.wheels), 4))
+    speed = r.wheels.speed[:, [0, 1, 0, 1]] + noise * (r.wheels.speed[:, :1] != 0.0)
+    return dataclasses.replace(r, wheels=Wheels(r.wheels.t_ns, speed, FOUR, "radps"))
+
+
+def in_mps(r: Recording) -> Recording:
+    assert r.wheels is not None
+    metric = Wheels(r.wheels.t_ns, r.wheels.speed * RADIUS_M, r.wheels.names, "mps")
+    return dataclasses.replace(r, wheels=metric, overrides=Overrides())
+
+
+def without(r: Recording, *channels: str) -> Recording:
+    return dataclasses.replace(r, **dict.fromkeys(channels))
+
+
+def imu_with(**change: Callable[[np.ndarray], np.ndarray]) -> Fault:
+    """Another reading of the IMU's arrays."""
+
+    def spoilt(r: Recording) -> Recording:
+        assert r.imu is not None
+        fields = {name: f(getattr(r.imu, name)) for name, f in change.items()}
+        return dataclasses.replace(r, imu=dataclasses.replace(r.imu, **fields))
+
+    return spoilt
+
+
+def wheels_with(change: Callable[[np.ndarray], np.ndarray]) -> Fault:
+    def spoilt(r: Recording) -> Recording:
+        assert r.wheels is not None
+        return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, speed=change(r.wheels.speed)))
+
+    return spoilt
+
+
+def gnss_with(**change: Callable[[np.ndarray], np.ndarray]) -> Fault:
+    def spoilt(r: Recording) -> Recording:
+        assert r.gnss is not None
+        fields = {name: f(getattr(r.gnss, name).copy()) for name, f in change.items()}
+        return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, **fields))
+
+    return spoilt
+
+
+def mounted(*axes: str) -> Fault:
+    """The IMU of which `axes` lie along body x, y, z."""
+    R = axes_matrix(axes)
+    return imu_with(gyro_radps=lambda g: g @ R, accel_mps2=lambda a: a @ R)
+
+
+def after(*steps: Fault) -> Fault:
+    def spoilt(r: Recording) -> Recording:
+        for step in steps:
+            r = step(r)
+        return r
+
+    return spoilt
+
+
+def rad_for_metres(r: Recording) -> Recording:
+    """Wheel rates (rad/s) given as speeds, in a log that tells the radius as well."""
+    assert r.wheels is not None
+    return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, unit="mps"))
+
+
+def rows(first: int, last: int, offset: Any) -> Callable[[np.ndarray], np.ndarray]:
+    def shifted(values: np.ndarray) -> np.ndarray:
+        values[first:last] += offset
+        return values
+
+    return shifted
+
+
+def radius(value: float) -> Fault:
+    return lambda r: dataclasses.replace(r, overrides=Overrides(wheel_radius_m=value))
+
+
+def latitude_longitude(order: list[int], scale: float = 1.0) -> Fault:
+    def spoilt(r: Recording) -> Recording:
+        assert r.gnss is not None
+        place = enu_to_geodetic(r.gnss.enu_m, DATUM)
+        place = np.column_stack([place[:, order] * scale, place[:, 2]])
+        return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, enu_m=place), datum=None)
+
+    return spoilt
+
+
+def no_fix_at_first(fix: np.ndarray) -> np.ndarray:
+    fix[:9] = Fix.NONE
+    return fix
+
+
+def frozen_fixes(r: Recording) -> Recording:
+    def held(enu: np.ndarray) -> np.ndarray:
+        enu[200:225] = enu[200]
+        return enu
+
+    return gnss_with(enu_m=held)(r)
+
+
+def scaled(factor: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda values: values * factor
+
+
+def times(*factors: float) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda values: values * np.array(factors)
+
+
+def columns(*order: int) -> Callable[[np.ndarray], np.ndarray]:
+    return lambda values: values[:, list(order)]
+
+
+def untold(fault: Fault, *channels: str) -> Fault:
+    """The fault in a log without these channels."""
+    return lambda r: without(fault(r), *channels)
+
+
+MENDED: dict[str, tuple[Fault, str, str]] = {
+    "accel in g": (imu_with(accel_mps2=scaled(1 / 9.80665)), "accel-in-g", "error"),
+    "forward, right, down": (mounted("+x", "-y", "-z"), "imu-axes", "error"),
+    "husky": (mounted("-z", "-x", "+y"), "imu-axes", "error"),
+    "backward, left, down": (mounted("-x", "+y", "-z"), "imu-axes", "error"),
+    "right, forward, down": (mounted("+y", "+x", "-z"), "imu-axes", "error"),
+    "accelerometer alone on its side": (
+        imu_with(accel_mps2=lambda a: a @ axes_matrix(("+x", "-z", "+y"))), "imu-axes", "error",
+    ),
+    "accelerometer negated": (imu_with(accel_mps2=scaled(-1.0)), "imu-axes", "error"),
+    "turned left": (mounted("-y", "+x", "+z"), "imu-forward", "error"),
+    "turned right": (mounted("+y", "-x", "+z"), "imu-forward", "error"),
+    "backward": (mounted("-x", "-y", "+z"), "imu-forward", "error"),
+    "on its side and in g": (
+        after(mounted("-z", "-x", "+y"), imu_with(accel_mps2=scaled(1 / 9.80665))), "accel-in-g", "error",
+    ),
+    "gyro in deg/s": (imu_with(gyro_radps=np.degrees), "gyro-in-degrees", "error"),
+    "gyro in deg/s beside the truth": (
+        untold(imu_with(gyro_radps=np.degrees), "wheels", "command", "gnss"), "gyro-in-degrees", "error",
+    ),
+    "gyro reversed": (imu_with(gyro_radps=times(1, 1, -1)), "yaw-sign", "error"),
+    "gyro reversed, nothing but wheels and accelerometer": (
+        untold(imu_with(gyro_radps=times(1, 1, -1)), "gnss", "truth", "command"), "yaw-sign", "error",
+    ),
+    "gyro bias": (imu_with(gyro_radps=lambda g: g + np.array([0.03, 0.0, -0.05])), "gyro-bias", "warning"),
+    "sides swapped": (wheels_with(columns(1, 0)), "wheel-swap", "error"),
+    "sides swapped, nothing but the IMU": (
+        untold(wheels_with(columns(1, 0)), "gnss", "truth", "command"), "wheel-swap", "error",
+    ),
+    "four wheels swapped": (after(four_wheels, wheels_with(columns(1, 0, 3, 2))), "wheel-swap", "error"),
+    "left negative": (wheels_with(times(-1, 1)), "wheel-sign", "error"),
+    "right negative": (wheels_with(times(1, -1)), "wheel-sign", "error"),
+    "left negative, nothing but the IMU": (
+        untold(wheels_with(times(-1, 1)), "gnss", "truth", "command"), "wheel-sign", "error",
+    ),
+    "left negative, no IMU": (untold(wheels_with(times(-1, 1)), "imu", "command"), "wheel-sign", "error"),
+    "pathfinder": (
+        after(mounted("+x", "-y", "-z"), four_wheels, wheels_with(times(-1, 1, -1, 1))), "imu-axes", "error",
+    ),
+    "both negative": (wheels_with(scaled(-1.0)), "wheel-reversed", "error"),
+    "both negative, nothing but the IMU": (
+        untold(wheels_with(scaled(-1.0)), "gnss", "truth", "command"), "wheel-reversed", "error",
+    ),
+    "rev/min": (wheels_with(scaled(60 / (2 * np.pi))), "wheel-unit", "error"),
+    "deg/s": (wheels_with(np.degrees), "wheel-unit", "error"),
+    "rev/min, no command": (
+        untold(wheels_with(scaled(60 / (2 * np.pi))), "command", "truth"), "wheel-unit", "error",
+    ),
+    "rad/s in a column of m/s": (rad_for_metres, "wheel-unit", "error"),
+    "km/h": (after(in_mps, wheels_with(scaled(3.6))), "wheel-unit", "error"),
+    "mm/s": (after(in_mps, wheels_with(scaled(1000.0))), "wheel-unit", "error"),
+    "radius 7 % short": (radius(RADIUS_M / 1.07), "wheel-radius", "warning"),
+    "radius 7 % short, by the truth": (untold(radius(RADIUS_M / 1.07), "gnss"), "wheel-radius", "warning"),
+    "speed 7 % short": (after(in_mps, wheels_with(scaled(1 / 1.07))), "wheel-radius", "warning"),
+    "front right dead": (after(four_wheels, wheels_with(times(1, 0, 1, 1))), "wheel-odd", "error"),
+    "rear left reversed": (after(four_wheels, wheels_with(times(1, 1, -1, 1))), "wheel-odd", "error"),
+    "rear right half": (after(four_wheels, wheels_with(times(1, 1, 1, 0.5))), "wheel-odd", "error"),
+    "sigma zero": (gnss_with(sigma_enu_m=scaled(0.0)), "sigma-impossible", "error"),
+    "one sigma negative": (gnss_with(sigma_enu_m=rows(7, 8, -1.0)), "sigma-impossible", "error"),
+    "some sigma missing": (gnss_with(sigma_enu_m=rows(7, 80, np.nan)), "sigma-impossible", "warning"),
+    "variance for sigma": (gnss_with(sigma_enu_m=np.square), "sigma-too-small", "warning"),
+    "degrees": (latitude_longitude([1, 0]), "gnss-degrees", "error"),
+    "degrees, latitude first": (latitude_longitude([0, 1]), "gnss-degrees", "error"),
+    "radians": (latitude_longitude([1, 0], np.pi / 180), "gnss-degrees", "error"),
+    "excursion": (gnss_with(enu_m=rows(200, 206, [6.0, 3.0, 0.0])), "gnss-jumps", "warning"),
+    "frozen": (frozen_fixes, "gnss-frozen", "warning"),
+    "some without fix": (gnss_with(fix=no_fix_at_first), "fix-none", "warning"),
+    "east and north swapped": (gnss_with(enu_m=columns(1, 0, 2)), "gnss-course", "error"),
+    "north negative": (gnss_with(enu_m=times(1, -1, 1)), "gnss-course", "error"),
+    "east negative": (gnss_with(enu_m=times(-1, 1, 1)), "gnss-course", "error"),
+    "velocity in knots": (gnss_with(velocity_enu_mps=scaled(1.943844)), "gnss-velocity", "warning"),
+    "velocity swapped": (gnss_with(velocity_enu_mps=columns(1, 0, 2)), "gnss-velocity", "warning"),
+    "velocity north negative": (gnss_with(velocity_enu_mps=times(1, -1, 1)), "gnss-velocity", "warning"),
+    "velocity negative": (gnss_with(velocity_enu_mps=times(-1, -1, 1)), "gnss-velocity", "warning"),
+    "command reversed": (
+        lambda r: dataclasses.replace(
+            r, command=dataclasses.replace(r.command, yaw_rate_radps=-r.command.yaw_rate_radps)
+        ),
+        "command-sign",
+        "warning",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", MENDED)
+def test_fault_is_found_and_mended(name: str) -> None:
+    spoil, code, severity = MENDED[name]
+    good = lively_drive()
+    spoilt = spoil(good)
+    found = {finding.code: finding for finding in examine(spoilt)}
+    assert code in found, sorted(found)
+    assert found[code].severity == severity
+    assert found[code].evidence
+    assert found[code].fix
+    mended, done = treat(spoilt)
+    assert code in [finding.code for finding in done]
+    assert {finding.code for finding in examine(mended)} <= {"gaps"}  # where fixes were dropped
+    assert_same(mended, good)
+
+
+def assert_same(mended: Recording, good: Recording) -> None:
+    """The numbers of the channels that are left are near those of the good drive."""
+    if mended.imu is not None:
+        np.testing.assert_allclose(mended.imu.gyro_radps, good.imu.gyro_radps, atol=0.005)
+        np.testing.assert_allclose(mended.imu.accel_mps2, good.imu.accel_mps2, atol=0.02)
+    if mended.wheels is not None:
+        found = mended.wheels.side_speeds_mps(mended.overrides.wheel_radius_m or RADIUS_M)
+        np.testing.assert_allclose(found, good.wheels.side_speeds_mps(RADIUS_M), rtol=0.01, atol=0.01)
+    if mended.gnss is not None:
+        same = good.gnss.select(np.isin(good.gnss.t_ns, mended.gnss.t_ns))
+        assert len(mended.gnss) > 0.9 * len(good.gnss)
+        away = same.enu_m - same.enu_m[0]
+        np.testing.assert_allclose(mended.gnss.enu_m - mended.gnss.enu_m[0], away, atol=0.01)
+        np.testing.assert_allclose(mended.gnss.velocity_enu_mps, same.velocity_enu_mps, rtol=0.05, atol=0.02)
+        assert (mended.gnss.sigma_enu_m > 0.03).all()
+        assert (mended.gnss.sigma_enu_m < 0.25).all()
+    if mended.command is not None:
+        np.testing.assert_array_equal(mended.command.yaw_rate_radps, good.command.yaw_rate_radps)
+
+
+@pytest.mark.parametrize("speed_mps", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("seed", range(4))
+def test_lively_drive_has_no_finding(seed: int, speed_mps: float, husky_rig: Rig) -> None:
+    good = lively_drive(seed, speed_mps)
+    for drive in (good, four_wheels(good), in_mps(good)):
+        assert examine(drive) == []
+    assert (
+        examine(good, dataclasses.replace(husky_rig, wheel_radius_m=RADIUS_M, sensors=level(husky_rig))) == []
+    )
+
+
+def level(rig: Rig) -> Any:
+    """The sensors of a rig whose antenna is above the origin, as in the drives here."""
+    gnss = dataclasses.replace(rig.sensors.gnss, antenna_m=(0.0, 0.0, 0.3))
+    return dataclasses.replace(rig.sensors, gnss=gnss)
