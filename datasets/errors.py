@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -48,3 +50,16 @@ class DataError(TerrafusionError):
 
 class ConfigError(TerrafusionError):
     """A parameter file with an unknown key, a wrong unit or a value out of range."""
+
+
+@contextmanager
+def errors_of(file: str | Path) -> Iterator[None]:
+    """Names the file in every DataError raised inside that does not name one, as channels do not."""
+    try:
+        yield
+    except DataError as error:
+        if error.file is not None:
+            raise
+        raise DataError(
+            error.what, file=file, channel=error.channel, time_s=error.time_s, remedy=error.remedy
+        ) from None

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog import CATALOG_VARIABLE, sha256_of
 from terrafusion.datasets.conventions import Conventions
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.errors import DataError, errors_of
 from terrafusion.datasets.frames import rpy_to_quaternion
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.safe_pickle import numbers, read_table
@@ -57,10 +57,11 @@ def read(request: Request) -> list[Recording]:
         )
     table = read_table(path)
     try:
-        if "ros_time" in table:
-            return [_drive(path, table, request.conventions)]
-        if "imu_yaw_0" in table:
-            return _windows(path, table, request.conventions)
+        with errors_of(path):
+            if "ros_time" in table:
+                return [_drive(path, table, request.conventions)]
+            if "imu_yaw_0" in table:
+                return _windows(path, table, request.conventions)
     except KeyError as error:
         raise DataError(f"column {error} is missing", file=path, remedy="give an unchanged table") from None
     except (ValueError, OverflowError) as error:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.errors import DataError, errors_of
 from terrafusion.datasets.frames import geodetic_to_enu
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.matlab_hdf5 import MatlabFile, is_hdf5, opened, variables
@@ -45,19 +45,8 @@ def read(request: Request) -> list[Recording]:
         DataError: the file is broken, a variable is missing, has other rows than its clock or
             claims an impossible size, or time runs backwards.
     """
-    with opened(request.path) as file:
-        try:
-            return [_recording(file, request)]
-        except KeyError as error:
-            raise DataError(
-                f"{error.args[0]}", file=request.path, remedy="give the whole workspace"
-            ) from None
-        except DataError as error:
-            if error.file is not None:
-                raise
-            raise DataError(
-                error.what, file=request.path, channel=error.channel, time_s=error.time_s, remedy=error.remedy
-            ) from None
+    with errors_of(request.path), opened(request.path) as file:
+        return [_recording(file, request)]
 
 
 def _recording(file: MatlabFile, request: Request) -> Recording:
