@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.catalog import CatalogFile, data_folders, load_catalog
 from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.measures import Measures, measure
+from terrafusion.datasets.doctor.mounting import heading
 from terrafusion.datasets.doctor.path import dead_reckoned
 from terrafusion.datasets.doctor.turning import accounts
 from terrafusion.datasets.readers import open_recordings
@@ -221,6 +222,12 @@ def _gravity_size(drives: Drives) -> float | None:
     return gravity.mean_mps2[2] if gravity else None
 
 
+def _off_forward(drives: Drives) -> float | None:
+    """Degrees by which the IMU's x lies left of forward, told by changes of speed and by the turns."""
+    found = heading(Patient(drives.opened[0], None))
+    return float(np.degrees(found.angle)) if found is not None and found.angle is not None else None
+
+
 def _effective_track(drives: Drives) -> float | None:
     return drives.measures.yaw.effective_track_m if drives.measures.yaw else None
 
@@ -317,6 +324,7 @@ QUANTITIES: dict[str, Callable[[Drives], Value | None]] = {
     **{f"path by {c} over path by wheels": _ratio(c) for c in ("gnss", "truth")},
     "gravity in the log on": _gravity_axis,
     "gravity on body z, m/s2": _gravity_size,
+    "imu x left of forward, deg": _off_forward,
     "gyro with wheels, r": _turn_r("gyro", "wheels"),
     "gyro with truth, r": _turn_r("gyro", "truth"),
     "gyro with wheels in the log, r": _turn_r("gyro", "wheels", logged=True),

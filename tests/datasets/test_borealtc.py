@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.conventions import Conventions, apply
+from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.measures import measure
+from terrafusion.datasets.doctor.mounting import heading
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers import borealtc_csv, open_recording
 from terrafusion.datasets.recording import TERRAINS, Recording, differences
@@ -38,9 +40,10 @@ def write_run(folder: Path) -> Path:
     t = np.round(np.arange(0.0, SECONDS, 0.01), 2)
     imu = rng.normal((0, 0, 0, 0, 0, 9.8), 0.05, (len(t), 6))
     imu[:, 2] += 0.2 * np.sin(0.7 * t)
+    imu[:, 3] += 0.3 * np.cos(0.9 * t) * 0.9
     t_pro = np.arange(0.0, SECONDS, 1 / 6.5)
-    half = 0.1 * TRACK_M * np.sin(0.7 * t_pro)
-    pro = np.stack([rng.random(len(t_pro)) * 9, rng.random(len(t_pro)) * 9, 0.5 - half, 0.5 + half], axis=1)
+    half, v = 0.1 * TRACK_M * np.sin(0.7 * t_pro), 0.5 + 0.3 * np.sin(0.9 * t_pro)
+    pro = np.stack([rng.random(len(t_pro)) * 9, rng.random(len(t_pro)) * 9, v - half, v + half], axis=1)
     for name, header, times, rows in (("imu", IMU_HEADER, t, imu), ("pro", PRO_HEADER, t_pro, pro)):
         lines = [
             f"{s!r},{','.join(map(repr, row))}\n"
@@ -73,8 +76,10 @@ def physics(recording: Recording) -> dict[str, bool]:
     assert recording.motor is not None
     assert measures.yaw is not None
     track = measures.yaw.effective_track_m
+    told = heading(Patient(recording, None))
     return {
         "gravity": measures.gravity is not None and measures.gravity.axis == "+z",
+        "forward": told is None or told.angle is None or abs(told.angle) < np.radians(15.0),
         "yaw": measures.yaw.r > 0.5,
         "metres and radians": track is not None and 0.6 < track < 1.7,
         "amperes": 1.0 < float(recording.motor.current_a.mean()) < 20.0,
@@ -111,6 +116,7 @@ def motor_in_ma(recording: Recording) -> Recording:
 FLIPS: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     "z down": (lambda r: apply(r, Conventions(imu_axes=("+x", "-y", "-z"))), "gravity"),
     "y up": (lambda r: apply(r, Conventions(imu_axes=("+x", "+z", "-y"))), "gravity"),
+    "x backwards": (lambda r: apply(r, Conventions(imu_axes=("-x", "-y", "+z"))), "forward"),
     "yaw rate to the right": (lambda r: apply(r, Conventions(gyro_z_sign=-1.0)), "yaw"),
     "right side first": (sides_swapped, "yaw"),
     "wheels in rad/s": (wheels_in_radps, "metres and radians"),
@@ -127,12 +133,21 @@ def test_a_flipped_convention_breaks_physics(run: Path, name: str) -> None:
     assert not physics(flip(recording))[check]
 
 
+@pytest.mark.parametrize("name", ["ASPHALT/01", "FLOORING/00", "FLOORING/05", "ICE/02"])
+@pytest.mark.parametrize("axes", [("-x", "-y", "+z"), ("-y", "+x", "+z"), ("+y", "-x", "+z")])
+def test_x_is_forward_where_the_run_tells(boreal_logs: Path, name: str, axes: tuple[str, ...]) -> None:
+    recording = open_recording(f"borealtc/{name}")
+    assert heading(Patient(recording, None)) is not None
+    assert physics(recording)["forward"]
+    assert not physics(apply(recording, Conventions(imu_axes=axes)))["forward"]
+
+
 @pytest.mark.parametrize("name", TURNING)
 def test_the_runs_obey_physics(boreal_logs: Path, name: str) -> None:
     recording = open_recording(f"borealtc/{name}")
     assert all(physics(recording).values()), (physics(recording), measure([recording]).yaw)
     for flip, check in FLIPS.values():
-        assert not physics(flip(recording))[check]
+        assert check == "forward" or not physics(flip(recording))[check]
 
 
 def test_spins_turn_the_way_the_wheels_say(boreal_logs: Path) -> None:

@@ -12,7 +12,9 @@ import pytest
 
 from terrafusion.datasets.catalog import load_catalog
 from terrafusion.datasets.conventions import Conventions, apply
+from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.measures import measure
+from terrafusion.datasets.doctor.mounting import heading
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers import open_recording, umich_text
 from terrafusion.datasets.recording import Recording, differences
@@ -47,10 +49,10 @@ def write_trial(folder: Path) -> Path:
     """The four files of a trial, all on one clock."""
     rng = np.random.default_rng(4)
     t = np.arange(0.0, SECONDS, 0.01)
-    _, rate, *_ = motion(t)
+    v, rate, *_ = motion(t)
     noise = rng.normal(0.0, 0.02, (6, len(t)))
     zero = np.zeros_like(t)
-    imu = [zero, zero, rate, zero, zero, zero + 9.8]
+    imu = [zero, zero, rate, np.gradient(v, t), v * rate, zero + 9.8]
     save(folder / FAMILY[0], t, [c + n for c, n in zip(imu, noise, strict=True)])
     t = np.arange(0.1, SECONDS, 0.1)
     v, *_ = motion(t)
@@ -113,6 +115,9 @@ def physics(recording: Recording) -> dict[str, bool]:
     if recording.wheels is not None:
         t = recording.truth.t_ns[9:-9]
         rolled = np.interp(t, recording.wheels.t_ns, recording.wheels.speed[:, 0])
+        told = heading(Patient(recording, None))
+        angle = told.angle if told is not None and told.angle is not None else np.pi
+        checks["imu forward"] = abs(angle) < np.radians(15.0)
         checks["wheel sign"] = bool(np.corrcoef(rolled, ahead)[0, 1] > 0.5)
         checks["wheel scale"] = 0.94 < measures.path_m["truth"] / measures.path_m["wheels"] < 1.0
         checks["wheel clock"] = late.get("speed", 9.0) < 0.06
@@ -155,6 +160,9 @@ def quarter_turn(q: np.ndarray) -> np.ndarray:
 FLIPS: dict[str, tuple[Callable[[Recording], Recording], str]] = {
     "IMU upside down": (turned(("+x", "-y", "-z")), "gravity"),
     "IMU on its side": (turned(("+x", "+z", "-y")), "gravity"),
+    "IMU to the back": (turned(("-x", "-y", "+z")), "imu forward"),
+    "IMU to the left": (turned(("-y", "+x", "+z")), "imu forward"),
+    "IMU to the right": (turned(("+y", "-x", "+z")), "imu forward"),
     "yaw rate to the right": (lambda r: apply(r, Conventions(gyro_z_sign=-1.0)), "yaw"),
     "wheels backwards": (scaled(-1.0), "wheel sign"),
     "diameter for radius": (scaled(2.0), "wheel scale"),
