@@ -32,7 +32,7 @@ def claims(path: Path, head: bytes) -> bool:
     return (
         numbers.ndim == 2
         and numbers.shape[1] == 8
-        and bool((np.abs(np.linalg.norm(numbers[:, 4:], axis=1) - 1.0) < NORM_TOLERANCE).all())
+        and bool((np.abs(_norms(numbers[:, 4:]) - 1.0) < NORM_TOLERANCE).all())
     )
 
 
@@ -87,7 +87,7 @@ def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:
 
 
 def _check_norms(path: Path, quaternion: Array) -> None:
-    norm = np.linalg.norm(quaternion, axis=1)
+    norm = _norms(quaternion)
     off = np.flatnonzero(np.abs(norm - 1.0) > NORM_TOLERANCE)
     if off.size:
         raise DataError(
@@ -96,3 +96,8 @@ def _check_norms(path: Path, quaternion: Array) -> None:
             channel="truth",
             remedy="give unit quaternions x, y, z, w",
         )
+
+
+def _norms(quaternion: Array) -> Array:
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.asarray(np.linalg.norm(quaternion, axis=1))

@@ -16,6 +16,7 @@ TimesNs = NDArray[np.int64]
 Array = NDArray[np.float64]
 
 UTC = tuple(f"UTC_{part}" for part in ("Year", "Month", "Day", "Hour", "Minute", "Second", "Nano", "Valid"))
+UTC_LOWEST, UTC_HIGHEST = (1980, 1, 1, 0, 0, 0, -(10**9)), (2200, 12, 31, 23, 59, 60, 10**9)
 UTC_VALID_BIT = 4
 """Bit of UTC_Valid: date, time and leap seconds are known."""
 
@@ -52,14 +53,14 @@ def clock_of(path: Path, columns: Columns, settings: dict[str, str]) -> Clock:
     if _known(ticks):
         assert ticks is not None
         rows = np.isfinite(ticks)
-        t_ns = _unwrapped(ticks[rows], TICK_SPAN) * TICK_NS
+        t_ns = _unwrapped(path, ticks[rows], TICK_SPAN) * TICK_NS
         _check_ticks(path, t_ns)
         notes: tuple[str, ...] = ()
     elif _known(counter):
         assert counter is not None
         rate_hz = _update_rate(path, settings)
         rows = np.isfinite(counter)
-        t_ns = np.rint(_unwrapped(counter[rows], COUNTER_SPAN) * (1e9 / rate_hz)).astype(np.int64)
+        t_ns = np.rint(_unwrapped(path, counter[rows], COUNTER_SPAN) * (1e9 / rate_hz)).astype(np.int64)
         notes = (f"times are packet counts at the update rate of {rate_hz:g} Hz: no clock was exported",)
     else:
         raise DataError(
@@ -82,29 +83,38 @@ def _utc(path: Path, columns: Columns) -> tuple[TimesNs, NDArray[np.bool_]]:
     parts = columns.stack(UTC)
     valid = np.asarray(np.isfinite(parts[:, :6]).all(axis=1))
     if "UTC_Valid" in columns.numbers:
-        valid &= (np.nan_to_num(parts[:, 7]).astype(np.int64) & UTC_VALID_BIT) > 0
+        flags = np.clip(np.nan_to_num(parts[:, 7]), 0, 255).astype(np.int64)
+        valid &= (flags & UTC_VALID_BIT) > 0
     t_ns = np.zeros(len(parts), dtype=np.int64)
     if not valid.any():
         return t_ns, valid
-    year, month, day, hour, minute, second = np.nan_to_num(parts[valid, :6]).astype(np.int64).T
-    nano = np.nan_to_num(parts[valid, 6]).astype(np.int64)
-    lowest, highest = [1980, 1, 1, 0, 0, 0], [2200, 12, 31, 23, 59, 60]
-    in_range = ((parts[valid, :6] >= lowest) & (parts[valid, :6] <= highest)).all(axis=1)
-    in_range &= np.abs(nano) < 10**9
-    if not in_range.all():
-        i = int(np.flatnonzero(~in_range)[0])
-        shown = " ".join(f"{x:g}" for x in parts[valid][i, :7])
-        raise DataError(
-            f"UTC '{shown}' is no date at data row {int(np.flatnonzero(valid)[i]) + 1}", file=path
-        )
+    told = np.nan_to_num(parts[valid, :7])
+    in_range = np.asarray(((told >= UTC_LOWEST) & (told <= UTC_HIGHEST)).all(axis=1))
+    year, month, day, hour, minute, second, nano = np.where(in_range[:, None], told, 1.0).astype(np.int64).T
     months = (year - 1970) * 12 + month - 1
     days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
+    in_range &= days.astype("datetime64[D]").astype("datetime64[M]").astype(np.int64) == months
+    if not in_range.all():
+        i = int(np.flatnonzero(~in_range)[0])
+        raise DataError(
+            f"UTC '{' '.join(f'{x:g}' for x in told[i])}' is no date, in data row "
+            f"{int(np.flatnonzero(valid)[i]) + 1}",
+            file=path,
+            remedy="remove that row",
+        )
     t_ns[valid] = ((days * 24 + hour) * 60 + minute) * 60 * 10**9 + second * 10**9 + nano
     return t_ns, valid
 
 
-def _unwrapped(counts: Array, span: int) -> NDArray[np.int64]:
+def _unwrapped(path: Path, counts: Array, span: int) -> NDArray[np.int64]:
     """Counts (N,) that go on where those of the file start again from zero."""
+    strange = np.flatnonzero((counts < 0) | (counts >= TICK_SPAN))
+    if strange.size:
+        raise DataError(
+            f"the counter is {counts[strange[0]]:g} in data row {int(strange[0]) + 1}",
+            file=path,
+            remedy="remove that row",
+        )
     whole = counts.astype(np.int64)
     wraps = np.cumsum(np.diff(whole, prepend=whole[:1]) < -span // 2)
     return whole + wraps * span

@@ -241,6 +241,16 @@ def test_another_device_is_not_taken_for_an_mti(tmp_path: Path) -> None:
         open_recording(export(tmp_path, columns, ""))
 
 
+@pytest.mark.parametrize(
+    ("part", "value"), [("Month", "13"), ("Day", "30"), ("Second", "61"), ("Hour", "1e300")]
+)
+def test_utc_that_is_no_date(tmp_path: Path, part: str, value: str) -> None:
+    columns = ticks() | utc_columns() | imu_columns()
+    columns[f"UTC_{part}"][5] = value  # the rows are of 29 February
+    with pytest.raises(DataError, match="is no date, in data row 6"):
+        open_recording(export(tmp_path, columns))
+
+
 def test_backward_ticks(tmp_path: Path) -> None:
     columns = ticks() | imu_columns()
     columns["SampleTimeFine"] = [str(50_000 + 100 * k - 2000 * (k >= 100)) for k in range(N)]
