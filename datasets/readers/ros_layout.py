@@ -24,7 +24,7 @@ Place = tuple[int, int]
 MAX_LAYOUTS, MAX_LAYOUTS_OF_A_SIZE = 20_000, 100
 MAX_DEPTH = 32
 CODES = {
-    "bool": "u1", "byte": "u1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
+    "bool": "?", "byte": "i1", "char": "u1", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
     "int32": "i4", "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 
@@ -129,7 +129,7 @@ class _Walk:
         if base not in CODES:
             raise BagError(f"fields of type {base} are not supported")
         code = self.order + CODES[base]
-        size = int(CODES[base][1:])
+        size = np.dtype(code).itemsize
         if count != 0:
             self.align(size)
         start = self.position
