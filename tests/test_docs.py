@@ -80,7 +80,9 @@ def test_tutorial(folder: Path) -> None:
     assert abs(session["state"].slip) < 1.0
 
 
-@pytest.mark.parametrize("name", ["conventions.md", "estimator.md", "limits.md", "terrain.md", "twin.md"])
+@pytest.mark.parametrize(
+    "name", ["conventions.md", "estimator.md", "formats.md", "limits.md", "terrain.md", "twin.md"]
+)
 def test_python_of_the_other_documents(name: str, folder: Path) -> None:
     document = ROOT / "docs" / name
     session: dict[str, Any] = {"__name__": name}
@@ -136,3 +138,16 @@ def test_log_folder_columns_are_told() -> None:
     columns += [f"{name}_{unit}" for names, unit in log_folder.WHEEL_LAYOUTS for name in names]
     for word in [*columns, *(f"{name}.csv" for name in log_folder.CHANNELS), *log_meta.KEYS]:
         assert re.search(rf"\b{re.escape(word)}\b", text), word
+
+
+def test_formats_and_units_are_told() -> None:
+    """Every format, unit and key of the column map stands in the document of formats."""
+    from terrafusion.datasets.readers import column_map, formats, units
+
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    words = [form.name for form in formats.FORMATS] + [
+        unit for known in units.UNITS.values() for unit in known
+    ]
+    words += [*column_map.TIME_UNITS, *column_map.EPOCHS, *filter(None, column_map.FIX_CODES)]
+    for word in words:
+        assert f"`{word}`" in text, word
