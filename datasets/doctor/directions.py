@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.doctor.finding import Patient
-from terrafusion.datasets.doctor.mounting import heading, wheels_turn_backwards
+from terrafusion.datasets.doctor.mounting import gravity, heading, wheels_turn_backwards
 from terrafusion.datasets.doctor.path import ANY_RADIUS_M, places, wheel_speed
 from terrafusion.datasets.doctor.turning import SURE_R, Account, account, agreement, seconds
+from terrafusion.datasets.recording import Imu
 
 Array = NDArray[np.float64]
 
@@ -38,7 +39,7 @@ def sides_opposed(patient: Patient) -> str | None:
     if np.abs(together[moving]).mean() > 0.5 * np.abs(sides[moving]).mean():
         return None
     imu, start = patient.recording.imu, patient.recording.start_ns
-    gyro = None if imu is None else account(start, imu.t_ns, imu.gyro_radps[:, 2])
+    gyro = None if imu is None else account(start, imu.t_ns, _upright_rate(patient, imu))
     made_good = _progress(patient, account(start, t_ns, 0.5 * apart))
     if gyro is not None:
         rate = float(np.abs(gyro.rates(np.linspace(gyro.t_s[0], gyro.t_s[-1], 200))).mean())
@@ -47,7 +48,7 @@ def sides_opposed(patient: Patient) -> str | None:
         summed = account(start, t_ns, together)
         by_sum = agreement(gyro, summed) if summed is not None else None
         if by_sum is not None and abs(by_sum.r) > SURE_R:
-            return f"gyro z turns as their sum does (correlation {abs(by_sum.r):.2f})"
+            return f"the gyro turns as their sum does (correlation {abs(by_sum.r):.2f})"
     if made_good is not None:
         progress, source = made_good
         return (
@@ -56,6 +57,14 @@ def sides_opposed(patient: Patient) -> str | None:
             else None
         )
     return ""
+
+
+def _upright_rate(patient: Patient, imu: Imu) -> Array:
+    """Angular rate (N,) about the direction of gravity, up to its sign; about z where that is unknown."""
+    mean = gravity(patient)
+    if mean is None or not imu.has_gyro() or not np.linalg.norm(mean) > 0.0:
+        return imu.gyro_radps[:, 2]
+    return np.asarray(imu.gyro_radps @ (mean / np.linalg.norm(mean)))
 
 
 def _progress(patient: Patient, rolled: Account | None) -> tuple[float, str] | None:
