@@ -2,11 +2,22 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from terrafusion.datasets.doctor.finding import Finding, Patient
+from terrafusion.datasets.doctor.finding import Finding, Patient, Repair
+from terrafusion.datasets.recording import Recording
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+TimesNs = NDArray[np.int64]
+
+MOST_ROWS = 0.2
+"""Where a larger share of the rows is impossible, the unit is wrong rather than some rows."""
 
 LIMITS = {
     ("command", "_mps"): 100.0,
@@ -27,22 +38,51 @@ LIMITS = {
 
 def check_magnitude(patient: Patient) -> Iterator[Finding]:
     """Numbers that no robot reaches: a wrong unit, or memory read as numbers."""
-    recording = patient.recording
-    tables = {name: (channel.t_ns, channel.columns()) for name, channel in recording.channels().items()}
+    for name, (t_ns, bad) in _beyond(patient.recording).items():
+        if not bad:
+            continue
+        rows = np.logical_or.reduce([over for _, over, _ in bad])
+        values, over, column = bad[0]
+        first, limit = int(np.flatnonzero(over)[0]), LIMITS[name, _unit(column)]
+        few = rows.sum() < MOST_ROWS * len(rows)
+        yield Finding(
+            "impossible-value",
+            "error",
+            name,
+            f"{column} is {values[first]:g}, beyond anything possible",
+            f"at t = {patient.since_start_s(t_ns[first]):.3f} s; {int(over.sum())} of {len(over)} values "
+            f"beyond {limit:g}" + (f", {int(rows.sum())} rows in all" if len(bad) > 1 else ""),
+            "leave these rows out" if few else "is the unit right? too many rows are wrong to leave them out",
+            _without_rows(name) if few else None,
+        )
+
+
+def _beyond(recording: Recording) -> dict[str, tuple[TimesNs, list[tuple[Array, Mask, str]]]]:
+    """Times by channel, and its columns with values beyond the limits: values, where, name."""
+    tables: dict[str, tuple[TimesNs, dict[str, NDArray[Any]]]] = {
+        name: (channel.t_ns, channel.columns()) for name, channel in recording.channels().items()
+    }
     if recording.truth is not None and len(recording.truth):
         position = dict(zip(("x_m", "y_m", "z_m"), recording.truth.position_m.T, strict=True))
         tables["truth"] = recording.truth.t_ns, position
+    found = {}
     for name, (t_ns, columns) in tables.items():
-        for column, values in columns.items():
-            limit = LIMITS.get((name, column[column.rindex("_") :] if "_" in column else ""))
-            bad = np.flatnonzero(np.abs(values) > limit) if limit is not None else np.zeros(0, dtype=int)
-            if bad.size:
-                at_s = patient.since_start_s(t_ns[bad[0]])
-                yield Finding(
-                    "impossible-value",
-                    "error",
-                    name,
-                    f"{column} is {values[bad[0]]:g}, beyond anything possible",
-                    f"at t = {at_s:.3f} s; {bad.size} of {len(values)} values beyond {limit:g}",
-                    "is the unit right? mend these rows, or leave the cells empty",
-                )
+        limited = [(v, LIMITS[name, _unit(c)], c) for c, v in columns.items() if (name, _unit(c)) in LIMITS]
+        over = [(values, np.abs(values) > limit, column) for values, limit, column in limited]
+        found[name] = t_ns, [one for one in over if one[1].any()]
+    return found
+
+
+def _unit(column: str) -> str:
+    return column[column.rindex("_") :] if "_" in column else ""
+
+
+def _without_rows(name: str) -> Repair:
+    def repair(recording: Recording) -> Recording:
+        t_ns, bad = _beyond(recording)[name]
+        wrong = np.zeros(len(t_ns), dtype=bool)
+        for _, over, _ in bad:
+            wrong |= over
+        return dataclasses.replace(recording, **{name: getattr(recording, name).select(~wrong)})
+
+    return repair

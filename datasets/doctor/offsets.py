@@ -24,6 +24,7 @@ from terrafusion.datasets.doctor.pairs import (
     signal_pairs,
     why,
 )
+from terrafusion.datasets.doctor.signals import without_stuck
 from terrafusion.datasets.doctor.timing import gap_findings
 from terrafusion.datasets.lag import Lag
 from terrafusion.datasets.recording import Recording
@@ -43,7 +44,7 @@ def lags(patient: Patient) -> dict[str, Lag]:
 
 def check_clocks(patient: Patient) -> Iterator[Finding]:
     """Clocks beside each other. A jump hides a drift, either hides an offset: the first is told."""
-    pairs = signal_pairs(patient)
+    pairs = signal_pairs(Patient(without_stuck(patient.recording), patient.rig))
     jumps = clock_jumps(patient.recording, pairs)
     yield from gap_findings(patient, {name: [jump.row for jump in found] for name, found in jumps.items()})
     if jumps:
@@ -59,9 +60,12 @@ def _offset_findings(recording: Recording, pairs: Pairs) -> Iterator[Finding]:
     told = {}
     for pair, signals in pairs.items():
         lag = far_lag(*signals)
-        if lag is not None and lag.r >= LEAST_R and not _opposed(lag, *signals):
-            suspect = pair[1] == "wheels" and _matters(pair, lag, *signals)
-            told[pair] = _without_smoothing(lag, *signals) if suspect else lag
+        if lag is None or lag.r < LEAST_R:
+            continue
+        suspect = _matters(pair, lag, *signals)
+        if not suspect or not _opposed(lag, *signals):
+            smooth = suspect and pair[1] == "wheels"
+            told[pair] = _without_smoothing(lag, *signals) if smooth else lag
     off = {pair: lag for pair, lag in told.items() if _matters(pair, lag, *pairs[pair])}
     sure = {pair for pair, lag in told.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[pair]}
     if off:
@@ -111,12 +115,13 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
 
     start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
     grid = np.arange(0.0, (end - start) * 1e-9, GRID_S)
-    a = _on(grid + 0.0, one, start)
-    b = _on(grid + lag.seconds, other, start)
+    a, a_known = _on(grid, one, start)
+    b, b_known = _on(grid + lag.seconds, other, start)
+    known = a_known & b_known
     sizes = range(1, round(LONGEST_MEAN_S / GRID_S), 4)
-    r = [_r(uniform_filter1d(a, size), b) for size in sizes]
+    r = [_r(uniform_filter1d(a, size)[known], b[known]) for size in sizes]
     size = sizes[int(np.argmax(r))]
-    both = _r(uniform_filter1d(a, size), uniform_filter1d(b, size))
+    both = _r(uniform_filter1d(a, size)[known], uniform_filter1d(b, size)[known])
     if size == 1 or max(r) < both or 1.0 - max(r) > 0.6 * (1.0 - r[0]):
         return lag
     delay_s = max(0.5 * (size * GRID_S - period_s(other[0])), 0.0)
@@ -134,16 +139,19 @@ def _opposed(lag: Lag, one: Signal, other: Signal) -> bool:
     if len(grid) < 2:
         return False
     width = round(0.5 / GRID_S)
-    here = uniform_filter1d(_on(grid, one, start), width)
-    there = [uniform_filter1d(_on(grid + s, other, start), width) for s in (0.0, lag.seconds)]
+    here = uniform_filter1d(_on(grid, one, start)[0], width)
+    there = [uniform_filter1d(_on(grid + s, other, start)[0], width) for s in (0.0, lag.seconds)]
     return -_r(here, there[0]) > _r(here, there[1]) - 0.1
 
 
-def _on(grid_s: Array, signal: Signal, origin_ns: np.int64) -> Array:
-    t_ns, values = signal
-    known = np.isfinite(values)
-    return np.interp(grid_s, (t_ns[known] - origin_ns) * 1e-9, values[known])
+def _on(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, NDArray[np.bool_]]:
+    """A signal on other times, and whether it is known there: away from its gaps."""
+    known = np.isfinite(signal[1])
+    t_s, values = (signal[0][known] - origin_ns) * 1e-9, signal[1][known]
+    after = np.clip(np.searchsorted(t_s, grid_s), 1, len(t_s) - 1)
+    near = t_s[after] - t_s[after - 1] < 3.0 * period_s(signal[0])
+    return np.interp(grid_s, t_s, values), np.asarray(near)
 
 
 def _r(a: Array, b: Array) -> float:
-    return float(np.corrcoef(a, b)[0, 1]) if min(a.std(), b.std()) > 0.0 else 0.0
+    return float(np.corrcoef(a, b)[0, 1]) if len(a) and min(a.std(), b.std()) > 1e-9 else 0.0
