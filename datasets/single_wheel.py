@@ -170,6 +170,5 @@ def _checked_slip(slip: Array, travel_mps: Array, rim_mps: Array) -> tuple[str, 
     off = np.abs(slip - expected)
     if off.max() <= SLIP_TOLERANCE:
         return ()
-    return (
-        f"slip: {int((off > SLIP_TOLERANCE).sum())} trials are off their speeds, by up to {off.max():.2f}",
-    )
+    wrong = int((off > SLIP_TOLERANCE).sum())
+    return (f"slip: off the speeds by up to {off.max():.2f}, in {wrong} of {len(off)} trials",)

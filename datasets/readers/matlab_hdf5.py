@@ -113,7 +113,9 @@ class MatlabFile:
             raise self._wrong(name, f"holds {data.dtype}, not numbers")
         if largest > MAX_VALUES or data.external or data.is_virtual:
             raise self._wrong(name, f"claims {largest} values, or keeps them in other files")
-        return np.asarray(data[()], dtype=float)
+        values = np.asarray(data[()], dtype=float)
+        values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
+        return values
 
     def _wrong(self, name: str, what: str) -> DataError:
         return DataError(what, file=self._path, channel=name, remedy="give the variable as it was published")

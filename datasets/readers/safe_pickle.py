@@ -148,7 +148,9 @@ def numbers(column: NDArray[Any]) -> NDArray[np.float64]:
         ValueError: a cell is something else.
     """
     if column.dtype != object:
-        return column.astype(float)
+        values = column.astype(float)
+        values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
+        return values
     cells = [np.nan if cell is None or cell == "" else cell for cell in column.tolist()]
     if not all(isinstance(cell, str | float | int) for cell in cells):
         raise ValueError("a cell is no number")
