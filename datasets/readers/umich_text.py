@@ -30,15 +30,17 @@ COLUMNS = {
     "center": POSE,
     "front": POSE,
 }
+STEM = r"(?:(?P<stem>.+?)_+)??"
 NAMES = {
-    "imu": re.compile(r"(?P<stem>.+?)_*(?:_wheel)?_imu\.txt"),
-    "wheels": re.compile(r"(?P<stem>.+?)_*(?:_wheel)?_vel(?:_input)?\.txt"),
-    "center": re.compile(r"(?P<stem>.+?)_center\.txt"),
-    "front": re.compile(r"(?P<stem>.+?)_front\.txt"),
+    "imu": re.compile(STEM + r"(?:wheel_)?imu\.txt"),
+    "wheels": re.compile(r"(?!.*inekf)" + STEM + r"(?:wheel_)?vel(?:_input)?\.txt"),
+    "center": re.compile(STEM + r"center\.txt"),
+    "front": re.compile(STEM + r"front\.txt"),
 }
-"""Such as `trial1_wheel_imu.txt`, `2_test_imu.txt`, `hill1__wheel_vel_input.txt`, `trial1_loop_front.txt`."""
-NUMBERED = re.compile(r"0*(\d+)_test")
-"""`2_test` is another name of `trial2`."""
+"""Such as `trial1_wheel_imu.txt`, `2_test_imu.txt`, `hill1__wheel_vel_input.txt`, `trial1_loop_front.txt`, or
+`wheel_imu.txt` in a folder of its own. `inekf_wheel_vel.txt` is an estimator's output, not a sensor's."""
+NUMBERED = re.compile(r"0*(\d+)(?:_test)?")
+"""`2_test` and `02` are other names of `trial2`."""
 NORM_TOLERANCE = 1e-3
 FRONT_DEG = 5.0
 """Yaw of the two rigid bodies may differ by this, as they start together and share a robot."""
@@ -75,11 +77,9 @@ def read(request: Request) -> list[Recording]:
     rows, apart = _contemporaries(rows, given.kind)
     notes = [_joined(given, rows), *apart, *clock, *(note for r in rows.values() for note in r.notes)]
     truth, said = _truth(rows)
-    wheels = _wheels(rows["wheels"]) if "wheels" in rows else None
-    if wheels is not None:
-        notes.append("wheels: vy and vz are zero throughout and left out; the speed says nothing of yaw")
+    wheels, spoken = _wheels(rows.get("wheels"), given.kind == "wheels")
     recording = Recording(
-        name=name,
+        name=name or request.path.resolve().parent.name,
         start_ns=min(int(r.t_ns[0]) for r in rows.values()),
         wheels=wheels,
         imu=_imu(rows["imu"]) if "imu" in rows else None,
@@ -88,7 +88,7 @@ def read(request: Request) -> list[Recording]:
         clock_jumps=tuple(
             replace(jump, channel="truth") if jump.channel == "center" else jump for jump in jumps
         ),
-        notes=(*notes, *said),
+        notes=(*notes, *said, *spoken),
     )
     return [recording]
 
@@ -97,7 +97,7 @@ def _part(path: Path) -> Part | None:
     for kind, pattern in NAMES.items():
         found = pattern.fullmatch(path.name)
         if found:
-            return Part(path, kind, found["stem"])
+            return Part(path, kind, found["stem"] or "")
     return None
 
 
@@ -164,16 +164,22 @@ def _imu(rows: Rows) -> Imu:
     return Imu(rows.t_ns, rows.values[:, :3], rows.values[:, 3:])
 
 
-def _wheels(rows: Rows) -> Wheels:
+def _wheels(rows: Rows | None, asked_for: bool) -> tuple[Wheels | None, list[str]]:
+    """The speed of the wheels; what moves sideways is the velocity of another source."""
+    if rows is None:
+        return None, []
     sideways = np.flatnonzero(rows.values[:, 1:].any(axis=1))
-    if sideways.size:
-        vy, vz = rows.values[sideways[0], 1:]
-        raise rows.error(
-            int(sideways[0]),
-            f"wheels that move sideways: vy {vy:g}, vz {vz:g} m/s",
-            "are the columns t, vx, vy, vz? a body velocity of another source is not read as wheels",
-        )
-    return Wheels(rows.t_ns, rows.values[:, :1], ("speed",), "mps")
+    if not sideways.size:
+        note = "wheels: vy and vz are zero throughout and left out; the speed says nothing of yaw"
+        return Wheels(rows.t_ns, rows.values[:, :1], ("speed",), "mps"), [note]
+    if not asked_for:
+        return None, [f"{rows.path.name} moves sideways: no speed of wheels; left out"]
+    vy, vz = rows.values[sideways[0], 1:]
+    raise rows.error(
+        int(sideways[0]),
+        f"wheels that move sideways: vy {vy:g}, vz {vz:g} m/s",
+        "are the columns t, vx, vy, vz? a body velocity of another source is not read as wheels",
+    )
 
 
 def _truth(rows: dict[str, Rows]) -> tuple[Trajectory | None, list[str]]:

@@ -286,10 +286,26 @@ def test_the_other_names_of_the_set(trial: Path, tmp_path: Path) -> None:
     assert set(open_recording(tmp_path / "trial4_cat_center.txt").channels()) == {"imu", "wheels"}
     for old, new in zip(FAMILY, ("hill__wheel_imu.txt", "hill__wheel_vel_input.txt"), strict=False):
         (tmp_path / new).write_bytes((trial / old).read_bytes())
-    recording = open_recording(tmp_path / "hill__wheel_vel_input.txt")
-    assert recording.name == "hill"
-    assert set(recording.channels()) == {"imu", "wheels"}
-    assert recording.truth is None
+    for old, new in zip(FAMILY, ("wheel_imu.txt", "wheel_vel_input.txt"), strict=False):
+        (tmp_path / new).write_bytes((trial / old).read_bytes())
+    for file, name in (("hill__wheel_vel_input.txt", "hill"), ("wheel_imu.txt", tmp_path.name)):
+        recording = open_recording(tmp_path / file)
+        assert recording.name == name
+        assert set(recording.channels()) == {"imu", "wheels"}
+        assert recording.truth is None
+
+
+def test_a_velocity_of_another_source_is_no_wheels(trial: Path, tmp_path: Path) -> None:
+    """Beside some trials lies a body velocity made of the motion capture under the wheels' name."""
+    (tmp_path / "4_test_imu.txt").write_bytes((trial / FAMILY[0]).read_bytes())
+    lines = (trial / FAMILY[1]).read_text().splitlines(keepends=True)
+    (tmp_path / "4_test_vel_input.txt").write_text("".join(put(9, 2, "0.01")(lines)))
+    recording = open_recording(tmp_path / "4_test_imu.txt")
+    assert set(recording.channels()) == {"imu"}
+    assert any("4_test_vel_input.txt moves sideways" in note for note in recording.notes)
+    with pytest.raises(DataError, match="line 10: wheels that move sideways"):
+        open_recording(tmp_path / "4_test_vel_input.txt")
+    assert not umich_text.claims(tmp_path / "4_inekf_wheel_vel.txt", b"1 2 3 4\n")
 
 
 def test_files_of_another_time_are_not_joined(trial: Path, tmp_path: Path) -> None:
