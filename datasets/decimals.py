@@ -62,7 +62,10 @@ def _plain_to_ns(characters: NDArray[np.uint8], places: int) -> tuple[NDArray[np
         decimals += digit & seen_dot
         seen_dot |= dot
         ended |= end
-    plain &= (digits > 0) & (decimals <= places) & (digits - decimals + places <= 18)
+    size = digits - decimals + places  # digits of the nanoseconds; int64 holds 19 that begin with 8 or less
+    signed = negative | (characters[0] == ord("+"))
+    first = np.where(signed, characters[min(1, len(characters) - 1)], characters[0])
+    plain &= (digits > 0) & (decimals <= places) & ((size <= 18) | ((size == 19) & (first <= ord("8"))))
     shift = np.where(plain, places - decimals, 0)
     value = np.where(plain, value, 0) * 10**shift
     return np.where(negative, -value, value), plain

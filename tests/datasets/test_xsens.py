@@ -316,9 +316,9 @@ def test_any_cells_are_read_or_told(tmp_path: Path, cells: list[str]) -> None:
 def test_random_bytes_and_one_long_line(tmp_path: Path) -> None:
     noise = random.Random(2).randbytes(200_000)
     path = tmp_path / "noise.txt"
-    begun = time.perf_counter()
+    begun = time.process_time()
     for data in (HEADER.encode() + NAMES.encode() + noise, HEADER.encode() + b"Acc_X\t" * 2_000_000):
         path.write_bytes(data)
         with pytest.raises(DataError):
             open_recording(path)
-    assert time.perf_counter() - begun < 10.0
+    assert time.process_time() - begun < 10.0
