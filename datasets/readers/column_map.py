@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 import json
 import re
@@ -27,6 +28,7 @@ from terrafusion.datasets.readers.channel_tables import (
 )
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.units import units_of
+from terrafusion.datasets.sensors import axes_matrix
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 WHEEL_FIELDS = tuple(dict.fromkeys(f"{n}_{unit}" for names, unit in WHEEL_LAYOUTS for n in names))
@@ -75,16 +77,14 @@ class TimeOf:
 
 
 @dataclass(frozen=True)
-class ColumnMap:
-    """What a table's columns are.
+class Layout:
+    """How a table stands.
 
     Attributes:
         time, channels: where times and fields stand, by channel and field.
         separator: of the text; "" for tab, semicolon, comma or blanks, as the header shows.
         header: "none" where the first line is a row: columns are then named 1, 2, ...
         imu_axes: IMU axes that point along body x, y, z.
-        held: rows for which a channel holds a value.
-        meta: the keys that a log folder's meta.yaml may have.
     """
 
     time: TimeOf
@@ -92,12 +92,27 @@ class ColumnMap:
     separator: str = ""
     header: str = "line"
     imu_axes: tuple[str, ...] = BODY_AXES
-    held: dict[str, str] = field(default_factory=dict)
-    meta: Meta = field(default=Meta(0), init=False)
+
+
+LAYOUT_KEYS = tuple(f.name for f in dataclasses.fields(Layout))
+KEYS = (*LAYOUT_KEYS, "held", *META_KEYS)
+
+
+@dataclass(frozen=True)
+class ColumnMap(Layout):
+    """What a table's columns are.
+
+    Attributes:
+        held: rows for which a channel holds a value.
+        meta: what a log folder's meta.yaml may say.
+    """
+
+    held: dict[str, float] = field(default_factory=dict)
+    meta: Meta = field(default_factory=lambda: Meta(0))
 
     def conventions(self) -> Conventions:
         """What is to be applied to the channels after reading."""
-        return Conventions(imu_axes=self.imu_axes, held={k: float(v) for k, v in self.held.items()})
+        return Conventions(imu_axes=self.imu_axes, held=self.held)
 
     def columns(self) -> list[str]:
         """Names of all columns that are asked for, each once."""
@@ -112,25 +127,31 @@ def read_column_map(path: Path) -> ColumnMap:
         ConfigError: unknown key, channel, field, unit or sign, a value of the wrong type.
     """
     raw = {key: value for key, value in read_yaml(path).items() if value is not None}
-    meta = parse_meta({key: raw.pop(key) for key in META_KEYS if key in raw} | {"start_ns": 0}, path)
-    raw["held"] = _held(path, raw.get("held", {}))
-    for key in ("time", "channels"):
-        raw[key] = _columns_as_sections(raw.get(key), levels=0 if key == "time" else 2)
-    found = structure(ColumnMap, {k: v for k, v in raw.items() if v is not None}, file=path)
-    _check_time(path, found.time)
-    _check_channels(path, found.channels)
-    if found.header not in ("line", "none"):
-        raise ConfigError(f"'header' is '{shown(found.header)}'", file=path, remedy="give line or none")
-    if len(found.separator) > 1:
+    strange = next((key for key in raw if key not in KEYS), None)
+    if strange is not None:
+        close = difflib.get_close_matches(strange, KEYS, n=1)
+        remedy = f"did you mean '{close[0]}'?" if close else f"known are {', '.join(KEYS)}"
+        raise ConfigError(f"unknown key '{shown(strange)}'", file=path, remedy=remedy)
+    sections = {key: raw[key] for key in LAYOUT_KEYS if key in raw}
+    for key, levels in (("time", 0), ("channels", 2)):
+        if key in sections:
+            sections[key] = _columns_as_sections(sections[key], levels)
+    layout = structure(Layout, sections, file=path)
+    _check_time(path, layout.time)
+    _check_channels(path, layout.channels)
+    if layout.header not in ("line", "none"):
+        raise ConfigError(f"'header' is '{shown(layout.header)}'", file=path, remedy="give line or none")
+    if len(layout.separator) > 1:
         raise ConfigError(
-            f"'separator' is '{shown(found.separator)}'", file=path, remedy="give one character"
+            f"'separator' is '{shown(layout.separator)}'", file=path, remedy="give one character"
         )
     try:
-        found.conventions()
+        axes_matrix(layout.imu_axes)
     except ValueError as error:
         raise ConfigError(str(error), file=path, channel="imu_axes") from None
-    object.__setattr__(found, "meta", meta)
-    return found
+    meta = parse_meta({key: raw[key] for key in META_KEYS if key in raw} | {"start_ns": 0}, path)
+    told = {key: getattr(layout, key) for key in LAYOUT_KEYS}
+    return ColumnMap(**told, held=_held(path, raw.get("held", {})), meta=meta)
 
 
 def contract_map(names: list[str]) -> ColumnMap | None:
@@ -204,12 +225,13 @@ def _columns_as_sections(raw: Any, levels: int) -> Any:
     return raw
 
 
-def _held(path: Path, raw: Any) -> dict[str, str]:
+def _held(path: Path, raw: Any) -> dict[str, float]:
     if not isinstance(raw, dict) or not set(raw) <= set(FIELDS):
         raise ConfigError(
             f"'held' is '{shown(raw)}'", file=path, remedy=f"give rows by channel: {', '.join(FIELDS)}"
         )
-    return {key: str(checked_number(value, ROWS, file=path, key=f"held.{key}")) for key, value in raw.items()}
+    rows = {key: checked_number(value, ROWS, file=path, key=f"held.{key}") for key, value in raw.items()}
+    return {key: value for key, value in rows.items() if isinstance(value, float)}
 
 
 def _check_time(path: Path, time: TimeOf) -> None:

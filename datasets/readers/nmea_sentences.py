@@ -154,6 +154,8 @@ def _arrays(path: Path, log: _Log) -> Epochs:
     epochs = [epoch for epoch in log.epochs if epoch.position is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence tells a position", file=path, remedy="record GGA or RMC")
+    if any(epoch.from_gga for epoch in epochs):  # RMC tells a poorer position of the same fixes
+        epochs = [epoch for epoch in epochs if epoch.from_gga]
     velocity = np.array([(*epoch.velocity, np.nan) for epoch in epochs])
     return Epochs(
         np.array([epoch.of_day_ns for epoch in epochs], dtype=np.int64),

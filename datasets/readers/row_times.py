@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -30,6 +32,10 @@ class RowTimes:
     order: Any = field(default_factory=lambda: slice(None))
     jumps: tuple[ClockJump, ...] = ()
     notes: tuple[str, ...] = ()
+
+    def jumps_of(self, channels: Iterable[str]) -> tuple[ClockJump, ...]:
+        """The jumps as those of each of the channels that are in these rows."""
+        return tuple(dataclasses.replace(jump, channel=name) for name in channels for jump in self.jumps)
 
 
 def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:

@@ -126,7 +126,8 @@ def _recording(request: Request, columns: AnyColumns, found: ColumnMap, notes: l
     of_text = columns.notes if isinstance(columns, TextColumns) else ()
     notes = [*notes, *told, *of_text, *times.notes, *reader.notes]
     recording = recording_of(channels, meta, request.path.stem, notes)
-    recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps)
+    held = [name for name, channel in channels.items() if channel is not None]
+    recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
     return apply(recording, found.conventions())
 
 

@@ -82,9 +82,8 @@ def read(request: Request) -> list[Recording]:
         datum=datum,
         source=_device(settings),
         notes=(*notes, *more, *of_gnss),
-        clock_jumps=times.jumps,
     )
-    return [recording]
+    return [dataclasses.replace(recording, clock_jumps=times.jumps_of(recording.channels()))]
 
 
 def _header(data: bytes) -> tuple[int, str, dict[str, str]] | None:

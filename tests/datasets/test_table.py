@@ -209,6 +209,15 @@ def test_the_columns_of_the_log_folder_need_no_map(tmp_path: Path) -> None:
     assert any("log folder's names" in note for note in recording.notes)
 
 
+def test_on_the_command_line(tmp_path: Path, terrafusion: Any) -> None:
+    path = table(tmp_path, "t,wz\n0,0.5\n1,0.25\n", None)
+    told = terrafusion("inspect", path)
+    assert (told.status, told.err.count("\n")) == (1, 1)
+    assert "nothing says what the columns" in told.err
+    (tmp_path / "map.yaml").write_text(GYRO_MAP)
+    assert "gyro_z_radps 0.25 to 0.5" in terrafusion("inspect", path, "--columns", tmp_path / "map.yaml").out
+
+
 def test_held_values_are_dropped(tmp_path: Path) -> None:
     columns = "time: {column: t}\nheld: {wheels: 4}\nchannels: {wheels: {speed_mps: v}}\n"
     text = "t,v\n" + "".join(f"{0.1 * k:.1f},{k // 4}\n" for k in range(16))
@@ -340,7 +349,7 @@ def test_backward_times(tmp_path: Path) -> None:
     recording = open_recording(path, repair_clock=True)
     assert recording.imu is not None
     assert set(np.diff(recording.imu.t_ns).tolist()) == {100_000_000}
-    assert [jump.step_s for jump in recording.clock_jumps] == [-3.0]
+    assert [(jump.channel, jump.step_s) for jump in recording.clock_jumps] == [("imu", -3.0)]
 
 
 def test_random_bytes_and_one_long_line(tmp_path: Path) -> None:
