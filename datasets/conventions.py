@@ -122,6 +122,8 @@ def _true_updates(recording: Recording, c: Conventions) -> Recording:
         if channel is None or not len(channel):
             continue
         keep = true_updates(_values(channel), round(rows))
+        if keep.all():
+            continue
         note = f"{name}: held values dropped: {int(keep.sum())} true updates of {len(keep)} rows"
         recording = dataclasses.replace(recording, **{name: channel.select(keep)}).with_notes(note)
     return recording

@@ -7,6 +7,7 @@ where its SHA-256 is in a catalogue, and even then by `safe_pickle` only.
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -31,6 +32,16 @@ GROUNDS = {"asphalt": "asphalt", "grass": "grass", "gravel": "gravel", "ice": "i
 """Ground in the folder's name -> terrain."""
 WINDOW_SAMPLES, SAMPLE_NS = 40, 50_000_000
 WINDOWS_A_STEP = 3
+UNIT_TOLERANCE = 0.1
+SIGNALS = {
+    "sides": ("left_wheel_vel", "right_wheel_vel"),
+    "commanded": ("cmd_left", "cmd_right"),
+    "rate": ("imu_yaw",),
+    "accel": ("imu_acceleration_x", "imu_acceleration_y", "imu_acceleration_z"),
+    "position": ("icp_x", "icp_y", "icp_z"),
+    "rpy": ("icp_roll", "icp_pitch", "icp_yaw"),
+}
+"""Columns of a window file, each numbered 0 to 39; `imu_yaw` is a rate despite its name."""
 TRUTH_CHANNELS = ("position", "yaw", "orientation")
 COMMANDING = "calib"
 """State of the calibration driver in which its command drives; otherwise a person does."""
@@ -88,17 +99,15 @@ def _drive(path: Path, table: Table, conventions: Conventions) -> Recording:
         _stack(table, "imu_x", "imu_y", "imu_z"),
         _stack(table, *(f"imu_acceleration_{axis}" for axis in "xyz")),
     )
-    powered = _stack(table, "left_wheel_voltage", "right_wheel_voltage")
-    live = _since_first(powered.any(axis=1), "wheels, motor", "the motors were on", notes)
+    motor, live = _motor(t_ns, table, notes)
     speed = _stack(table, "meas_left_vel", "meas_right_vel")
-    current = _stack(table, "left_wheel_current", "right_wheel_current")
     return Recording(
         name=path.parent.name,
         start_ns=int(t_ns[0]),
         command=_command_of_drive(t_ns, table, notes),
         wheels=Wheels(t_ns[live], speed[live], ("left", "right"), "radps"),
         imu=imu.select(_since_first(imu.accel_mps2.any(axis=1), "imu", "its first message", notes)),
-        motor=Motor(t_ns[live], current[live], powered[live]),
+        motor=motor,
         terrain=_labels(int(t_ns[0]), terrain),
         terrain_name=terrain,
         truth=_truth_of_drive(t_ns, table, notes),
@@ -121,15 +130,31 @@ def _since_first(known: Any, channel: str, what: str, notes: list[str]) -> slice
     return slice(first, None)
 
 
+def _motor(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> tuple[Motor | None, slice]:
+    """The motors, and the rows from which on they, and the wheels' encoders with them, are on."""
+    if not {f"{side}_wheel_{what}" for side in ("left", "right") for what in ("voltage", "current")} <= set(
+        table
+    ):
+        notes.append("motor: no currents and voltages in the file")
+        return None, slice(None)
+    voltage = _stack(table, "left_wheel_voltage", "right_wheel_voltage")
+    on = (voltage != 0.0).all(axis=1)
+    if not on.any():
+        notes.append("motor: the voltages are zero throughout; left out")
+        return None, slice(None)
+    live = _since_first(on, "wheels, motor", "the motors were on", notes)
+    current = _stack(table, "left_wheel_current", "right_wheel_current")
+    return Motor(t_ns[live], current[live], voltage[live]), live
+
+
 def _command_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> Command | None:
-    driving = table["calib_state"] == COMMANDING
+    state = table.get("calib_state")
+    driving = np.ones(len(t_ns), dtype=bool) if state is None else state == COMMANDING
     if not driving.any():
         notes.append("command: none, a person drove all the time")
         return None
-    notes.append(
-        f"command: known while the calibration driver drove ({driving.mean():.0%} of the rows); "
-        "what a person commanded is not in the log"
-    )
+    when = "at all times, for all the file tells" if state is None else f"in {driving.mean():.0%} of the rows"
+    notes.append(f"command: the calibration driver's, {when}; what a person commanded is not in the log")
     twist = _stack(table, "cmd_vel_x", "cmd_vel_omega")[driving]
     return Command(t_ns[driving], twist[:, 0], twist[:, 1])
 
@@ -139,58 +164,61 @@ def _truth_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> 
     quaternion = _stack(table, "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w")
     placed = position.any(axis=1) | quaternion[:, :3].any(axis=1)
     rows = _since_first(placed, "truth", "the first pose in the map", notes)
-    return Trajectory(t_ns[rows], position[rows], quaternion[rows])
+    truth = Trajectory(t_ns[rows], position[rows], quaternion[rows])
+    turned = np.abs(np.linalg.norm(quaternion[rows], axis=1) - 1.0) < UNIT_TOLERANCE
+    if not turned.all():
+        notes.append(f"truth: {int((~turned).sum())} poses without a unit quaternion left out")
+    return truth.select(turned)
 
 
 def _windows(path: Path, table: Table, conventions: Conventions) -> list[Recording]:
-    terrain, folder_notes = _of_folder(path.parent.name, conventions)
-    signals = {name: _signal(table, name) for name in ("left_wheel_vel", "right_wheel_vel", "imu_yaw")}
-    notes = (
-        *folder_notes,
-        "windows have no absolute time: it counts from the start of the command step",
-        *_against_the_wheels(signals, conventions),
-    )
-    accel = np.stack([_signal(table, f"imu_acceleration_{axis}") for axis in "xyz"], axis=-1)
-    position = np.stack([_signal(table, f"icp_{axis}") for axis in "xyz"], axis=-1)
-    rpy = np.stack([_signal(table, f"icp_{angle}") for angle in ("roll", "pitch", "yaw")], axis=-1)
-    commanded = np.stack([_signal(table, "cmd_left"), _signal(table, "cmd_right")], axis=-1)
+    terrain, notes = _of_folder(path.parent.name, conventions)
+    signals = {name: _signals(table, *columns) for name, columns in SIGNALS.items()}
+    notes.append("windows have no absolute time: it counts from the start of the command step")
+    notes.extend(_against_the_wheels(signals, conventions))
     begins = numbers(table["transitory_state_mask"]) == 1.0
-    recordings = []
-    for k in range(len(begins)):
-        part = _part_of_step(begins, k)
-        t_ns = part * WINDOW_SAMPLES * SAMPLE_NS + np.arange(WINDOW_SAMPLES, dtype=np.int64) * SAMPLE_NS
-        gyro = np.full((WINDOW_SAMPLES, 3), np.nan)
-        gyro[:, 2] = signals["imu_yaw"][k]
-        sides = np.stack([signals["left_wheel_vel"][k], signals["right_wheel_vel"][k]], axis=-1)
-        recordings.append(
-            Recording(
-                name=f"{path.parent.name}#{k}",
-                start_ns=int(t_ns[0]),
-                command=_command_of_window(t_ns, commanded[k], conventions),
-                wheels=Wheels(t_ns, sides, ("left", "right"), "radps"),
-                imu=Imu(t_ns, gyro, accel[k]),
-                terrain=_labels(int(t_ns[0]), terrain),
-                terrain_name=terrain,
-                truth=Trajectory(t_ns, position[k], rpy_to_quaternion(rpy[k])),
-                truth_channels=TRUTH_CHANNELS,
-                description=f"step {int(begins[: k + 1].sum())}, window {part + 1} of {WINDOWS_A_STEP}, "
-                f"{'the command just changed' if begins[k] else 'steady command'}; "
-                "the truth starts at its own origin",
-                notes=notes,
-            )
+    return [
+        dataclasses.replace(
+            _window({name: signal[k] for name, signal in signals.items()}, begins[: k + 1], conventions),
+            name=f"{path.parent.name}#{k}",
+            terrain=_labels(0, terrain),
+            terrain_name=terrain,
+            notes=tuple(notes),
         )
-    return recordings
+        for k in range(len(begins))
+    ]
 
 
-def _signal(table: Table, name: str) -> Array:
-    """The 40 samples of every window, (windows, 40)."""
-    return _stack(table, *(f"{name}_{i}" for i in range(WINDOW_SAMPLES)))
+def _window(signals: dict[str, Array], begins: NDArray[np.bool_], conventions: Conventions) -> Recording:
+    """The last window of those whose command `begins` (k,) there."""
+    part = _part_of_step(begins)
+    t_ns = (part * WINDOW_SAMPLES + np.arange(WINDOW_SAMPLES, dtype=np.int64)) * SAMPLE_NS
+    gyro = np.full((WINDOW_SAMPLES, 3), np.nan)
+    gyro[:, 2:] = signals["rate"]
+    state = "the command just changed" if begins[-1] else "steady command"
+    return Recording(
+        name="",
+        start_ns=int(t_ns[0]),
+        command=_command_of_window(t_ns, signals["commanded"], conventions),
+        wheels=Wheels(t_ns, signals["sides"], ("left", "right"), "radps"),
+        imu=Imu(t_ns, gyro, signals["accel"]),
+        truth=Trajectory(t_ns, signals["position"], rpy_to_quaternion(signals["rpy"])),
+        truth_channels=TRUTH_CHANNELS,
+        description=f"step {int(begins.sum())}, window {part + 1} of {WINDOWS_A_STEP}, {state}; "
+        "the truth starts at its own origin",
+    )
 
 
-def _part_of_step(begins: NDArray[np.bool_], k: int) -> int:
+def _signals(table: Table, *names: str) -> Array:
+    """The 40 samples of some signals in every window, (windows, 40, signals)."""
+    columns = [_stack(table, *(f"{name}_{i}" for i in range(WINDOW_SAMPLES))) for name in names]
+    return np.stack(columns, axis=-1)
+
+
+def _part_of_step(begins: NDArray[np.bool_]) -> int:
     """Windows since the command changed; a log that begins inside a step counts from its start."""
-    before = np.flatnonzero(begins[: k + 1])
-    return min(k - int(before[-1]) if before.size else k, WINDOWS_A_STEP - 1)
+    before = np.flatnonzero(begins)
+    return min(len(begins) - 1 - int(before[-1]) if before.size else len(begins) - 1, WINDOWS_A_STEP - 1)
 
 
 def _command_of_window(t_ns: NDArray[np.int64], sides: Array, conventions: Conventions) -> Command | None:
@@ -204,8 +232,8 @@ def _command_of_window(t_ns: NDArray[np.int64], sides: Array, conventions: Conve
 
 def _against_the_wheels(signals: dict[str, Array], conventions: Conventions) -> list[str]:
     """A note where the yaw rate turns against the wheels: 2 s are too short to see it in one window."""
-    turn = (signals["right_wheel_vel"] - signals["left_wheel_vel"]).mean(axis=1)
-    rate = conventions.gyro_z_sign * signals["imu_yaw"].mean(axis=1)
+    left, right = signals["sides"].mean(axis=1).T
+    turn, rate = right - left, conventions.gyro_z_sign * signals["rate"][:, :, 0].mean(axis=1)
     if len(turn) < 8 or not turn.std() > 0.0 or not rate.std() > 0.0:
         return []
     r = float(np.corrcoef(turn, rate)[0, 1])

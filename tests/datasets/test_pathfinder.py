@@ -1,34 +1,20 @@
-"""Pathfinder workspaces: axes, signs, radius, lags and the fixes' clock; published, synthetic and broken."""
+"""Pathfinder workspaces: axes, signs, radius, lags and the fixes' clock, published and synthetic."""
 
 from __future__ import annotations
 
-import io
-import resource
-import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import pytest
 
 from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import enu_to_geodetic
-from terrafusion.datasets.gnss_time import GPS_EPOCH_S
 from terrafusion.datasets.lag import lag_between
-from terrafusion.datasets.readers import open_recording, open_recordings
+from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.recording import Fix, Recording
 
 from .conftest import CatalogWith
-
-START_S = 1_600_000_000.25
-SECONDS = 60.0
-RADIUS_M, TRACK_M = 0.116, 1.03
-DATUM = (39.65, -79.97, 300.0)
-WEEK_START_S = GPS_EPOCH_S + (1_600_000_000 - GPS_EPOCH_S) // 604_800 * 604_800
-
+from .pathfinder_files import DATUM, RADIUS_M, SECONDS, START_S, TRACK_M, WEEK_START_S, fixes, save, workspace
 
 # --- physical checks ---------------------------------------------------------------------------------------
 
@@ -219,77 +205,6 @@ def test_angles_are_two_percent_short_of_the_rates(s5t1: Path) -> None:
 # --- synthetic files ---------------------------------------------------------------------------------------
 
 
-def motion(t: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Speed, yaw rate, east and north at seconds from the start: stops and turns."""
-    fine = np.arange(-5.0, SECONDS + 5.0, 0.002)
-    v = 0.7 * np.clip(2.0 * np.sin(0.35 * fine), 0.0, 1.0)
-    rate = 0.4 * np.sin(0.8 * fine) * (v > 0)
-    yaw = np.cumsum(rate) * 0.002
-    east, north = np.cumsum(v * np.cos(yaw)) * 0.002, np.cumsum(v * np.sin(yaw)) * 0.002
-    return tuple(np.interp(t, fine, column) for column in (v, rate, east, north))
-
-
-def workspace() -> dict[str, np.ndarray]:
-    """The variables of a workspace without fixes."""
-    t, t_imu = np.arange(0.0, SECONDS, 0.1), np.arange(0.0, SECONDS, 0.004)
-    v, rate, *_ = motion(t)
-    table = {"tTodom": START_S + t, "tTimu": START_S + t_imu}
-    for name in ("frontLeft", "rearLeft", "frontRight", "rearRight"):
-        sign = -1.0 if name.endswith("Left") else 1.0
-        speed = (v + sign * rate * TRACK_M / 2) * sign / RADIUS_M
-        table |= {f"{name}Vel": speed, f"{name}Pos": np.cumsum(speed) * 0.1}
-    v, rate, *_ = motion(t_imu)
-    noise = np.random.default_rng(1).normal(0.0, 0.02, (6, len(t_imu)))
-    table |= {"Ax": np.gradient(v, t_imu), "Ay": -v * rate, "Az": -9.8 + 0.0 * v}
-    table |= {"Gx": 0.0 * v, "Gy": 0.0 * v, "Gz": -rate}
-    return table | {n: table[n] + e for n, e in zip(("Ax", "Ay", "Az", "Gx", "Gy", "Gz"), noise, strict=True)}
-
-
-def fixes(t: np.ndarray) -> dict[str, np.ndarray]:
-    """Fixes of a few millimetres at seconds from the start."""
-    _, _, east, north = motion(t)
-    enu = np.stack([east, north, 0.0 * east], axis=1) + np.random.default_rng(2).normal(0, 0.002, (len(t), 3))
-    llh = enu_to_geodetic(enu - enu[0], DATUM)
-    return {"ENUGPS": enu - enu[0], "llhGPS": np.stack([*np.radians(llh[:, :2].T), llh[:, 2]], axis=1)}
-
-
-def save(path: Path, table: dict[str, np.ndarray], times: np.ndarray | None = None) -> Path:
-    """As MATLAB does: text before the HDF5, vectors as rows; `times` as a column of a table object."""
-    with h5py.File(path, "w", userblock_size=512) as file:
-        for name, values in table.items():
-            rows = values.reshape(1, -1) if values.ndim == 1 else values
-            file.create_dataset(name, data=rows, compression="gzip").attrs["MATLAB_class"] = np.bytes_(
-                "double"
-            )
-        if times is not None:
-            add_table(file, {"time": times, "x": 0.0 * times})
-    data = path.read_bytes()
-    path.write_bytes(b"MATLAB 7.3 MAT-file, Platform: test".ljust(508) + b"\x00\x02IM" + data[512:])
-    return path
-
-
-def add_table(file: h5py.File, columns: dict[str, np.ndarray]) -> None:
-    """A MATLAB table, as far as its numbers go."""
-    refs = file.create_group("#refs#")
-
-    def put(name: str, values: np.ndarray, kind: str) -> h5py.Reference:
-        data = refs.create_dataset(name, data=values)
-        data.attrs["MATLAB_class"] = np.bytes_(kind)
-        return data.ref
-
-    def cell(name: str, parts: list[h5py.Reference]) -> h5py.Reference:
-        data = refs.create_dataset(name, (len(parts), 1), dtype=h5py.ref_dtype)
-        data[:, 0] = parts
-        data.attrs["MATLAB_class"] = np.bytes_("cell")
-        return data.ref
-
-    values = [put(f"v{i}", c.reshape(1, -1), "double") for i, c in enumerate(columns.values())]
-    names = [put(f"n{i}", np.array([[ord(x)] for x in n], np.uint16), "char") for i, n in enumerate(columns)]
-    objects = [put("rows", np.zeros((1, 1)), "double"), cell("values", values), cell("names", names)]
-    mcos = file.create_dataset("#subsystem#/MCOS", (1, len(objects)), dtype=h5py.ref_dtype)
-    mcos[0, :] = objects
-
-
 def test_a_synthetic_workspace(tmp_path: Path) -> None:
     r = open_recording(save(tmp_path / "any.mat", workspace()))
     assert r.wheels is not None
@@ -384,86 +299,3 @@ def test_enu_that_is_not_llh_is_told(tmp_path: Path) -> None:
     assert r.gnss is not None
     assert right is not None
     np.testing.assert_array_equal(r.gnss.enu_m, right.enu_m)
-
-
-# --- broken files ------------------------------------------------------------------------------------------
-
-Change = Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
-BROKEN: dict[str, tuple[Change, str]] = {
-    "no channel": (lambda t: {k: v for k, v in t.items() if k != "rearLeftVel"}, "rearLeftVel"),
-    "short channel": (lambda t: t | {"Gz": t["Gz"][:-3]}, "Gz: has 14997 values for 15000 times in tTimu"),
-    "a matrix": (lambda t: t | {"Gz": np.zeros((100, 150))}, "not one row or column"),
-    "nan clock": (lambda t: t | {"tTodom": t["tTodom"] * np.nan}, "tTodom: holds no times"),
-    "nanoseconds": (lambda t: t | {"tTodom": t["tTodom"] * 1e9}, "tTodom: holds no times"),
-    "backwards": (lambda t: t | {"tTimu": t["tTimu"][::-1].copy()}, "time runs backwards"),
-    "degrees": (lambda t: t | {"llhGPS": np.full((10, 3), 39.0)}, "not radians"),
-    "no fixes": (lambda t: t | {"llhGPS": np.full((10, 3), np.nan)}, "llhGPS"),
-    "complex": (lambda t: t | {"Gz": t["Gz"].astype(complex)}, "not numbers"),
-}
-
-
-@pytest.mark.parametrize("name", BROKEN)
-def test_wrong_variables_are_refused(name: str, tmp_path: Path) -> None:
-    change, words = BROKEN[name]
-    path = save(tmp_path / "any.mat", change(workspace()))
-    with pytest.raises(DataError, match=words) as refusal:
-        open_recordings(path)
-    assert str(path) in str(refusal.value)
-
-
-def hostile(path: Path, name: str) -> Path:
-    """A workspace one of whose variables claims what it does not hold."""
-    save(path, {k: v for k, v in workspace().items() if k != "Gz"})
-    with h5py.File(path, "r+") as file:
-        if name == "huge":
-            file.create_dataset("Gz", (1, 1 << 40), dtype="f8", chunks=(1, 1000))
-        elif name == "huge piece":
-            file.create_dataset("Gz", (1, 10), maxshape=(1, None), dtype="f8", chunks=(1, 1 << 28))
-        elif name == "elsewhere":
-            file.create_dataset("Gz", (1, 15000), dtype="f8", external=[("/etc/passwd", 0, 120000)])
-        elif name == "link":
-            file["Gz"] = h5py.ExternalLink("/etc/passwd", "/Gz")
-        elif name == "loop":
-            file["Gz"] = h5py.SoftLink("/Gz")
-        elif name == "virtual":
-            layout = h5py.VirtualLayout((1, 15000), "f8")
-            layout[:] = h5py.VirtualSource("/etc/passwd", "Gz", (1, 15000))
-            file.create_virtual_dataset("Gz", layout)
-        else:
-            file.create_group("Gz")
-    return path
-
-
-@pytest.mark.parametrize("name", ["huge", "huge piece", "elsewhere", "link", "loop", "virtual", "group"])
-def test_impossible_claims_are_refused(name: str, tmp_path: Path) -> None:
-    path = hostile(tmp_path / "any.mat", name)
-    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
-    with pytest.raises(DataError, match="Gz"):
-        open_recordings(path)
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 200_000
-    assert time.monotonic() - began < 5.0
-
-
-def test_other_hdf5_is_not_claimed(tmp_path: Path) -> None:
-    path = save(tmp_path / "any.mat", {"temperature": np.zeros(10)})
-    with pytest.raises(DataError, match="unknown kind of file"):
-        open_recordings(path)
-
-
-def test_truncated_and_flipped_files(tmp_path: Path) -> None:
-    """Read or refused in one line, nothing else."""
-    whole = save(tmp_path / "any.mat", workspace() | fixes(np.arange(0.0, 30.0, 0.1))).read_bytes()
-    path, rng, lines = tmp_path / "bad.mat", np.random.default_rng(11), []
-    for k in range(120):
-        data = io.BytesIO(whole if k % 2 else whole[: int(rng.integers(520, len(whole)))])
-        if k % 2:
-            for at in rng.integers(512, 8192, size=4):
-                data.seek(int(at))
-                data.write(bytes([int(rng.integers(0, 256))]))
-        path.write_bytes(data.getvalue())
-        try:
-            open_recordings(path)
-        except DataError as error:
-            lines.append(str(error))
-    assert len(lines) >= 60
-    assert not any("\n" in line for line in lines)
