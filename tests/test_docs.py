@@ -130,12 +130,17 @@ def test_numbers_stand_between_marks() -> None:
 
 def test_log_folder_columns_are_told() -> None:
     """Every column and key the reader knows stands in the conventions."""
-    from terrafusion.datasets.readers import log_folder, log_meta
+    from terrafusion.datasets.readers import channel_tables, log_folder, log_meta
 
     text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
-    columns = [*log_folder.GYRO, *log_folder.ACCEL, *log_folder.GNSS_POSITION, *log_folder.GNSS_HEIGHT]
-    columns += [*log_folder.GNSS_VELOCITY, *log_folder.QUATERNION, *log_folder.TRUTH_TWIST]
-    columns += [f"{name}_{unit}" for names, unit in log_folder.WHEEL_LAYOUTS for name in names]
+    columns = [
+        *channel_tables.GYRO,
+        *channel_tables.ACCEL,
+        *channel_tables.GNSS_POSITION,
+        *channel_tables.GNSS_HEIGHT,
+    ]
+    columns += [*channel_tables.GNSS_VELOCITY, *channel_tables.QUATERNION, *channel_tables.TRUTH_TWIST]
+    columns += [f"{name}_{unit}" for names, unit in channel_tables.WHEEL_LAYOUTS for name in names]
     for word in [*columns, *(f"{name}.csv" for name in log_folder.CHANNELS), *log_meta.KEYS]:
         assert re.search(rf"\b{re.escape(word)}\b", text), word
 
