@@ -15,6 +15,8 @@ Array = NDArray[np.float64]
 
 WIDEST_TRACK_M = 6.0
 """Sides that turn against each other by v spin a robot at v over half its effective track, below this."""
+LEAST_S, LEAST_MPS = 10.0, 0.05
+"""Shorter and slower drives do not tell which way the wheels run."""
 LEAST_PROGRESS = 0.3
 """Way made good over way rolled, if the sides turn the same way, from which the robot does not spin."""
 
@@ -47,7 +49,7 @@ def sides_opposed(patient: Patient) -> str | None:
             return None
         summed = account(start, t_ns, together)
         by_sum = agreement(gyro, summed) if summed is not None else None
-        if by_sum is not None and abs(by_sum.r) > SURE_R:
+        if by_sum is not None and by_sum.is_sure():
             return f"the gyro turns as their sum does (correlation {abs(by_sum.r):.2f})"
     if made_good is not None:
         progress, source = made_good
@@ -90,31 +92,34 @@ def runs_backwards(patient: Patient) -> str | None:
         backwards = abs(found.angle) > 0.75 * np.pi and wheels_turn_backwards(patient)
         return "acceleration answers them with the opposite sign" if backwards else None
     t, v = driven
-    for name, (t_other, other) in _forward_speeds(patient).items():
-        there = np.interp(t, t_other, other)
-        power = float(np.sqrt(np.sum(v**2) * np.sum(there**2)))
-        if power > 0.0:
-            r = float(np.sum(v * there)) / power
+    way = Account(t, np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))]))
+    for name, there in _forward_ways(patient).items():
+        start, end = max(t[0], there.t_s[0]), min(t[-1], there.t_s[-1])
+        if end - start < LEAST_S:
+            continue
+        grid = np.arange(start, end, 0.5)
+        a, b = way.rates(grid), there.rates(grid)
+        power = float(np.sqrt(np.sum(a**2) * np.sum(b**2)))
+        if power > 0.0 and np.abs(a).mean() > LEAST_MPS:
+            r = float(np.sum(a * b)) / power
             return f"{name} goes the other way (correlation {r:.2f})" if r < -SURE_R else None
     total = float(np.abs(v).sum())
-    mostly = total > 0.0 and float(v.sum()) / total < -0.8
+    mostly = total > 0.0 and float(v.sum()) / total < -0.8 and t[-1] - t[0] > LEAST_S
     return "they run backwards nearly all the time" if mostly and wheels_turn_backwards(patient) else None
 
 
-def _forward_speeds(patient: Patient) -> dict[str, tuple[Array, Array]]:
-    """Times (N,) s and signed forward speed (N,) m/s, by what tells it."""
-    recording = patient.recording
-    found: dict[str, tuple[Array, Array]] = {}
+def _forward_ways(patient: Patient) -> dict[str, Account]:
+    """The way driven forward (m), by what tells it with its sign."""
+    recording, start = patient.recording, patient.recording.start_ns
     truth, command = recording.truth, recording.command
+    found: dict[str, Account | None] = {}
     if truth is not None and truth.quaternion is not None:
         known = np.isfinite(truth.position_m[:, :2]).all(axis=1) & np.isfinite(truth.quaternion).all(axis=1)
         if known.sum() > 10:
-            t = seconds(truth.t_ns[known], recording.start_ns)
-            place = truth.position_m[known, 0] + 1j * truth.position_m[known, 1]
-            velocity = np.asarray(np.gradient(place, t))
-            found["the truth"] = t, np.real(velocity * np.exp(-1j * truth.yaw_rad()[known]))
+            t, yaw = seconds(truth.t_ns[known], start), truth.yaw_rad()[known]
+            step = np.diff(truth.position_m[known, 0] + 1j * truth.position_m[known, 1])
+            forward = np.real(step * np.exp(-1j * yaw[:-1]))
+            found["the truth"] = Account(t, np.concatenate([[0.0], np.cumsum(forward)]))
     if command is not None:
-        given = np.isfinite(command.v_mps)
-        if given.sum() > 10:
-            found["the command"] = seconds(command.t_ns[given], recording.start_ns), command.v_mps[given]
-    return found
+        found["the command"] = account(start, command.t_ns, command.v_mps)
+    return {name: way for name, way in found.items() if way is not None}

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.conventions import Conventions, apply
 from terrafusion.datasets.doctor.finding import Finding, Patient, Repair
 from terrafusion.datasets.doctor.path import ANY_RADIUS_M, wheel_speed
-from terrafusion.datasets.doctor.turning import SURE_R, Account, account, accounts, agreement
+from terrafusion.datasets.doctor.turning import Account, account, accounts, agreement
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.recording import Imu, Recording
 from terrafusion.datasets.sensors import AXES, axes_matrix
@@ -129,11 +129,11 @@ def turning_axis(patient: Patient) -> str | None:
     other = known.get("wheels") or known.get("truth")
     if imu is None or other is None:
         return None
-    best, name = SURE_R, None
+    best, name = 0.0, None
     for k, axis in enumerate("xyz"):
         turned = account(patient.recording.start_ns, imu.t_ns, imu.gyro_radps[:, k])
         both = agreement(turned, other) if turned is not None else None
-        if both is not None and abs(both.r) > best:
+        if both is not None and both.is_sure() and abs(both.r) > best:
             best, name = abs(both.r), f"{'+' if both.r > 0 else '-'}{axis}"
     return name
 

@@ -16,7 +16,7 @@ from terrafusion.datasets.recording import Gnss
 
 Array = NDArray[np.float64]
 
-WINDOW_S, TRUTH_WINDOW_S, LEAST_WINDOWS = 0.5, 1.0, 20
+WINDOW_S, TRUTH_WINDOW_S, LEAST_WINDOWS = 0.5, 1.0, 10
 LEAST_RATE = 0.02
 """Standard deviation of a rate (rad/s, m/s) below which the drive is straight: nothing is compared."""
 SURE_R = 0.5
@@ -50,6 +50,10 @@ class Agreement:
     slope: float
     windows: int
     spread: tuple[float, float]
+
+    def is_sure(self) -> bool:
+        """Whether the correlation is far from 0: high, and beyond three standard errors of noise."""
+        return abs(self.r) > max(SURE_R, 3.0 / np.sqrt(self.windows))
 
 
 def seconds(t_ns: NDArray[np.int64], start_ns: int) -> Array:
@@ -88,7 +92,7 @@ def accounts(patient: Patient) -> dict[str, Account]:
 
 
 def agreement(a: Account, b: Account, window_s: float = WINDOW_S) -> Agreement | None:
-    """How the rates of two accounts agree; None on a straight drive, or where 10 s in common are lacking."""
+    """How the rates of two accounts agree; None on a straight drive, or one of few windows in common."""
     start, end = max(a.t_s[0], b.t_s[0]), min(a.t_s[-1], b.t_s[-1])
     if not end - start >= LEAST_WINDOWS * window_s:
         return None

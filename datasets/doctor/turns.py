@@ -13,7 +13,6 @@ from terrafusion.datasets.doctor.finding import Finding, Patient, Repair
 from terrafusion.datasets.doctor.gnss_frame import reflection
 from terrafusion.datasets.doctor.mounting import heading, stands_up
 from terrafusion.datasets.doctor.turning import (
-    SURE_R,
     Agreement,
     accounts,
     agreements,
@@ -27,7 +26,7 @@ Signs = dict[tuple[str, str], float]
 
 DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
 """Gyro rate over another's: the inverse track, 0.3 to 4 1/m, for the wheels, else 1; above these in deg/s."""
-UNRELATED_R, LIVELY = 0.3, 0.05
+UNRELATED_R, LIVELY, MANY = 0.3, 0.05, 40
 NAMES = {
     "gyro": "gyro z",
     "wheels": "the wheels",
@@ -52,7 +51,7 @@ def check_gyro_unit(patient: Patient) -> Iterator[Finding]:
     found = _pairs(patient)
     for other, limit in DEGREES_SLOPE.items():
         both = found.get(("gyro", other))
-        if both is None or abs(both.r) < SURE_R or abs(both.slope) < limit:
+        if both is None or not both.is_sure() or abs(both.slope) < limit:
             continue
         unit = (
             "rad/s for each m/s between the sides"
@@ -94,8 +93,8 @@ def check_turns(patient: Patient) -> Iterator[Finding]:
         return  # one fault explains both: see wheels.check_direction
     for name in sorted(blamed[0]):
         pairs = [pair for pair in against if name in pair]
-        if not pairs:
-            continue
+        if not pairs or (name == "gyro" and not stands_up(patient)):
+            continue  # an IMU that does not stand up: see mounting.check_axes
         fix, repair = _remedy(patient, name)
         other = next(one for one in pairs[0] if one != name)
         if len(blamed) > 1:
@@ -117,7 +116,7 @@ def _signs(patient: Patient, found: Pairs) -> Signs:
     signs = {}
     for (a, b), both in found.items():
         late = both.r < 0.0 and a in known and b in known and is_late(known[a], known[b], both.r)
-        if abs(both.r) > SURE_R and not late:
+        if both.is_sure() and not late:
             signs[a, b] = float(np.sign(both.r))
     pressed = heading(patient)
     if pressed is not None and pressed.turn and ("gyro", "wheels") in signs:
@@ -142,8 +141,6 @@ def _told(pairs: list[tuple[str, str]], signs: Signs, found: Pairs) -> str:
 def _remedy(patient: Patient, name: str) -> tuple[str, Repair | None]:
     """What to do where one channel turns the wrong way."""
     if name == "gyro":
-        if not stands_up(patient):
-            return "turn the IMU to z up first, then look again", None
         return "change the sign of gyro z (left turn positive)", _gyro_sign
     if name == "wheels":
         return "swap left and right wheels", _swap_sides
@@ -159,7 +156,13 @@ def _remedy(patient: Patient, name: str) -> tuple[str, Repair | None]:
 def check_unrelated(patient: Patient) -> Iterator[Finding]:
     """Gyro z must follow the wheels, whatever its sign."""
     both = _pairs(patient).get(("gyro", "wheels"))
-    if both is None or min(both.spread) < LIVELY or not -SURE_R <= both.r < UNRELATED_R:
+    if (
+        both is None
+        or both.windows < MANY
+        or min(both.spread) < LIVELY
+        or both.is_sure()
+        or both.r > UNRELATED_R
+    ):
         return
     yield Finding(
         "yaw-unrelated",
