@@ -16,6 +16,7 @@ from terrafusion.datasets.doctor import (
     scale,
     signals,
     timing,
+    truth,
     turns,
     wheels,
 )
@@ -55,6 +56,8 @@ CHECKS: tuple[Check, ...] = (
     gnss.check_jumps,
     gnss.check_scatter,
     gnss_frame.check_velocity,
+    truth.check_unit,
+    truth.check_yaw,
     scale.check_speed_scale,
 )
 

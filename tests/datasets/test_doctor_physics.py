@@ -160,6 +160,18 @@ def latitude_longitude(order: list[int], scale: float = 1.0) -> Fault:
     return spoilt
 
 
+def truth_yawed(r: Recording, degrees: float) -> Recording:
+    assert r.truth is not None
+    zero = np.zeros(len(r.truth))
+    quaternion = rpy_to_quaternion(np.stack([zero, zero, r.truth.yaw_rad() + np.radians(degrees)], axis=1))
+    return dataclasses.replace(r, truth=dataclasses.replace(r.truth, quaternion=quaternion))
+
+
+def truth_scaled(r: Recording, factor: float) -> Recording:
+    assert r.truth is not None
+    return dataclasses.replace(r, truth=dataclasses.replace(r.truth, position_m=r.truth.position_m * factor))
+
+
 def no_fix_at_first(fix: np.ndarray) -> np.ndarray:
     fix[:9] = Fix.NONE
     return fix
@@ -183,6 +195,21 @@ def times(*factors: float) -> Callable[[np.ndarray], np.ndarray]:
 
 def columns(*order: int) -> Callable[[np.ndarray], np.ndarray]:
     return lambda values: values[:, list(order)]
+
+
+def tilted(r: Recording) -> Recording:
+    """The IMU pitched by 45 deg."""
+    c = np.sqrt(0.5)
+    R = np.array([[c, 0.0, c], [0.0, 1.0, 0.0], [-c, 0.0, c]])
+    return imu_with(gyro_radps=lambda g: g @ R, accel_mps2=lambda a: a @ R)(r)
+
+
+def other_gyro(r: Recording) -> Recording:
+    """Gyro z of a drive that turned otherwise; nothing else tells of turns."""
+    rng = np.random.default_rng(3)
+    steps = np.repeat(rng.normal(0.0, 0.3, 46), 100)[:4500]
+    bare = without(r, "gnss", "truth", "command")
+    return imu_with(gyro_radps=lambda g: np.stack([g[:, 0], g[:, 1], steps], axis=1))(bare)
 
 
 def untold(fault: Fault, *channels: str) -> Fault:
@@ -260,6 +287,10 @@ MENDED: dict[str, tuple[Fault, str, str]] = {
     "east and north swapped": (gnss_with(enu_m=columns(1, 0, 2)), "gnss-course", "error"),
     "north negative": (gnss_with(enu_m=times(1, -1, 1)), "gnss-course", "error"),
     "east negative": (gnss_with(enu_m=times(-1, 1, 1)), "gnss-course", "error"),
+    "truth turned": (lambda r: truth_yawed(r, 90.0), "truth-yaw", "warning"),
+    "truth backward": (lambda r: truth_yawed(r, 180.0), "truth-yaw", "warning"),
+    "truth askew": (lambda r: truth_yawed(r, -50.0), "truth-yaw", "warning"),
+    "truth in mm": (lambda r: truth_scaled(r, 1000.0), "truth-unit", "error"),
     "velocity in knots": (gnss_with(velocity_enu_mps=scaled(1.943844)), "gnss-velocity", "warning"),
     "velocity swapped": (gnss_with(velocity_enu_mps=columns(1, 0, 2)), "gnss-velocity", "warning"),
     "velocity north negative": (gnss_with(velocity_enu_mps=times(1, -1, 1)), "gnss-velocity", "warning"),
@@ -306,6 +337,10 @@ def assert_same(mended: Recording, good: Recording) -> None:
         np.testing.assert_allclose(mended.gnss.velocity_enu_mps, same.velocity_enu_mps, rtol=0.05, atol=0.02)
         assert (mended.gnss.sigma_enu_m > 0.03).all()
         assert (mended.gnss.sigma_enu_m < 0.25).all()
+    if mended.truth is not None:
+        np.testing.assert_allclose(mended.truth.position_m, good.truth.position_m, atol=1e-6)
+        off = np.angle(np.exp(1j * (mended.truth.yaw_rad() - good.truth.yaw_rad())))
+        np.testing.assert_allclose(off, 0.0, atol=0.05)
     if mended.command is not None:
         np.testing.assert_array_equal(mended.command.yaw_rate_radps, good.command.yaw_rate_radps)
 
@@ -325,3 +360,109 @@ def level(rig: Rig) -> Any:
     """The sensors of a rig whose antenna is above the origin, as in the drives here."""
     gnss = dataclasses.replace(rig.sensors.gnss, antenna_m=(0.0, 0.0, 0.3))
     return dataclasses.replace(rig.sensors, gnss=gnss)
+
+
+FOUND: dict[str, tuple[Fault, str, str]] = {
+    "gravity removed": (imu_with(accel_mps2=lambda a: a - [0.0, 0.0, 9.81]), "accel-magnitude", "error"),
+    "mounted at 45 deg": (tilted, "imu-axes", "error"),
+    "left side of y": (imu_with(accel_mps2=times(1, -1, 1)), "accel-mirrored", "warning"),
+    "gyro of another drive": (other_gyro, "yaw-unrelated", "warning"),
+    "map shifted for good": (gnss_with(enu_m=rows(200, 10**6, [6.0, 3.0, 0.0])), "gnss-jumps", "warning"),
+    "no fix has a class": (gnss_with(fix=np.zeros_like), "fix-none", "warning"),
+    "slip, or a radius too large": (radius(1.5 * RADIUS_M), "wheel-scale", "warning"),
+    "radius of another robot": (radius(RADIUS_M / 2.5), "wheel-radius", "warning"),
+    "rev/s or m/s": (wheels_with(scaled(1 / 6.17)), "wheel-unit", "error"),
+}
+
+
+@pytest.mark.parametrize("name", FOUND)
+def test_what_the_data_leave_open_is_found_and_left(name: str) -> None:
+    spoil, code, severity = FOUND[name]
+    spoilt = spoil(lively_drive())
+    found = {finding.code: finding for finding in examine(spoilt)}
+    assert code in found, sorted(found)
+    assert found[code].severity == severity
+    assert found[code].repair is None
+    _, done = treat(spoilt)
+    assert code not in [finding.code for finding in done]
+
+
+def test_slip_on_soft_ground_is_no_finding() -> None:
+    slipping = dataclasses.replace(radius(1.5 * RADIUS_M)(lively_drive()), terrain_name="mud")
+    assert examine(slipping) == []
+
+
+def test_the_gyro_is_assumed_where_nothing_tells() -> None:
+    bare = without(lively_drive(), "gnss", "truth", "command")
+    assert bare.imu is not None
+    gyro_only = imu_with(
+        gyro_radps=times(np.nan, np.nan, -1.0), accel_mps2=lambda a: np.full_like(a, np.nan)
+    )(bare)
+    found = examine(gyro_only)
+    assert [finding.code for finding in found] == ["yaw-sign"]
+    assert "assumed" in found[0].fix
+    mended, _ = treat(gyro_only)
+    assert any("assumed" in note for note in mended.notes)
+
+
+@pytest.mark.parametrize("rows_kept", [1, 2, 5, 30])
+def test_short_recordings_are_taken(rows_kept: int) -> None:
+    good = lively_drive()
+    for name in ("wheels", "imu", "gnss", "command"):
+        examine(dataclasses.replace(good, **{name: getattr(good, name).select(slice(0, rows_kept))}))
+    assert good.truth is not None
+    examine(dataclasses.replace(good, truth=good.truth.select(slice(0, rows_kept))))
+
+
+BARE: dict[str, Fault] = {
+    "gyro z alone": imu_with(
+        gyro_radps=times(np.nan, np.nan, 1.0), accel_mps2=lambda a: np.full_like(a, np.nan)
+    ),
+    "no gyro": imu_with(gyro_radps=lambda g: np.full_like(g, np.nan)),
+    "accelerometer lacks z": imu_with(accel_mps2=times(1.0, 1.0, np.nan)),
+    "body speed": lambda r: dataclasses.replace(
+        r, wheels=Wheels(r.wheels.t_ns, r.wheels.speed.mean(axis=1, keepdims=True), ("speed",), "radps")
+    ),
+    "no wheels": lambda r: without(r, "wheels"),
+    "wheels unknown": wheels_with(lambda s: np.full_like(s, np.nan)),
+    "no fixes": lambda r: without(r, "gnss"),
+    "positions unknown": gnss_with(enu_m=lambda e: np.full_like(e, np.nan)),
+    "sigmas unknown, no height": gnss_with(enu_m=times(1.0, 1.0, np.nan)),
+    "velocities unknown": gnss_with(velocity_enu_mps=lambda v: np.full_like(v, np.nan)),
+    "wheels and fixes": lambda r: without(r, "imu", "command", "truth"),
+    "imu alone": lambda r: without(r, "wheels", "gnss", "command", "truth"),
+    "every tenth unknown": after(
+        imu_with(gyro_radps=lambda g: np.where(np.arange(len(g))[:, None] % 10 == 3, np.nan, g)),
+        wheels_with(lambda s: np.where(np.arange(len(s))[:, None] % 10 == 3, np.nan, s)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BARE)
+def test_a_log_with_less_is_clean_too(name: str) -> None:
+    found = {finding.code for finding in examine(BARE[name](lively_drive()))}
+    assert found <= {"dead", "missing-values"}  # true of two of them
+
+
+def test_a_robot_that_spins_on_the_spot_is_clean() -> None:
+    good = lively_drive()
+    assert good.wheels is not None
+    assert good.imu is not None
+    n = len(good.wheels)
+    rate = 0.6 + 0.3 * np.sin(0.3 * np.arange(n) / 20.0)
+    sides = np.stack([-rate, rate], axis=1) * EFFECTIVE_TRACK_M / 2 / RADIUS_M
+    gyro = good.imu.gyro_radps.copy()
+    t = (good.imu.t_ns - START_NS) * 1e-9
+    gyro[:, 2] += np.interp(t, np.arange(n) / 20.0, rate) - motion_rate(good, t)
+    imu = Imu(good.imu.t_ns, gyro, good.imu.accel_mps2 * [0.01, 0.01, 1.0])
+    spinning = without(good, "gnss", "truth", "command")
+    spinning = dataclasses.replace(spinning, imu=imu, wheels=dataclasses.replace(good.wheels, speed=sides))
+    assert examine(spinning) == []
+    stuck = dataclasses.replace(spinning, imu=None)
+    assert [(f.code, f.severity, f.repair) for f in examine(stuck)] == [("wheel-sign", "warning", None)]
+
+
+def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
+    """The yaw rate of the drive as commanded."""
+    assert r.command is not None
+    return np.interp(t_s, (r.command.t_ns - START_NS) * 1e-9, r.command.yaw_rate_radps)
