@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.config import shown
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.errors import ClockError, DataError
 from terrafusion.datasets.trajectory import seconds_to_ns
 
 Array = NDArray[np.float64]
@@ -34,7 +34,7 @@ class Table:
     """The rows of one CSV.
 
     Attributes:
-        t_ns: (N,) int64, from the start of the recording, never decreasing.
+        t_ns: (N,) int64, from the start of the recording, never decreasing unless asked for otherwise.
         numbers: (N,) float columns by name; an empty cell is NaN.
         texts: (N,) object columns by name; an empty cell is "".
         notes: what was odd about the file, in sentences.
@@ -50,8 +50,8 @@ class Table:
         missing = np.full(len(self.t_ns), np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
 
-    def select(self, rows: NDArray[np.bool_]) -> Table:
-        """The rows of a boolean mask."""
+    def select(self, rows: NDArray[Any]) -> Table:
+        """The rows of a boolean mask or index array."""
         return Table(
             self.t_ns[rows],
             {name: column[rows] for name, column in self.numbers.items()},
@@ -61,7 +61,12 @@ class Table:
 
 
 def read_table(
-    path: Path, known: Iterable[str], *, texts: Sequence[str] = (), prefixes: Sequence[str] = ()
+    path: Path,
+    known: Iterable[str],
+    *,
+    texts: Sequence[str] = (),
+    prefixes: Sequence[str] = (),
+    in_order: bool = True,
 ) -> Table:
     """Read one channel's `.csv` or `.csv.gz`.
 
@@ -70,11 +75,13 @@ def read_table(
         known: names of the numeric columns the channel may have.
         texts: names of the text columns it may have.
         prefixes: numeric columns that start with one of these are known too.
+        in_order: refuse times that run backwards.
 
     Raises:
+        ClockError: a time runs backwards.
         DataError: unreadable or empty file, unknown or repeated column, a cell that is not a
-            finite number, a line with too few or too many cells, a time that is missing,
-            runs backwards or looks like Unix time. The message names file, column, line and time.
+            finite number, a line with too few or too many cells, a time that is missing
+            or looks like Unix time. The message names file, column, line and time.
     """
     data = _read_bytes(path)
     header = _header(path, data, [*known], texts, prefixes)
@@ -85,7 +92,7 @@ def read_table(
     if table is None:
         raise DataError("cannot be read as a table", file=path, remedy="write plain comma-separated numbers")
     seconds = table["t_s"]
-    _check_times(path, seconds)
+    _check_times(path, seconds, in_order=in_order)
     notes = () if data.endswith(b"\n") else (f"{path.name}: the last line has no line end; was it cut off?",)
     return Table(
         _to_ns(path, data, header, seconds),
@@ -215,7 +222,12 @@ def _bad_cell(path: Path, name: str, cell: str, line: int, time_s: float | None)
     raise DataError(what, file=path, time_s=time_s, remedy=remedy)
 
 
-def _check_times(path: Path, seconds: Array) -> None:
+def read_times(path: Path) -> NDArray[np.int64]:
+    """The times of a table as they stand there, in any order; errors as in `read_table`."""
+    return read_table(path, (), texts=("fix", "label"), prefixes=("",), in_order=False).t_ns
+
+
+def _check_times(path: Path, seconds: Array, *, in_order: bool) -> None:
     far = np.flatnonzero(np.abs(seconds) > MAX_T_S)
     if far.size:
         raise DataError(
@@ -224,14 +236,14 @@ def _check_times(path: Path, seconds: Array) -> None:
             remedy="t_s must be seconds from start_ns of meta.yaml",
         )
     back = np.flatnonzero(np.diff(seconds) < 0)
-    if back.size:
+    if back.size and in_order:
         i = int(back[0])
-        raise DataError(
+        raise ClockError(
             f"time runs backwards from {seconds[i]:.9f} to {seconds[i + 1]:.9f} s at data row {i + 2}",
             file=path,
             channel="t_s",
             time_s=float(seconds[i]),
-            remedy="sort the rows, or split the log at the clock jump",
+            remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",
         )
 
 

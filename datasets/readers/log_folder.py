@@ -6,22 +6,26 @@ else that is not a number is an error: this reader never guesses.
 
 from __future__ import annotations
 
+import dataclasses
 import difflib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.clock import in_order, repair_together
+from terrafusion.datasets.errors import ClockError, DataError
 from terrafusion.datasets.readers.channel_tables import ChannelReader
-from terrafusion.datasets.readers.csv_table import Table, read_table
+from terrafusion.datasets.readers.csv_table import Table, read_table, read_times
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import Trajectory
 
 META = "meta.yaml"
+TimesNs = NDArray[np.int64]
 CHANNELS = ("command", "wheels", "imu", "gnss", "motor", "terrain", "truth")
 
 
@@ -32,11 +36,31 @@ def claims(path: Path, head: bytes) -> bool:
 
 def read(request: Request) -> list[Recording]:
     """The one recording of a log folder."""
-    return [read_log_folder(request.path)]
+    try:
+        return [read_log_folder(request.path)]
+    except ClockError:
+        if not request.repair_clock:
+            raise
+    return [_with_clock_repaired(request.path)]
 
 
-def read_log_folder(folder: Path) -> Recording:
+def _with_clock_repaired(folder: Path) -> Recording:
+    """Read a log folder whose times run backwards somewhere."""
+    files = _Folder(folder)
+    paths = {channel: files.place(channel) for channel in CHANNELS}
+    times = {channel: read_times(path) for channel, path in paths.items() if path.is_file()}
+    clocks, jumps = repair_together(times)
+    recording = read_log_folder(folder, clocks)
+    moved = tuple(dataclasses.replace(jump, t_ns=jump.t_ns + recording.start_ns) for jump in jumps)
+    return dataclasses.replace(recording, clock_jumps=(*recording.clock_jumps, *moved))
+
+
+def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -> Recording:
     """Read a log folder.
+
+    Args:
+        folder: the folder.
+        clocks: times in ns from the start, by channel, in place of those of the files; one for each row.
 
     Returns:
         Recording named after the folder, times in ns from `start_ns`; its notes tell what was
@@ -54,13 +78,15 @@ def read_log_folder(folder: Path) -> Recording:
             remedy = f"give the bag itself: {', '.join(bags[:5])}{' ...' if len(bags) > 5 else ''}"
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = read_meta(meta_path)
-    source = _Folder(folder)
+    source = _Folder(folder, clocks)
     reader = ChannelReader(source, meta)
     channels = {name: getattr(reader, name)() for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         names = ", ".join(f"{name}.csv" for name in CHANNELS)
         raise DataError("no channel holds a sample", file=folder, remedy=f"add at least one of {names}")
-    return recording_of(channels, meta, folder.resolve().name, [*reader.notes, *source.strangers()])
+    return recording_of(
+        channels, meta, folder.resolve().name, [*reader.notes, *source.notes, *source.strangers()]
+    )
 
 
 def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequence[str]) -> Recording:
@@ -91,16 +117,29 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
 
 
 class _Folder:
-    """The tables of one folder, each read from its CSV."""
+    """The tables of one folder, each read from its CSV; `notes` tell which rows were sorted."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, clocks: Mapping[str, TimesNs] | None = None) -> None:
         self.folder = folder
+        self.clocks = clocks or {}
+        self.notes: list[str] = []
 
     def table(
         self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
     ) -> Table | None:
         path = self._path(channel)
-        return None if path is None else read_table(path, known, texts=texts, prefixes=prefixes)
+        if path is None:
+            return None
+        if channel not in self.clocks:
+            return read_table(path, known, texts=texts, prefixes=prefixes)
+        table = read_table(path, known, texts=texts, prefixes=prefixes, in_order=False)
+        table = dataclasses.replace(table, t_ns=self.clocks[channel])
+        order = in_order(table.t_ns)
+        if order is None:
+            return table
+        moved = int((order != np.arange(len(order))).sum())
+        self.notes.append(f"{channel}: {moved} rows out of order were sorted")
+        return table.select(order)
 
     def place(self, channel: str) -> Path:
         return self._path(channel) or self.folder

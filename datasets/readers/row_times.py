@@ -59,7 +59,7 @@ def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
             file=request.path,
             channel=channel,
             time_s=(int(t_ns[i]) - int(t_ns[0])) * 1e-9,
-            remedy="sort the rows, split the log there, or ask for the clock to be repaired",
+            remedy="sort the rows, split the log there, or have the clock repaired (--repair-clock)",
         )
     repaired, jumps = repair(t_ns, channel)
     order = in_order(repaired)
