@@ -247,7 +247,8 @@ def main() -> int:
         told = ", ".join(f"{outcome} {counts[name, outcome]}" for outcome in (*OUTCOMES.values(), "hang"))
         print(f"{name:16} {told}")
     defects = sum(n for (_, outcome), n in counts.items() if outcome in DEFECTS)
-    print(f"{options.count} inputs, {defects} defects, slowest {slowest:.2f} s")
+    read = sum(n for (_, outcome), n in counts.items() if outcome == "read")
+    print(f"{options.count} inputs, {read} read, {defects} defects, slowest {slowest:.2f} s")
     if not defects:
         shutil.rmtree(scratch)
     return int(defects > 0)

@@ -70,7 +70,19 @@ def _recording() -> Any:
 
 def write_samples(folder: Path) -> list[Path]:
     """Write all samples into `folder`; returns their folders, sorted."""
-    for write in (_log_folder, _bags, _pickles, _matlab, _umich, _borealtc, _tum):
+    for write in (
+        _log_folder,
+        _bags,
+        _pickles,
+        _matlab,
+        _umich,
+        _borealtc,
+        _tum,
+        _xsens,
+        _pos,
+        _nmea,
+        _tables,
+    ):
         write(folder)
     return sorted(path for path in folder.iterdir())
 
@@ -224,3 +236,90 @@ def _tum(folder: Path) -> None:
     sample = _sample(folder, "tum", "poses.tum")
     t, _, rate, place = _drive(10)
     _text(sample / "poses.tum", _poses(START_NS * 1e-9 + t, place, np.cumsum(rate) / 10))
+
+
+def _degrees(place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Latitude and longitude of places about 46.8 N, 71.2 W."""
+    return 46.8 + place[:, 1] / 111_170.0, -71.2 + place[:, 0] / 76_300.0
+
+
+def _xsens(folder: Path) -> None:
+    t, gyro, accel = _inertial(100)
+    latitude, longitude = _degrees(_drive(100)[3])
+    vectors = [f"{name}_{axis}" for name in ("Acc", "Gyr") for axis in "XYZ"]
+    names = "\t".join(["PacketCounter", "SampleTimeFine", *vectors, "Latitude", "Longitude", "Altitude"])
+    lines = ["// Device ID: 0380ABCD", "// Update Rate: 100.0Hz", names]
+    for k in range(len(t)):
+        fix = (f"{latitude[k]:.9f}", f"{longitude[k]:.9f}", "90.0") if k % 20 == 0 else ("", "", "")
+        cells = (k, round(t[k] * 1e4), *accel[k].round(6), *gyro[k].round(6), *fix)
+        lines.append("\t".join(map(str, cells)))
+    path = _sample(folder, "xsens", "MT_0380ABCD-000.txt") / "MT_0380ABCD-000.txt"
+    path.write_text("\n".join(lines) + "\n")
+
+
+def _pos(folder: Path) -> None:
+    t, _, _, place = _drive(5)
+    lines = [
+        "% program   : RTKLIB",
+        "% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix,2:float,3:sbas,4:dgps,5:single,6:ppp)",
+        "%  GPST                  latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)"
+        "  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio",
+    ]
+    for at, latitude, longitude in zip(t, *_degrees(place), strict=True):
+        whole, rest = divmod(round(at * 1000), 1000)
+        lines.append(
+            f"2023/11/14 22:13:{20 + whole:02d}.{rest:03d}  {latitude:.9f}  {longitude:.9f}  90.0000   1  12"
+            "   0.0100   0.0100   0.0200   0.0   0.0   0.0   0.00    9.9"
+        )
+    (_sample(folder, "rtklib", "rover.pos") / "rover.pos").write_text("\n".join(lines) + "\n")
+
+
+def _nmea(folder: Path) -> None:
+    t, v, _, place = _drive(5)
+    lines = []
+    for at, latitude, longitude, speed in zip(t, *_degrees(place), v, strict=True):
+        clock = f"2213{20 + at:05.2f}"
+        north = f"46{(latitude - 46) * 60:09.6f},N"
+        west = f"071{(-longitude - 71) * 60:09.6f},W"
+        for body in (
+            f"GNGGA,{clock},{north},{west},4,12,0.8,90.0,M,-30.0,M,1.0,0000",
+            f"GNRMC,{clock},A,{north},{west},{speed / 0.514444:.3f},45.0,141123,,,R",
+            f"GNGST,{clock},0.02,0.01,0.01,0.0,0.01,0.01,0.02",
+        ):
+            total = 0
+            for letter in body.encode():
+                total ^= letter
+            lines.append(f"${body}*{total:02X}")
+    (_sample(folder, "nmea", "receiver.nmea") / "receiver.nmea").write_text("\r\n".join(lines) + "\r\n")
+
+
+MAP = """
+time: {column: stamp, unit: s, epoch: unix}
+track_m: 0.55
+channels:
+  imu:
+    gyro_z_radps: {column: gz, unit: deg/s}
+    accel_z_mps2: {column: az, unit: g}
+  wheels: {left_mps: vl, right_mps: vr}
+  gnss: {latitude_deg: lat, longitude_deg: lon}
+"""
+
+
+def _tables(folder: Path) -> None:
+    import pandas as pd
+
+    t, gyro, accel = _inertial(50)
+    _, v, rate, place = _drive(50)
+    latitude, longitude = _degrees(place)
+    table = pd.DataFrame(
+        {
+            "stamp": START_NS * 1e-9 + t, "gz": np.degrees(gyro[:, 2]), "az": accel[:, 2] / 9.80665,
+            "vl": _sides(v, rate)[:, 0], "vr": _sides(v, rate)[:, 1], "lat": latitude, "lon": longitude,
+        }
+    )  # fmt: skip
+    text = _sample(folder, "table", "drive.csv")
+    table.to_csv(text / "drive.csv", index=False)
+    (text / "drive.csv.columns.yaml").write_text(MAP)
+    packed = _sample(folder, "parquet", "drive.parquet")
+    table.to_parquet(packed / "drive.parquet", index=False)
+    (packed / "drive.parquet.columns.yaml").write_text(MAP)
