@@ -62,7 +62,7 @@ def opened(path: Path) -> Iterator[MatlabFile]:
         with _file(path) as file:
             yield MatlabFile(file, path)
     except _BROKEN as error:
-        why = str(error).split("\n")[0][:100]
+        why = str(error).rpartition("(")[2].split("\n")[0].split(",")[0].rstrip(")")[:100]
         raise DataError(
             f"the HDF5 cannot be read: {why}", file=path, remedy="copy it again; is it complete?"
         ) from None
@@ -101,6 +101,8 @@ class MatlabFile:
     def _numbers(self, name: str) -> Array:
         import h5py
 
+        if not self.has(name):
+            raise self._wrong(name, "is missing")
         link = self._file.get(name, getlink=True)
         if not isinstance(link, h5py.HardLink) or not isinstance(self._file[name], h5py.Dataset):
             raise self._wrong(name, "is no variable of numbers")

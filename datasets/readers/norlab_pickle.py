@@ -19,7 +19,7 @@ from terrafusion.datasets.conventions import Conventions
 from terrafusion.datasets.errors import DataError, errors_of
 from terrafusion.datasets.frames import rpy_to_quaternion
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.safe_pickle import numbers, read_table
+from terrafusion.datasets.readers.safe_pickle import MAX_BYTES, numbers, read_table
 from terrafusion.datasets.recording import Command, Imu, Motor, Recording, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 
@@ -61,8 +61,10 @@ def read(request: Request) -> list[Recording]:
     """
     path = request.path
     if not request.trusted:
+        size = path.stat().st_size
+        which = f"SHA-256 {sha256_of(path)}" if size <= MAX_BYTES else f"{size >> 20} MiB"
         raise DataError(
-            f"a pickle can run code, and this one (SHA-256 {sha256_of(path)}) is in no catalogue",
+            f"a pickle can run code, and this one ({which}) is in no catalogue",
             file=path,
             remedy=f"if you trust its source, add it to a catalogue of your own ({CATALOG_VARIABLE})",
         )

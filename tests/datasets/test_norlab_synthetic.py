@@ -114,6 +114,15 @@ def test_an_unknown_hash_is_refused(tmp_path: Path) -> None:
         open_recordings(path)
 
 
+def test_a_huge_pickle_is_not_even_hashed(tmp_path: Path) -> None:
+    path = tmp_path / "huge.pkl"
+    with path.open("wb") as file:
+        file.write(b"\x80\x04")
+        file.truncate(40 << 30)
+    with pytest.raises(DataError, match="40960 MiB"):
+        open_recordings(path)
+
+
 def test_a_synthetic_drive(tmp_path: Path, catalog_with: CatalogWith) -> None:
     path = save(drive_table(), tmp_path)
     catalog_with("norlab_drive", {path: "any/raw"}, held={}, lag_s={})

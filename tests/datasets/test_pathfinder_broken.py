@@ -19,7 +19,7 @@ from .pathfinder_files import fixes, save, workspace
 
 Change = Callable[[dict[str, np.ndarray]], dict[str, np.ndarray]]
 BROKEN: dict[str, tuple[Change, str]] = {
-    "no channel": (lambda t: {k: v for k, v in t.items() if k != "rearLeftVel"}, "rearLeftVel"),
+    "no channel": (lambda t: {k: v for k, v in t.items() if k != "rearLeftVel"}, "rearLeftVel: is missing"),
     "short channel": (lambda t: t | {"Gz": t["Gz"][:-3]}, "Gz: has 14997 values for 15000 times in tTimu"),
     "a matrix": (lambda t: t | {"Gz": np.zeros((100, 150))}, "not one row or column"),
     "nan clock": (lambda t: t | {"tTodom": t["tTodom"] * np.nan}, "tTodom: holds no times"),
