@@ -25,6 +25,7 @@ Array = NDArray[np.float64]
 
 MAX_BYTES = 2**29
 MAX_LINE = 2**16
+BOM = b"\xef\xbb\xbf"
 BLANKS = r"\s+"
 """The separator that stands for any run of blanks and tabs."""
 
@@ -102,7 +103,7 @@ def read_text(path: Path) -> bytes:
                 file=path,
                 remedy="split it, or convert it to Parquet",
             )
-        data = path.read_bytes().removeprefix(b"\xef\xbb\xbf")
+        data = path.read_bytes().removeprefix(BOM)
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
     if not data or data.isspace():
@@ -118,7 +119,7 @@ def read_text(path: Path) -> bytes:
 
 def head_lines(data: bytes, count: int = 1000) -> Iterator[tuple[int, str]]:
     """Number, from 1, and text of the first lines; one that is too long for a line of a table ends them."""
-    begin = 0
+    begin = len(BOM) if data.startswith(BOM) else 0
     for number in range(1, count + 1):
         end = data.find(b"\n", begin, begin + MAX_LINE)
         if end < 0:

@@ -26,8 +26,8 @@ UNKNOWN_HDOP = 99.0
 
 
 def claims(path: Path, head: bytes) -> bool:
-    """Whether a sentence of a GNSS receiver stands in the first bytes."""
-    return bool(SENTENCE.search(head))
+    """Whether the name ends in .nmea, or a sentence of a GNSS receiver stands in the first bytes."""
+    return (path.suffix.lower() == ".nmea" and bool(head)) or bool(SENTENCE.search(head))
 
 
 def read(request: Request) -> list[Recording]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -13,7 +14,6 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.decimals import to_ns
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import Fix
 
@@ -135,7 +135,7 @@ def collect(path: Path, text: str) -> tuple[Epochs, list[str]]:
         except (ValueError, IndexError):
             damaged += 1
             continue
-        if epoch is not None and np.isnan(epoch.receipt_s):
+        if epoch is not None and math.isnan(epoch.receipt_s):
             epoch.receipt_s = _receipt_s(text, match.start())
     if damaged * 2 > total or not total:
         what = f"{damaged} of {total} sentences are damaged" if total else "no sentence of a receiver"
@@ -198,7 +198,7 @@ def _rmc(log: _Log, f: list[str]) -> _Epoch:
     day = _date(int(f[8][4:6]), f[8][2:4], f[8][:2]) if f[8] else np.nan
     mode = f[11] if len(f) > 11 else ""
     epoch = log.at(f[0])
-    if np.isnan(epoch.date):
+    if math.isnan(epoch.date):
         epoch.date = day
     epoch.velocity = velocity
     if epoch.position is None:
@@ -234,8 +234,10 @@ _PARSERS: dict[str, Callable[[_Log, list[str]], _Epoch | None]] = {
 
 def _float(text: str) -> float:
     """A number, NaN where the field is empty."""
-    number = float(text) if text else np.nan
-    if "_" in text or np.isinf(number) or (text and np.isnan(number)):
+    if not text:
+        return math.nan
+    number = float(text)
+    if not math.isfinite(number) or "_" in text:
         raise ValueError(text)
     return number
 
@@ -249,7 +251,7 @@ def _time_of_day(text: str) -> int:
     hour, minute, second = int(text[:2]), int(text[2:4]), int(text[4:6])
     if hour > 23 or minute > 59 or second > 60:
         raise ValueError(text)
-    return (hour * 60 + minute) * 60 * 10**9 + int(to_ns([text[4:]])[0])
+    return ((hour * 60 + minute) * 60 + second) * 10**9 + int(text[7:16].ljust(9, "0"))
 
 
 def _angle(text: str, side: str, sides: str) -> float:
@@ -274,8 +276,8 @@ def _velocity(knots: str, course: str) -> tuple[float, float]:
     speed = _float(knots) * KNOT_MPS
     if speed == 0.0:
         return 0.0, 0.0
-    heading = np.radians(_float(course))
-    return float(speed * np.sin(heading)), float(speed * np.cos(heading))
+    heading = math.radians(_float(course))
+    return speed * math.sin(heading), speed * math.cos(heading)
 
 
 def _date(year: int, month: str, day: str) -> float:

@@ -22,7 +22,9 @@ NORM_TOLERANCE = 0.01
 
 
 def claims(path: Path, head: bytes) -> bool:
-    """Whether the first rows are eight numbers each, the last four of them a unit quaternion."""
+    """Whether the name ends in .tum, or the first rows are eight numbers with a unit quaternion."""
+    if path.suffix.lower() == ".tum" and head:
+        return True
     rows = [line.split() for _, line in head_lines(head, 20) if line.strip() and not line.startswith("#")]
     complete = rows[:-1] if len(rows) > 1 else rows  # the head may end inside a line
     try:

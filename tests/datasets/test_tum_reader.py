@@ -104,6 +104,11 @@ def test_quaternions_that_are_none(tmp_path: Path) -> None:
         open_recording(poses(tmp_path, text))
 
 
+def test_the_ending_alone_is_enough(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="column 'x' is 'nan' at line 1"):
+        open_recording(poses(tmp_path, f"0 nan {POSE[4:]}\n", "drive.tum"))
+
+
 def test_a_cut_last_line_is_left_out(tmp_path: Path) -> None:
     recording = open_recording(poses(tmp_path, f"0 {POSE}\n1 {POSE}\n2 1.0 2"))
     assert recording.truth is not None

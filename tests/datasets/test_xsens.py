@@ -80,10 +80,12 @@ def gnss_columns(every: int = 25, status: str = "{:d}") -> dict[str, list[str]]:
     return columns | {"StatusWord": [status.format(FIXED)] * N}
 
 
-def export(tmp_path: Path, columns: dict[str, list[str]], header: str = HEADER, mark: str = "\t") -> Path:
+def export(
+    tmp_path: Path, columns: dict[str, list[str]], header: str = HEADER, mark: str = "\t", bom: str = ""
+) -> Path:
     path = tmp_path / "MT_0080005BF5-000.txt"
     rows = zip(*columns.values(), strict=True)
-    path.write_text(header + mark.join(columns) + "\n" + "".join(mark.join(row) + "\n" for row in rows))
+    path.write_text(bom + header + mark.join(columns) + "\n" + "".join(mark.join(row) + "\n" for row in rows))
     return path
 
 
@@ -229,6 +231,11 @@ def test_rows_that_end_with_a_separator(tmp_path: Path) -> None:
     imu = open_recording(path).imu
     assert imu is not None
     np.testing.assert_array_equal(imu.gyro_radps, motion()[0])
+
+
+def test_a_byte_order_mark(tmp_path: Path) -> None:
+    recording = open_recording(export(tmp_path, ticks() | imu_columns(), bom="\ufeff"))
+    assert recording.source.startswith("Xsens")
 
 
 def test_another_device_is_not_taken_for_an_mti(tmp_path: Path) -> None:
