@@ -81,7 +81,8 @@ def test_tutorial(folder: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["conventions.md", "estimator.md", "formats.md", "limits.md", "terrain.md", "twin.md"]
+    "name",
+    ["conventions.md", "doctor.md", "estimator.md", "formats.md", "limits.md", "terrain.md", "twin.md"],
 )
 def test_python_of_the_other_documents(name: str, folder: Path) -> None:
     document = ROOT / "docs" / name
