@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ from terrafusion.datasets.doctor.measures import Measures, measure
 from terrafusion.datasets.doctor.mounting import heading
 from terrafusion.datasets.doctor.path import dead_reckoned
 from terrafusion.datasets.doctor.turning import accounts
+from terrafusion.datasets.lag import lag_between
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.readers.formats import Request, format_of
 from terrafusion.datasets.recording import Channel, Recording
@@ -70,6 +72,21 @@ class Drives:
         return read_wheel_trials(self.path)
 
 
+class Estimate(float):
+    """A number with its 95 % interval."""
+
+    low: float
+    high: float
+
+    def __new__(cls, value: float, low: float, high: float) -> Self:
+        number = super().__new__(cls, value)
+        number.low, number.high = sorted((low, high))
+        return number
+
+    def __str__(self) -> str:
+        return f"{float(self):.3g} [{self.low:.3g}, {self.high:.3g}]"
+
+
 @dataclass(frozen=True)
 class Row:
     """A line of the table: a fact, what was found, how many recordings it was found on, and the verdict."""
@@ -90,7 +107,9 @@ class Row:
         """Texts of the table's columns."""
         known = [value for value in self.found if value is not None]
         numbers = [value for value in known if not isinstance(value, str)]
-        if numbers:
+        if len(known) == 1 and isinstance(known[0], Estimate):
+            found = str(known[0])
+        elif numbers:
             low, high = f"{min(numbers):.4g}", f"{max(numbers):.4g}"
             found = low if low == high else f"{low} to {high}"
         else:
@@ -174,16 +193,28 @@ def _ratio(channel: str) -> Callable[[Drives], float | None]:
     return ratio
 
 
-def _lag(quantity: str, early: str, late: str) -> Callable[[Drives], float | None]:
+def _lag(quantity: str, early: str, late: str) -> Callable[[Drives], Estimate | None]:
     """Seconds by which `late` tells, in the log, after `early` does."""
 
-    def lag(drives: Drives) -> float | None:
+    def lag(drives: Drives) -> Estimate | None:
         for pair in drives.logged_measures.lags:
             if pair.quantity == quantity and {pair.earlier, pair.later} == {early, late}:
-                return pair.seconds if pair.later == late else -pair.seconds
+                sign = 1.0 if pair.later == late else -1.0
+                return Estimate(sign * pair.seconds, sign * pair.low_s, sign * pair.high_s)
         return None
 
     return lag
+
+
+def _accelerometer_behind(drives: Drives) -> Estimate | None:
+    """Seconds by which, in the log, the IMU's x feels a change of speed after the wheels tell it."""
+    wheels, imu = drives.logged[0].wheels, drives.logged[0].imu
+    if wheels is None or imu is None or len(wheels) < ENOUGH_TURNS:
+        return None
+    t_wheels, t_imu = ((channel.t_ns - imu.t_ns[0]) * 1e-9 for channel in (wheels, imu))
+    gain = np.gradient(wheels.side_speeds_mps(1.0).mean(axis=1), t_wheels)
+    lag = lag_between(t_wheels, gain, t_imu, imu.accel_mps2[:, 0], reach_s=0.5)
+    return Estimate(lag.seconds, lag.low_s, lag.high_s) if lag is not None else None
 
 
 def _turn_r(one: str, other: str, *, logged: bool = False) -> Callable[[Drives], float | None]:
@@ -335,6 +366,7 @@ QUANTITIES: dict[str, Callable[[Drives], Value | None]] = {
     "truth behind gyro, s": _lag("yaw rate", "imu", "truth"),
     "gyro behind wheels, s": _lag("yaw rate", "wheels", "imu"),
     "wheels behind truth, s": _lag("speed", "truth", "wheels"),
+    "accelerometer behind wheels, s": _accelerometer_behind,
     "least sigma, m": _sigma("min"),
     "largest sigma, m": _sigma("max"),
     "reckoned by gyro beside fixes, m rms": _reckoned_rms(gyro=True),

@@ -144,6 +144,10 @@ FACTS: tuple[Fact, ...] = (
     Fact(f"{MOCAP}/trial7", "truth behind gyro, s", (-1.058, -1.050), "not known"),
     Fact(f"{MOCAP}/trial2", "truth behind gyro, s", (-0.758, -0.748), "not told"),
     Fact(f"{MOCAP}/trial3", "truth behind gyro, s", (-0.619, -0.608), "not told"),
+    *(Fact(f"{MOCAP}/{of}", "accelerometer behind wheels, s", (0.05, 0.085), "not told")
+      for of in ("trial1", "trial7")),
+    *(Fact(f"{FIELD}/{of}", "accelerometer behind wheels, s", (0.08, 0.16), "not told")
+      for of in ("sand_small_pebble", "slip_detect1", "slip_detect2")),
     Fact("borealtc/*", "wheels rows a second", (6.45, 6.55), "6.5 Hz"),
     Fact("borealtc/*", "imu rows a second", (99.9, 100.1), "100 Hz"),
     Fact("borealtc/*", "wheels of", "left right mps", "left/right m/s"),

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +17,7 @@ from terrafusion.datasets.config import shown
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.delimited import (
     BLANKS,
+    MAX_LINE,
     Columns,
     Layout,
     head_lines,
@@ -71,13 +75,17 @@ def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, he
 
     Raises:
         DataError: unreadable, too large, no rows, a wrong header, a line that has too few or too
-            many numbers, a cell that is no finite number, with its line. Times are not checked for
-            order: `put_in_time` does that.
+            many numbers, a cell that is no finite number, with its line and, where that can be read,
+            its time. Times are not checked for order: `put_in_time` does that.
     """
     data = read_text(path)
     names = _header(path, data, columns, separator) if header else tuple(columns)
     layout = Layout(names, separator, first_line=2 if header else 1)
-    table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
+    try:
+        table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
+    except DataError as error:
+        time_s = _time_of_line(error.what, data, layout, columns[0])
+        raise DataError(error.what, file=path, time_s=time_s, remedy=error.remedy) from None
     t_ns = table.times_ns(columns[0])
     far = np.flatnonzero(np.abs(t_ns) > MAX_T_NS)
     if far.size:
@@ -110,7 +118,7 @@ def put_in_time(
             if back.size:
                 by_s = (rows.t_ns[back[0]] - rows.t_ns[back[0] + 1]) * 1e-9
                 what = f"the time of {name} runs backwards by {by_s:.6f} s"
-                remedy = "sort the rows, split the log there, or ask for the clock to be repaired"
+                remedy = "sort the rows, split the log there, or have the clock repaired (--repair-clock)"
                 raise rows.error(int(back[0]) + 1, what, remedy)
         return dict(parts), (), ()
     times, jumps = repair_together({name: rows.t_ns for name, rows in parts.items()})
@@ -140,6 +148,22 @@ def _header(path: Path, data: bytes, columns: Sequence[str], separator: str) -> 
     if sorted(names) != sorted(columns):
         raise DataError(f"the header is '{shown(line)}'", file=path, remedy=f"give {', '.join(columns)}")
     return names
+
+
+def _time_of_line(what: str, data: bytes, layout: Layout, time: str) -> float | None:
+    """Seconds from the first row to the line that a message names."""
+    named = re.search(r"\bline (\d+)", what)
+    column = layout.names.index(time)
+    if named is None:
+        return None
+    seconds = []
+    for number in (layout.first_line, int(named[1])):
+        line = next(islice(io.BytesIO(data), number - 1, None), b"")[:MAX_LINE]
+        try:
+            seconds.append(float(split(line.decode("utf-8", "replace"), layout.separator)[column]))
+        except (ValueError, IndexError):
+            return None
+    return seconds[1] - seconds[0] if np.isfinite(seconds).all() else None
 
 
 def _refuse_missing(table: Columns, rows: Rows, columns: Sequence[str]) -> None:

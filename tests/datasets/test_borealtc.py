@@ -269,11 +269,11 @@ def test_swapped_columns_under_the_right_header_break_physics(run: Path, tmp_pat
 
 
 BAD = {
-    "text": ("0.04,1,2,3,4,fast,6", ("'fast'", "line 6")),
+    "text": ("0.04,1,2,3,4,fast,6", ("'fast'", "line 6", "t = 0.040 s")),
     "NaN": ("0.04,1,2,3,4,nan,6", ("'nan'", "line 6", "t = 0.040 s")),
     "nothing": ("0.04,1,2,,4,5,6", ("line 6", "'wz'")),
     "infinite": ("0.04,1,2,3,4,inf,6", ("'inf'", "line 6")),
-    "short": ("0.04,1,2", ("line 6 has 3 cells for 7",)),
+    "short": ("0.04,1,2", ("line 6 has 3 cells for 7", "t = 0.040 s")),
     "long": ("0.04,1,2,3,4,5,6,7", ("line 6 has 8 cells for 7",)),
     "time runs back": ("0.01,1,2,3,4,5,6", ("line 6", "runs backwards by 0.020000 s")),
     "time of no clock": ("1e30,1,2,3,4,5,6", ("'1e30'", "line 6")),

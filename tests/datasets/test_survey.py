@@ -69,6 +69,9 @@ def test_verdicts() -> None:
     assert survey.Row(word, ("+z", "+y")).cells() == [
         "set/* (2 of 2)", "axis", "z up (+z)", "+y, +z", survey.WRONG
     ]  # fmt: skip
+    late = survey.Row(Fact("set/one", "lag", (0.1, 0.2), "0.15 s"), (survey.Estimate(-0.15, -0.1, -0.2),))
+    assert late.verdict() == survey.WRONG
+    assert late.cells()[3] == "-0.15 [-0.2, -0.1]"
     table = survey.markdown([survey.Row(fact, (9.5, 10.25, None))])
     assert table.splitlines()[2] == "| * (2 of 3) | q | 10 Hz (9 to 11) | 9.5 to 10.25 | agrees |"
 

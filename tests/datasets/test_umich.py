@@ -160,11 +160,11 @@ def columns(*order: int) -> Callable[[list[str]], list[str]]:
 
 
 BAD: dict[str, tuple[int, Callable[[list[str]], list[str]], tuple[str, ...]]] = {
-    "short line": (0, lambda x: [*x[:6], "1652300000.06 1 2\n", *x[7:]], ("line 7 has 3 cells for 7",)),
+    "short line": (0, lambda x: [*x[:6], "1652300000.06 1 2\n", *x[7:]], ("line 7 has 3", "t = 0.060 s")),
     "long line": (2, lambda x: [*x[:6], x[6].strip() + " 1\n", *x[7:]], ("line 7 has 9 cells for 8",)),
-    "text": (0, put(9, 3, "fast"), ("'fast'", "line 10")),
+    "text": (0, put(9, 3, "fast"), ("'fast'", "line 10", "t = 0.090 s")),
     "NaN": (0, put(9, 3, "nan"), ("'nan'", "line 10", "t = 0.090 s")),
-    "infinite": (2, put(9, 3, "inf"), ("'inf'", "line 10")),
+    "infinite": (2, put(9, 3, "inf"), ("'inf'", "line 10", "t = 0.150 s")),
     "time in words": (1, put(4, 0, "noon"), ("'noon'", "line 5")),
     "time of no year": (1, put(4, 0, "1e17"), ("'1e17'", "line 5")),
     "columns of another file": (0, columns(0, 1, 2, 3, 4, 5), ("6 cells for 7",)),
