@@ -77,7 +77,7 @@ def read(request: Request) -> list[Recording]:
                 return _windows(path, table, request.conventions)
     except KeyError as error:
         raise DataError(f"column {error} is missing", file=path, remedy="give an unchanged table") from None
-    except (ValueError, OverflowError) as error:
+    except (ValueError, TypeError, OverflowError) as error:
         raise DataError(f"cannot be read: {error}", file=path, remedy="give an unchanged table") from None
     raise DataError(
         "has neither the columns of a drive (ros_time) nor those of windows (imu_yaw_0)",
@@ -88,10 +88,12 @@ def read(request: Request) -> list[Recording]:
 
 def _drive(path: Path, table: Table, conventions: Conventions) -> Recording:
     terrain, notes = _of_folder(path.parent.name, conventions)
-    t_ns = table["ros_time"]
-    first = next((row for row, cell in enumerate(t_ns.tolist()) if float(cell) > 0.0), len(t_ns))
-    if first == len(t_ns):
-        raise DataError("no row has a time", file=path, remedy="give an unchanged table")
+    stamps = table["ros_time"]
+    first = next((row for row, cell in enumerate(stamps.tolist()) if float(cell) > 0.0), len(stamps))
+    if first == len(stamps):
+        raise DataError("no row has a time", remedy="give an unchanged table")
+    if stamps.dtype.kind == "f":
+        notes.append("times are stored as doubles: exact to 0.3 microseconds")
     if first:
         notes.append(f"the first {first} row{'s' * (first > 1)}, without a time, left out")
     table = {name: column[first:] for name, column in table.items()}
@@ -179,6 +181,8 @@ def _windows(path: Path, table: Table, conventions: Conventions) -> list[Recordi
     notes.append("windows have no absolute time: it counts from the start of the command step")
     notes.extend(_against_the_wheels(signals, conventions))
     begins = numbers(table["transitory_state_mask"]) == 1.0
+    if not len(begins):
+        raise DataError("holds no windows", remedy="give an unchanged table")
     return [
         dataclasses.replace(
             _window({name: signal[k] for name, signal in signals.items()}, begins[: k + 1], conventions),

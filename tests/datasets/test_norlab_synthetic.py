@@ -211,6 +211,19 @@ def test_a_drive_without_motors_and_states(tmp_path: Path, catalog_with: Catalog
     assert len(drive.command) == 399
 
 
+def test_times_of_other_kinds(tmp_path: Path, catalog_with: CatalogWith) -> None:
+    """Whole numbers stay exact; doubles are read, and said to be less so."""
+    frame = drive_table(300)
+    for kind, exact in ((np.int64, True), (float, False)):
+        stamps = np.array([int(cell.split(".")[0]) for cell in frame["ros_time"]]).astype(kind)
+        path = save(frame.assign(ros_time=stamps), tmp_path)
+        catalog_with("norlab_drive", {path: "any/raw"})
+        drive = open_recording(path)
+        assert (drive.start_ns == START_NS + 50_000_000) == exact
+        assert abs(drive.start_ns - START_NS - 50_000_000) < 300
+        assert any("stored as doubles" in note for note in drive.notes) != exact
+
+
 def test_poses_without_a_quaternion_are_left_out(tmp_path: Path, catalog_with: CatalogWith) -> None:
     frame = drive_table(200)
     frame.loc[50:52, ["icp_quat_z", "icp_quat_w"]] = "0.0"
@@ -237,7 +250,10 @@ def test_another_robots_folder_is_told(tmp_path: Path, catalog_with: CatalogWith
         (lambda f: f.assign(ros_time="0.0"), "no row has a time"),
         (lambda f: f.assign(ros_time=["0.0", *f["ros_time"][:0:-1]]), "backwards"),
         (lambda f: f.assign(ros_time="9" * 30), "cannot be read"),
+        (lambda f: f.assign(ros_time=[None] * len(f)), "cannot be read"),
         (lambda f: f.iloc[:0], "no row has a time"),
+        (lambda f: window_table(3).iloc[:0], "holds no windows"),
+        (lambda f: window_table(3).drop(columns="icp_x_7"), "'icp_x_7' is missing"),
     ],
 )
 def test_tables_that_are_no_drive(change, words: str, tmp_path: Path, catalog_with: CatalogWith) -> None:  # type: ignore[no-untyped-def]
