@@ -75,9 +75,7 @@ def restore(
         DataError, ConfigError: the bag is not as this library writes it.
     """
     saved = _parse(read({META: ("data",)})[META], file)
-    keys = {
-        name: (f"{PREFIX}{name}", ROW) if name in saved.tables else STANDARD.get(name) for name in CHANNELS
-    }
+    keys = STANDARD | {name: (f"{PREFIX}{name}", ROW) for name in saved.tables}
     asked = {
         key: ("data",) if key[1] == ROW else wanted_fields(name, key[1])
         for name, key in keys.items()
@@ -147,6 +145,8 @@ class _BagTables:
             raise self._error(channel, "stamps that are no times")
         seconds, nanoseconds = stamps.astype(np.int64).T
         t_ns = seconds * 10**9 + nanoseconds - self.saved.meta.start_ns
+        if (np.diff(t_ns) < 0).any():
+            raise self._error(channel, "stamps that run backwards")
         numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}
         words = {name: self._words(channel, name, numbers.pop(name)) for name in texts if name in numbers}
         return Table(t_ns, numbers, words)

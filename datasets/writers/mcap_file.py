@@ -6,7 +6,6 @@ rosbags writes it too, but takes a message at a time: 40 s for an hour of sensor
 from __future__ import annotations
 
 import struct
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,10 +15,14 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.readers.ros_raw import zstd
+from terrafusion.datasets.writers.cdr import split
+
 TimesNs = NDArray[np.int64]
 
 MAGIC = b"\x89MCAP0\r\n"
 CHUNK_MESSAGES = 4096
+ZSTD_LEVEL = 1
 MESSAGE_HEAD = np.dtype(
     [("op", "u1"), ("size", "<u8"), ("channel", "<u2"), ("number", "<u4"), ("log", "<u8"), ("sent", "<u8")]
 )
@@ -127,7 +130,7 @@ class _File:
         sizes = np.array([len(message) for message in parts[:, 1]]) + MESSAGE_HEAD.itemsize
         offsets = np.cumsum(sizes) - sizes
         plain = b"".join(parts.ravel().tolist())
-        packed = _compress(plain)
+        packed = zstd().compress(plain, ZSTD_LEVEL)
         span = struct.pack("<QQ", times[0], times[-1])
         start = self.out.tell()
         sums = struct.pack("<QI", len(plain), crc32(plain))
@@ -210,8 +213,6 @@ def qos_profile(latched: bool) -> str:
 
 
 def _heads(channel: int, first: int, t_ns: TimesNs, messages: Sequence[bytes]) -> list[bytes]:
-    from terrafusion.datasets.writers.cdr import split
-
     heads = np.empty(len(messages), dtype=MESSAGE_HEAD)
     heads["op"], heads["channel"] = MESSAGE, channel
     heads["size"] = [len(message) for message in messages]
@@ -234,11 +235,3 @@ def _text(text: str) -> bytes:
 def _map(**entries: str) -> bytes:
     data = b"".join(_text(key) + _text(value) for key, value in entries.items())
     return struct.pack("<I", len(data)) + data
-
-
-def _compress(data: bytes) -> bytes:
-    if sys.version_info >= (3, 14):
-        from compression import zstd
-    else:
-        from backports import zstd
-    return bytes(zstd.compress(data, 1))

@@ -5,7 +5,7 @@ Every function takes rows that a message can hold: the caller leaves the others 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -83,11 +83,13 @@ def wheel_odometry(wheels: Wheels, track_m: float | None) -> Topic:
 
     Where sides or track are not known the yaw rate is zero under a variance of 1e6.
     """
-    sides, n = wheels.side_speeds_mps(1.0), len(wheels)
-    with np.errstate(over="ignore", invalid="ignore"):
+    n = len(wheels)
+    with np.errstate(all="ignore"):  # impossible speeds, too, are written
+        sides = wheels.side_speeds_mps(1.0)
         v = sides.mean(axis=1)
         rate = (sides[:, 1] - sides[:, 0]) / track_m if track_m is not None else np.zeros(n)
         x, y, yaw = dead_reckoning(wheels.t_ns, v, rate)
+        yaw = np.where(np.isfinite(yaw), yaw, 0.0)
     q = rpy_to_quaternion(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
     pose = np.hstack([np.stack([x, y, 0.0 * x], axis=1), q])
     twist = np.zeros((n, 6))
@@ -122,9 +124,9 @@ def _known(values: Array) -> Array:
 
 def fixes(gnss: Gnss, datum: tuple[float, float, float]) -> Topic:
     """sensor_msgs/NavSatFix of the antenna; an unknown height is NaN, a place not on Earth is no fix."""
-    flat = np.isnan(gnss.enu_m[:, 2])
+    flat = np.asarray(np.isnan(gnss.enu_m[:, 2]))
     enu = np.where(flat[:, None] & [False, False, True], 0.0, gnss.enu_m)
-    lost = ~(np.abs(enu) < EARTH_M).all(axis=1)
+    lost = np.asarray(~(np.abs(enu) < EARTH_M).all(axis=1))
     llh = enu_to_geodetic(np.where(lost[:, None], 0.0, enu), datum)
     llh[lost] = np.nan
     llh[flat, 2] = np.nan
@@ -144,7 +146,7 @@ def _fix_topic(name: str, t_ns: TimesNs, llh: Array, status: NDArray[Any], sigma
     layout.field("llh", count=3).field("P", count=9).field("kind", "u1")
     with np.errstate(over="ignore"):
         variance = sigma**2
-    known = np.isfinite(variance[:, :2]).all(axis=1)
+    known = np.asarray(np.isfinite(variance[:, :2]).all(axis=1))
     P = np.zeros((len(t_ns), 9))
     P[:, ::4] = np.where(known[:, None], np.where(np.isfinite(variance), variance, UNKNOWN_VARIANCE), 0.0)
     kind = np.where(known, 2, 0)
@@ -182,7 +184,7 @@ def terrain(terrain: Terrain) -> Topic:
     )
 
 
-def static_transforms(t_ns: int, positions_m: dict[str, Sequence[float]]) -> Topic:
+def static_transforms(t_ns: int, positions_m: Mapping[str, Sequence[float]]) -> Topic:
     """tf2_msgs/TFMessage, latched: base_link -> each frame, at its position and not turned."""
     layout = Layout().constant("I", len(positions_m))
     for frame, position in positions_m.items():
