@@ -19,6 +19,7 @@ from terrafusion.datasets.readers.ros_raw import (
     BagError,
     Batch,
     Groups,
+    Places,
     Source,
     decompress,
     grouped,
@@ -28,6 +29,8 @@ from terrafusion.datasets.readers.ros_raw import (
 
 MAGIC = b"\x89MCAP0\r\n"
 HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, STATISTICS = 1, 2, 3, 4, 5, 6, 7, 11
+RECORD_HEAD = 9
+"""Kind and length, before a record's content."""
 MESSAGE_HEAD = 31
 """Kind, length, channel, sequence number and two times, before a message's own bytes."""
 BLOCK_BYTES = 1 << 20
@@ -75,7 +78,7 @@ class McapFile:
         self._schemas: dict[int, tuple[str, str, str]] = {}
         self._channels: dict[int, tuple[int, str, str]] = {}
         self._chunks: list[_Chunk] = []
-        self._loose: list[int] = []  # where the messages outside of chunks begin
+        self._loose = np.zeros(0, dtype=np.int64)  # where the messages outside of chunks begin
         self._counts: dict[int, int] | None = None
         try:
             self._walk()
@@ -93,10 +96,10 @@ class McapFile:
         """Go over all records of the file, without unpacking chunks."""
         if self._read(0, len(MAGIC)) != MAGIC:
             raise BagError("it does not begin as MCAP")
-        kind = 0
+        kind, loose = 0, []
         for kind, start, size in self._records():
             if kind == MESSAGE:
-                self._loose.append(start)
+                loose.append(start - RECORD_HEAD)
             elif kind == CHUNK:
                 self._chunks.append(_Chunk(start, size, set()))
             elif kind == INDEX and self._chunks and size >= 6:
@@ -107,6 +110,7 @@ class McapFile:
                 self._learn(kind, self._content(start, size))
             elif kind == FOOTER:
                 break
+        self._loose = np.array(loose, dtype=np.int64)
         if kind != FOOTER or self._read(self._end - len(MAGIC), len(MAGIC)) != MAGIC:
             raise BagError("the file breaks off: it has no footer")
 
@@ -115,13 +119,13 @@ class McapFile:
         position, base, block = len(MAGIC), 0, b""
         while position < self._end:
             at = position - base
-            if at + 9 > len(block):
+            if at + RECORD_HEAD > len(block):
                 self._file.seek(position)
                 base, at, block = position, 0, self._file.read(BLOCK_BYTES)
-            if at + 9 > len(block):
+            if at + RECORD_HEAD > len(block):
                 break
             kind, size = _head(block, at)
-            position += 9 + size
+            position += RECORD_HEAD + size
             if position > self._end:
                 raise BagError(f"the file ends at {self._end} of {position} bytes")
             yield kind, position - size, size
@@ -169,19 +173,18 @@ class McapFile:
         for chunk in self._chunks:
             if not chunk.channels or not all(chunk.channels.isdisjoint(ids) for ids in wanted):
                 data = self._unpacked(chunk)
-                yield from _split(data, self._messages(data), wanted)
+                yield from _split(data, np.array(self._messages(data), dtype=np.int64), wanted)
         first = 0
         while first < len(self._loose):
-            begin = self._loose[first] - 9
-            last = int(np.searchsorted(self._loose, begin + BLOCK_BYTES))
-            last = max(last, first + 1)
-            stop = self._loose[last] - 9 if last < len(self._loose) else begin + 2 * BLOCK_BYTES
-            yield from _split(
-                self._read(begin, stop - begin),
-                [place - 9 - begin for place in self._loose[first:last]],
-                wanted,
-            )
-            first = last
+            begin = int(self._loose[first])
+            last = max(int(np.searchsorted(self._loose, begin + BLOCK_BYTES)) - 1, first)
+            end = self._record_end(int(self._loose[last]))
+            yield from _split(self._read(begin, end - begin), self._loose[first : last + 1] - begin, wanted)
+            first = last + 1
+
+    def _record_end(self, position: int) -> int:
+        _, size = _head(self._read(position, RECORD_HEAD), 0)
+        return position + RECORD_HEAD + int(size)
 
     def _unpacked(self, chunk: _Chunk) -> bytes:
         content = self._content(chunk.start, chunk.size)
@@ -202,8 +205,8 @@ class McapFile:
                 if kind == MESSAGE:
                     starts.append(position)
                 elif learn:
-                    self._learn(kind, _Text(chunk[position + 9 : position + 9 + size]))
-                position += 9 + size
+                    self._learn(kind, _Text(chunk[position + RECORD_HEAD :][:size]))
+                position += RECORD_HEAD + size
         except struct.error:
             position = -1
         if position != end:
@@ -211,10 +214,10 @@ class McapFile:
         return starts
 
 
-def _split(block: bytes, records: list[int], wanted: Groups) -> Iterator[Batch]:
-    """The messages of a block by channel."""
-    data, places = np.frombuffer(block, dtype=np.uint8), np.array(records, dtype=np.int64)
-    sizes = numbers_at(data, places + 1, "<u8").astype(np.int64) - (MESSAGE_HEAD - 9)
+def _split(block: bytes, places: Places, wanted: Groups) -> Iterator[Batch]:
+    """The messages of a block, whose records begin at `places`, by channel."""
+    data = np.frombuffer(block, dtype=np.uint8)
+    sizes = numbers_at(data, places + 1, "<u8").astype(np.int64) - (MESSAGE_HEAD - RECORD_HEAD)
     channels = numbers_at(data, places + 9, "<u2")
     receipt_ns = numbers_at(data, places + 15, "<u8").astype(np.int64)
     if (sizes < 0).any() or (receipt_ns < 0).any():
