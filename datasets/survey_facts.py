@@ -108,6 +108,8 @@ FACTS: tuple[Fact, ...] = (
     Fact(f"{WARTHOG}/*/raw", "imu x left of forward, deg", (-12, 12), "not told"),
     Fact(f"{WARTHOG}/*", "gyro with wheels, r", (0.8, 1.0), "yaw rate to the left"),
     Fact(f"{WARTHOG}/*/raw", "gyro with wheels in the log, r", (0.9, 1.0), "as it should be"),
+    Fact(f"{WARTHOG}/*/raw", "truth behind gyro, s", (0.2, 0.45), "not told"),
+    Fact(f"{WARTHOG}/*/raw", "gyro behind wheels, s", (-0.16, -0.12), "not told"),
     *(Fact(f"{WARTHOG}/{of}*/windows", "gyro with wheels in the log, r", (-1, -0.8), "opposite sign")
       for of in ("ice", "gravel", "grass_2024_7_29")),
     Fact(f"{WARTHOG}/sand*/windows", "gyro with wheels, r", (0.985, 1.0), "0.99"),
