@@ -91,7 +91,7 @@ def wheel_odometry(wheels: Wheels, track_m: float | None) -> Topic:
         x, y, yaw = dead_reckoning(wheels.t_ns, v, rate)
         yaw = np.where(np.isfinite(yaw), yaw, 0.0)
     q = rpy_to_quaternion(np.stack([0.0 * yaw, 0.0 * yaw, yaw], axis=1))
-    pose = np.hstack([np.stack([x, y, 0.0 * x], axis=1), q])
+    pose = np.hstack([np.stack([x, y, np.zeros(n)], axis=1), q])
     twist = np.zeros((n, 6))
     twist[:, 0], twist[:, 5] = v, rate
     unknown = 0.0 if wheels.has_sides() and track_m is not None else UNKNOWN_VARIANCE
