@@ -14,22 +14,11 @@ from hypothesis.extra import numpy as hnp
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Fix, Gnss, Imu, Recording, Wheels
+from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Recording, Terrain, Wheels, differences
 from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.datasets.writers import write_log_folder
+from terrafusion.datasets.writers import log_folder, write_log_folder
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
-
-
-def assert_same(a: Recording, b: Recording) -> None:
-    assert a.channels().keys() == b.channels().keys()
-    for name, channel in a.channels().items():
-        other = b.channels()[name]
-        np.testing.assert_array_equal(channel.t_ns, other.t_ns)
-        columns = channel.columns()
-        assert list(columns) == list(other.columns())
-        for column, values in columns.items():
-            np.testing.assert_array_equal(values, other.columns()[column])
 
 
 def folder_with(tmp_path: Path, meta: str = META, **files: str) -> Path:
@@ -42,20 +31,11 @@ def folder_with(tmp_path: Path, meta: str = META, **files: str) -> Path:
 
 
 def test_round_trip_keeps_everything(drive: Recording, tmp_path: Path) -> None:
-    back = open_recording(write_log_folder(drive, tmp_path / "drive"))
-    assert_same(drive, back)
-    assert back.truth is not None
-    assert drive.truth is not None
-    np.testing.assert_array_equal(back.truth.t_ns, drive.truth.t_ns)
-    np.testing.assert_array_equal(back.truth.position_m, drive.truth.position_m)
-    np.testing.assert_array_equal(back.truth.quaternion, drive.truth.quaternion)
-    np.testing.assert_array_equal(back.truth.twist_body, drive.truth.twist_body)
-    plain = [f.name for f in dataclasses.fields(Recording) if f.name not in (*Recording.CHANNELS, "truth")]
-    for name in plain:
-        assert getattr(back, name) == getattr(drive, name), name
-    assert back.terrain is not None
-    assert back.terrain.source == "simulation"
-    assert back.terrain.classes == ("mud", "snow")
+    assert differences(drive, open_recording(write_log_folder(drive, tmp_path / "drive"))) == []
+    renamed = open_recording(write_log_folder(drive, tmp_path / "other"))
+    assert renamed.name == "drive"
+    (tmp_path / "other").rename(tmp_path / "third")
+    assert differences(drive, open_recording(tmp_path / "third")) == []
 
 
 TIMES = st.lists(st.integers(-(10**12), 3 * 10**17), min_size=1, max_size=20).map(sorted)
@@ -84,7 +64,7 @@ def test_packed_files_read_the_same(drive: Recording, tmp_path: Path) -> None:
     for path in list(folder.glob("*.csv")):
         (folder / f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes()))
         path.unlink()
-    assert_same(drive, open_recording(folder))
+    assert differences(drive, open_recording(folder)) == []
 
 
 def test_times_are_exact_to_the_nanosecond(tmp_path: Path) -> None:
@@ -162,6 +142,11 @@ BAD_META = {
     "start_ns: 1\ntruth_frame: wheel\n": ["truth_frame", "wheel"],
     "start_ns: 1\ntruth_channels: position\n": ["truth_channels"],
     "start_ns: 1\nvehicle: 5\n": ["vehicle", "5"],
+    "start_ns: 1\nnotes: dusty\n": ["notes", "dusty"],
+    "start_ns: 1\nkeep_empty: 1\n": ["keep_empty", "true"],
+    "start_ns: 1\nclock_jumps: 3\n": ["clock_jumps", "step_s"],
+    "start_ns: 1\nclock_jumps: [{channel: imu, t_ns: 1.5, step_s: 2}]\n": ["clock_jumps", "t_ns"],
+    "start_ns: 1\nclock_jumps: [{channel: imu, t_ns: 1, step_s: .inf}]\n": ["clock_jumps", "step_s"],
     "start_ns: 1\nstart_ns: 2\n": ["start_ns"],
     "start_ns: [1\n": ["YAML"],
     "- 1\n": ["mapping"],
@@ -217,6 +202,7 @@ BAD_TABLES = {
     "no label": ("terrain", "t_s,p_mud\n0,1\n", ["label"]),
     "bad quaternion": ("truth", "t_s,x_m,y_m,qx,qy,qz,qw\n0,1,1,0,0,0,0\n", ["norm", "unit"]),
     "half quaternion": ("truth", "t_s,x_m,y_m,qz,qw\n0,1,1,0,1\n", ["qz"]),
+    "covariance in part": ("truth", "t_s,x_m,y_m,cov_x_x\n0,1,1,1\n", ["cov_x_y", "missing"]),
     "repeated truth": ("truth", "t_s,x_m,y_m\n0,1,1\n0,1,1\n", ["increase"]),
 }
 
@@ -308,3 +294,88 @@ def test_truth_with_unknown_height_and_antenna_frame(tmp_path: Path) -> None:
     back = open_recording(write_log_folder(recording, tmp_path / "x"))
     assert back.truth_frame == "antenna"
     assert back.truth_channels == ("position",)
+
+
+def test_all_of_the_truth(tmp_path: Path) -> None:
+    """A symmetric covariance takes 21 columns, another 36; both come back."""
+    t = np.arange(4) * 10**9
+    rng = np.random.default_rng(5)
+    P = rng.normal(size=(4, 6, 6))
+    twist = rng.normal(size=(4, 6))
+    for name, covariance in (("symmetric", P + P.transpose(0, 2, 1)), ("other", P)):
+        truth = Trajectory(t, rng.normal(size=(4, 3)), None, twist, covariance)
+        folder = write_log_folder(Recording(name, 0, truth=truth), tmp_path / name)
+        header = (folder / "truth.csv").read_text().splitlines()[0].split(",")
+        assert sum(c.startswith("cov_") for c in header) == (21 if name == "symmetric" else 36)
+        assert differences(open_recording(folder).truth, truth) == []
+
+
+def test_rows_and_channels_without_values_are_kept_where_meta_says_so(tmp_path: Path) -> None:
+    t = np.array([0, 10**9], dtype=np.int64)
+    none = np.full((2, 3), np.nan)
+    gnss = Gnss(t, none, none, np.array([Fix.NONE, Fix.SINGLE], dtype=np.uint8))
+    imu = Imu(t[:0], none[:0], none[:0])
+    recording = Recording("x", 0, imu=imu, gnss=gnss)
+    folder = write_log_folder(recording, tmp_path / "x")
+    assert differences(recording, open_recording(folder)) == []
+    meta = folder / "meta.yaml"
+    meta.write_text(meta.read_text().replace("keep_empty: true", "keep_empty: false"))
+    with pytest.raises(TerrafusionError, match="no channel holds a sample"):
+        open_recording(folder)
+
+
+@pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])
+def test_a_writer_that_fails_leaves_what_was_there(
+    drive: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    write_log_folder(drive, tmp_path / "old")
+    (tmp_path / "old" / "diary.txt").write_text("kept")
+    written: list[Path] = []
+    write_table = log_folder._write_table
+
+    def fail_at_the_third(path: Path, *rest: object) -> None:
+        written.append(path)
+        if len(written) % 3 == 0:
+            raise error
+        write_table(path, *rest)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(log_folder, "_write_table", fail_at_the_third)
+    smaller = dataclasses.replace(drive, motor=None, name="old")
+    for name in ("old", "new"):
+        with pytest.raises((TerrafusionError, KeyboardInterrupt)):
+            write_log_folder(smaller, tmp_path / name)
+    monkeypatch.undo()
+    assert [path.name for path in tmp_path.iterdir()] == ["old"]
+    assert differences(open_recording(tmp_path / "old"), drive) == []
+    write_log_folder(smaller, tmp_path / "old")
+    assert differences(open_recording(tmp_path / "old"), smaller) == []
+    assert (tmp_path / "old" / "diary.txt").read_text() == "kept"
+    assert not list((tmp_path / "old").glob(".*"))
+
+
+UNWRITABLE = {
+    "infinite": ({"imu": Imu(np.zeros(1, np.int64), np.full((1, 3), np.inf), np.ones((1, 3)))}, "infinite"),
+    "far": ({"imu": Imu(np.array([2 * 10**18]), np.ones((1, 3)), np.ones((1, 3)))}, "start_ns"),
+    "zero byte": ({"terrain": Terrain(np.zeros(1, np.int64), np.array(["a\0b"], dtype=object))}, "zero byte"),
+    "half a character": (
+        {"terrain": Terrain(np.zeros(1, np.int64), np.array(["\ud800"], dtype=object))},
+        "no character",
+    ),
+    "class of two lines": (
+        {"terrain": Terrain(np.zeros(1, np.int64), np.array(["a"]), "x", ("a\nb",), np.ones((1, 1)))},
+        "cannot be a column",
+    ),
+    "datum": ({"datum": (91.0, 0.0, 0.0)}, "latitude"),
+    "start": ({"start_ns": -5}, "start_ns"),
+    "notes": ({"notes": ("x" * 300_000,)}, "KiB"),
+}
+
+
+@pytest.mark.parametrize("case", UNWRITABLE)
+def test_writer_refuses_what_could_not_be_read(tmp_path: Path, case: str) -> None:
+    fields, words = UNWRITABLE[case]
+    recording = Recording("x", 0, command=Command(np.zeros(1, np.int64), np.ones(1), np.ones(1)))
+    with pytest.raises(TerrafusionError) as caught:
+        write_log_folder(dataclasses.replace(recording, **fields), tmp_path / "x")
+    one_line(caught.value, words, str(tmp_path / "x"))
+    assert list(tmp_path.iterdir()) == []
