@@ -21,6 +21,8 @@ Array = NDArray[np.float64]
 
 MAX_VALUES = 2_000_000
 """Values of a variable, and of a stored piece of one: two hours at 250 Hz."""
+LARGEST = 1e30
+"""No number of a log is larger; squares of these are still numbers."""
 MAX_REFERENCES = 10_000
 MAGIC = b"\x89HDF\r\n\x1a\n"
 USER_BLOCK = 512
@@ -117,6 +119,8 @@ class MatlabFile:
             raise self._wrong(name, f"claims {largest} values, or keeps them in other files")
         values = np.asarray(data[()], dtype=float)
         values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
+        if (np.abs(values) > LARGEST).any():
+            raise self._wrong(name, f"holds numbers beyond {LARGEST:g}")
         return values
 
     def _wrong(self, name: str, what: str) -> DataError:

@@ -21,6 +21,9 @@ from terrafusion.datasets.config import shown
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.pickled_frame import ALLOWED, MAX_CELLS, Frame, Partial, StandIn
 
+LARGEST = 1e30
+"""No number of a log is larger; squares of these are still numbers."""
+
 MAX_BYTES = 32 * 2**20
 """A longer pickle is refused; two hours of a published log have 32 MiB."""
 
@@ -145,13 +148,16 @@ def numbers(column: NDArray[Any]) -> NDArray[np.float64]:
     """A column (N,) of numbers, or of texts that are numbers; an empty text or None is NaN.
 
     Raises:
-        ValueError: a cell is something else.
+        ValueError: a cell is something else, or beyond `LARGEST`.
     """
-    if column.dtype != object:
+    if column.dtype == object:
+        cells = [np.nan if cell is None or cell == "" else cell for cell in column.tolist()]
+        if not all(isinstance(cell, str | float | int) for cell in cells):
+            raise ValueError("a cell is no number")
+        values = np.array([float(cell) for cell in cells])
+    else:
         values = column.astype(float)
         values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
-        return values
-    cells = [np.nan if cell is None or cell == "" else cell for cell in column.tolist()]
-    if not all(isinstance(cell, str | float | int) for cell in cells):
-        raise ValueError("a cell is no number")
-    return np.array([float(cell) for cell in cells])
+    if (np.abs(values) > LARGEST).any():
+        raise ValueError(f"a number beyond {LARGEST:g}")
+    return values

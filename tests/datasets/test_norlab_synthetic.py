@@ -251,6 +251,8 @@ def test_another_robots_folder_is_told(tmp_path: Path, catalog_with: CatalogWith
         (lambda f: f.assign(ros_time=["0.0", *f["ros_time"][:0:-1]]), "backwards"),
         (lambda f: f.assign(ros_time="9" * 30), "cannot be read"),
         (lambda f: f.assign(ros_time=[None] * len(f)), "cannot be read"),
+        (lambda f: f.assign(imu_z="inf"), "a number beyond 1e"),
+        (lambda f: window_table(9).assign(imu_yaw_3=1e200), "a number beyond 1e"),
         (lambda f: f.iloc[:0], "no row has a time"),
         (lambda f: window_table(3).iloc[:0], "holds no windows"),
         (lambda f: window_table(3).drop(columns="icp_x_7"), "'icp_x_7' is missing"),

@@ -27,6 +27,7 @@ BROKEN: dict[str, tuple[Change, str]] = {
     "backwards": (lambda t: t | {"tTimu": t["tTimu"][::-1].copy()}, "time runs backwards"),
     "degrees": (lambda t: t | {"llhGPS": np.full((10, 3), 39.0)}, "not radians"),
     "no fixes": (lambda t: t | {"llhGPS": np.full((10, 3), np.nan)}, "llhGPS"),
+    "infinite": (lambda t: t | {"Gz": t["Gz"] + np.inf}, "Gz: holds numbers beyond"),
     "complex": (lambda t: t | {"Gz": t["Gz"].astype(complex)}, "not numbers"),
 }
 
