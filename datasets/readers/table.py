@@ -47,6 +47,8 @@ FIX_WORDS = {
     "navsatfix": {-1: "none", 0: "single", 1: "dgps", 2: "fixed"},
 }
 SHOWN_COLUMNS = 60
+MAX_NS = 8 * 10**18
+"""Leaves room for any epoch in int64."""
 
 
 class AnyColumns(Protocol):
@@ -117,7 +119,7 @@ def _recording(request: Request, columns: AnyColumns, found: ColumnMap, notes: l
     times = row_times(request, "table", t_ns)
     if not len(t_ns):
         raise DataError("holds no rows", file=request.path, remedy="record or copy it again")
-    start_ns = int(times.t_ns[0])
+    start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
     meta = dataclasses.replace(found.meta, start_ns=start_ns)
     reader = _Reader(_Source(request.path, columns, found, times, start_ns), meta, request)
     channels = {name: getattr(reader, name)() for name in CHANNELS}
@@ -137,6 +139,13 @@ def _times(columns: AnyColumns, found: ColumnMap) -> tuple[NDArray[np.int64], li
     t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
     if t_ns is None:
         return _iso_ns(columns, time.column)
+    late = np.flatnonzero(np.abs(t_ns) > MAX_NS)
+    if late.size:
+        raise DataError(
+            f"the time of row {int(late[0]) + 1} is {t_ns[late[0]] * 1e-9:.9g} s",
+            file=columns.path,
+            remedy=f"is the unit {time.unit}?",
+        )
     if time.epoch == "none":
         return t_ns, ["times have no calendar"]
     if time.epoch == "gps":

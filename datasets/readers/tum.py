@@ -58,7 +58,7 @@ def read(request: Request) -> list[Recording]:
     )
     recording = Recording(
         name=request.path.stem,
-        start_ns=int(truth.t_ns[0]),
+        start_ns=max(int(truth.t_ns[0]), 0),  # no recording starts before 1970
         truth=truth,
         truth_channels=truth_contents(truth),
         source="TUM trajectory",
