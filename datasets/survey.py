@@ -19,7 +19,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.catalog import CatalogFile, data_folders, load_catalog
+from terrafusion.datasets.catalog import DATA_VARIABLE, CatalogFile, data_folders, load_catalog
 from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.measures import Measures, measure
 from terrafusion.datasets.doctor.mounting import heading
@@ -84,7 +84,7 @@ class Estimate(float):
         return number
 
     def __str__(self) -> str:
-        return f"{float(self):.3g} [{self.low:.3g}, {self.high:.3g}]"
+        return f"{float(self):.4g} [{self.low:.4g}, {self.high:.4g}]"
 
 
 @dataclass(frozen=True)
@@ -380,8 +380,11 @@ QUANTITIES: dict[str, Callable[[Drives], Value | None]] = {
 
 
 def main() -> int:
-    """Print the table; 1 where a fact is wrong."""
+    """Print the table; 1 where a fact is wrong, or where there is no recording."""
     rows = list(survey(*sys.argv[1:2]))
+    if not rows:
+        print(f"error: no such recording here; set {DATA_VARIABLE}, or download it", file=sys.stderr)
+        return 1
     print(markdown(rows), end="")
     return int(any(row.verdict() == WRONG for row in rows))
 

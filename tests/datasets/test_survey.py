@@ -102,6 +102,14 @@ def test_quantities_of_a_known_drive(drive: Recording, tmp_path: Path) -> None:
         assert 0.9 < r <= 1.0
 
 
+def test_no_recording_is_told(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("sys.argv", ["survey", "no such set/*"])
+    assert survey.main() == 1
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert DATA_VARIABLE in err
+
+
 def test_the_table_of_one_set(
     field_sets: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
