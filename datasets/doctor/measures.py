@@ -33,8 +33,8 @@ LAG_PAIRS = {
     "speed": (("wheels", "gnss"), ("wheels", "truth"), ("command", "wheels")),
 }
 """By quantity: channels whose accounts of it are compared in time."""
-LEAST_R = 0.5
-"""A lag at a lower correlation is noise; it is not told."""
+LEAST_R, LEAST_TRACK_R = 0.5, 0.8
+"""A lag, and a track, at a lower correlation is noise; it is not told."""
 HELD = 0.8
 """A channel whose values change at less than this share of its rate is held."""
 
@@ -170,7 +170,7 @@ def _yaw(patients: Sequence[Patient]) -> YawFit | None:
     covariance = np.cov(turn, rate)
     r = float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
     metric = all(patient.wheel_radius_m() is not None for patient in patients)
-    track = float(covariance[0, 1] / covariance[1, 1]) if metric and abs(r) > LEAST_R else None
+    track = float(covariance[0, 1] / covariance[1, 1]) if metric and abs(r) > LEAST_TRACK_R else None
     return YawFit(r, track, len(turn) * WINDOW_S)
 
 

@@ -100,8 +100,8 @@ def _ranges(channel: Channel) -> dict[str, Any]:
     for column, values in channel.columns().items():
         if values.dtype == object:
             ranges[column] = dict(sorted(Counter(values.astype(str).tolist()).items()))
-        elif np.isfinite(values).any():
-            ranges[column] = [float(np.nanmin(values)), float(np.nanmax(values))]
+        elif (known := values[np.isfinite(values)]).size:
+            ranges[column] = [float(known.min()), float(known.max())]
     return ranges
 
 
@@ -183,4 +183,14 @@ def _common(words: Iterable[str]) -> str | None:
 
 
 def _plain(measures: Measures) -> dict[str, Any]:
-    return dataclasses.asdict(measures)
+    plain: dict[str, Any] = _finite(dataclasses.asdict(measures))
+    return plain
+
+
+def _finite(value: Any) -> Any:
+    """The same without numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value

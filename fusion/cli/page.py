@@ -12,6 +12,7 @@ from typing import Any
 
 WIDTH = 100
 INDENT = 10
+MOST_WORDS = 12
 Line = tuple[str, str]
 
 
@@ -91,11 +92,18 @@ def _ranges(channel: dict[str, Any]) -> str:
     parts = []
     for column, found in channel["ranges"].items():
         if isinstance(found, dict):
-            parts.append(_glued(f"{column} {', '.join(f'{word} {count}' for word, count in found.items())}"))
+            parts.append(f"{column} {_words(found)}")
         else:
             low, high = (format(value, ".3g") for value in found)
             parts.append(_glued(f"{column} {low}" if low == high else f"{column} {low} to {high}"))
     return "; ".join(parts)
+
+
+def _words(counts: dict[str, int]) -> str:
+    """The most frequent words of a column."""
+    told = sorted(counts, key=lambda word: -counts[word])[:MOST_WORDS]
+    more = [f"{len(counts) - len(told)} more"] if len(told) < len(counts) else []
+    return ", ".join([*(_glued(f"{word[:40]} {counts[word]}") for word in counts if word in told), *more])
 
 
 def _measured(measured: dict[str, Any]) -> Iterator[Line]:
