@@ -18,6 +18,9 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.sensors import Rig
 
 HEAD_BYTES = 4096
+MAP_SUFFIX = ".columns.yaml"
+"""Behind the name of a table, the name of its column map."""
+PARQUET_MAGIC = b"PAR1"
 
 
 @dataclass(frozen=True)
@@ -80,11 +83,15 @@ FORMATS: tuple[Format, ...] = (
     Format("tum", "a TUM trajectory", f"{_READERS}.tum"),
     Format("table", "a table (.csv, .tsv, .txt, .parquet) with a column map", f"{_READERS}.table"),
 )
-"""In the order in which they are asked; the first that claims a file reads it."""
+"""In the order in which they are asked; the first that claims a file reads it. Tables come last."""
 
 
-def format_of(path: Path) -> Format:
+def format_of(path: Path, *, mapped: bool = False) -> Format:
     """The format of a file or folder.
+
+    Args:
+        path: the file or folder.
+        mapped: a column map was given: text is a table then, as it is where a map lies beside it.
 
     Raises:
         DataError: it cannot be read, is empty, or no format claims it.
@@ -100,7 +107,9 @@ def format_of(path: Path) -> Format:
                 raise DataError("the file is empty", file=path, remedy="record or copy it again")
         elif not path.is_dir():
             raise DataError("is neither a file nor a folder", file=path, remedy="give a log")
-        found = next((form for form in FORMATS if form.claims(path, head)), None)
+        mapped = mapped or bool(head and path.with_name(path.name + MAP_SUFFIX).is_file())
+        table = FORMATS[-1] if mapped and _may_be_table(head) else None
+        found = table or next((form for form in FORMATS if form.claims(path, head)), None)
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
     if found is None:
@@ -111,3 +120,7 @@ def format_of(path: Path) -> Format:
             remedy=f"give {kinds}",
         )
     return found
+
+
+def _may_be_table(head: bytes) -> bool:
+    return head.startswith(PARQUET_MAGIC) or (bool(head) and b"\0" not in head)

@@ -50,7 +50,7 @@ def open_recordings(
     if stamps not in STAMPS:
         raise DataError(f"stamps is '{stamps}'", file=path, remedy=f"give one of {', '.join(STAMPS)}")
     place, number = _place(path)
-    form = format_of(place)
+    form = format_of(place, mapped=columns is not None)
     entry, conventions, notes = _known(place, form)
     if rig is not None and form.name in ("ros1", "ros2"):
         conventions = dataclasses.replace(conventions, imu_axes=BODY_AXES)  # the reader turns it by the rig

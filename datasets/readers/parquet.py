@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from terrafusion.datasets.decimals import NS_PER
 from terrafusion.datasets.errors import DataError
 
-MAGIC = b"PAR1"
 MAX_VALUES = 2**27
 """A gigabyte of numbers."""
 

@@ -28,9 +28,9 @@ from terrafusion.datasets.readers.column_map import (
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
-from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
-from terrafusion.datasets.readers.parquet import MAGIC, ParquetColumns
+from terrafusion.datasets.readers.parquet import ParquetColumns
 from terrafusion.datasets.readers.row_times import RowTimes, row_times
 from terrafusion.datasets.readers.text_columns import TextColumns
 from terrafusion.datasets.readers.units import units_of
@@ -39,7 +39,6 @@ from terrafusion.datasets.recording import Fix, Gnss, Recording
 Array = NDArray[np.float64]
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
-MAP_SUFFIX = ".columns.yaml"
 
 FIX_WORDS = {
     "nmea": {0: "none", 1: "single", 2: "dgps", 3: "single", 4: "fixed", 5: "float", 6: "none"},
@@ -65,7 +64,7 @@ class AnyColumns(Protocol):
 
 def claims(path: Path, head: bytes) -> bool:
     """Whether a file is Parquet, or text that ends as tables do (.txt, .dat: with rows of one length)."""
-    if head.startswith(MAGIC):
+    if head.startswith(PARQUET_MAGIC):
         return True
     if path.suffix.lower() not in (*SUFFIXES, *LOOSE_SUFFIXES) or b"\0" in head:
         return False
@@ -74,7 +73,7 @@ def claims(path: Path, head: bytes) -> bool:
     except UnicodeDecodeError as error:
         if error.start < len(head) - 3:  # else the head ends inside a character
             return False
-    if path.suffix.lower() in SUFFIXES or path.with_name(path.name + MAP_SUFFIX).is_file():
+    if path.suffix.lower() in SUFFIXES:
         return True
     lines = [line for _, line in head_lines(head, 20) if line.strip() and not line.startswith("#")]
     lengths = {len(split(line, separator_of(lines[0]))) for line in lines[: max(len(lines) - 1, 2)]}
@@ -88,7 +87,7 @@ def read(request: Request) -> list[Recording]:
     found = read_column_map(given) if request.columns or given.is_file() else None
     columns: AnyColumns
     with path.open("rb") as file:
-        parquet = file.read(len(MAGIC)) == MAGIC
+        parquet = file.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
     columns = ParquetColumns(path) if parquet else TextColumns(path, found)
     notes = [] if found is None else [f"columns as {given.name} says"]
     if found is None:

@@ -264,6 +264,17 @@ def test_the_map_may_lie_elsewhere(tmp_path: Path) -> None:
     assert open_recording(path, columns=tmp_path / "map.yaml").imu is not None
 
 
+def test_a_map_makes_a_table_of_any_text(tmp_path: Path) -> None:
+    """Also of one that another reader would take, in units that it does not have."""
+    text = "PacketCounter,SampleTimeFine,Acc_X,Gyr_X\n1,1000000,0.5,90\n2,1016667,0.5,90\n"
+    columns = "time: {column: SampleTimeFine, unit: us, epoch: none}\n"
+    columns += "channels: {imu: {gyro_x_radps: {column: Gyr_X, unit: deg/s}}}\n"
+    imu = open_recording(table(tmp_path, text, columns, "dot.log")).imu
+    assert imu is not None
+    assert imu.t_ns.tolist() == [1_000_000_000, 1_016_667_000]
+    np.testing.assert_allclose(imu.gyro_radps[:, 0], np.pi / 2)
+
+
 def test_without_a_map_the_error_is_one(tmp_path: Path) -> None:
     """What the error proposes is a valid map, and reads the file."""
     path = table(tmp_path, "time,gyro_x,gyro_y,gyro_z,acc_x,lat,lon,odd name\n0,1,2,3,4,48,11,9\n", None)
