@@ -72,9 +72,8 @@ def convert(
         recording, mended = treat(recording, rig)
         for finding in mended:
             print(f"mended: {_told(finding)}")
-    left_out = _write(log, recording, rig, out, overwrite)
-    for part in left_out:
-        print(f"left out: {part}")
+    for part in _write(log, recording, rig, out, overwrite):
+        print(f"not in standard messages: {part}")
     for finding in examine(recording, rig):
         if apply_fixes or finding.severity == "error":
             print(f"{finding.severity}: {_told(finding)}{_why_left(finding, apply_fixes)}")
@@ -83,7 +82,7 @@ def convert(
 
 
 def _write(log: str, recording: Recording, rig: Rig | None, out: Path, overwrite: bool) -> list[str]:
-    """Write the log; what an MCAP has no message for is returned."""
+    """Write the log; what ROS has no standard message for is returned."""
     from terrafusion.datasets.writers import write_log_folder, write_mcap
 
     if out.suffix != ".mcap":

@@ -93,14 +93,14 @@ def replay(
     if mcap:
         from terrafusion.datasets.writers.mcap import write_mcap
 
-        for left_out in write_mcap(
+        for part in write_mcap(
             recording,
             out / "estimate.mcap",
             result.estimate.trajectory,
             rig=result.vehicle.rig(),
             overwrite=True,
         ):
-            print(f"not in estimate.mcap: {left_out}")
+            print(f"not in standard messages: {part}")
     for line in summary(result):
         print(line)
     print(f"written to {out}")
