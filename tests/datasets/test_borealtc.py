@@ -28,7 +28,6 @@ TURNING = (
     "FLOORING/09",
     "ICE/00",
     "ICE/02",
-    "SNOW/10",
 )
 """Runs that turn both ways, so that the yaw rate's sign shows."""
 
