@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 TimesNs = NDArray[np.int64]
 
-HELD_SHARE = 0.5
+HELD_SHARE, LEAST_UPDATES = 0.5, 10
 STUCK_S, STUCK_ZERO_S, STUCK_ROWS = 2.0, 5.0, 20
 """A value that stays for so long, and so many updates, is stuck; wheels may well stand a while."""
 CLIPPED_ROWS = 10
@@ -108,7 +108,7 @@ def _held_share(t_ns: TimesNs, values: Array) -> tuple[float, float]:
     across = np.abs(values[2 * reach :] - values[: -2 * reach])
     changing = np.any(across > 0.1 * np.where(spread > 0, spread, np.inf), axis=1)
     same = np.all(values[reach:-reach] == values[reach - 1 : -reach - 1], axis=1)
-    if changing.sum() < 20:
+    if changing.sum() < 20 or (~same[changing]).sum() < LEAST_UPDATES:
         return 0.0, 1.0
     share = float(same[changing].mean())
     return share, 1.0 / max(1.0 - share, 1e-3)
