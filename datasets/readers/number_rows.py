@@ -29,6 +29,8 @@ from terrafusion.datasets.recording import ClockJump
 
 Array = NDArray[np.float64]
 
+MAX_LINES = 1_000_000
+"""83 minutes of a 200 Hz IMU, read in some 8 s and 0.6 GB; longer files are refused."""
 MAX_T_NS = 4 * 10**18
 """A time beyond this (year 2096) is none of a recording, and differences of times stay within 64 bits."""
 
@@ -79,6 +81,9 @@ def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, he
             its time. Times are not checked for order: `put_in_time` does that.
     """
     data = read_text(path)
+    if data.count(b"\n") > MAX_LINES:
+        remedy = "split it into shorter recordings"
+        raise DataError(f"has more than {MAX_LINES} lines", file=path, remedy=remedy)
     names = _header(path, data, columns, separator) if header else tuple(columns)
     layout = Layout(names, separator, first_line=2 if header else 1)
     try:

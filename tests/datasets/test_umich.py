@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers import open_recording, umich_text
+from terrafusion.datasets.readers import number_rows, open_recording, umich_text
 from terrafusion.datasets.recording import differences
 
 START_S = 1_652_300_000
@@ -199,6 +199,12 @@ def test_other_text_is_not_claimed(tmp_path: Path) -> None:
     assert not umich_text.claims(tmp_path / "x_imu.txt", b"t wx wy\n")
     (tmp_path / "notes.txt").write_text("1 2 3 4 5 6 7\n")
     assert not umich_text.claims(tmp_path / "notes.txt", b"1 2 3 4 5 6 7\n")
+
+
+def test_a_file_of_too_many_lines_is_refused(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(number_rows, "MAX_LINES", 2999)
+    with pytest.raises(DataError, match=r"trial4_wheel_imu\.txt: has more than 2999 lines"):
+        open_recording(trial / FAMILY[0])
 
 
 def test_a_huge_file_is_refused_unread(tmp_path: Path) -> None:
