@@ -1,6 +1,6 @@
 """The path by wheels and gyro beside the path by positions (GNSS, truth): its scale and its shape.
 
-Over windows of some seconds the dead-reckoned path is turned, scaled and moved onto the positions by
+Over windows of some metres the dead-reckoned path is turned, scaled and moved onto the positions by
 least squares (in the plane as complex numbers, one factor for scale and turn). Slip, a wrong radius
 and wrong units show in the scale; a wrong sign of the yaw rate shows where the mirrored path fits better.
 """
@@ -19,12 +19,14 @@ from terrafusion.datasets.recording import Recording
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-SHORTEST_S, LONGEST_S = 10.0, 60.0
-SIGMAS = 20.0
-"""A window is so long that the robot goes this many sigma in it, where its limits allow."""
+SHORTEST_M, SIGMAS, LONGEST_S = 6.0, 20.0, 60.0
+"""A window is so long that the wheels roll the first in it, and that many sigma, where the drive is long
+enough; but no longer than the last, since the gyro drifts."""
 LEAST_FIXES, LEAST_WINDOWS = 5, 5
 LEAST_COHERENCE = 0.9
 """Correlation of the two paths in a window below which its scale means nothing."""
+WHEEL_UNITS = (5e-4, 50.0)
+"""From speeds in mm/s to speeds taken for rates; beyond these it is the positions that have another unit."""
 BENDS = 6.0
 """Variance of the second difference of white noise over its own."""
 RESAMPLES, SEED = 400, 20_240_811
@@ -139,11 +141,22 @@ def compare(patient: Patient, true: Places) -> Windows | None:
     t_fix, g = true.t_s[inside], true.place[inside]
     if len(t_fix) < 2 * LEAST_FIXES:
         return None
-    mean_speed = max(float(rolled[-1] / (t[-1] - t[0])), 1e-3)
-    longest_s = max(SHORTEST_S, min(LONGEST_S, float(t_fix[-1] - t_fix[0]) / (LEAST_WINDOWS + 1)))
-    length_s = float(np.clip(SIGMAS * true.sigma_m / mean_speed, SHORTEST_S, longest_s))
-    window = ((t_fix - t_fix[0]) / length_s).astype(int)
+    way = rolled * _crude_scale(t, rolled, t_fix, g)
+    longest_m = max(SHORTEST_M, float(way[-1]) / (LEAST_WINDOWS + 1))
+    length_m = float(np.clip(SIGMAS * true.sigma_m, SHORTEST_M, longest_m))
+    passed = np.maximum(np.diff(way) / length_m, np.diff(t) / LONGEST_S)
+    window = np.interp(t_fix, t, np.concatenate([[0.0], np.cumsum(passed)])).astype(int)
     return _fit(window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * true.sigma_m))
+
+
+def _crude_scale(t: Array, rolled: Array, t_fix: Array, g: Complex) -> float:
+    """Way of the positions over way rolled, if it may be that of a unit: windows are the same in any unit."""
+    grid = np.arange(t_fix[0], t_fix[-1], 5.0)
+    total = float(rolled[-1])
+    if len(grid) < 2 or total <= 0.0:
+        return 1.0
+    ratio = float(np.abs(np.diff(np.interp(grid, t_fix, g))).sum()) / total
+    return ratio if WHEEL_UNITS[0] < ratio < WHEEL_UNITS[1] else 1.0
 
 
 def _antenna(patient: Patient) -> complex:
