@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +17,20 @@ ROWS = 1024
 class Db3File:
     """An open SQLite database of a ROS 2 bag.
 
+    Args:
+        path: the file.
+        counts: numbers of messages by topic where they are known; counting them takes a pass over the file.
+
     Raises:
         BagError: the file is cut off, or not such a database.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, counts: Mapping[str, int] | None = None) -> None:
         _refuse_cut(path)
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         self._database = sqlite3.connect(uri, uri=True)
         try:
-            self.sources = self._sources()
+            self.sources = self._sources(counts)
         except BaseException:
             self.close()
             raise
@@ -34,12 +38,14 @@ class Db3File:
     def close(self) -> None:
         self._database.close()
 
-    def _sources(self) -> list[Source]:
+    def _sources(self, known_counts: Mapping[str, int] | None) -> list[Source]:
         run = self._database.execute
         tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
             raise BagError("the database has no tables of topics and messages")
-        counts = dict(run("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+        counts: dict[int, int] = {}
+        if known_counts is None:
+            counts = dict(run("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
         definitions: dict[str, tuple[str, str]] = {}
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
@@ -48,7 +54,7 @@ class Db3File:
         for number, topic, name, encoding in run("SELECT id, name, type, serialization_format FROM topics"):
             language, text = definitions.get(name, ("", ""))
             known = LANGUAGES.get(language, "msg")
-            count = int(counts.get(number, 0))
+            count = int(counts.get(number, 0) if known_counts is None else known_counts.get(topic, 0))
             sources.append(
                 Source(int(number), str(topic), normal_type(str(name)), text, known, str(encoding), count)
             )

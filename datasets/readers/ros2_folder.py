@@ -57,7 +57,9 @@ class Ros2Folder:
                 path = folder / PurePosixPath(str(name)).name
                 if not path.is_file():
                     raise BagError(f"the file {path.name} is missing")
-                self._add(storage(self._unpacked(path) if mode == "file" else path))
+                path = self._unpacked(path) if mode == "file" else path
+                alone = storage is Db3File and len(names) == 1
+                self._add(Db3File(path, _counts(said)) if alone else storage(path))
         except BaseException:
             self.close()
             raise
@@ -120,6 +122,15 @@ def _unpacked_messages(batch: Batch) -> Batch:
     sizes = np.array([len(m) for m in messages], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     return batch._replace(data=np.frombuffer(b"".join(messages), dtype=np.uint8), starts=starts, sizes=sizes)
+
+
+def _counts(said: dict[str, Any]) -> dict[str, int] | None:
+    """Numbers of messages by topic, as the metadata tell them."""
+    try:
+        topics = said["topics_with_message_count"]
+        return {str(t["topic_metadata"]["name"]): int(t["message_count"]) for t in topics}
+    except (KeyError, TypeError, ValueError):
+        return None
 
 
 def _metadata(path: Path) -> dict[str, Any]:

@@ -42,22 +42,20 @@ def read_bag(request: Request, open_container: Callable[[Path], Container], reme
     try:
         with foreign():
             container = open_container(path)
+        try:
+            return _assemble(container, request)
+        finally:
+            container.close()
     except BagError as error:
-        raise DataError(f"cannot be read as a ROS bag: {error}", file=path, remedy=remedy) from None
-    try:
-        return _assemble(container, request)
-    except BagError as error:
-        raise DataError(
-            f"the bag breaks off: {error}", file=path, channel=error.topic, remedy=remedy
-        ) from None
-    finally:
-        container.close()
+        what = f"cannot be read as a ROS bag: {error}"
+        raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
 
 
 def _assemble(container: Container, request: Request) -> Recording:
     path, rig = request.path, request.rig
-    there = {(source.topic, source.msgtype) for source in container.sources}
-    if META in there and not request.topics and request.stamps == "header":
+    there = {(source.topic, source.msgtype) for source in container.sources if source.count}
+    chosen_otherwise = bool(request.topics) or request.stamps != "header"
+    if META in there and not chosen_otherwise:
         return restore(functools.partial(read_streams, container), there, path)
     joints = said_joints(request.topics)
     topics = _topics_of(container)
@@ -69,7 +67,9 @@ def _assemble(container: Container, request: Request) -> Recording:
         is_wheel_joints=lambda topic: _has_wheels(container, topic, joints),
     )
     streams = _streams(container, chosen)
-    notes += [f"{kind}: {chosen[kind].name} is empty after all" for kind in chosen.keys() - streams.keys()]
+    notes += [
+        f"{kind}: {topic.name} is empty after all" for kind, topic in chosen.items() if kind not in streams
+    ]
     if "gnss" not in streams:
         streams.pop("gnss_velocity", None)
     if not set(streams) - {"datum", "gnss_velocity"}:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -55,7 +56,8 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool,
     receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
     received_jumps: tuple[ClockJump, ...] = ()
     if repair_clock:
-        receipt, received_jumps = repair_together(receipt)
+        with _told_of(file):
+            receipt, received_jumps = repair_together(receipt)
     headed = _headed(timing, stamps)
     headed, header_jumps = _on_one_clock(timing, headed, receipt, repair_clock, file)
     others = {kind: t for kind, t in receipt.items() if kind not in headed}
@@ -93,7 +95,7 @@ def _headed(timing: Timing, stamps: str) -> Times:
         late = _latencies(timing, headed, {kind: timing.streams[kind].receipt_ns for kind in headed})
         timing.notes.append("times are receipt stamps, as asked" + (f"; {late}" if late else ""))
         return {}
-    for kind in found.keys() - headed.keys():
+    for kind in (kind for kind in found if kind not in headed):
         topic = timing.streams[kind].topic
         timing.notes.append(f"{topic}: header stamps are all zero; receipt stamps are used")
     if not found:
@@ -114,15 +116,13 @@ def _on_one_clock(
             _refuse_backwards(
                 timing.streams[kind], t_ns, "header", f"{RECEIPT} or {REPAIR}" if in_time else REPAIR, file
             )
+    jumps: tuple[ClockJump, ...] = ()
     beside = {kind: receipt[kind] for kind, t in headed.items() if _same_rate(t, receipt[kind])}
-    repaired, jumps = repair_together(headed, beside=beside)
     if repair_clock:
-        headed = repaired
-    elif jumps:
-        timing.notes.append(
-            f"the header clock leaps ahead by {jumps[0].step_s:.3f} s and the recorder's does not "
-            f"({len(jumps)} such steps); to take that out, {REPAIR}"
-        )
+        with _told_of(file):
+            headed, jumps = repair_together(headed, beside=beside)
+    else:
+        timing.notes += _leaps(headed, beside)
     spread_s, far = _spread(headed, receipt)
     if spread_s > CLOCK_TOLERANCE_S:
         timing.notes.append(
@@ -131,7 +131,30 @@ def _on_one_clock(
         )
         return {}, ()
     timing.notes.append(f"times are header stamps; {_latencies(timing, headed, receipt)}")
-    return headed, jumps if repair_clock else ()
+    return headed, jumps
+
+
+@contextmanager
+def _told_of(file: Path) -> Iterator[None]:
+    """Errors that name the file too."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(error.what, file=file, channel=error.channel, remedy=error.remedy) from None
+
+
+def _leaps(headed: Times, beside: Times) -> list[str]:
+    """A note on header stamps that leap ahead where the receipt stamps do not."""
+    try:
+        _, jumps = repair_together(headed, beside=beside)
+    except DataError:
+        return ["the header clock leaps ahead of the recorder's all the time"]
+    if not jumps:
+        return []
+    return [
+        f"the header clock leaps ahead by {jumps[0].step_s:.3f} s and the recorder's does not "
+        f"({len(jumps)} such steps); to take that out, {REPAIR}"
+    ]
 
 
 def _refuse_zeros(stream: Stream, header_ns: TimesNs, file: Path) -> None:
@@ -187,7 +210,7 @@ def _most_frequent(times: Times) -> str:
 def _spread(headed: Times, receipt: Times) -> tuple[float, str]:
     """Largest distance (s) of a header clock to that of the most frequent one, and whose it is."""
     far = dict.fromkeys(headed, 0.0)
-    for kind in headed.keys() - {_most_frequent(headed)}:
+    for kind in (kind for kind in headed if kind != _most_frequent(headed)):
         apart = receipt[kind] - headed[kind] - _offset_at(headed, receipt, receipt[kind])
         far[kind] = abs(float(np.median(apart))) * 1e-9
     worst = max(far, key=far.__getitem__)
