@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import os
 import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -163,3 +165,23 @@ def test_any_recording_survives_the_mcap(recording: Recording) -> None:
         write_mcap(recording, Path(scratch) / "log.mcap")
         back = open_recording(Path(scratch) / "log.mcap")
     assert differences(recording, back) == []
+
+
+FIELD_LOGS = (
+    "husky_parkinglot/test1",
+    "wvu_pathfinder/s5t1",
+    "umich_husky/mair_mocap/trial1",
+    "borealtc/ICE/01",
+    "norlab_drive/grass_2024_7_29_14h46s15/raw",
+    "norlab_drive/sand_2024_9_25_14h13s47/windows#0",
+)
+
+
+@pytest.mark.parametrize("name", FIELD_LOGS)
+def test_field_logs_survive_both(name: str, tmp_path: Path) -> None:
+    if not os.environ.get("TERRAFUSION_DATA"):
+        pytest.skip("TERRAFUSION_DATA is not set: the field logs are not at hand")
+    recording = open_recording(name)
+    write_mcap(recording, tmp_path / "log.mcap")
+    for path in (write_log_folder(recording, tmp_path / "log"), tmp_path / "log.mcap"):
+        assert differences(recording, open_recording(path)) == []
