@@ -43,8 +43,9 @@ def convert(
 ) -> None:
     """Convert a log to a log folder, or to a ROS 2 MCAP file when OUT ends in .mcap.
 
-    The numbers stay as they are, unless `--apply-fixes` asks for the input doctor's repairs: then each is
-    printed and kept as a note of the log, and so is what could not be mended.
+    Numbers stay as they are unless `--apply-fixes` asks for the input doctor's
+    repairs. Each repair is printed and kept as a note of the log; what could
+    not be mended is printed, too.
 
     Examples:
 

@@ -33,8 +33,9 @@ def inspect(
 ) -> None:
     """Show what a log holds, what its channels say of each other, and what the input doctor finds.
 
-    Changes nothing: `terrafusion convert --apply-fixes` makes the repairs that are offered. Steps of a
-    clock are told as findings. Several recordings in one file are summed up; LOG#0 shows the first alone.
+    Changes nothing; `terrafusion convert --apply-fixes` makes the repairs that
+    are offered. Steps of a clock are findings, too. Several recordings in one
+    file are summed up; LOG#0 shows the first alone.
 
     Examples:
 
