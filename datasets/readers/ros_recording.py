@@ -54,11 +54,12 @@ REMEDY = "write the bag again, or choose its topics with --topic"
 
 @dataclass(frozen=True)
 class Saved:
-    """The content of `/terrafusion/meta`: the columns of each table, and texts by column."""
+    """The content of `/terrafusion/meta`: the columns of each table, texts by column, lateness of stamps."""
 
     meta: Meta
     tables: dict[str, list[str]]
     words: dict[str, list[str]]
+    shift_ns: int
 
 
 def restore(
@@ -86,7 +87,9 @@ def restore(
     tables = ChannelReader(_BagTables(saved, file, streams), saved.meta, LAYOUTS)
     builder = Builder(file, None, Conventions(), saved.meta.start_ns, {})
     channels = {
-        name: getattr(tables, name)() if name in saved.tables else _standard(builder, name, streams.get(name))
+        name: getattr(tables, name)()
+        if name in saved.tables
+        else _standard(builder, name, streams.get(name), saved.shift_ns)
         for name in CHANNELS
     }
     return recording_of(channels, saved.meta, file.stem, tables.notes)
@@ -95,26 +98,31 @@ def restore(
 def _parse(stream: Stream, file: Path) -> Saved:
     try:
         content = json.loads(stream.column("data")[0])
-        tables, words = content.pop("tables"), content.pop("words")
+        tables, words, shift_ns = (content.pop(key) for key in ("tables", "words", "shift_ns"))
         for lists in (tables, words):
             if not all(isinstance(text, str) for key, texts in lists.items() for text in [key, *texts]):
                 raise TypeError("tables and words are lists of texts")
+        if not 0 <= int(shift_ns) < 2**62:
+            raise ValueError("not a time")
     except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise DataError(
             "is not what this library writes", file=file, channel=META[0], remedy=REMEDY
         ) from None
-    return Saved(dataclasses.replace(parse_meta(content, file), keep_empty=True), tables, words)
+    return Saved(
+        dataclasses.replace(parse_meta(content, file), keep_empty=True), tables, words, int(shift_ns)
+    )
 
 
-def _standard(builder: Builder, name: str, stream: Stream | None) -> Any:
+def _standard(builder: Builder, name: str, stream: Stream | None, shift_ns: int) -> Any:
     """A channel from its standard messages, whose stamps are its times."""
     if stream is None or not len(stream) or stream.header_ns is None:
         return None
+    t_ns = stream.header_ns - shift_ns
     if name == "wheels":
-        return builder.wheels(stream, stream.header_ns, None)[0]
+        return builder.wheels(stream, t_ns, None)[0]
     if name == "truth":
-        return builder.truth(stream, stream.header_ns)[0]
-    return getattr(builder, name)(stream, stream.header_ns)
+        return builder.truth(stream, t_ns)[0]
+    return getattr(builder, name)(stream, t_ns)
 
 
 class _BagTables:
@@ -144,7 +152,7 @@ class _BagTables:
         if not ((np.abs(stamps) < 2**32) & (stamps == np.rint(stamps))).all():
             raise self._error(channel, "stamps that are no times")
         seconds, nanoseconds = stamps.astype(np.int64).T
-        t_ns = seconds * 10**9 + nanoseconds - self.saved.meta.start_ns
+        t_ns = seconds * 10**9 + nanoseconds - self.saved.shift_ns - self.saved.meta.start_ns
         if (np.diff(t_ns) < 0).any():
             raise self._error(channel, "stamps that run backwards")
         numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tempfile
 from collections.abc import Iterator
@@ -59,17 +60,23 @@ def write_mcap(
         Sentences on what is not in standard messages, and so only seen by this library.
 
     Raises:
-        DataError: the file exists, cannot be written, or a time outside 1970 to 2038. ConfigError:
+        DataError: the file exists, cannot be written, or a time after 2038. ConfigError:
             a text, position or datum that the log folder would not take either.
     """
     path = Path(path)
     if path.is_dir() or (path.exists() and not overwrite):
         raise DataError("exists already", file=path, remedy="remove it or give another name")
+    saved = meta_of(recording, path, path.stem)
+    shift_ns = _shift_ns(recording)
+    recording = _later(recording, shift_ns)
     parts = _Parts(recording, rig)
+    if shift_ns:
+        parts.unseen.append(f"times before 1970: stamps are {shift_ns // 10**9} s later")
     topics = list(parts.standard())
     if estimate is not None:
+        estimate = dataclasses.replace(estimate, t_ns=estimate.t_ns + shift_ns)
         topics.append(ros.trajectory("/odometry/filtered", estimate, "base_link"))
-    saved = {**meta_of(recording, path, path.stem), **parts.saved()}
+    saved |= {**parts.saved(), "shift_ns": shift_ns}
     start_ns = min([recording.start_ns, *(int(t.t_ns[0]) for t in topics if len(t.t_ns))])
     topics = [ros.text(META[0], start_ns, json.dumps(saved)), *parts.once(start_ns), *topics]
     for topic in topics:
@@ -89,11 +96,24 @@ def write_mcap(
     return tuple(parts.unseen)
 
 
+def _shift_ns(recording: Recording) -> int:
+    """Whole seconds, in ns, that bring the first time up to 1970: a log without a date starts at 0."""
+    channels = (*recording.channels().values(), recording.truth)
+    first = min((int(c.t_ns[0]) for c in channels if c is not None and len(c)), default=0)
+    return max(-(first // 10**9), 0) * 10**9
+
+
+def _later(recording: Recording, shift_ns: int) -> Recording:
+    parts = {name: getattr(recording, name) for name in (*Recording.CHANNELS, "truth")}
+    moved = {n: dataclasses.replace(p, t_ns=p.t_ns + shift_ns) for n, p in parts.items() if p is not None}
+    return dataclasses.replace(recording, start_ns=recording.start_ns + shift_ns, **moved)
+
+
 def _check_times(topic: Topic, path: Path) -> None:
     for t in topic.t_ns[:1].tolist() + topic.t_ns[-1:].tolist():
-        if not 0 <= t < END_NS:
+        if t >= END_NS:
             raise DataError(
-                f"time {t} ns", file=path, channel=topic.name, remedy="ROS has times from 1970 to 2038"
+                f"time {t} ns", file=path, channel=topic.name, remedy="ROS has no time after 2038"
             )
 
 

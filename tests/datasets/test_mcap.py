@@ -290,10 +290,13 @@ def test_a_bag_that_was_recorded_again(drive: Recording, tmp_path: Path, storage
 
 def test_topics_that_are_asked_for_are_taken(drive: Recording, tmp_path: Path) -> None:
     write_mcap(drive, tmp_path / "a.mcap", drive.truth)
-    asked = open_recording(tmp_path / "a.mcap", topics={"wheels": "/odometry/filtered"}).wheels
-    assert asked is not None
-    assert asked.unit == "mps"
+    asked = open_recording(tmp_path / "a.mcap", topics={"wheels": "/odometry/filtered"})
+    assert asked.wheels is not None
+    assert asked.wheels.unit == "mps"
+    assert any("/terrafusion is not used" in note for note in asked.notes)
 
+
+START_NS = 1_700_000_000_123_456_789
 
 META_FAULTS = {
     "no JSON": lambda meta: "{",
@@ -304,6 +307,7 @@ META_FAULTS = {
     "fewer columns": lambda meta: json.dumps(meta | {"tables": {"motor": ["left_a", "right_a"]}}),
     "twice a column": lambda meta: json.dumps(meta | {"tables": {"motor": ["left_a"] * 4}}),
     "no such word": lambda meta: json.dumps(meta | {"words": {"fix": ["none"], "label": []}}),
+    "no shift": lambda meta: json.dumps(meta | {"shift_ns": "late"}),
     "unknown key": lambda meta: json.dumps(meta | {"colour": "red"}),
 }
 
@@ -322,12 +326,25 @@ def test_a_broken_account_of_the_tables_is_told(
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("start_ns", [-1, 2**31 * 10**9])
-def test_times_that_ros_does_not_have(drive: Recording, tmp_path: Path, start_ns: int) -> None:
-    imu = Imu(np.array([start_ns]), np.ones((1, 3)), np.ones((1, 3)))
-    with pytest.raises(TerrafusionError, match="1970 to 2038"):
+def test_a_time_that_ros_does_not_have(tmp_path: Path) -> None:
+    imu = Imu(np.array([2**31 * 10**9]), np.ones((1, 3)), np.ones((1, 3)))
+    with pytest.raises(TerrafusionError, match="no time after 2038"):
         write_mcap(Recording("x", 0, imu=imu), tmp_path / "a.mcap")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_times_before_the_start_of_a_log_without_a_date(drive: Recording, tmp_path: Path) -> None:
+    assert drive.imu is not None
+    assert drive.motor is not None
+    recording = Recording(
+        "a",
+        0,
+        imu=dataclasses.replace(drive.imu, t_ns=drive.imu.t_ns - START_NS - 1),
+        motor=dataclasses.replace(drive.motor, t_ns=drive.motor.t_ns - START_NS - 470_000_000),
+    )
+    unseen = write_mcap(recording, tmp_path / "a.mcap")
+    assert any("stamps are 1 s later" in sentence for sentence in unseen)
+    assert differences(recording, open_recording(tmp_path / "a.mcap")) == []
 
 
 @pytest.mark.parametrize("error", [OSError(28, "No space left on device"), KeyboardInterrupt()])

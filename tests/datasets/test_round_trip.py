@@ -118,7 +118,7 @@ def truths(draw: st.DrawFn, t_ns: np.ndarray) -> Trajectory:
 def recordings(draw: st.DrawFn, latest_ns: int) -> Recording:
     """Recordings with at least one sample, within 1e9 s of their start."""
     start_ns = draw(st.one_of(st.just(0), st.integers(0, latest_ns)))
-    first_ns, last_ns = max(start_ns - 10**18, 0), min(start_ns + 10**18, latest_ns)
+    first_ns, last_ns = start_ns - 10**18, min(start_ns + 10**18, latest_ns)
     found = draw(channels(first_ns, start_ns, last_ns).filter(lambda c: any(map(len, c.values()))))
     positive = st.floats(0.05, 2.0)
     place = st.none() | st.tuples(*[st.floats(-20.0, 20.0)] * 3)
@@ -159,7 +159,7 @@ def test_any_recording_survives_the_log_folder(recording: Recording) -> None:
 
 
 @CHECKED
-@given(recordings(latest_ns=2**31 * S - 1))
+@given(recordings(latest_ns=10**18))
 def test_any_recording_survives_the_mcap(recording: Recording) -> None:
     with tempfile.TemporaryDirectory() as scratch:
         write_mcap(recording, Path(scratch) / "log.mcap")
