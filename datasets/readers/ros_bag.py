@@ -54,8 +54,7 @@ def read_bag(request: Request, open_container: Callable[[Path], Container], reme
 def _assemble(container: Container, request: Request) -> Recording:
     path, rig = request.path, request.rig
     there = {(source.topic, source.msgtype) for source in container.sources if source.count}
-    chosen_otherwise = bool(request.topics) or request.stamps != "header"
-    if META in there and not chosen_otherwise:
+    if META in there and not request.topics and request.stamps == "header":
         return restore(functools.partial(read_streams, container), there, path)
     joints = said_joints(request.topics)
     topics = _topics_of(container)
@@ -67,6 +66,8 @@ def _assemble(container: Container, request: Request) -> Recording:
         is_wheel_joints=lambda topic: _has_wheels(container, topic, joints),
     )
     streams = _streams(container, chosen)
+    if META in there:
+        notes.append(f"{META[0].rpartition('/')[0]} is not used: topics or stamps were asked for")
     notes += [
         f"{kind}: {topic.name} is empty after all" for kind, topic in chosen.items() if kind not in streams
     ]
