@@ -17,9 +17,10 @@ from terrafusion.datasets.conventions import true_updates
 from terrafusion.datasets.doctor.accounts import speeds, yaw_rates
 from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.magnitude import check_magnitude
+from terrafusion.datasets.doctor.pairs import far_lag
 from terrafusion.datasets.doctor.path import Places, Windows, compare, dead_reckoned, places, scale_of
 from terrafusion.datasets.doctor.turning import LEAST_WINDOWS, WINDOW_S, accounts
-from terrafusion.datasets.lag import held_rows, lag_between
+from terrafusion.datasets.lag import held_rows
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.sensors import Rig
 
@@ -239,8 +240,7 @@ def _lags(patient: Patient) -> Iterator[PairLag]:
         for one, other in pairs:
             if one not in signals or other not in signals:
                 continue
-            (t_one, a), (t_other, b) = signals[one], signals[other]
-            lag = lag_between((t_one - t_one[0]) * 1e-9, a, (t_other - t_one[0]) * 1e-9, b)
+            lag = far_lag(signals[one], signals[other])
             if lag is None or lag.r < LEAST_R:
                 continue
             late, low, high = float(lag.seconds), float(lag.low_s), float(lag.high_s)

@@ -92,7 +92,7 @@ def _ranges(channel: dict[str, Any]) -> str:
     parts = []
     for column, found in channel["ranges"].items():
         if isinstance(found, dict):
-            parts.append(f"{column} {_words(found)}")
+            parts.append(f"{column}{GLUE}{_words(found)}")
         else:
             low, high = (format(value, ".3g") for value in found)
             parts.append(_glued(f"{column} {low}" if low == high else f"{column} {low} to {high}"))

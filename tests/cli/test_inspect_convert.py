@@ -153,7 +153,7 @@ def test_page_tells_the_same_and_fits(known_log: Path, capsys: pytest.CaptureFix
         "licence MIT; a test",
         "along +y",
         "effective track 0.79",
-        "gnss over wheels 0.95",
+        "gnss over wheels 0.9",
         "wheels after imu by 0.",
         "wheels: 5",
         "[imu-axes]",
