@@ -213,7 +213,7 @@ def _whole(patient: Patient, true: Places) -> Windows | None:
     reckoned = dead_reckoned(patient)
     if reckoned is None:
         return None
-    t, v, path = reckoned
+    t, _, path = reckoned
     inside = (true.t_s >= t[0]) & (true.t_s <= t[-1])
     n = int(inside.sum())
     if n < 3:
@@ -223,9 +223,13 @@ def _whole(patient: Patient, true: Places) -> Windows | None:
     pp, gg, pg = np.vdot(p, p).real, np.vdot(g, g).real, abs(np.vdot(p, g))
     if min(pp, gg) <= n * max(LEAST_SPREAD_M, 3.0 * true.sigma_m) ** 2:
         return None
-    residual = np.sqrt(max(gg - pg**2 / pp, 0.0) / max(2 * n - 4, 1))
-    row = (pg / pp, pg / np.sqrt(pp * gg), np.abs(v).mean(), pp, residual)
-    return Windows(*(np.array([float(value)]) for value in row))
+    return Windows(
+        scale=np.array([pg / pp]),
+        coherence=np.array([pg / np.sqrt(pp * gg)]),
+        weight=np.array([pp]),
+        span_ratio=np.array([np.sqrt(gg / pp)]),
+        scatter_m=np.array([np.nan]),  # not told by so few
+    )
 
 
 def _lags(patient: Patient) -> Iterator[PairLag]:
