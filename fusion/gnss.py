@@ -27,6 +27,9 @@ UNKNOWN_HEIGHT_SIGMA_M = 100.0
 LARGE_TURN_RAD = 0.05
 WHITE_SHARE = 0.2
 """Share of a fix's variance that is new at every fix; the rest drifts slowly."""
+OPTIMISM = 3.0
+"""A stand-alone receiver may claim so many times less than its data sheet and drift all the same; one
+that claims even less has fixes of a better class (RTK), which drift in proportion to what they claim."""
 
 
 class GnssUpdater:
@@ -45,6 +48,7 @@ class GnssUpdater:
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         spec = config.rig.sensors.gnss
+        self.sheet_sigma_m = spec.sigma_horizontal_m
         self.drift_sigma_m = spec.sigma_horizontal_m * float(np.sqrt(1.0 - WHITE_SHARE))
         self.drift_time_s = max(spec.correlation_time_s, 0.1)
         # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
@@ -98,10 +102,11 @@ class GnssUpdater:
         accel_world = R @ (node.accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
         lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
         predicted = np.asarray(state.pose.translation()) + R @ lever
-        sigma = self._white_sigma(fix, row)
-        innovation = fix.enu_m - predicted - np.append(state.drift, 0.0)
+        share = self._drift_share(fix, row)
+        sigma = self._white_sigma(fix, row, share)
+        innovation = fix.enu_m - predicted - np.append(share * state.drift, 0.0)
         J = np.zeros((3, DIM))
-        J[:, POSE], J[:, DRIFT] = antenna_jacobian(R, lever), np.eye(3)[:, :2]
+        J[:, POSE], J[:, DRIFT] = antenna_jacobian(R, lever), share * np.eye(3)[:, :2]
         P = J @ covariance @ J.T
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
         P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * row.gnss_inflation) ** 2
@@ -115,7 +120,7 @@ class GnssUpdater:
         if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
             fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
             sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
-        chain.add_fix(k, GnssPosition(fix.enu_m, lever, sigma))
+        chain.add_fix(k, GnssPosition(fix.enu_m, lever, sigma, share))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
@@ -126,12 +131,16 @@ class GnssUpdater:
         self.last_used_ns = fix.t_ns
         return True
 
-    def _white_sigma(self, fix: GnssFix, row: SensorNoise) -> Array:
+    def _drift_share(self, fix: GnssFix, row: SensorNoise) -> float:
+        """How much of the receiver's drift is in this fix, 0 to 1."""
+        claimed = float(np.max(fix.sigma_m[:2])) * row.gnss_inflation
+        return min(1.0, OPTIMISM * claimed / self.sheet_sigma_m)
+
+    def _white_sigma(self, fix: GnssFix, row: SensorNoise, share: float) -> Array:
         """1 sigma (3,) of what is new in a fix, beyond the drift that is a state."""
         reported = fix.sigma_m * row.gnss_inflation
-        level = np.sqrt(
-            np.maximum(reported[:2] ** 2 - self.drift_sigma_m**2, WHITE_SHARE * reported[:2] ** 2)
-        )
+        drift_m = share * self.drift_sigma_m
+        level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, WHITE_SHARE * reported[:2] ** 2))
         return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
 
     @staticmethod

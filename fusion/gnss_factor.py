@@ -2,12 +2,13 @@
 
 Residual (3,), world frame, metres::
 
-    r = p + R lever + (drift, 0) - fix
+    r = p + R lever + share (drift, 0) - fix
 
 A receiver repeats its error for tens of seconds (atmosphere, multipath). Were
 its fixes taken for independent, their average would turn the heading and the
 gyro bias after it; as a Gauss-Markov state the drift takes the blame instead
-(Schmidt-Kalman tradition; Groves 2013, Principles of GNSS, ch. 14.2.6).
+(Schmidt-Kalman tradition; Groves 2013, Principles of GNSS, ch. 14.2.6). The drift is that of a fix of
+the receiver's data sheet; one of a far better class has a small `share` of it.
 """
 
 from __future__ import annotations
@@ -29,18 +30,19 @@ class GnssPosition:
     enu_m: Array
     lever_m: Array
     sigma_m: Array
+    drift_share: float = 1.0
 
 
 def residual(fix: GnssPosition, pose: Any, drift_m: Array) -> Array:
     """The residual of the module's docstring, unwhitened."""
     antenna = pose.translation() + pose.rotation().matrix() @ fix.lever_m
-    return np.asarray(antenna + np.append(drift_m, 0.0) - fix.enu_m)
+    return np.asarray(antenna + np.append(fix.drift_share * drift_m, 0.0) - fix.enu_m)
 
 
 def jacobians(fix: GnssPosition, pose: Any) -> tuple[Array, Array]:
     """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the drift (3, 2)."""
     R = pose.rotation().matrix()
-    return antenna_jacobian(R, fix.lever_m), np.eye(3)[:, :2]
+    return antenna_jacobian(R, fix.lever_m), fix.drift_share * np.eye(3)[:, :2]
 
 
 def antenna_jacobian(R: Array, lever: Array) -> Array:

@@ -214,7 +214,7 @@ def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
 def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose, h = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), 1e-6
-    fix = GnssPosition(rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), np.ones(3))
+    fix = GnssPosition(rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), np.ones(3), drift_share=0.3)
     drift = rng.normal(0, 1, 2)
     H_pose, H_drift = gnss_factor.jacobians(fix, pose)
     for i in range(6):

@@ -9,7 +9,7 @@ import pytest
 
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.recording import Fix, Recording
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate
@@ -252,6 +252,25 @@ def test_every_fifth_fix_is_kept_back_without_truth(mixed: Recording) -> None:
     assert np.isin(held.t_ns, used.t_ns).sum() == 0
     used, held = split_fixes(mixed, [])
     assert held is None
+
+
+def test_rtk_fixes_are_believed_on_a_robot_whose_sheet_says_metres() -> None:
+    """The vehicle's receiver drifts by metres, but what the log holds are fixes of 1 cm: another receiver."""
+    drive = simulate("figure_eight", vehicle="pathfinder", terrain="asphalt", seed=3)
+    exact = simulate("figure_eight", vehicle="pathfinder", terrain="asphalt", noiseless=True).gnss
+    assert exact is not None
+    rng = np.random.default_rng(4)
+    fixes = dataclasses.replace(
+        exact,
+        enu_m=exact.enu_m + rng.normal(0.0, 0.01, exact.enu_m.shape),
+        sigma_enu_m=np.full_like(exact.enu_m, 0.01),
+        fix=np.full(len(exact), Fix.FIXED, dtype=np.uint8),
+        velocity_enu_mps=None,
+        sigma_v_mps=None,
+    )
+    scores = replay(dataclasses.replace(drive, gnss=fixes), vehicle="pathfinder", mode="fixed").scores
+    assert scores.errors is not None
+    assert np.nanmedian(scores.errors.distance_m()) < 0.05
 
 
 def test_a_log_of_an_unknown_robot_is_refused_or_run_with_its_own_geometry(mixed: Recording) -> None:
