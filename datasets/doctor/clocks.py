@@ -151,7 +151,7 @@ def clock_drifts(recording: Recording, pairs: Pairs) -> dict[Pair, Drift]:
     """Drifts of the second clock of a pair against the first: durations differ, and lags grow alike."""
     clocks, found = clocks_of(recording), {}
     for pair, signals in pairs.items():
-        spans = [float(clocks[name][-1] - clocks[name][0]) for name in pair]
+        spans = [float(clocks[name][-1]) - float(clocks[name][0]) for name in pair]
         rate = spans[1] / spans[0] - 1.0 if spans[0] > 0.0 else 0.0
         if LEAST_DRIFT < abs(rate) < MOST_DRIFT:
             drift = _drift(*signals, rate)
@@ -203,7 +203,7 @@ def _growing_lag(one: Signal, other: Signal, anchor: int) -> tuple[float, float,
 
 def _odd_duration(recording: Recording, names: set[str]) -> str:
     """The channel whose duration is furthest from the median of all; of equals the one of lowest rate."""
-    spans = {name: float(t[-1] - t[0]) for name, t in clocks_of(recording).items()}
+    spans = {name: float(t[-1]) - float(t[0]) for name, t in clocks_of(recording).items()}
     median = float(np.median(list(spans.values())))
     oddness = {name: round(abs(spans[name] / median - 1.0), 4) for name in names}
     return max(sorted(names), key=lambda name: (oddness[name], period_s(clocks_of(recording)[name])))

@@ -57,4 +57,4 @@ class Patient:
 
     def since_start_s(self, t_ns: np.int64) -> float:
         """Seconds from the start of the recording."""
-        return float(t_ns - self.recording.start_ns) * 1e-9
+        return (int(t_ns) - self.recording.start_ns) * 1e-9  # int: far times overflow int64

@@ -33,7 +33,7 @@ Array = NDArray[np.float64]
 
 LEAST_LAG_S = dict.fromkeys(YAW_PAIRS, 0.1) | dict.fromkeys(SPEED_PAIRS, 0.2)
 """Smaller lags are no finding; slip bends the speed of wheels, so that theirs may be larger."""
-GRID_S, LONGEST_MEAN_S = 0.02, 2.0
+GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
 
 
 def lags(patient: Patient) -> dict[str, Lag]:
@@ -114,7 +114,7 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
     from scipy.ndimage import uniform_filter1d
 
     start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
-    grid = np.arange(0.0, (end - start) * 1e-9, GRID_S)
+    grid = np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S)
     a, a_known = _on(grid, one, start)
     b, b_known = _on(grid + lag.seconds, other, start)
     known = a_known & b_known
@@ -135,7 +135,7 @@ def _opposed(lag: Lag, one: Signal, other: Signal) -> bool:
     from scipy.ndimage import uniform_filter1d
 
     start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
-    grid = np.arange(0.0, (end - start) * 1e-9, GRID_S)
+    grid = np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S)
     if len(grid) < 2:
         return False
     width = round(0.5 / GRID_S)

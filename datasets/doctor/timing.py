@@ -40,7 +40,7 @@ def check_spans(patient: Patient) -> Iterator[Finding]:
     own, others = clocks[lonely], [clocks[name] for name in clocks if name != lonely]
     begins, ends = min(int(t[0]) for t in others), max(int(t[-1]) for t in others)
     late = own[0] > ends
-    alike = abs((own[-1] - own[0]) - (ends - begins)) <= SAME_SPAN * (ends - begins)
+    alike = abs(int(own[-1]) - int(own[0]) - (ends - begins)) <= SAME_SPAN * (ends - begins)
     yield Finding(
         "no-common-time",
         "error",
