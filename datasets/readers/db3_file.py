@@ -11,7 +11,8 @@ import numpy as np
 from terrafusion.datasets.readers.ros_raw import BagError, Batch, Groups, Source, grouped, normal_type
 
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
-ROWS = 1024
+BLOCK_BYTES, MAX_ROWS = 1 << 21, 8192
+"""So many bytes of messages are fetched at once, and at most so many rows."""
 
 
 class Db3File:
@@ -66,11 +67,13 @@ class Db3File:
         marks = ", ".join("?" * len(topics))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
         rows = self._database.execute(query, topics)
-        while block := rows.fetchmany(ROWS):
+        count = 16
+        while block := rows.fetchmany(count):
             numbers, times, blobs = zip(*block, strict=True)
             ids, receipt_ns = np.array(numbers, dtype=np.int64), np.array(times, dtype=np.int64)
             sizes = np.fromiter(map(len, blobs), dtype=np.int64, count=len(blobs))
             starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+            count = int(np.clip(BLOCK_BYTES * len(sizes) // max(int(sizes.sum()), 1), 1, MAX_ROWS))
             data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
             for group, mine in grouped(ids, wanted):
                 yield Batch(group, data, starts[mine], sizes[mine], receipt_ns[mine])
