@@ -1,4 +1,4 @@
-"""Decimal numbers as they were written -> whole nanoseconds, exactly and many at once."""
+"""Times as they were written, decimal or ISO 8601 -> whole nanoseconds, exactly and many at once."""
 
 from __future__ import annotations
 
@@ -13,10 +13,11 @@ NS_PER = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1}
 
 MAX_CHARACTERS = 40
 _LIMIT_NS = 2**63 - 1
+FIRST_YEAR, LAST_YEAR = 1900, 2200
 
 
 class NotADecimal(ValueError):  # noqa: N818 - it names what the cell is
-    """The text at `row` is not a decimal number, or none that fits into int64 nanoseconds."""
+    """The text at `row` is no decimal number or date, or none that fits into int64 nanoseconds."""
 
     def __init__(self, row: int) -> None:
         super().__init__(f"row {row}")
@@ -45,6 +46,23 @@ def to_ns(texts: Sequence[str], unit: str = "s") -> NDArray[np.int64]:
     for i in np.flatnonzero(~plain).tolist():
         value[i] = _one_to_ns(cells[i], NS_PER[unit], i)
     return value
+
+
+def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
+    """Instants in ISO 8601 (or with / between year, month and day) as Unix nanoseconds (N,) int64.
+
+    Those without an offset are in UTC.
+
+    Raises:
+        NotADecimal: a text is no date, or none of the years 1900 to 2200.
+    """
+    import pandas as pd
+
+    stamps = pd.to_datetime(pd.Series(texts, dtype=object), format="ISO8601", errors="coerce", utc=True)
+    bad = np.flatnonzero(stamps.isna() | ~stamps.dt.year.between(FIRST_YEAR, LAST_YEAR))
+    if bad.size:
+        raise NotADecimal(int(bad[0]))
+    return np.asarray(stamps.dt.as_unit("ns").astype("int64").to_numpy())
 
 
 def _plain_to_ns(characters: NDArray[np.uint8], places: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:

@@ -12,7 +12,7 @@ from typing import Any
 
 from terrafusion.datasets.config import Quantity, checked_number, read_yaml, shown, structure
 from terrafusion.datasets.conventions import BODY_AXES, Conventions
-from terrafusion.datasets.decimals import NS_PER
+from terrafusion.datasets.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.readers import log_meta
 from terrafusion.datasets.readers.channel_tables import (
@@ -239,13 +239,16 @@ def _check_time(path: Path, time: TimeOf) -> None:
         raise ConfigError(
             f"'time.unit' is '{shown(time.unit)}'", file=path, remedy=f"give one of {', '.join(TIME_UNITS)}"
         )
-    dated = re.fullmatch(r"\d{4}-\d\d-\d\d([T ][\d:.]+)?(Z|[+-]\d\d:\d\d)?", time.epoch)
-    if time.epoch not in EPOCHS and not dated:
+    if time.epoch in EPOCHS:
+        return
+    try:
+        dates_to_ns([time.epoch])
+    except NotADecimal:
         raise ConfigError(
             f"'time.epoch' is '{shown(time.epoch)}'",
             file=path,
             remedy=f"give {', '.join(EPOCHS)} or an instant such as 2024-05-01T12:00:00Z, in quotes",
-        )
+        ) from None
 
 
 def _check_channels(path: Path, channels: dict[str, dict[str, ColumnOf]]) -> None:

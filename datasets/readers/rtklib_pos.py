@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.decimals import NS_PER
+from terrafusion.datasets.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns, leap_note
 from terrafusion.datasets.readers.delimited import (
@@ -177,16 +177,13 @@ def _times(path: Path, columns: Columns, header: Header) -> tuple[TimesNs, list[
 
 
 def _calendar_ns(columns: Columns) -> TimesNs:
-    import pandas as pd
-
     text = columns.texts["date"]
     if "clock" in columns.texts:
         text = text + " " + columns.texts["clock"]
-    stamps = pd.to_datetime(pd.Series(text), format="ISO8601", errors="coerce", utc=True)
-    bad = np.flatnonzero(stamps.isna())
-    if bad.size:
-        raise columns.bad_cell("date", int(bad[0]), "give YYYY/MM/DD HH:MM:SS.SSS")
-    return np.asarray(stamps.dt.as_unit("ns").astype("int64").to_numpy())
+    try:
+        return dates_to_ns(text.tolist())
+    except NotADecimal as bad:
+        raise columns.bad_cell("date", bad.row, "give YYYY/MM/DD HH:MM:SS.SSS") from None
 
 
 class _Solution:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.conventions import apply
+from terrafusion.datasets.decimals import NotADecimal, dates_to_ns
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import rpy_to_quaternion
 from terrafusion.datasets.gnss_time import gps_to_unix_ns, leap_note
@@ -151,28 +152,22 @@ def _times(columns: AnyColumns, found: ColumnMap) -> tuple[NDArray[np.int64], li
         t_ns = gps_to_unix_ns(t_ns)
         return t_ns, [leap_note(t_ns)] if len(t_ns) else []
     if time.epoch != "unix":
-        import pandas as pd
-
-        stamp = pd.Timestamp(time.epoch)
-        t_ns = t_ns + (stamp.tz_localize("UTC") if stamp.tzinfo is None else stamp).value
+        t_ns = t_ns + dates_to_ns([time.epoch])[0]
     return t_ns, []
 
 
 def _iso_ns(columns: AnyColumns, name: str) -> tuple[NDArray[np.int64], list[str]]:
-    import pandas as pd
-
-    texts = columns.texts(name)
-    stamps = pd.to_datetime(pd.Series(texts, dtype=object), format="ISO8601", errors="coerce", utc=True)
-    bad = np.flatnonzero(stamps.isna())
-    if bad.size:
+    texts = columns.texts(name).tolist()
+    try:
+        t_ns = dates_to_ns(texts)
+    except NotADecimal as bad:
         raise DataError(
-            f"column '{name}' is '{str(texts[bad[0]])[:40]}' in row {int(bad[0]) + 1}",
+            f"column '{name}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
             file=columns.path,
             remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map",
-        )
-    zoned = bool(len(texts)) and re.search(r"(Z|[+-]\d\d:?\d\d)$", str(texts[0]).strip())
-    notes = [] if zoned else ["times without an offset are taken as UTC"]
-    return np.asarray(stamps.dt.as_unit("ns").astype("int64").to_numpy()), notes
+        ) from None
+    zoned = bool(texts) and re.search(r"(Z|[+-]\d\d:?\d\d)$", texts[0].strip())
+    return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
 
 
 class _Source:

@@ -300,6 +300,7 @@ WRONG_MAPS = {
     "unknown unit": (GYRO_MAP.replace("wz}", "{column: wz, unit: dps}}"), "'dps'; give one of rad/s, deg/s"),
     "unknown sign": (GYRO_MAP.replace("wz}", "{column: wz, sign: -1}}"), "sign"),
     "unknown time unit": (GYRO_MAP.replace("t}", "t, unit: min}"), "time.unit.*one of s, ms, us, ns, iso"),
+    "an epoch that is no date": (GYRO_MAP.replace("t}", "t, epoch: '2024-13-01'}"), "time.epoch"),
     "unknown epoch": (GYRO_MAP.replace("t}", "t, epoch: yesterday}"), "time.epoch"),
     "axes that are none": (GYRO_MAP + "imu_axes: ['+x', '+y', '-z']\n", "not a rotation"),
     "impossible radius": (GYRO_MAP + "wheel_radius_m: 165\n", "wheel_radius_m.*out of range"),
@@ -417,6 +418,7 @@ def test_parquet(tmp_path: Path, kind: str) -> None:
         ({"t": [1e300], "wz": [1.0]}, "64 bits"),
         ({"t": [None, 1.0], "wz": [1.0, 1.0]}, "1 rows have no 't'"),
         ({"t": ["x"], "wz": [1.0]}, "is 'x' in row 1"),
+        ({"t": ["6024-01-01T00:00:00Z"], "wz": [1.0]}, "6024-01-01"),
         ({"t": np.zeros(0), "wz": np.zeros(0)}, "no rows"),
     ],
 )
