@@ -71,7 +71,7 @@ def check_speed_scale(patient: Patient) -> Iterator[Finding]:
         )
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
         yield _too_small(patient, scale, evidence, wheels.unit, radius)
-    elif scale.ratio < SMALL and _firm(patient.recording):
+    elif scale.ratio < SMALL and is_firm(patient.recording):
         yield Finding(
             "wheel-scale",
             "warning",
@@ -154,7 +154,7 @@ def _descent(recording: Recording) -> float:
     return float(enu[0, 2] - enu[-1, 2]) / way if way > 1.0 else 0.0
 
 
-def _firm(recording: Recording) -> bool:
+def is_firm(recording: Recording) -> bool:
     """Whether the ground is not known to be soft."""
     if recording.terrain_name in TERRAINS:
         return recording.terrain_name not in SOFT

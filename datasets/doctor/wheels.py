@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.conventions import Conventions, apply
 from terrafusion.datasets.doctor.directions import runs_backwards, sides_opposed
 from terrafusion.datasets.doctor.finding import Finding, Patient, Repair
+from terrafusion.datasets.doctor.scale import is_firm
 from terrafusion.datasets.recording import Recording, Wheels
 
 Array = NDArray[np.float64]
@@ -90,8 +91,8 @@ def _one_wheel(wheel: int, partner: int, factor: float | None) -> Repair:
 def check_wheel_signs(patient: Patient) -> Iterator[Finding]:
     """Left and right must mostly turn the same way, unless the robot spins on the spot."""
     wheels, told = patient.recording.wheels, sides_opposed(patient)
-    if wheels is None or told is None:
-        return
+    if wheels is None or told is None or (not told and not is_firm(patient.recording)):
+        return  # on soft ground a robot may well turn its wheels on the spot and not get round
     side = backward_side(wheels)
     yield Finding(
         "wheel-sign",

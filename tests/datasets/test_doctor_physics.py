@@ -460,6 +460,7 @@ def test_a_robot_that_spins_on_the_spot_is_clean() -> None:
     assert examine(spinning) == []
     stuck = dataclasses.replace(spinning, imu=None)
     assert [(f.code, f.severity, f.repair) for f in examine(stuck)] == [("wheel-sign", "warning", None)]
+    assert examine(dataclasses.replace(stuck, terrain_name="snow")) == []
 
 
 def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
