@@ -51,7 +51,7 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = folder if folder.is_dir() else folder.parent
         with tempfile.TemporaryDirectory(dir=beside, prefix=".log-") as scratch:
-            whole = Path(scratch) / folder.name
+            whole = Path(scratch) / "log"
             whole.mkdir()
             for name, table in tables.items():
                 _write_table(whole / f"{name}.csv", recording.start_ns, table)

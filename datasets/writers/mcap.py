@@ -60,7 +60,7 @@ def write_mcap(
         Sentences on what is not in standard messages, and so only seen by this library.
 
     Raises:
-        DataError: the file exists, cannot be written, or a time after 2038. ConfigError:
+        DataError: the file exists, cannot be written, or a time beyond 2038. ConfigError:
             a text, position or datum that the log folder would not take either.
     """
     path = Path(path)
@@ -111,9 +111,9 @@ def _later(recording: Recording, shift_ns: int) -> Recording:
 
 def _check_times(topic: Topic, path: Path) -> None:
     for t in topic.t_ns[:1].tolist() + topic.t_ns[-1:].tolist():
-        if t >= END_NS:
+        if not 0 <= t < END_NS:
             raise DataError(
-                f"time {t} ns", file=path, channel=topic.name, remedy="ROS has no time after 2038"
+                f"time {t} ns", file=path, channel=topic.name, remedy="ROS has times from 1970 to 2038"
             )
 
 

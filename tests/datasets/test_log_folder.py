@@ -279,6 +279,12 @@ def test_writer_replaces_an_older_log(drive: Recording, tmp_path: Path) -> None:
     assert open_recording(write_log_folder(smaller, tmp_path / "log")).motor is None
 
 
+def test_writing_here(drive: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "drive").mkdir()
+    monkeypatch.chdir(tmp_path / "drive")
+    assert differences(drive, open_recording(write_log_folder(drive, "."))) == []
+
+
 def test_writer_refuses_wheels_without_columns(tmp_path: Path) -> None:
     t = np.arange(3, dtype=np.int64)
     wheels = Wheels(t, np.ones((3, 4)), Wheels.LAYOUTS[1], "mps")
