@@ -92,7 +92,10 @@ def _may_be_units(recording: Recording, impossible: list[Finding]) -> bool:
     told = [] if recording.wheels is None else [recording.wheels.speed]
     told += [] if recording.imu is None else [recording.imu.gyro_radps, recording.imu.accel_mps2]
     largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in told), default=0.0)
-    return {finding.channel for finding in impossible} <= {"wheels", "imu"} and largest < LARGEST
+    explicable = {(f.channel, f.code) for f in impossible} <= {
+        (c, "impossible-value") for c in ("wheels", "imu")
+    }
+    return explicable and largest < LARGEST
 
 
 def treat(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:

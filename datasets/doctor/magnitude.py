@@ -19,6 +19,8 @@ TimesNs = NDArray[np.int64]
 MOST_ROWS = 0.2
 """Where a larger share of the rows is impossible, the unit is wrong rather than some rows."""
 
+LONGEST_DAYS = 30.0
+"""No drive lasts longer; grids over such a time would not fit into memory either."""
 LIMITS = {
     ("command", "_mps"): 100.0,
     ("command", "_radps"): 100.0,
@@ -38,6 +40,7 @@ LIMITS = {
 
 def check_magnitude(patient: Patient) -> Iterator[Finding]:
     """Numbers that no robot reaches: a wrong unit, or memory read as numbers."""
+    yield from _check_duration(patient)
     for name, (t_ns, bad) in _beyond(patient.recording).items():
         if not bad:
             continue
@@ -55,6 +58,26 @@ def check_magnitude(patient: Patient) -> Iterator[Finding]:
             "leave these rows out" if few else "is the unit right? too many rows are wrong to leave them out",
             _without_rows(name) if few else None,
         )
+
+
+def _check_duration(patient: Patient) -> Iterator[Finding]:
+    """A channel that lasts longer than any drive has a leap in its times, or another unit of them."""
+    clocks = {name: channel.t_ns for name, channel in patient.recording.channels().items()}
+    if patient.recording.truth is not None and len(patient.recording.truth):
+        clocks["truth"] = patient.recording.truth.t_ns
+    for name, t_ns in clocks.items():
+        days = (float(t_ns[-1]) - float(t_ns[0])) * 1e-9 / 86400.0
+        if days > LONGEST_DAYS:
+            row = int(np.argmax(np.diff(t_ns)))
+            leap_s = (float(t_ns[row + 1]) - float(t_ns[row])) * 1e-9
+            yield Finding(
+                "impossible-time",
+                "error",
+                name,
+                f"its times span {days:.0f} days",
+                f"longest interval {leap_s:.3g} s after t = {patient.since_start_s(t_ns[row]):.3f} s",
+                "is the unit of time right? split the log where the clock leaps",
+            )
 
 
 def _beyond(recording: Recording) -> dict[str, tuple[TimesNs, list[tuple[Array, Mask, str]]]]:

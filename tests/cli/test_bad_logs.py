@@ -162,7 +162,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
             swap("gnss.csv", "east_m", "north_m")(log),
             swap("gnss.csv", "v_e_mps", "v_n_mps")(log),
         ],
-        ("log", "gnss", "turns against gyro z", "swap east and north", "--apply-fixes"),
+        ("log", "gnss", "turns against gyro z", "--apply-fixes"),
     ),
     "north upside down": (
         scaled("gnss.csv", ("north_m", "v_n_mps"), -1.0),
@@ -185,7 +185,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     ),
     "sigma nan": (cells("gnss.csv", "sigma_n_m", "NaN"), ("gnss.csv", "sigma_n_m", "'NaN'", "line 52")),
     **{
-        f"huge {column}": (cells(name, column, value), (name.removesuffix(".csv"), value, "unit"))
+        f"huge {column}": (cells(name, column, value), (name.removesuffix(".csv"), value, "beyond anything"))
         for name, column, value in (
             ("imu.csv", "gyro_z_radps", "1e+300"),
             ("imu.csv", "accel_x_mps2", "-1e+300"),
