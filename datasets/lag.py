@@ -40,13 +40,16 @@ class Lag:
     r: float
 
 
-def lag_between(t_a_s: Array, a: Array, t_b_s: Array, b: Array, *, reach_s: float = 2.0) -> Lag | None:
+def lag_between(
+    t_a_s: Array, a: Array, t_b_s: Array, b: Array, *, reach_s: float = 2.0, least_r: float = 0.0
+) -> Lag | None:
     """How much later `b` tells what `a` tells.
 
     Args:
         t_a_s, a: times (N,) s and values (N,) of the first signal, in any order; NaN is left out.
         t_b_s, b: the same of the second, (M,).
         reach_s: largest lag that is looked for, either way; at most a quarter of the common time.
+        least_r: correlation below which nothing is told, which is quicker.
 
     Returns:
         Lag, or None where the common time is below 10 s, a signal is constant, or no peak stands
@@ -73,6 +76,8 @@ def lag_between(t_a_s: Array, a: Array, t_b_s: Array, b: Array, *, reach_s: floa
         return None
     reach = max(int(min(reach_s, common_s / 4) / step), 2)
     r = _correlation(_at_all_lags(*moments, reach))
+    if r.max() < least_r:
+        return None
     blocks = int(np.clip(common_s / BLOCK_S, LEAST_BLOCKS, MOST_BLOCKS))
     fits = [_fit(*moments, lags, blocks) for lags in _peaks(r)]
     sharp = [fit for fit in fits if fit is not None]

@@ -26,8 +26,8 @@ SPEED_PAIRS: tuple[Pair, ...] = (("truth", "wheels"), ("gnss", "wheels"), ("trut
 LEAST_R = 0.7
 NEAR_S, FAR_S = 2.0, 20.0
 """Lags are looked for nearby first; where nothing correlates there, further off."""
-FAR_R, FAR_GAIN = 0.85, 0.2
-"""A lag far off counts where the correlation is this high, and so much higher than nearby."""
+FAR_R = 0.87
+"""A lag far off counts where the correlation is this high."""
 
 
 def signal_pairs(patient: Patient) -> Pairs:
@@ -44,23 +44,19 @@ def signal_pairs(patient: Patient) -> Pairs:
     return found
 
 
-def near_lag(one: Signal, other: Signal, reach_s: float = NEAR_S) -> Lag | None:
-    """Lag of the second signal within the reach."""
+def near_lag(one: Signal, other: Signal, reach_s: float = NEAR_S, least_r: float = LEAST_R) -> Lag | None:
+    """Lag of the second signal within the reach, where they correlate."""
     if not min(len(one[0]), len(other[0])):
         return None
     origin = one[0][0]
     t_one, t_other = (one[0] - origin) * 1e-9, (other[0] - origin) * 1e-9
-    return lag_between(t_one, one[1], t_other, other[1], reach_s=reach_s)
+    return lag_between(t_one, one[1], t_other, other[1], reach_s=reach_s, least_r=least_r)
 
 
 def far_lag(one: Signal, other: Signal) -> Lag | None:
-    """Lag of the second signal, nearby or else far off."""
+    """Lag of the second signal, nearby or else far off, where they correlate."""
     near = near_lag(one, other)
-    r = near.r if near is not None else 0.0
-    if r >= LEAST_R:
-        return near
-    far = near_lag(one, other, FAR_S)
-    return far if far is not None and far.r > max(FAR_R, r + FAR_GAIN) else near
+    return near if near is not None else near_lag(one, other, FAR_S, FAR_R)
 
 
 def period_s(t_ns: TimesNs) -> float:
