@@ -52,8 +52,9 @@ class Agreement:
     spread: tuple[float, float]
 
     def is_sure(self) -> bool:
-        """Whether the correlation is far from 0: high, and beyond three standard errors of noise."""
-        return abs(self.r) > max(SURE_R, 3.0 / np.sqrt(self.windows))
+        """Whether the correlation is far from 0: high, and beyond three standard errors (Fisher's z)."""
+        z = np.arctanh(min(abs(self.r), 1.0 - 1e-9)) * np.sqrt(max(self.windows - 3, 0))
+        return abs(self.r) > SURE_R and bool(z > 3.0)
 
 
 def seconds(t_ns: NDArray[np.int64], start_ns: int) -> Array:
