@@ -25,6 +25,7 @@ from terrafusion.datasets.readers.ros_raw import (
     grouped,
     normal_type,
     numbers_at,
+    within_reason,
 )
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -33,6 +34,8 @@ RECORD_HEAD = 9
 """Kind and length, before a record's content."""
 MESSAGE_HEAD = 31
 """Kind, length, channel, sequence number and two times, before a message's own bytes."""
+MIN_CHANNEL_BYTES = 14
+"""Of a schema or channel: its number, and the lengths of its parts."""
 BLOCK_BYTES = 1 << 20
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl", "ros1msg": "msg"}
 _head = struct.Struct("<BQ").unpack_from
@@ -153,8 +156,8 @@ class McapFile:
 
     def _count(self) -> None:
         """Learn channels and the numbers of their messages from the messages themselves."""
-        for chunk in self._chunks:
-            self._messages(self._unpacked(chunk), learn=True)
+        for data in self._unpacked(()):
+            self._messages(data, learn=True)
         channels = sorted(self._channels)
         self._counts = dict.fromkeys(channels, 0)
         for batch in self.batches([[number] for number in channels]):
@@ -170,10 +173,8 @@ class McapFile:
 
     def batches(self, wanted: Groups) -> Iterator[Batch]:
         """The messages of the wanted groups of channels, block by block."""
-        for chunk in self._chunks:
-            if not chunk.channels or not all(chunk.channels.isdisjoint(ids) for ids in wanted):
-                data = self._unpacked(chunk)
-                yield from _split(data, np.array(self._messages(data), dtype=np.int64), wanted)
+        for data in self._unpacked(wanted):
+            yield from _split(data, np.array(self._messages(data), dtype=np.int64), wanted)
         first = 0
         while first < len(self._loose):
             begin = int(self._loose[first])
@@ -186,7 +187,16 @@ class McapFile:
         _, size = _head(self._read(position, RECORD_HEAD), 0)
         return position + RECORD_HEAD + int(size)
 
-    def _unpacked(self, chunk: _Chunk) -> bytes:
+    def _unpacked(self, wanted: Groups) -> Iterator[bytes]:
+        """The chunks that may hold messages of these channels; all where none are named."""
+        chunks = (
+            self._unpack(chunk)
+            for chunk in self._chunks
+            if not (wanted and chunk.channels) or not all(chunk.channels.isdisjoint(ids) for ids in wanted)
+        )
+        return within_reason(chunks, self._end)
+
+    def _unpack(self, chunk: _Chunk) -> bytes:
         content = self._content(chunk.start, chunk.size)
         content.take(16)
         size, checksum = content.number(8), content.number(4)
@@ -203,7 +213,11 @@ class McapFile:
             while position < end:
                 kind, size = _head(chunk, position)
                 if kind == MESSAGE:
+                    if size < MESSAGE_HEAD - RECORD_HEAD:
+                        raise BagError("a message record is broken")
                     starts.append(position)
+                elif kind not in (SCHEMA, CHANNEL) or size < MIN_CHANNEL_BYTES:
+                    raise BagError("a chunk holds what is neither message, channel nor schema")
                 elif learn:
                     self._learn(kind, _Text(chunk[position + RECORD_HEAD :][:size]))
                 position += RECORD_HEAD + size

@@ -26,11 +26,14 @@ from terrafusion.datasets.readers.ros_raw import (
     normal_type,
     numbers_at,
     rows_at,
+    within_reason,
 )
 
 MAGIC = b"#ROSBAG V2.0\n"
 MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 4, 5, 6, 7
-MAX_HEADER_BYTES = 1 << 20
+MIN_HEADER_BYTES, MAX_HEADER_BYTES = 25, 1 << 20
+"""Of a record: the fields op and conn, and one more."""
+MAX_CONNECTIONS, MAX_HEADER_LAYOUTS = 1 << 16, 100
 _length = struct.Struct("<I").unpack_from
 
 
@@ -130,25 +133,37 @@ class Ros1File:
 
     def batches(self, wanted: Groups) -> Iterator[Batch]:
         """The messages of the wanted groups of connections, chunk by chunk."""
+        for data in within_reason(self._unpacked(wanted), self._end):
+            yield from _messages(data, wanted)
+
+    def _unpacked(self, wanted: Groups) -> Iterator[bytes]:
+        """The chunks that hold messages of these connections."""
         for chunk in self._chunks:
             if all(chunk.counts.keys().isdisjoint(ids) for ids in wanted):
                 continue
             if chunk.size > MAX_CHUNK_BYTES:
                 raise BagError(f"a chunk claims {chunk.size} bytes")
             packed = self._read(chunk.start, chunk.size)
-            yield from _messages(decompress(packed, chunk.compression, chunk.unpacked), wanted)
+            yield decompress(packed, chunk.compression, chunk.unpacked)
 
 
 def _messages(chunk: bytes, wanted: Groups) -> Iterator[Batch]:
     data = np.frombuffer(chunk, dtype=np.uint8)
     left = np.array(_records(chunk), dtype=np.int64)
-    while left.size:
-        header_size = int(_length(chunk, left[0])[0])
-        header = chunk[left[0] + 4 : left[0] + 4 + header_size]
-        fields = _fields(header)
-        if _number(fields, "op") != MESSAGE:
-            left = left[1:]
+    others = layouts = 0
+    while others < len(left):
+        record = int(left[others])
+        header_size = int(_length(chunk, record)[0])
+        header = chunk[record + 4 : record + 4 + header_size]
+        if _number(_fields(header), "op") != MESSAGE:
+            others += 1
+            if others > MAX_CONNECTIONS:
+                raise BagError("a chunk holds too many records that are no messages")
             continue
+        layouts += 1
+        if layouts > MAX_HEADER_LAYOUTS:
+            raise BagError("the headers of a chunk's messages are all different")
+        left, others = left[others:], 0
         conn_at, time_at = header.index(b"conn=") + 5, header.index(b"time=") + 5
         alike = _alike(data, left, header, (conn_at, conn_at + 4), (time_at, time_at + 8))
         records, left = left[alike], left[~alike]
@@ -169,6 +184,8 @@ def _records(chunk: bytes) -> list[int]:
         while position < end:
             starts.append(position)
             size, data = lengths(chunk, position)
+            if size < MIN_HEADER_BYTES:
+                raise BagError("a record's header is broken")
             if size != header:  # both lengths in one go as long as headers are alike
                 header, lengths = size, struct.Struct(f"<I{size}xI").unpack_from
                 size, data = lengths(chunk, position)

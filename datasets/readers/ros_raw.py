@@ -23,6 +23,8 @@ Groups = Sequence[Collection[int]]
 
 MAX_CHUNK_BYTES = 1 << 28
 """A chunk that claims to hold more is not believed: recorders write chunks of a few MB."""
+MAX_EXPANSION = 200
+"""Nor are chunks, beyond the first such one, that together unpack to so many times the size of the file."""
 
 
 class BagError(Exception):
@@ -119,6 +121,20 @@ def rows_at(data: Bytes, starts: Places, size: int) -> Bytes:
     if not size:
         return np.zeros((len(starts), 0), dtype=np.uint8)
     return numbers_at(data, starts, f"V{size}").view(np.uint8).reshape(len(starts), size)
+
+
+def within_reason(chunks: Iterator[bytes], file_bytes: int) -> Iterator[bytes]:
+    """The unpacked chunks of a file, as long as there are not many times as many bytes as in the file.
+
+    Raises:
+        BagError: then.
+    """
+    room = MAX_CHUNK_BYTES + MAX_EXPANSION * file_bytes
+    for chunk in chunks:
+        room -= len(chunk)
+        if room < 0:
+            raise BagError(f"its chunks unpack to more than {MAX_EXPANSION} times its size")
+        yield chunk
 
 
 def decompress(data: bytes, compression: str, size: int) -> bytes:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import bz2
 import struct
+import time
 import tracemalloc
 from pathlib import Path
 from typing import Any
@@ -112,6 +113,7 @@ def make(tmp_path: Path, kind: str) -> Path:
         "unchunked": {"use_chunking": False},
         "bare": bare,
         "ros1": {"ros": 1},
+        "unchecked": {"enable_crcs": False},
         "bare unchunked": bare | {"use_chunking": False},
     }
     return write_mcap(tmp_path / "a.mcap", **options[option])
@@ -212,6 +214,31 @@ def test_a_chunk_that_unpacks_to_more_than_it_claims(compression: str) -> None:
     assert decompress(pack(bytes(5000)) + pack(b"end"), compression, 5003) == bytes(5000) + b"end"
     with pytest.raises(BagError, match="claims 6000 bytes and holds 5000"):
         decompress(pack(bytes(5000)), compression, 6000)
+
+
+@pytest.mark.parametrize("kind", ["bag BZ2", "mcap zstd"])
+def test_a_small_bag_that_unpacks_to_gigabytes(
+    tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each chunk is as it claims; together they are more than a recording could be."""
+    monkeypatch.setattr("terrafusion.datasets.readers.ros_raw.MAX_CHUNK_BYTES", 20_000)
+    monkeypatch.setattr("terrafusion.datasets.readers.ros_raw.MAX_EXPANSION", 1)
+    with pytest.raises(TerrafusionError, match="more than 1 times its size"):
+        open_recording(make(tmp_path, kind))
+
+
+@pytest.mark.parametrize(("kind", "word"), [("bag BZ2", "broken"), ("mcap unchecked", "neither")])
+def test_a_chunk_of_nothing_is_refused_in_time(
+    tmp_path: Path, kind: str, word: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zeros are records without content, as many as there are: not one of them is gone through."""
+    path = make(tmp_path, kind)
+    module = "ros1_file" if kind.startswith("bag") else "mcap_file"
+    monkeypatch.setattr(f"terrafusion.datasets.readers.{module}.decompress", lambda *_: bytes(200_000_000))
+    start = time.process_time()
+    with pytest.raises(TerrafusionError, match=word):
+        open_recording(path)
+    assert time.process_time() - start < 2
 
 
 def test_unknown_types_elsewhere_do_no_harm(tmp_path: Path) -> None:
