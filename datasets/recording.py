@@ -53,13 +53,13 @@ class Channel:
             value = getattr(self, spec.name)
             if isinstance(value, np.ndarray) and len(value) != len(t):
                 raise ValueError(f"{self.name}.{spec.name} has {len(value)} rows for {len(t)} times")
-        back = np.flatnonzero(np.diff(t) < 0)
+        back = np.flatnonzero(t[1:] < t[:-1])  # a difference could overflow
         if back.size:
             i = int(back[0])
             raise DataError(
-                f"time runs backwards by {(t[i] - t[i + 1]) * 1e-9:.6f} s after row {i}",
+                f"time runs backwards by {(int(t[i]) - int(t[i + 1])) * 1e-9:.6f} s after row {i}",
                 channel=self.name,
-                time_s=float(t[i] - t[0]) * 1e-9,
+                time_s=(int(t[i]) - int(t[0])) * 1e-9,
                 remedy="sort the rows or split the log at the clock jump",
             )
 

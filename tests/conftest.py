@@ -10,6 +10,9 @@ from pathlib import Path
 
 import pytest
 
+# The matrices here are small: threads of the linear algebra only wait for each other on a busy machine.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from terrafusion.fusion.cli.main import main
 
 

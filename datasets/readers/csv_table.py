@@ -22,6 +22,9 @@ from terrafusion.datasets.trajectory import seconds_to_ns
 
 Array = NDArray[np.float64]
 
+MAX_BYTES = 512 * 2**20
+"""Of one channel, unpacked: a day at 100 Hz. What claims to be more may be a trap for the memory."""
+
 MAX_T_S = 1e9
 """A |t_s| beyond this (32 years) is a Unix time, not seconds from the start."""
 
@@ -104,11 +107,14 @@ def read_table(
 
 def _read_bytes(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
-        if path.suffix == ".gz":
-            data = gzip.decompress(data)
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(f"cannot be read: {error}", file=path, remedy="is it complete?") from None
+    if len(data) > MAX_BYTES:
+        raise DataError(
+            f"holds more than {MAX_BYTES // 2**20} MiB", file=path, remedy="split the drive into several logs"
+        )
     data = data.removeprefix(b"\xef\xbb\xbf")
     if not data.strip():
         raise DataError("the file is empty", file=path, remedy="remove it, or write at least the header row")

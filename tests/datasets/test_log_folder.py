@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers import csv_table, open_recording
 from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Recording, Terrain, Wheels, differences
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers import log_folder, write_log_folder
@@ -239,6 +239,16 @@ def test_both_packed_and_plain(tmp_path: Path) -> None:
     (folder / "imu.csv.gz").write_bytes(gzip.compress(b"t_s,gyro_z_radps\n0,0\n"))
     with pytest.raises(TerrafusionError, match="both"):
         open_recording(folder)
+
+
+def test_a_packed_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A few kilobytes of gzip can stand for gigabytes."""
+    monkeypatch.setattr(csv_table, "MAX_BYTES", 2**20)
+    folder = folder_with(tmp_path)
+    (folder / "imu.csv.gz").write_bytes(gzip.compress(b"t_s,gyro_z_radps\n" + b"0,0\n" * 10**6))
+    with pytest.raises(TerrafusionError) as caught:
+        open_recording(folder)
+    one_line(caught.value, "imu.csv.gz", "more than 1 MiB", "split")
 
 
 @pytest.mark.parametrize("content", [b"not gzip", gzip.compress(b"t_s,gyro_z_radps\n0,0\n" * 50)[:-20]])
