@@ -122,5 +122,21 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
     return found
 
 
+def logs_in(folder: Path, most: int = 50) -> list[str]:
+    """Names of the files of a folder that some format claims, and of log folders in it, sorted.
+
+    Only the first `most` entries are looked at.
+    """
+    found = []
+    for path in sorted(folder.iterdir())[:most]:
+        try:
+            form = format_of(path)
+        except DataError:
+            continue
+        if form.name != "log_folder" or (path / "meta.yaml").is_file():
+            found.append(path.name)
+    return found
+
+
 def _may_be_table(head: bytes) -> bool:
     return head.startswith(PARQUET_MAGIC) or (bool(head) and b"\0" not in head)

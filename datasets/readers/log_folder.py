@@ -19,7 +19,7 @@ from terrafusion.datasets.clock import in_order, repair_together
 from terrafusion.datasets.errors import ClockError, DataError
 from terrafusion.datasets.readers.channel_tables import ChannelReader
 from terrafusion.datasets.readers.csv_table import Table, read_table, read_times
-from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import Trajectory
@@ -72,10 +72,10 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
     """
     meta_path = folder / META
     if not meta_path.is_file():
-        bags = sorted(p.name for p in folder.iterdir() if p.suffix in (".bag", ".mcap", ".db3"))
+        logs = logs_in(folder)
         remedy = "give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle"
-        if bags:
-            remedy = f"give the bag itself: {', '.join(bags[:5])}{' ...' if len(bags) > 5 else ''}"
+        if logs:
+            remedy = f"give one of its logs itself: {', '.join(logs[:5])}{' ...' if len(logs) > 5 else ''}"
         raise DataError("no meta.yaml in this folder", file=folder, remedy=remedy)
     meta = read_meta(meta_path)
     source = _Folder(folder, clocks)

@@ -49,7 +49,7 @@ def open_recordings(
     """
     if stamps not in STAMPS:
         raise DataError(f"stamps is '{stamps}'", file=path, remedy=f"give one of {', '.join(STAMPS)}")
-    place, number = _place(path)
+    place, number = find_log(path)
     form = format_of(place, mapped=columns is not None)
     entry, conventions, notes = _known(place, form)
     if rig is not None and form.name in ("ros1", "ros2"):
@@ -87,14 +87,22 @@ def open_recording(path: Path | str, **options: Any) -> Recording:
     return recordings[0]
 
 
-def _place(path: Path | str) -> tuple[Path, int | None]:
-    """The file or folder that is meant, and the number behind `#` where there is one."""
+def find_log(path: Path | str) -> tuple[Path, int | None]:
+    """The file or folder that a LOG means, and the number behind `#` where there is one.
+
+    Raises:
+        DataError: it is in the catalogue, but not on this machine, or a document of a set.
+    """
     text, mark, number = str(path).rpartition("#")
     numbered = bool(mark) and number.isdigit() and len(number) < 9 and not Path(path).exists()
     name = text if numbered else str(path)
     place = Path(name)
     if not place.exists():
         place = locate(name) or place
+    entry = load_catalog().find(place) if place.is_file() else None
+    if entry is not None and not entry.recording:
+        remedy = f"`terrafusion fetch` lists the recordings of {entry.set_name}"
+        raise DataError(f"is a document of the set {entry.set_name}, no recording", file=place, remedy=remedy)
     return place, int(number) if numbered else None
 
 

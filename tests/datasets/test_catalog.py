@@ -97,6 +97,18 @@ def test_a_recording_that_is_not_here_tells_how_to_get_it(
         open_recording("husky_parkinglot/test1")
 
 
+def test_a_document_of_a_set_is_told_from_a_recording(data_folder: Path) -> None:
+    with pytest.raises(DataError, match="a document of the set norlab_drive"):
+        open_recording(data_folder / "norlab_drive" / "LICENSE")
+
+
+def test_a_folder_of_logs_names_them(tmp_path: Path) -> None:
+    (tmp_path / "notes.md").write_text("nothing")
+    (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")
+    with pytest.raises(DataError, match=r"give one of its logs itself: poses\.tum$"):
+        open_recording(tmp_path)
+
+
 def test_a_misspelt_key_of_a_set_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "catalog.yaml").write_text("mine: {titel: x}\n")
     (tmp_path / "catalog_files.csv").write_text(",".join(catalog.FILE_COLUMNS) + "\n")
