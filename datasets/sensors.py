@@ -14,12 +14,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.config import Position, Quantity
+from terrafusion.datasets.recording import Fix
 
 AXES = {
     "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0),
     "+y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
     "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
 }  # fmt: skip
+
+ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
+"""Sigma of each horizontal axis by class of fix, where neither log nor vehicle says it; up takes twice that.
+Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
 
 
 def axes_matrix(axes: tuple[str, ...]) -> NDArray[np.float64]:

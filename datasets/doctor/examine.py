@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 import numpy as np
 
 from terrafusion.datasets.doctor import (
+    dilution,
     gnss,
     gnss_frame,
     inertial,
@@ -55,6 +56,7 @@ CHECKS: tuple[Check, ...] = (
     gnss.check_frozen,
     gnss.check_jumps,
     gnss.check_scatter,
+    dilution.check_dilution,
     gnss_frame.check_velocity,
     truth.check_unit,
     truth.check_yaw,

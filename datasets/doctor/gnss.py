@@ -13,12 +13,11 @@ from terrafusion.datasets.doctor.path import ANY_RADIUS_M, compare, places, whee
 from terrafusion.datasets.doctor.timing import GAP_PERIODS
 from terrafusion.datasets.doctor.turning import seconds, typical_sigma
 from terrafusion.datasets.recording import Fix, Gnss, Recording
+from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-USUAL_SIGMA_M = {Fix.SINGLE: 5.0, Fix.DGPS: 2.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.1}
-"""Cautious horizontal sigma by class of fix, where the receiver states none; heights have twice as much."""
 OVERCONFIDENT, LEAST_SCATTER_M = 5.0, 0.03
 FROZEN_S = 3.0
 FLIGHT_FIXES, CLOSED = 25, 0.3
@@ -59,14 +58,14 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
         first = int(np.flatnonzero(rows)[0])
         missing_only = bool(np.isnan(gnss.sigma_enu_m[bad]).all())  # such fixes are left out, others mislead
         at_s, said = patient.since_start_s(gnss.t_ns[first]), gnss.sigma_enu_m[first].tolist()
-        usual = ", ".join(f"{fix.name.lower()} {sigma:g}" for fix, sigma in USUAL_SIGMA_M.items())
+        usual = ", ".join(f"{fix.name.lower()} {sigma:g}" for fix, sigma in ASSUMED_SIGMA_M.items())
         yield Finding(
             "sigma-impossible",
             "warning" if missing_only else "error",
             "gnss",
             f"{int(rows.sum())} of {len(rows)} fixes have a sigma that is zero, negative or missing",
             f"first at t = {at_s:.2f} s: {said} m",
-            "take the median of the other fixes of the class; where there is none, a cautious value "
+            "take the median of the other fixes of the class; where there is none, the usual value "
             f"({usual} m, heights twice)",
             _with_usual_sigma,
         )
@@ -84,7 +83,7 @@ def _with_usual_sigma(recording: Recording) -> Recording:
     assert gnss is not None
     sigma, bad = gnss.sigma_enu_m.copy(), _impossible(gnss)
     for fix in np.unique(gnss.fix).tolist():
-        usual = USUAL_SIGMA_M.get(fix, USUAL_SIGMA_M[Fix.SINGLE])
+        usual = ASSUMED_SIGMA_M[Fix(fix)]
         for k, factor in enumerate((1.0, 1.0, 2.0)):
             of_class = gnss.fix == fix
             good = sigma[of_class & (sigma[:, k] > 0.0), k]

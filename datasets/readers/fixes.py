@@ -13,13 +13,10 @@ from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import geodetic_to_enu
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.recording import Fix, Gnss
+from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
 
 Array = NDArray[np.float64]
 Datum = tuple[float, float, float]
-
-ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
-"""Sigma of each horizontal axis by class, where neither log nor vehicle says it; up takes twice that.
-Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
 
 UP_FACTOR = 2.0
 

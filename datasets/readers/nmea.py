@@ -11,11 +11,12 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.delimited import MAX_BYTES
-from terrafusion.datasets.readers.fixes import ASSUMED_SIGMA_M, UP_FACTOR, Fixes, gnss_channel
+from terrafusion.datasets.readers.fixes import UP_FACTOR, Fixes, gnss_channel
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.nmea_sentences import DAY_NS, Epochs, collect
 from terrafusion.datasets.readers.row_times import row_times
 from terrafusion.datasets.recording import Fix, Recording
+from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
 
 Array = NDArray[np.float64]
 

@@ -155,6 +155,12 @@ def noisy_fixes(sigma_m: float) -> Spoil:
     return chain(change("gnss", enu_m=lambda p: p + noise), sigmas(sigma_m, sigma_m))
 
 
+def dilutions(worth_m: float) -> Spoil:
+    """The dilution of precision that changes with the satellites, times what one is worth."""
+    dop = np.random.default_rng(8).integers(7, 13, (501, 1)) / 10
+    return change("gnss", sigma_enu_m=lambda s: 0 * s + dop * worth_m * [1.0, 1.0, 2.0])
+
+
 def without_angles(r: Recording) -> Recording:
     assert r.wheels is not None
     return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, angle_rad=None))
@@ -306,7 +312,7 @@ CLOCK_CASES: dict[str, Case] = {
 
 GNSS_CASES: dict[str, Case] = {
     "gnss: sigma zero": Case(
-        change("gnss", sigma_enu_m=lambda s: s * 0), "sigma-impossible", "gnss", good=sigmas(0.1, 0.2)
+        change("gnss", sigma_enu_m=lambda s: s * 0), "sigma-impossible", "gnss", good=sigmas(0.02, 0.04)
     ),
     "gnss: some sigmas negative": Case(
         change("gnss", sigma_enu_m=at((slice(50, 60), slice(None)), np.negative)), "sigma-impossible", "gnss"
@@ -317,6 +323,9 @@ GNSS_CASES: dict[str, Case] = {
     "gnss: variances as sigmas": Case(
         chain(noisy_fixes(0.1), sigmas(0.1**2, 0.1**2)),
         "sigma-too-small", "gnss", good=noisy_fixes(0.1), share=0.2,
+    ),
+    "gnss: dilutions as sigmas": Case(
+        dilutions(1.0), "sigma-dilution", "gnss", good=dilutions(0.02), share=1e-6
     ),
     "gnss: class none in between": Case(
         change("gnss", fix=at(slice(30, 33), lambda f: f * 0)), "fix-none", "gnss", kept=0.99
