@@ -80,7 +80,6 @@ def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParam
     if overrides.track_m is None or (needs_radius and overrides.wheel_radius_m is None):
         raise DataError(
             "the log names no vehicle and not its geometry",
-            file=recording.name,
             remedy="give --vehicle NAME, or wheel_radius_m and track_m in meta.yaml",
         )
     notes += ("no vehicle is named: a generic one is used, with its assumed sensor noise",)
@@ -134,7 +133,6 @@ def replay(
         if outage.start_s >= recording.duration_s():
             raise DataError(
                 f"the outage starts at {outage.start_s:g} s, after the end of the log",
-                file=recording.name,
                 remedy=f"the log lasts {recording.duration_s():.1f} s",
             )
     used, held_out = split_fixes(recording, outages)
@@ -180,26 +178,23 @@ def _usable(recording: Recording) -> tuple[Imu, Wheels]:
     if imu is None or not len(imu) or not imu.has_gyro() or not imu.has_accel():
         raise DataError(
             "the log has no six-axis IMU",
-            file=recording.name,
             channel="imu",
             remedy="this version estimates from three gyro and three accelerometer axes",
         )
     if wheels is None or not len(wheels):
         raise DataError(
             "the log has no wheel speeds",
-            file=recording.name,
             channel="wheels",
             remedy="name their topic, or add wheels.csv",
         )
     imu = imu.select(np.isfinite(imu.gyro_radps.sum(axis=1) + imu.accel_mps2.sum(axis=1)))
     wheels = wheels.select(np.isfinite(wheels.speed.sum(axis=1)))
     if not len(imu) or not len(wheels):
-        raise DataError("no sample has all its values", file=recording.name, channel="imu or wheels")
+        raise DataError("no sample has all its values", channel="imu or wheels")
     overlap = (min(imu.t_ns[-1], wheels.t_ns[-1]) - max(imu.t_ns[0], wheels.t_ns[0])) * 1e-9
     if overlap < 2.0:
         raise DataError(
             f"IMU and wheels overlap for {overlap:.1f} s only",
-            file=recording.name,
             remedy="check their clocks; at least 2 s are needed",
         )
     return imu, wheels
@@ -308,10 +303,7 @@ def _never_started(recording: Recording, used: Gnss | None) -> DataError:
     if used is not None and len(used):
         return DataError(
             "the robot never moved far enough for GNSS to show its heading",
-            file=recording.name,
             channel="gnss",
             remedy="replay a longer drive, or leave the GNSS channel out for a local path",
         )
-    return DataError(
-        "the log is too short to start from", file=recording.name, remedy="give at least two seconds"
-    )
+    return DataError("the log is too short to start from", remedy="give at least two seconds")

@@ -58,7 +58,7 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
         first = int(np.flatnonzero(rows)[0])
         missing_only = bool(np.isnan(gnss.sigma_enu_m[bad]).all())  # such fixes are left out, others mislead
         at_s, said = patient.since_start_s(gnss.t_ns[first]), gnss.sigma_enu_m[first].tolist()
-        usual = ", ".join(f"{fix.name.lower()} {sigma:g}" for fix, sigma in ASSUMED_SIGMA_M.items())
+        usual = ", ".join(f"{fix.name.lower()} {sigma:g}" for fix, sigma in ASSUMED_SIGMA_M.items() if fix)
         yield Finding(
             "sigma-impossible",
             "warning" if missing_only else "error",
@@ -209,12 +209,16 @@ def check_frozen(patient: Patient) -> Iterator[Finding]:
         "gnss-frozen",
         "warning",
         "gnss",
-        f"the position stands still {int(frozen.sum())} times while the wheels roll",
+        f"the position stands still {_times(int(frozen.sum()))} while the wheels roll",
         f"from t = {t_fix[begins[worst]]:.1f} s for {t_fix[ends[worst]] - t_fix[begins[worst]]:.1f} s "
         f"and {way[worst]:.1f} m of wheel path",
         f"drop the {int(repeats.sum())} repeated fixes",
         _dropping(repeats),
     )
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
 
 
 def _dropping(rows: Mask) -> Repair:

@@ -36,12 +36,6 @@ LEAST_LAG_S = dict.fromkeys(YAW_PAIRS, 0.1) | dict.fromkeys(SPEED_PAIRS, 0.2)
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
 
 
-def lags(patient: Patient) -> dict[str, Lag]:
-    """Lags between the sensors of a recording, by "wheels after imu" and the like; those that can be told."""
-    found = {pair: far_lag(*signals) for pair, signals in signal_pairs(patient).items()}
-    return {f"{other} after {one}": lag for (one, other), lag in found.items() if lag is not None}
-
-
 def check_clocks(patient: Patient) -> Iterator[Finding]:
     """Clocks beside each other. A jump hides a drift, either hides an offset: the first is told."""
     pairs = signal_pairs(Patient(without_stuck(patient.recording), patient.rig))
@@ -63,7 +57,7 @@ def _offset_findings(recording: Recording, pairs: Pairs) -> Iterator[Finding]:
         if lag is None or lag.r < LEAST_R:
             continue
         suspect = _matters(pair, lag, *signals)
-        if not suspect or not _opposed(lag, *signals):
+        if not suspect or not opposed(lag, *signals):
             smooth = suspect and pair[1] == "wheels"
             told[pair] = _without_smoothing(lag, *signals) if smooth else lag
     off = {pair: lag for pair, lag in told.items() if _matters(pair, lag, *pairs[pair])}
@@ -130,7 +124,7 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
     )
 
 
-def _opposed(lag: Lag, one: Signal, other: Signal) -> bool:
+def opposed(lag: Lag, one: Signal, other: Signal) -> bool:
     """Whether the two agree about as well where they stand, with one of them reversed: a sign, no clock."""
     from scipy.ndimage import uniform_filter1d
 

@@ -72,7 +72,8 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
     """
     meta_path = folder / META
     if not meta_path.is_file():
-        logs = logs_in(folder)
+        is_log = any((folder / f"{name}.csv{gz}").is_file() for name in CHANNELS for gz in ("", ".gz"))
+        logs = [] if is_log else logs_in(folder)
         remedy = "give a log folder, a ROS bag, or write meta.yaml with start_ns and vehicle"
         if logs:
             remedy = f"give one of its logs itself: {', '.join(logs[:5])}{' ...' if len(logs) > 5 else ''}"

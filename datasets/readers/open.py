@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -98,12 +99,25 @@ def find_log(path: Path | str) -> tuple[Path, int | None]:
     name = text if numbered else str(path)
     place = Path(name)
     if not place.exists():
-        place = locate(name) or place
+        place = locate(name) or _misspelt(name, place)
     entry = load_catalog().find(place) if place.is_file() else None
     if entry is not None and not entry.recording:
         remedy = f"`terrafusion fetch` lists the recordings of {entry.set_name}"
         raise DataError(f"is a document of the set {entry.set_name}, no recording", file=place, remedy=remedy)
     return place, int(number) if numbered else None
+
+
+def _misspelt(name: str, place: Path) -> Path:
+    """`place`, unless the name is nearly one of the catalogue's.
+
+    Raises:
+        DataError: it is; names the near ones.
+    """
+    close = difflib.get_close_matches(name, load_catalog().recordings(), n=3, cutoff=0.8)
+    if close:
+        remedy = f"did you mean {', '.join(close)} of the catalogue?"
+        raise DataError("no such file or folder", file=name, remedy=remedy)
+    return place
 
 
 def _known(path: Path, form: Format) -> tuple[CatalogFile | None, Conventions, tuple[str, ...]]:

@@ -65,6 +65,7 @@ def replay(
 
     Example: terrafusion replay drive.bag --vehicle husky --gnss-outage 150:60 --out results
     """
+    from terrafusion.datasets.errors import errors_of
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config import MODES
     from terrafusion.fusion.metrics import parse_outage
@@ -79,7 +80,7 @@ def replay(
     if repair_clock:
         recording = clock_accepted(recording)
     refuse_errors(log, recording, rig)
-    with progress_bar(f"{mode} {recording.name}") as progress:
+    with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording,
             vehicle=vehicle,

@@ -177,7 +177,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "gyro in deg/s": (scaled("imu.csv", SIX[:3], 57.29578), ("imu", "gyro", "deg/s")),
     "sigma zero": (
         cells("gnss.csv", "sigma_e_m", "0", ALL),
-        ("gnss", "sigma that is zero", "a cautious value"),
+        ("gnss", "sigma that is zero", "the usual value"),
     ),
     "one sigma negative": (
         cells("gnss.csv", "sigma_n_m", "-1"),

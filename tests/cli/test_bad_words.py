@@ -111,7 +111,7 @@ def test_bag_without_a_channel(channel: str, told: str, good_log: Path, tmp_path
     (tmp_path / "log" / f"{channel}.csv").unlink()
     assert terrafusion("convert", "log", "part.mcap").status == 0
     outcome = terrafusion("replay", "part.mcap", "--vehicle", "elevate", "--out", "results")
-    outcome.refused(channel, told)
+    outcome.refused("part.mcap", channel, told)
 
 
 @pytest.mark.parametrize("share", [0.0005, 0.1, 0.5, 0.9, 1.0])

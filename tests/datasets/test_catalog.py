@@ -102,6 +102,11 @@ def test_a_document_of_a_set_is_told_from_a_recording(data_folder: Path) -> None
         open_recording(data_folder / "norlab_drive" / "LICENSE")
 
 
+def test_a_misspelt_name_is_told_the_near_ones() -> None:
+    with pytest.raises(DataError, match="did you mean husky_parkinglot/test"):
+        open_recording("husky_parkinglt/test1")
+
+
 def test_a_folder_of_logs_names_them(tmp_path: Path) -> None:
     (tmp_path / "notes.md").write_text("nothing")
     (tmp_path / "poses.tum").write_text("0 0 0 0 0 0 0 1\n1 1 0 0 0 0 0 1\n")

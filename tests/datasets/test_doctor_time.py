@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.doctor import Finding, Patient, examine, treat
-from terrafusion.datasets.doctor.offsets import lags
+from terrafusion.datasets.doctor.pairs import far_lag, signal_pairs
+from terrafusion.datasets.lag import Lag
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.recording import ClockJump, Imu, Recording, Wheels
 from terrafusion.datasets.sensors import Rig
@@ -281,15 +282,21 @@ def test_steps_taken_out_on_reading_are_told_once(drive: Recording) -> None:
     assert mended.imu is drive.imu
 
 
+def lags(recording: Recording) -> dict[str, Lag]:
+    """The lags that the check of clocks starts from, by pair."""
+    found = {pair: far_lag(*signals) for pair, signals in signal_pairs(Patient(recording, None)).items()}
+    return {f"{other} after {one}": lag for (one, other), lag in found.items() if lag is not None}
+
+
 def test_lags_are_told_by_pair(drive: Recording) -> None:
-    found = lags(Patient(late("wheels", 0.5)(drive), None))
+    found = lags(late("wheels", 0.5)(drive))
     assert set(found) == {
         "wheels after imu", "imu after truth", "wheels after truth", "wheels after gnss", "gnss after truth"
     }  # fmt: skip
     assert abs(found["wheels after truth"].seconds - 0.5) < 0.02
     assert abs(found["gnss after truth"].seconds) < 0.02
     assert found["wheels after imu"].low_s < 0.5 < found["wheels after imu"].high_s
-    assert lags(Patient(Recording("x", 0), None)) == {}
+    assert lags(Recording("x", 0)) == {}
 
 
 def test_a_moving_mean_of_odometry_is_no_offset(drive: Recording) -> None:
@@ -306,7 +313,7 @@ def test_a_moving_mean_of_odometry_is_no_offset(drive: Recording) -> None:
     sides = np.stack([1.0 - 0.25 * turn, 1.0 + 0.25 * turn], axis=1)
     imu = Imu(t_ns, gyro, np.full_like(gyro, np.nan))
     r = Recording("x", START_NS, wheels=Wheels(slow, sides, ("left", "right"), "mps"), imu=imu)
-    assert lags(Patient(r, None))["wheels after imu"].seconds == pytest.approx(0.395, abs=0.02)
+    assert lags(r)["wheels after imu"].seconds == pytest.approx(0.395, abs=0.02)
     assert found_in(r) == []
     assert [f.code for f in found_in(late("wheels", 0.5)(r))] == ["clock-offset"]
 
