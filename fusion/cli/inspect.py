@@ -48,12 +48,14 @@ def inspect(
       terrafusion inspect my_log_folder --json
     """
     from terrafusion.fusion.cli.page import page_lines, print_lines
+    from terrafusion.fusion.cli.trials import trials_lines, trials_of
 
-    page = examined(log, vehicle, topic, stamps, columns)
+    trials = trials_of(log) if columns is None else None
+    page = trials or examined(log, vehicle, topic, stamps, columns)
     if as_json:
         print(json.dumps(page, indent=2, allow_nan=False))
     else:
-        print_lines(page_lines(page))
+        print_lines(trials_lines(page) if trials else page_lines(page))
 
 
 def examined(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import resource
 import struct
 import time
@@ -67,6 +68,17 @@ def test_the_published_trials(smooth: Path) -> None:
     np.testing.assert_allclose(degrees, [0, 15, 30, 45, 60, 75, 90])
     assert np.abs(trials.side_slip_rad - trials.commanded_side_slip_rad).max() < np.radians(1.0)
     np.testing.assert_allclose(trials.travel_speed_mps, 0.01, atol=3e-5)
+
+
+def test_the_page_of_trials(tmp_path: Path, terrafusion: Any) -> None:
+    path = save(tmp_path / "trials.mat", raw_trials())
+    shown = terrafusion("inspect", path)
+    assert shown.status == 0, shown.err
+    assert f"{len(read_wheel_trials(path))} trials of a single wheel" in shown.out
+    assert "side_slip_deg" in shown.out
+    page = json.loads(terrafusion("inspect", path, "--json").out)
+    assert page["trials"] == len(read_wheel_trials(path))
+    terrafusion("convert", path, tmp_path / "out").refused("not a drive", "inspect")
 
 
 def axes_checks(t: WheelTrials) -> dict[str, bool]:
