@@ -23,8 +23,9 @@ FAR_SPIKE = 6.0
 """A spike stands so many times further out than anything near it."""
 NEAR_ROWS = 12
 MOST_SPIKES = 0.02
-FLOORS = {"gyro_radps": (0.5, 30.0), "accel_mps2": (20.0, 0.0), "speed": (0.5, 15.0)}
-"""Least size of a spike, and what a robot reaches a second at most: rad/s, m/s2 and m/s."""
+FLOORS = {"gyro_radps": (0.5, 30.0), "accel_mps2": (150.0, 0.0), "speed": (0.5, 15.0)}
+"""Least size of a spike, and what a robot reaches a second at most: rad/s, m/s2 and m/s. A stone under a
+wheel shakes a Husky by 100 m/s2 for one sample of 100 Hz (BorealTC)."""
 
 
 def check_saturated(patient: Patient) -> Iterator[Finding]:

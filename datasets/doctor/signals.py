@@ -63,9 +63,9 @@ def check_held(patient: Patient) -> Iterator[Finding]:
     for name, channel in patient.recording.channels().items():
         values = _sensed(channel)
         share, run = _held_share(channel.t_ns, values)
-        if share <= HELD_SHARE:
+        rows = held_rows(values)
+        if share <= HELD_SHARE or rows == 1:  # runs of any length are those of a coarse signal
             continue
-        rows = max(held_rows(values), round(run))
 
         def repair(recording: Recording, name: str = name, rows: int = rows) -> Recording:
             channel = getattr(recording, name)
