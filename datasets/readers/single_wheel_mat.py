@@ -26,5 +26,5 @@ def read(request: Request) -> NoReturn:
     raise DataError(
         f"holds {len(trials)} trials of a single wheel, not a drive",
         file=request.path,
-        remedy="`terrafusion inspect` sums them up; in Python, datasets.single_wheel.read_wheel_trials reads them",
+        remedy="`terrafusion inspect` sums them up; in Python, single_wheel.read_wheel_trials reads them",
     )
