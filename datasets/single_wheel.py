@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers.matlab_v5 import read_structures
+from terrafusion.datasets.readers.sets.matlab_v5 import read_structures
 
 if TYPE_CHECKING:
     import pandas as pd

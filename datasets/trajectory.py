@@ -149,7 +149,7 @@ def read_tum(path: Path) -> Trajectory:
     Raises:
         DataError: missing file, a line that is not eight finite numbers, or time not increasing.
     """
-    from terrafusion.datasets.readers.tum import tum_rows
+    from terrafusion.datasets.readers.text.tum import tum_rows
 
     t_ns, table, _ = tum_rows(path)
     try:

@@ -148,7 +148,8 @@ def test_log_folder_columns_are_told() -> None:
 
 def test_formats_and_units_are_told() -> None:
     """Every format, unit and key of the column map stands in the document of formats."""
-    from terrafusion.datasets.readers import column_map, formats, units
+    from terrafusion.datasets.readers import formats
+    from terrafusion.datasets.readers.text import column_map, units
 
     text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     words = [form.name for form in formats.FORMATS] + [

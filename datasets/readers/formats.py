@@ -70,18 +70,18 @@ class Format:
 _READERS = "terrafusion.datasets.readers"
 FORMATS: tuple[Format, ...] = (
     Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
-    Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros1"),
-    Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros2"),
-    Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.umich_text"),
-    Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.norlab_pickle"),
-    Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.pathfinder_mat"),
-    Format("single_wheel_mat", "trials of a single wheel (MATLAB v5)", f"{_READERS}.single_wheel_mat"),
-    Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.borealtc_csv"),
-    Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.xsens_text"),
-    Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.rtklib_pos"),
-    Format("nmea", "an NMEA 0183 log", f"{_READERS}.nmea"),
-    Format("tum", "a TUM trajectory", f"{_READERS}.tum"),
-    Format("table", "a table (.csv, .tsv, .txt, .parquet) with a column map", f"{_READERS}.table"),
+    Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros.ros1"),
+    Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros.ros2"),
+    Format("umich_text", "a text log of the Michigan Husky", f"{_READERS}.sets.umich_text"),
+    Format("norlab_pickle", "a pickled DataFrame of DRIVE", f"{_READERS}.sets.norlab_pickle"),
+    Format("pathfinder_mat", "a MATLAB v7.3 workspace of the Pathfinder", f"{_READERS}.sets.pathfinder_mat"),
+    Format("single_wheel_mat", "trials of a single wheel (MATLAB v5)", f"{_READERS}.sets.single_wheel_mat"),
+    Format("borealtc_csv", "an imu_NN.csv or pro_NN.csv of BorealTC", f"{_READERS}.sets.borealtc_csv"),
+    Format("xsens_text", "a text export of Xsens MT Manager", f"{_READERS}.text.xsens_text"),
+    Format("rtklib_pos", "an RTKLIB solution (.pos)", f"{_READERS}.text.rtklib_pos"),
+    Format("nmea", "an NMEA 0183 log", f"{_READERS}.text.nmea"),
+    Format("tum", "a TUM trajectory", f"{_READERS}.text.tum"),
+    Format("table", "a table (.csv, .tsv, .txt, .parquet) with a column map", f"{_READERS}.text.table"),
 )
 """In the order in which they are asked; the first that claims a file reads it. Tables come last."""
 

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers.ros_recording import META
+from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.recording import Fix, Gnss, Imu, Recording, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
@@ -45,7 +45,7 @@ def write_mcap(
     `/datum` NavSatFix (the ENU origin, once), `/cmd_vel` TwistStamped, `/terrain` String,
     `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link,
     `/tf_static` (positions of IMU and antenna where known). Log times are the stamps. What these
-    cannot hold to the bit stands on topics of their own, see `readers/ros_recording.py`.
+    cannot hold to the bit stands on topics of their own, see `readers/ros/exact.py`.
 
     Args:
         recording: the drive.

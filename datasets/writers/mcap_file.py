@@ -15,7 +15,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.readers.ros_raw import zstd
+from terrafusion.datasets.readers.ros.raw import zstd
 from terrafusion.datasets.writers.cdr import split
 
 TimesNs = NDArray[np.int64]

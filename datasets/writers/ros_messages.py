@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.frames import enu_to_geodetic, rpy_to_quaternion
-from terrafusion.datasets.readers.ros_recording import PREFIX, ROW, STAMP
+from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
 from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers.cdr import Layout, split

@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from terrafusion.datasets.readers.ros_layout import Decoder
-from terrafusion.datasets.readers.ros_messages import Stream
-from terrafusion.datasets.readers.ros_raw import Batch
+from terrafusion.datasets.readers.ros.layout import Decoder
+from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.readers.ros.raw import Batch
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 T0 = 1_600_000_000_000_000_000

@@ -15,7 +15,8 @@ from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.measures import measure
 from terrafusion.datasets.doctor.mounting import heading
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers import borealtc_csv, open_recording
+from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.sets import borealtc_csv
 from terrafusion.datasets.recording import TERRAINS, Recording, differences
 
 IMU_HEADER, PRO_HEADER = "time,wx,wy,wz,ax,ay,az", "time,curL,curR,velL,velR"

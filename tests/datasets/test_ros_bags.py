@@ -13,7 +13,7 @@ from rosbags.rosbag2 import StoragePlugin
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.ros_joints import wheel_of_joint
+from terrafusion.datasets.readers.ros.joints import wheel_of_joint
 from terrafusion.datasets.recording import Fix, Recording
 from terrafusion.datasets.sensors import Rig
 

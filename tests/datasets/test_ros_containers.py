@@ -18,10 +18,10 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.ros1_file import Ros1File
-from terrafusion.datasets.readers.ros2 import open_container
-from terrafusion.datasets.readers.ros_raw import BagError, Container, decompress, zstd
-from terrafusion.datasets.readers.ros_streams import read_streams
+from terrafusion.datasets.readers.ros.raw import BagError, Container, decompress, zstd
+from terrafusion.datasets.readers.ros.ros1_file import Ros1File
+from terrafusion.datasets.readers.ros.ros2 import open_container
+from terrafusion.datasets.readers.ros.streams import read_streams
 
 from .ros_bits import ROS1, ROS2, T0, assert_same, imu, serialized
 
@@ -220,8 +220,8 @@ def test_a_small_bag_that_unpacks_to_gigabytes(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each chunk is as it claims; together they are more than a recording could be."""
-    monkeypatch.setattr("terrafusion.datasets.readers.ros_raw.MAX_CHUNK_BYTES", 20_000)
-    monkeypatch.setattr("terrafusion.datasets.readers.ros_raw.MAX_EXPANSION", 1)
+    monkeypatch.setattr("terrafusion.datasets.readers.ros.raw.MAX_CHUNK_BYTES", 20_000)
+    monkeypatch.setattr("terrafusion.datasets.readers.ros.raw.MAX_EXPANSION", 1)
     with pytest.raises(TerrafusionError, match="more than 1 times its size"):
         open_recording(make(tmp_path, kind))
 
@@ -233,7 +233,9 @@ def test_a_chunk_of_nothing_is_refused_in_time(
     """Zeros are records without content, as many as there are: not one of them is gone through."""
     path = make(tmp_path, kind)
     module = "ros1_file" if kind.startswith("bag") else "mcap_file"
-    monkeypatch.setattr(f"terrafusion.datasets.readers.{module}.decompress", lambda *_: bytes(200_000_000))
+    monkeypatch.setattr(
+        f"terrafusion.datasets.readers.ros.{module}.decompress", lambda *_: bytes(200_000_000)
+    )
     start = time.process_time()
     with pytest.raises(TerrafusionError, match=word):
         open_recording(path)

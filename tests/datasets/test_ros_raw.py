@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.readers.ros_layout import Decoder
-from terrafusion.datasets.readers.ros_raw import BagError
+from terrafusion.datasets.readers.ros.layout import Decoder
+from terrafusion.datasets.readers.ros.raw import BagError
 
 from .ros_bits import (
     ROS1,

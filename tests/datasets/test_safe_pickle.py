@@ -17,8 +17,8 @@ import pytest
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers import open_recordings
-from terrafusion.datasets.readers.pickled_frame import ALLOWED
-from terrafusion.datasets.readers.safe_pickle import numbers, read_table
+from terrafusion.datasets.readers.sets.pickled_frame import ALLOWED
+from terrafusion.datasets.readers.sets.safe_pickle import numbers, read_table
 
 from .conftest import CatalogWith
 
@@ -221,5 +221,7 @@ def test_flipped_bytes_are_read_or_refused(store: Any) -> None:
 
 def test_only_stand_ins_are_allowed() -> None:
     """Nothing of pandas or NumPy is called, and of Python nothing but `slice`."""
-    foreign = {v for v in ALLOWED.values() if v.__module__ != "terrafusion.datasets.readers.pickled_frame"}
+    foreign = {
+        v for v in ALLOWED.values() if v.__module__ != "terrafusion.datasets.readers.sets.pickled_frame"
+    }
     assert foreign == {slice}

@@ -17,8 +17,8 @@ from hypothesis import strategies as st
 from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.frames import enu_to_geodetic, geodetic_to_enu
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.column_map import FIELDS, starter_map
-from terrafusion.datasets.readers.units import UNITS, units_of
+from terrafusion.datasets.readers.text.column_map import FIELDS, starter_map
+from terrafusion.datasets.readers.text.units import UNITS, units_of
 from terrafusion.datasets.recording import Fix, Recording
 
 START_NS = 1_700_000_000_123_456_789

@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers import number_rows, open_recording, umich_text
+from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.sets import umich_text
+from terrafusion.datasets.readers.text import number_rows
 from terrafusion.datasets.recording import differences
 
 START_S = 1_652_300_000

@@ -1,0 +1,153 @@
+"""What ROS 1 and ROS 2 bags share: choose topics, read them, build the recording."""
+
+from __future__ import annotations
+
+import functools
+from collections import Counter
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.log_folder import truth_contents
+from terrafusion.datasets.readers.ros.channels import Builder
+from terrafusion.datasets.readers.ros.exact import META, restore
+from terrafusion.datasets.readers.ros.joints import joint_names, wheel_joints
+from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
+from terrafusion.datasets.readers.ros.raw import BagError, Container
+from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
+from terrafusion.datasets.readers.ros.times import Timing, timing_of
+from terrafusion.datasets.readers.ros.topics import JOINTS, Topic, choose_topics, said_joints
+from terrafusion.datasets.recording import Overrides, Recording
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.readers.formats import Request
+
+LOOK_AT_MESSAGES = 20
+"""Enough messages of a JointState to learn its joints."""
+
+
+def read_bag(request: Request, open_container: Callable[[Path], Container], remedy: str) -> Recording:
+    """Read a bag of either ROS.
+
+    Args:
+        request: the bag, the robot, topics and stamps.
+        open_container: opens the file or folder.
+        remedy: what to do about a bag that does not open.
+
+    Raises:
+        DataError: a broken bag, no usable topic, or what the channels refuse.
+    """
+    path = request.path
+    try:
+        with foreign():
+            container = open_container(path)
+        try:
+            return _assemble(container, request)
+        finally:
+            container.close()
+    except BagError as error:
+        what = f"cannot be read as a ROS bag: {error}"
+        raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
+
+
+def _assemble(container: Container, request: Request) -> Recording:
+    path, rig = request.path, request.rig
+    there = {(source.topic, source.msgtype) for source in container.sources if source.count}
+    if META in there and not request.topics and request.stamps == "header":
+        return restore(functools.partial(read_streams, container), there, path)
+    joints = said_joints(request.topics)
+    topics = _topics_of(container)
+    chosen, notes = choose_topics(
+        topics,
+        file=path,
+        user=request.topics,
+        usual=rig.topics if rig else None,
+        is_wheel_joints=lambda topic: _has_wheels(container, topic, joints),
+    )
+    streams = _streams(container, chosen)
+    if META in there:
+        notes.append(f"{META[0].rpartition('/')[0]} is not used: topics or stamps were asked for")
+    notes += [
+        f"{kind}: {topic.name} is empty after all" for kind, topic in chosen.items() if kind not in streams
+    ]
+    if "gnss" not in streams:
+        streams.pop("gnss_velocity", None)
+    if not set(streams) - {"datum", "gnss_velocity"}:
+        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in topics) or "none"
+        raise DataError(
+            f"no topic of a type this library uses; topics here: {seen}",
+            file=path,
+            remedy="name one with --topic, such as --topic imu=/imu/data",
+        )
+    datum = streams.pop("datum", None)
+    timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock, file=path)
+    start_ns = min(int(t[0]) for t in timing.times.values())
+    builder = Builder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
+    return _build(builder, timing, datum)
+
+
+def _build(builder: Builder, timing: Timing, datum_stream: Stream | None) -> Recording:
+    """One channel after the other; the order matters where one looks at another."""
+    streams, t = timing.streams, timing.times
+    imu = builder.imu(streams["imu"], t["imu"]) if "imu" in streams else None
+    wheels, track = None, None
+    if "wheels" in streams:
+        wheels, track = builder.wheels(streams["wheels"], t["wheels"], imu)
+    gnss, datum = None, builder.datum(datum_stream) if datum_stream is not None else None
+    if "gnss" in streams:
+        gnss, datum = builder.gnss(streams["gnss"], t["gnss"], datum)
+        if gnss is not None and "gnss_velocity" in streams:
+            gnss = builder.gnss_velocity(gnss, streams["gnss_velocity"], t["gnss_velocity"])
+    truth, frame = None, "base"
+    if "truth" in streams:
+        truth, frame = builder.truth(streams["truth"], t["truth"])
+    return Recording(
+        name=builder.file.stem,
+        start_ns=builder.start_ns,
+        command=builder.command(streams["command"], t["command"]) if "command" in streams else None,
+        wheels=wheels,
+        imu=imu,
+        gnss=gnss,
+        terrain=builder.terrain(streams["terrain"], t["terrain"]) if "terrain" in streams else None,
+        truth=truth,
+        datum=datum,
+        truth_channels=truth_contents(truth) if truth is not None else (),
+        truth_frame=frame,
+        overrides=Overrides(track_m=track),
+        source="topics: " + ", ".join(f"{kind} {stream.topic}" for kind, stream in streams.items()),
+        notes=tuple(builder.notes),
+        clock_jumps=timing.jumps,
+        imu_frame_id=_usual_frame(streams["imu"]) if "imu" in streams else "",
+    )
+
+
+def _usual_frame(stream: Stream) -> str:
+    """The frame of most messages."""
+    names = Counter(stream.frame_ids.tolist())
+    return str(names.most_common(1)[0][0]) if names else ""
+
+
+def _topics_of(container: Container) -> list[Topic]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for source in container.sources:
+        counts[source.topic, source.msgtype] += source.count
+    return [Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items()) if count]
+
+
+def _has_wheels(container: Container, topic: str, joints: dict[str, str]) -> bool:
+    """Whether the first messages of a JointState topic name wheels."""
+    key = topic, JOINTS
+    stream = read_streams(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
+    return bool(wheel_joints(joint_names(stream), joints))
+
+
+def _streams(container: Container, chosen: Mapping[str, Topic]) -> dict[str, Stream]:
+    """The streams of the chosen topics that do hold messages, by channel."""
+    asked: dict[Key, tuple[str, ...]] = {}
+    for kind, topic in chosen.items():
+        key, fields = (topic.name, topic.msgtype), wanted_fields(kind, topic.msgtype)
+        asked[key] = (*asked.get(key, ()), *fields)
+    streams = read_streams(container, asked)
+    found = {kind: streams[topic.name, topic.msgtype] for kind, topic in chosen.items()}
+    return {kind: stream for kind, stream in found.items() if len(stream)}

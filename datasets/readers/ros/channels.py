@@ -1,0 +1,319 @@
+"""Streams of a bag -> channels of a recording, with a note for everything assumed or left out."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.conventions import BODY_AXES, Conventions
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import geodetic_to_enu
+from terrafusion.datasets.readers.ros import topics
+from terrafusion.datasets.readers.ros.joints import holding, joint_names, joint_values, wheel_joints
+from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE, Stream, poses, twists
+from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Terrain, Wheels
+from terrafusion.datasets.sensors import Rig
+from terrafusion.datasets.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+Datum = tuple[float, float, float]
+
+NOMINAL_TRACK_M = 1.0
+DEFAULT_SIGMA_M = (3.0, 3.0, 6.0)
+"""Sigma (east, north, up) of a stand-alone fix whose receiver and log say nothing."""
+
+FIX_OF_STATUS = {0: Fix.SINGLE, 1: Fix.DGPS, 2: Fix.FIXED}
+MOVING_MPS = 0.05
+
+
+@dataclass
+class Builder:
+    """Turns streams into channels; `notes` gathers what a user should know.
+
+    `known` are the conventions of a catalogued bag: its track makes the side speeds where there is
+    no rig, and its IMU's axes are left to whoever applies the conventions.
+    """
+
+    file: Path
+    rig: Rig | None
+    known: Conventions
+    start_ns: int
+    joints: dict[str, str]
+    notes: list[str] = field(default_factory=list)
+
+    def command(self, stream: Stream, t_ns: TimesNs) -> Command:
+        """Commanded twists."""
+        twist, _ = twists(stream)
+        self._refuse_nan(twist[:, [0, 5]], t_ns, stream.topic)
+        return Command(t_ns, twist[:, 0], twist[:, 5])
+
+    def imu(self, stream: Stream, t_ns: TimesNs) -> Imu:
+        """Rates and specific forces in body axes; rotated only where the frame is the rig's."""
+        gyro, accel = stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")
+        gyro[stream.column("angular_velocity_covariance.0") == -1] = np.nan
+        accel[stream.column("linear_acceleration_covariance.0") == -1] = np.nan
+        for what, values in (("angular velocity", gyro), ("linear acceleration", accel)):
+            known = ~np.isnan(values).all(axis=0)
+            if not known.any():
+                self.notes.append(f"imu: {stream.topic} has no {what}")
+            self._refuse_nan(values[:, known], t_ns, stream.topic, what)
+        gyro, accel = self._to_body(stream, gyro, accel)
+        return Imu(t_ns, gyro, accel)
+
+    def _to_body(self, stream: Stream, gyro: Array, accel: Array) -> tuple[Array, Array]:
+        frames = sorted(set(stream.frame_ids.tolist()))
+        said = ", ".join(f"'{name}'" for name in frames)
+        if self.rig is None:
+            if self.known.imu_axes == BODY_AXES:
+                self.notes.append(
+                    f"imu: no vehicle given: {stream.topic} (frame {said}) taken as x forward, y left, z up"
+                )
+            return gyro, accel
+        spec = self.rig.sensors.imu
+        wanted = spec.frame_id.lstrip("/")
+        turn = np.asarray(stream.frame_ids == wanted, dtype=bool)
+        if not turn.any():
+            self.notes.append(
+                f"imu: {stream.topic} is in frame {said}, not '{wanted}' of the vehicle: not rotated"
+            )
+            return gyro, accel
+        R = spec.base_from_sensor()
+        if not np.array_equal(R, np.eye(3)):
+            share = "" if turn.all() else f" ({int(turn.sum())} of {len(turn)} messages)"
+            self.notes.append(f"imu: rotated from {wanted} to the body: axes {', '.join(spec.axes)}{share}")
+        out = []
+        for values in (gyro, accel):
+            turned = values.copy()
+            turned[turn] = _rotate(R, values[turn])
+            out.append(turned)
+        return out[0], out[1]
+
+    def wheels(self, stream: Stream, t_ns: TimesNs, imu: Imu | None) -> tuple[Wheels | None, float | None]:
+        """Wheel speeds, and the nominal track (m) where one had to be assumed."""
+        if stream.msgtype == topics.JOINTS:
+            return self._wheels_of_joints(stream, t_ns), None
+        twist, variance = twists(stream)
+        v, rate = twist[:, 0], twist[:, 5]
+        self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
+        if stream.msgtype == topics.ODOMETRY and not twist.any():
+            position, _, _ = poses(stream)
+            if np.nanmax(np.ptp(position[:, :2], axis=0), initial=0.0) > 1.0:
+                self.notes.append(f"wheels: {stream.topic} moves but its twist is zero throughout; left out")
+                return None, None
+        if self._says_no_yaw(stream, rate, variance[:, 5], v, imu):
+            return Wheels(t_ns, v[:, None], ("speed",), "mps"), None
+        self._refuse_nan(rate[:, None], t_ns, stream.topic, "yaw rate")
+        track = self.rig.track_m if self.rig else self.known.track_m or NOMINAL_TRACK_M
+        assumed = None if self.rig or self.known.track_m else NOMINAL_TRACK_M
+        if assumed:
+            self.notes.append(
+                f"wheels: no vehicle given: side speeds of {stream.topic} are for a nominal track of "
+                f"{NOMINAL_TRACK_M:g} m, which keeps its yaw rate"
+            )
+        half = rate * (track / 2.0)
+        return Wheels(t_ns, np.stack([v - half, v + half], axis=1), ("left", "right"), "mps"), assumed
+
+    def _says_no_yaw(self, stream: Stream, rate: Array, variance: Array, v: Array, imu: Imu | None) -> bool:
+        why = ""
+        if np.isnan(rate).all() or (variance >= UNKNOWN_VARIANCE).all() or (variance < 0).all():
+            why = "its yaw rate is marked unknown"
+        elif not rate.any() and np.abs(v).max(initial=0.0) > MOVING_MPS and imu is not None:
+            turning = imu.gyro_radps[:, 2]
+            if np.isfinite(turning).any() and np.nanstd(turning) > 0.05:
+                why = "its yaw rate is zero throughout while the gyro turns"
+        if why:
+            self.notes.append(f"wheels: {stream.topic}: {why}; only the speed is used")
+        return bool(why)
+
+    def _wheels_of_joints(self, stream: Stream, t_ns: TimesNs) -> Wheels | None:
+        names = joint_names(stream)
+        joints = wheel_joints(names, self.joints)
+        if not joints:
+            raise DataError(
+                f"joints {', '.join(names) or '(none)'} name no wheels",
+                file=self.file,
+                channel=stream.topic,
+                remedy="name them with --topic joint.left=NAME --topic joint.right=NAME",
+            )
+        held = holding(stream, [*joints.values()])
+        if not held.any():
+            raise DataError(
+                f"no message holds all of the joints {', '.join(joints.values())}",
+                file=self.file,
+                channel=stream.topic,
+                remedy="name the wheel joints with --topic joint.left=NAME --topic joint.right=NAME",
+            )
+        stream, t_ns = stream.select(held), t_ns[held]
+        speed = joint_values(stream, [*joints.values()], "velocity")
+        angle = joint_values(stream, [*joints.values()], "position")
+        said = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
+        self.notes.append(f"wheels: joints of {stream.topic}: {said}")
+        if speed is None and angle is not None and len(t_ns) > 1:
+            dt = np.diff(t_ns) * 1e-9
+            keep = np.concatenate([[False], dt > 0])
+            speed = np.full_like(angle, np.nan)
+            speed[keep] = np.diff(angle, axis=0)[dt > 0] / dt[dt > 0, None]
+            speed, angle, t_ns = speed[keep], angle[keep], t_ns[keep]
+            self.notes.append(
+                f"wheels: {stream.topic} has no velocities; taken from differences of the angles"
+            )
+        if speed is None:
+            raise DataError("joints have neither velocity nor position", file=self.file, channel=stream.topic)
+        self._refuse_nan(speed, t_ns, stream.topic, "wheel speed")
+        return Wheels(t_ns, speed, tuple(joints), "radps", angle)
+
+    def gnss(self, stream: Stream, t_ns: TimesNs, datum: Datum | None) -> tuple[Gnss | None, Datum | None]:
+        """Fixes as ENU about `datum`, or about the first valid fix."""
+        llh = self._llh(stream)
+        status = stream.column("status.status")
+        valid = np.isfinite(llh[:, :2]).all(axis=1) & (status >= 0)
+        null = (llh[:, 0] == 0.0) & (llh[:, 1] == 0.0)
+        if valid.any() and np.abs(np.median(llh[valid, :2], axis=0)).max() > 0.1:
+            valid &= ~null
+        self._check_range(llh, valid, t_ns, stream.topic)
+        dropped = int((~valid).sum())
+        if dropped:
+            self.notes.append(
+                f"gnss: {dropped} of {len(valid)} messages of {stream.topic} hold no fix; left out"
+            )
+        if not valid.any():
+            return None, None
+        llh, t_ns, status = llh[valid], t_ns[valid], status[valid]
+        if datum is None:
+            heights = llh[np.isfinite(llh[:, 2]), 2]
+            datum = (float(llh[0, 0]), float(llh[0, 1]), float(heights[0]) if heights.size else 0.0)
+            self.notes.append(
+                f"gnss: datum is the first fix, {datum[0]:.7f} deg, {datum[1]:.7f} deg, {datum[2]:.2f} m"
+            )
+        flat = np.isnan(llh[:, 2])
+        enu = geodetic_to_enu(np.where(flat[:, None] & [False, False, True], datum[2], llh), datum)
+        enu[flat, 2] = np.nan
+        codes = np.full(len(status), Fix.SINGLE, dtype=np.uint8)
+        for number, fix in FIX_OF_STATUS.items():
+            codes[status == number] = fix
+        return Gnss(t_ns, enu, self._sigma(stream.select(valid)), codes), datum
+
+    def _llh(self, stream: Stream) -> Array:
+        """Latitude, longitude (deg) and height (m), (N, 3)."""
+        names = ("latitude", "longitude", "altitude")
+        return np.stack([stream.column(name).astype(float) for name in names], axis=1)
+
+    def _check_range(self, llh: Array, valid: NDArray[np.bool_], t_ns: TimesNs, topic: str) -> None:
+        bad = valid & ((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            raise DataError(
+                f"latitude {llh[i, 0]:g}, longitude {llh[i, 1]:g} is not on Earth",
+                file=self.file,
+                channel=topic,
+                time_s=self._since(t_ns[i]),
+                remedy="NavSatFix wants degrees",
+            )
+
+    def _sigma(self, stream: Stream) -> Array:
+        diagonal = [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)]
+        variance = np.stack(diagonal, axis=1)
+        unknown = stream.column("position_covariance_type") == 0
+        with np.errstate(invalid="ignore"):
+            sigma = np.sqrt(variance)
+        if unknown.any():
+            spec = self.rig.sensors.gnss if self.rig else None
+            flat = spec.sigma_horizontal_m if spec else DEFAULT_SIGMA_M[0]
+            up = spec.sigma_vertical_m if spec else DEFAULT_SIGMA_M[2]
+            sigma[unknown] = (flat, flat, up)
+            origin = "the vehicle's receiver" if spec else "a stand-alone receiver, assumed"
+            self.notes.append(
+                f"gnss: {int(unknown.sum())} fixes have no covariance; sigma {flat:g} m flat and {up:g} m up "
+                f"({origin})"
+            )
+        return sigma
+
+    def gnss_velocity(self, gnss: Gnss, stream: Stream, t_ns: TimesNs) -> Gnss:
+        """The fixes with the ENU velocity of another topic, matched within half a fix interval."""
+        twist, variance = twists(stream)
+        if not len(t_ns):
+            return gnss
+        after = np.clip(np.searchsorted(t_ns, gnss.t_ns), 0, len(t_ns) - 1)
+        before = np.clip(after - 1, 0, None)
+        nearer = np.abs(t_ns[before] - gnss.t_ns) <= np.abs(t_ns[after] - gnss.t_ns)
+        nearest = np.where(nearer, before, after)
+        interval = np.median(np.diff(gnss.t_ns)) if len(gnss) > 1 else 1e9
+        close = np.abs(t_ns[nearest] - gnss.t_ns) <= min(interval / 2, 5e7)
+        velocity = np.where(close[:, None], twist[nearest, :3], np.nan)
+        velocity[:, 2][variance[nearest, 2] >= UNKNOWN_VARIANCE] = np.nan
+        with np.errstate(invalid="ignore"):
+            deviation = np.sqrt(np.where(variance[nearest, 0] > 0, variance[nearest, 0], np.nan))
+        self.notes.append(
+            f"gnss: velocity of {stream.topic} taken as east, north, up; {int((~close).sum())} fixes without"
+        )
+        if np.isnan(velocity).all():
+            return gnss
+        sigma = None if np.isnan(deviation).all() else np.where(close, deviation, np.nan)
+        return dataclasses.replace(gnss, velocity_enu_mps=velocity, sigma_v_mps=sigma)
+
+    def datum(self, stream: Stream) -> Datum:
+        """The ENU origin that a bag written by this library carries."""
+        self.notes.append(f"gnss: datum from {stream.topic}")
+        latitude, longitude, height = self._llh(stream)[0].tolist()
+        return latitude, longitude, height
+
+    def terrain(self, stream: Stream, t_ns: TimesNs) -> Terrain:
+        """Labels as they were published."""
+        return Terrain(t_ns, stream.column("data"), stream.topic)
+
+    def truth(self, stream: Stream, t_ns: TimesNs) -> tuple[Trajectory, str]:
+        """Ground truth, and which point it is of: "base" or "antenna"."""
+        position, quaternion, covariance = poses(stream)
+        self._refuse_nan(position[:, :2], t_ns, stream.topic, "position")
+        orientation: Array | None = quaternion
+        if not np.abs(np.linalg.norm(quaternion, axis=1) - 1.0).max(initial=0.0) <= 0.01:
+            self.notes.append(f"truth: {stream.topic} has no valid quaternions; only the position is used")
+            orientation = None
+        if covariance is not None:
+            position[:, 2][covariance[:, 2, 2] >= UNKNOWN_VARIANCE] = np.nan
+            if (covariance[:, 5, 5] >= UNKNOWN_VARIANCE).all():
+                orientation = None
+            if not covariance.any() or covariance.diagonal(axis1=1, axis2=2).max() >= UNKNOWN_VARIANCE:
+                covariance = None
+        twist = self._truth_twist(stream)
+        child = str(stream.column("child_frame_id")[0]) if stream.has("child_frame_id") else ""
+        frame = "antenna" if any(word in child.lower() for word in ("antenna", "gps", "gnss")) else "base"
+        fresh = np.concatenate([[True], np.diff(t_ns) > 0])
+        if not fresh.all():
+            self.notes.append(f"truth: {int((~fresh).sum())} poses with a repeated time left out")
+        columns = (position, orientation, twist, covariance)
+        kept = [None if column is None else column[fresh] for column in columns]
+        return Trajectory(t_ns[fresh], position[fresh], *kept[1:]), frame
+
+    def _truth_twist(self, stream: Stream) -> Array | None:
+        if stream.msgtype != topics.ODOMETRY:
+            return None
+        twist, variance = twists(stream)
+        twist[variance >= UNKNOWN_VARIANCE] = np.nan
+        return twist if np.nan_to_num(twist).any() else None
+
+    def _since(self, t_ns: np.int64) -> float:
+        return float(t_ns - self.start_ns) * 1e-9
+
+    def _refuse_nan(self, values: Array, t_ns: TimesNs, topic: str, what: str = "value") -> None:
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            i = int(np.flatnonzero(bad)[0])
+            raise DataError(
+                f"{int(bad.sum())} of {len(values)} messages have a {what} that is not a finite number",
+                file=self.file,
+                channel=topic,
+                time_s=self._since(t_ns[i]),
+                remedy="mend the driver, or filter these messages out of the bag",
+            )
+
+
+def _rotate(R: Array, values: Array) -> Array:
+    """`values` (N, 3) turned by the signed permutation R, exactly: NaN stays on its own axis."""
+    source = np.abs(R).argmax(axis=1)
+    return np.asarray(values[:, source] * R[np.arange(3), source])

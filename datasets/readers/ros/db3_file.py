@@ -1,0 +1,94 @@
+"""The container of ROS 2 bags in SQLite."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+
+import numpy as np
+
+from terrafusion.datasets.readers.ros.raw import BagError, Batch, Groups, Source, grouped, normal_type
+
+LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
+BLOCK_BYTES, MAX_ROWS = 1 << 21, 8192
+"""So many bytes of messages are fetched at once, and at most so many rows."""
+
+
+class Db3File:
+    """An open SQLite database of a ROS 2 bag.
+
+    Args:
+        path: the file.
+        counts: numbers of messages by topic where they are known; counting them takes a pass over the file.
+
+    Raises:
+        BagError: the file is cut off, or not such a database.
+    """
+
+    def __init__(self, path: Path, counts: Mapping[str, int] | None = None) -> None:
+        _refuse_cut(path)
+        uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
+        self._database = sqlite3.connect(uri, uri=True)
+        try:
+            self.sources = self._sources(counts)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        self._database.close()
+
+    def _sources(self, known_counts: Mapping[str, int] | None) -> list[Source]:
+        run = self._database.execute
+        tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        if not {"topics", "messages"} <= tables:
+            raise BagError("the database has no tables of topics and messages")
+        counts: dict[int, int] = {}
+        if known_counts is None:
+            counts = dict(run("SELECT topic_id, COUNT(*) FROM messages GROUP BY topic_id").fetchall())
+        definitions: dict[str, tuple[str, str]] = {}
+        if "message_definitions" in tables:
+            query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
+            definitions = {str(name): (str(language), str(text)) for name, language, text in run(query)}
+        sources = []
+        for number, topic, name, encoding in run("SELECT id, name, type, serialization_format FROM topics"):
+            language, text = definitions.get(name, ("", ""))
+            known = LANGUAGES.get(language, "msg")
+            count = int(counts.get(number, 0) if known_counts is None else known_counts.get(topic, 0))
+            sources.append(
+                Source(int(number), str(topic), normal_type(str(name)), text, known, str(encoding), count)
+            )
+        return sources
+
+    def batches(self, wanted: Groups) -> Iterator[Batch]:
+        """The messages of the wanted groups of topics, in the order in which they were written."""
+        topics = tuple(number for ids in wanted for number in ids)
+        marks = ", ".join("?" * len(topics))
+        query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
+        rows = self._database.execute(query, topics)
+        count = 16
+        while block := rows.fetchmany(count):
+            numbers, times, blobs = zip(*block, strict=True)
+            ids, receipt_ns = np.array(numbers, dtype=np.int64), np.array(times, dtype=np.int64)
+            sizes = np.fromiter(map(len, blobs), dtype=np.int64, count=len(blobs))
+            starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+            count = int(np.clip(BLOCK_BYTES * len(sizes) // max(int(sizes.sum()), 1), 1, MAX_ROWS))
+            data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
+            for group, mine in grouped(ids, wanted):
+                yield Batch(group, data, starts[mine], sizes[mine], receipt_ns[mine])
+
+
+def _refuse_cut(path: Path) -> None:
+    """SQLite reads a file that lost its tail without a word: compare its size with its header.
+
+    Page size at byte 16 (1 means 65536) and page count at byte 28, which holds when the counters
+    at bytes 24 and 92 agree: SQLite file format, sec. 1.3.
+    """
+    with path.open("rb") as file:
+        header = file.read(100)
+    size = path.stat().st_size
+    page = int.from_bytes(header[16:18], "big")
+    wanted = (65536 if page == 1 else page) * int.from_bytes(header[28:32], "big")
+    if len(header) < 100 or (header[24:28] == header[92:96] and size < wanted):
+        raise BagError(f"the database is cut off: {size} of {wanted} bytes")

@@ -1,0 +1,169 @@
+"""What a bag written by this library carries beside its standard messages, and how it is read back.
+
+`/terrafusion/meta` (std_msgs/String, once) holds the keys of `meta.yaml` as JSON, the columns of the
+`tables` below and the `words` that some of their numbers stand for. `/terrafusion/<channel>`
+(std_msgs/Float64MultiArray) holds the rows of that channel's table where the standard messages
+cannot hold it to the bit: its stamp (seconds, nanoseconds), then the columns of the log folder.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.conventions import Conventions
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.channel_tables import ChannelReader, Layouts
+from terrafusion.datasets.readers.csv_table import Table
+from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
+from terrafusion.datasets.readers.log_meta import Meta, parse_meta
+from terrafusion.datasets.readers.ros.channels import Builder
+from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
+from terrafusion.datasets.readers.ros.topics import IMU, JOINTS, ODOMETRY, STRING, TWIST_STAMPED
+from terrafusion.datasets.recording import Recording, Wheels
+
+Key = tuple[str, str]
+"""Name and type of a topic."""
+
+PREFIX = "/terrafusion/"
+META: Key = (f"{PREFIX}meta", STRING)
+ROW = "std_msgs/msg/Float64MultiArray"
+STAMP = ("sec", "nanosec")
+"""What stands before the columns in a row."""
+
+STANDARD: dict[str, Key] = {
+    "command": ("/cmd_vel", TWIST_STAMPED),
+    "wheels": ("/joint_states", JOINTS),
+    "imu": ("/imu/data", IMU),
+    "truth": ("/ground_truth/odom", ODOMETRY),
+}
+"""Topics whose standard messages hold a channel to the bit, unless it has a table."""
+
+LAYOUTS: Layouts = tuple((names, unit) for names in Wheels.LAYOUTS for unit in ("radps", "mps"))
+"""A bag holds wheels of any layout, also those that the log folder has no columns for."""
+
+REMEDY = "write the bag again, or choose its topics with --topic"
+
+
+@dataclass(frozen=True)
+class Saved:
+    """The content of `/terrafusion/meta`: the columns of each table, texts by column, lateness of stamps."""
+
+    meta: Meta
+    tables: dict[str, list[str]]
+    words: dict[str, list[str]]
+    shift_ns: int
+
+
+def restore(
+    read: Callable[[Mapping[Key, tuple[str, ...]]], Mapping[Key, Stream]], there: Collection[Key], file: Path
+) -> Recording:
+    """The recording that was written into a bag.
+
+    Args:
+        read: gives the streams of topics with the wanted fields.
+        there: the topics of the bag.
+        file: the bag.
+
+    Raises:
+        DataError, ConfigError: the bag is not as this library writes it.
+    """
+    saved = _parse(read({META: ("data",)})[META], file)
+    keys = STANDARD | {name: (f"{PREFIX}{name}", ROW) for name in saved.tables}
+    asked = {
+        key: ("data",) if key[1] == ROW else wanted_fields(name, key[1])
+        for name, key in keys.items()
+        if key in there
+    }
+    found = read(asked)
+    streams = {name: found[key] for name, key in keys.items() if key in there}
+    tables = ChannelReader(_BagTables(saved, file, streams), saved.meta, LAYOUTS)
+    builder = Builder(file, None, Conventions(), saved.meta.start_ns, {})
+    channels = {
+        name: getattr(tables, name)()
+        if name in saved.tables
+        else _standard(builder, name, streams.get(name), saved.shift_ns)
+        for name in CHANNELS
+    }
+    return recording_of(channels, saved.meta, file.stem, tables.notes)
+
+
+def _parse(stream: Stream, file: Path) -> Saved:
+    try:
+        content = json.loads(stream.column("data")[0])
+        tables, words, shift_ns = (content.pop(key) for key in ("tables", "words", "shift_ns"))
+        for lists in (tables, words):
+            if not all(isinstance(text, str) for key, texts in lists.items() for text in [key, *texts]):
+                raise TypeError("tables and words are lists of texts")
+        if not 0 <= int(shift_ns) < 2**62:
+            raise ValueError("not a time")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        raise DataError(
+            "is not what this library writes", file=file, channel=META[0], remedy=REMEDY
+        ) from None
+    return Saved(
+        dataclasses.replace(parse_meta(content, file), keep_empty=True), tables, words, int(shift_ns)
+    )
+
+
+def _standard(builder: Builder, name: str, stream: Stream | None, shift_ns: int) -> Any:
+    """A channel from its standard messages, whose stamps are its times."""
+    if stream is None or not len(stream) or stream.header_ns is None:
+        return None
+    t_ns = stream.header_ns - shift_ns
+    if name == "wheels":
+        return builder.wheels(stream, t_ns, None)[0]
+    if name == "truth":
+        return builder.truth(stream, t_ns)[0]
+    return getattr(builder, name)(stream, t_ns)
+
+
+class _BagTables:
+    """The tables of a bag."""
+
+    def __init__(self, saved: Saved, file: Path, streams: Mapping[str, Stream]) -> None:
+        self.saved = saved
+        self.file = file
+        self.streams = streams
+
+    def place(self, channel: str) -> Path:
+        return self.file
+
+    def table(
+        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
+    ) -> Table | None:
+        columns = self.saved.tables[channel]
+        strange = [c for c in columns if c not in (*known, *texts) and not c.startswith(tuple(prefixes))]
+        if strange or len(set(columns)) != len(columns):
+            raise self._error(channel, f"the columns {', '.join(columns)}")
+        stream = self.streams.get(channel)
+        shape = (len(stream) if stream is not None else 0, len(STAMP) + len(columns))
+        rows = stream.column("data") if stream is not None and len(stream) else np.zeros(shape)
+        if rows.shape != shape:
+            raise self._error(channel, f"{rows.shape[1:]} numbers a row for {shape[1:]}")
+        stamps = rows[:, : len(STAMP)]
+        if not ((np.abs(stamps) < 2**32) & (stamps == np.rint(stamps))).all():
+            raise self._error(channel, "stamps that are no times")
+        seconds, nanoseconds = stamps.astype(np.int64).T
+        t_ns = seconds * 10**9 + nanoseconds - self.saved.shift_ns - self.saved.meta.start_ns
+        if (np.diff(t_ns) < 0).any():
+            raise self._error(channel, "stamps that run backwards")
+        numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}
+        words = {name: self._words(channel, name, numbers.pop(name)) for name in texts if name in numbers}
+        return Table(t_ns, numbers, words)
+
+    def _words(self, channel: str, column: str, codes: NDArray[np.float64]) -> NDArray[Any]:
+        words = self.saved.words.get(column, [])
+        if not ((codes >= 0) & (codes < len(words)) & (codes == np.rint(codes))).all():
+            raise self._error(channel, f"a {column} that stands for no word")
+        return np.array([*words, None], dtype=object)[codes.astype(np.int64)]
+
+    def _error(self, channel: str, what: str) -> DataError:
+        return DataError(f"the table has {what}", file=self.file, channel=f"{PREFIX}{channel}", remedy=REMEDY)

@@ -1,0 +1,100 @@
+"""Wheels among the joints of a JointState: which joint is which wheel, and its values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.recording import Wheels
+
+Array = NDArray[np.float64]
+
+_SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
+_ENDS = {"front": "front", "f": "front", "rear": "rear", "back": "rear", "b": "rear", "hind": "rear"}
+_SHORT = {
+    f"{e}{s}": (end, side)
+    for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"))
+    for s, side in (("l", "left"), ("r", "right"))
+}
+_SHORT |= {f"l{e}": (end, "left") for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"))}
+_SHORT |= {"rf": ("front", "right"), "rb": ("rear", "right")}
+_NOT_WHEELS = re.compile(r"steer|arm|flipper|gripper|pan|tilt|caster|suspension|rocker|bogie", re.IGNORECASE)
+
+
+def wheel_of_joint(joint: str) -> str | None:
+    """Name of the wheel (left, front_right, ...) that a joint's name tells, or None."""
+    if _NOT_WHEELS.search(joint):
+        return None
+    spaced = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint)
+    words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word]
+    for word in words:
+        if word in _SHORT:
+            return "_".join(_SHORT[word])
+    side = next((_SIDES[w] for w in words if w in _SIDES), None)
+    if side is None:
+        return None
+    end = next((_ENDS[w] for w in words if w in _ENDS), None)
+    if end is None and any(w in ("middle", "mid", "center", "centre") for w in words):
+        return None
+    return f"{end}_{side}" if end else side
+
+
+def wheel_joints(names: Sequence[str], said: dict[str, str]) -> dict[str, str]:
+    """Wheel -> joint name for the best layout the joints fill; empty when none is filled."""
+    found = dict(said)
+    candidates = [n for n in names if "wheel" in n.lower()] or list(names)
+    for joint in candidates:
+        wheel = wheel_of_joint(joint)
+        if wheel is not None:
+            found.setdefault(wheel, joint)
+    for layout in (Wheels.LAYOUTS[1], Wheels.LAYOUTS[0]):
+        if all(wheel in found for wheel in layout):
+            return {wheel: found[wheel] for wheel in layout}
+    return {}
+
+
+def joint_names(stream: Stream) -> list[str]:
+    """All joints that a JointState topic names, in the order of their appearance."""
+    firsts = sorted((int(rows[0]), names) for rows, names, _ in _by_names(stream))
+    return list(dict.fromkeys(name for _, names in firsts for name in names))
+
+
+def holding(stream: Stream, joints: Sequence[str]) -> NDArray[np.bool_]:
+    """Mask (N,) of the messages that name all these joints."""
+    held = np.zeros(len(stream), dtype=bool)
+    for rows, names, _ in _by_names(stream):
+        held[rows] = all(joint in names for joint in joints)
+    return held
+
+
+def joint_values(stream: Stream, joints: Sequence[str], path: str) -> Array | None:
+    """Values (N, k) of these joints: "velocity" or "position".
+
+    None where a message holds another number of values than of names, or no value is known at all.
+    """
+    out = np.full((len(stream), len(joints)), np.nan)
+    for rows, names, columns in _by_names(stream):
+        values = columns.get(path)
+        if values is None or values.ndim != 2 or values.shape[1] != len(names):
+            return None
+        out[rows] = values[:, [names.index(joint) for joint in joints]]
+    return None if np.isnan(out).all() else out
+
+
+def _by_names(stream: Stream) -> Iterator[tuple[NDArray[np.int64], tuple[str, ...], dict[str, NDArray[Any]]]]:
+    """Rows, names and columns of the messages that have the same list of names."""
+    for block in stream.blocks:
+        names = block.columns["name"]
+        if not names.shape[1] or (names == names[0]).all():
+            yield block.rows, tuple(names[0]), block.columns
+            continue
+        groups: dict[tuple[str, ...], list[int]] = {}
+        for row, each in enumerate(map(tuple, names.tolist())):
+            groups.setdefault(each, []).append(row)
+        for each, rows in groups.items():
+            yield block.rows[rows], each, {path: column[rows] for path, column in block.columns.items()}

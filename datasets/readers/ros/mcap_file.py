@@ -1,0 +1,240 @@
+"""The container MCAP (mcap.dev/spec), with chunks or without, indexed or not.
+
+A file is a row of records: one byte for the kind, eight for the length, content. The records are found by
+one walk over their lengths; an index is used to pass over chunks, where there is one.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from terrafusion.datasets.readers.ros.raw import (
+    MAX_CHUNK_BYTES,
+    BagError,
+    Batch,
+    Groups,
+    Places,
+    Source,
+    decompress,
+    grouped,
+    normal_type,
+    numbers_at,
+    within_reason,
+)
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, STATISTICS = 1, 2, 3, 4, 5, 6, 7, 11
+RECORD_HEAD = 9
+"""Kind and length, before a record's content."""
+MESSAGE_HEAD = 31
+"""Kind, length, channel, sequence number and two times, before a message's own bytes."""
+MIN_CHANNEL_BYTES = 14
+"""Of a schema or channel: its number, and the lengths of its parts."""
+BLOCK_BYTES = 1 << 20
+LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl", "ros1msg": "msg"}
+_head = struct.Struct("<BQ").unpack_from
+
+
+class _Chunk(NamedTuple):
+    start: int
+    size: int
+    channels: set[int]
+    """Those of the index records behind the chunk; empty without them."""
+
+
+class _Text:
+    """Reads numbers and strings off a record's content."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data, self.position = data, 0
+
+    def number(self, size: int) -> int:
+        return int.from_bytes(self.take(size), "little")
+
+    def text(self) -> str:
+        return self.take(self.number(4)).decode(errors="replace")
+
+    def take(self, size: int) -> bytes:
+        taken = self.data[self.position : self.position + size]
+        if len(taken) != size:
+            raise BagError("a record is shorter than its content")
+        self.position += size
+        return taken
+
+
+class McapFile:
+    """An open MCAP file.
+
+    Raises:
+        BagError: the file is cut off, was not closed by its recorder, or breaks the format.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._file = path.open("rb")
+        self._end = path.stat().st_size
+        self._schemas: dict[int, tuple[str, str, str]] = {}
+        self._channels: dict[int, tuple[int, str, str]] = {}
+        self._chunks: list[_Chunk] = []
+        self._loose = np.zeros(0, dtype=np.int64)  # where the messages outside of chunks begin
+        self._counts: dict[int, int] | None = None
+        try:
+            self._walk()
+            if self._counts is None or not self._counts.keys() <= self._channels.keys():
+                self._count()
+        except BaseException:
+            self.close()
+            raise
+        self.sources = [self._source(number) for number in sorted(self._channels)]
+
+    def close(self) -> None:
+        self._file.close()
+
+    def _walk(self) -> None:
+        """Go over all records of the file, without unpacking chunks."""
+        if self._read(0, len(MAGIC)) != MAGIC:
+            raise BagError("it does not begin as MCAP")
+        kind, loose = 0, []
+        for kind, start, size in self._records():
+            if kind == MESSAGE:
+                loose.append(start - RECORD_HEAD)
+            elif kind == CHUNK:
+                self._chunks.append(_Chunk(start, size, set()))
+            elif kind == INDEX and self._chunks and size >= 6:
+                number, length = struct.unpack("<HI", self._read(start, 6))
+                if length:
+                    self._chunks[-1].channels.add(number)
+            elif kind in (SCHEMA, CHANNEL, STATISTICS):
+                self._learn(kind, self._content(start, size))
+            elif kind == FOOTER:
+                break
+        self._loose = np.array(loose, dtype=np.int64)
+        if kind != FOOTER or self._read(self._end - len(MAGIC), len(MAGIC)) != MAGIC:
+            raise BagError("the file breaks off: it has no footer")
+
+    def _records(self) -> Iterator[tuple[int, int, int]]:
+        """Kind, place and length of the content of each record of the file."""
+        position, base, block = len(MAGIC), 0, b""
+        while position < self._end:
+            at = position - base
+            if at + RECORD_HEAD > len(block):
+                self._file.seek(position)
+                base, at, block = position, 0, self._file.read(BLOCK_BYTES)
+            if at + RECORD_HEAD > len(block):
+                break
+            kind, size = _head(block, at)
+            position += RECORD_HEAD + size
+            if position > self._end:
+                raise BagError(f"the file ends at {self._end} of {position} bytes")
+            yield kind, position - size, size
+
+    def _read(self, position: int, size: int) -> bytes:
+        if size > MAX_CHUNK_BYTES:
+            raise BagError(f"a record claims {size} bytes")
+        self._file.seek(max(position, 0))
+        return self._file.read(size)
+
+    def _content(self, start: int, size: int) -> _Text:
+        return _Text(self._read(start, size))
+
+    def _learn(self, kind: int, content: _Text) -> None:
+        if kind == SCHEMA:
+            number = content.number(2)
+            self._schemas[number] = content.text(), content.text(), content.text()
+        elif kind == CHANNEL:
+            number = content.number(2)
+            self._channels[number] = content.number(2), content.text(), content.text()
+        elif kind == STATISTICS:
+            content.take(42)
+            counts = content.take(content.number(4))
+            self._counts = dict(struct.iter_unpack("<HQ", counts)) if len(counts) % 10 == 0 else None
+
+    def _count(self) -> None:
+        """Learn channels and the numbers of their messages from the messages themselves."""
+        for data in self._unpacked(()):
+            self._messages(data, learn=True)
+        channels = sorted(self._channels)
+        self._counts = dict.fromkeys(channels, 0)
+        for batch in self.batches([[number] for number in channels]):
+            self._counts[channels[batch.group]] += len(batch.starts)
+
+    def _source(self, number: int) -> Source:
+        schema, topic, encoding = self._channels[number]
+        name, language, definition = self._schemas.get(schema, ("", "", ""))
+        count = (self._counts or {}).get(number, 0)
+        return Source(
+            number, topic, normal_type(name), definition, LANGUAGES.get(language, "msg"), encoding, count
+        )
+
+    def batches(self, wanted: Groups) -> Iterator[Batch]:
+        """The messages of the wanted groups of channels, block by block."""
+        for data in self._unpacked(wanted):
+            yield from _split(data, np.array(self._messages(data), dtype=np.int64), wanted)
+        first = 0
+        while first < len(self._loose):
+            begin = int(self._loose[first])
+            last = max(int(np.searchsorted(self._loose, begin + BLOCK_BYTES)) - 1, first)
+            end = self._record_end(int(self._loose[last]))
+            yield from _split(self._read(begin, end - begin), self._loose[first : last + 1] - begin, wanted)
+            first = last + 1
+
+    def _record_end(self, position: int) -> int:
+        _, size = _head(self._read(position, RECORD_HEAD), 0)
+        return position + RECORD_HEAD + int(size)
+
+    def _unpacked(self, wanted: Groups) -> Iterator[bytes]:
+        """The chunks that may hold messages of these channels; all where none are named."""
+        chunks = (
+            self._unpack(chunk)
+            for chunk in self._chunks
+            if not (wanted and chunk.channels) or not all(chunk.channels.isdisjoint(ids) for ids in wanted)
+        )
+        return within_reason(chunks, self._end)
+
+    def _unpack(self, chunk: _Chunk) -> bytes:
+        content = self._content(chunk.start, chunk.size)
+        content.take(16)
+        size, checksum = content.number(8), content.number(4)
+        compression = content.text()
+        data = decompress(content.take(content.number(8)), compression, size)
+        if checksum and zlib.crc32(data) != checksum:
+            raise BagError("a chunk's checksum does not match")
+        return data
+
+    def _messages(self, chunk: bytes, *, learn: bool = False) -> list[int]:
+        """Where the message records of a chunk begin."""
+        position, end, starts = 0, len(chunk), []
+        try:
+            while position < end:
+                kind, size = _head(chunk, position)
+                if kind == MESSAGE:
+                    if size < MESSAGE_HEAD - RECORD_HEAD:
+                        raise BagError("a message record is broken")
+                    starts.append(position)
+                elif kind not in (SCHEMA, CHANNEL) or size < MIN_CHANNEL_BYTES:
+                    raise BagError("a chunk holds what is neither message, channel nor schema")
+                elif learn:
+                    self._learn(kind, _Text(chunk[position + RECORD_HEAD :][:size]))
+                position += RECORD_HEAD + size
+        except struct.error:
+            position = -1
+        if position != end:
+            raise BagError("the records of a chunk do not fill it")
+        return starts
+
+
+def _split(block: bytes, places: Places, wanted: Groups) -> Iterator[Batch]:
+    """The messages of a block, whose records begin at `places`, by channel."""
+    data = np.frombuffer(block, dtype=np.uint8)
+    sizes = numbers_at(data, places + 1, "<u8").astype(np.int64) - (MESSAGE_HEAD - RECORD_HEAD)
+    channels = numbers_at(data, places + 9, "<u2")
+    receipt_ns = numbers_at(data, places + 15, "<u8").astype(np.int64)
+    if (sizes < 0).any() or (receipt_ns < 0).any():
+        raise BagError("a message record is broken")
+    for group, rows in grouped(channels, wanted):
+        yield Batch(group, data, places[rows] + MESSAGE_HEAD, sizes[rows], receipt_ns[rows])

@@ -1,0 +1,79 @@
+"""Topics of a bag as streams: the messages of a container, decoded in one go over the file."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+
+import numpy as np
+
+from terrafusion.datasets.readers.ros.layout import Block, Decoder
+from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.readers.ros.raw import BagError, Container, Source
+from terrafusion.datasets.readers.ros.types import types_of
+
+Key = tuple[str, str]
+"""Name and type of a topic."""
+
+
+@contextmanager
+def foreign(topic: str | None = None) -> Iterator[None]:
+    """Around parsers: the bytes are of unknown origin, so whatever they raise, the bag is broken."""
+    try:
+        yield
+    except Exception as error:
+        raise BagError(str(error).rstrip(".") or type(error).__name__, topic) from None
+
+
+def read_streams(
+    container: Container, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
+) -> dict[Key, Stream]:
+    """The streams of topics, in one go over the file.
+
+    Args:
+        container: the bag.
+        asked: paths of the wanted fields by topic and type.
+        enough: stop when one topic has so many messages.
+    """
+    decoders: list[tuple[Key, Decoder]] = []
+    groups: list[list[int]] = []
+    for key, fields in asked.items():
+        alike: dict[tuple[str, str, str], list[Source]] = {}
+        for source in container.sources:
+            if (source.topic, source.msgtype) == key:
+                alike.setdefault((source.definition, source.language, source.encoding), []).append(source)
+        for sources in alike.values():
+            with foreign(key[0]):
+                decoders.append((key, Decoder(key[1], types_of(sources[0]), fields, _is_cdr(sources[0]))))
+            groups.append([source.id for source in sources])
+    batches = container.batches(groups)
+    while True:
+        with foreign():
+            batch = next(batches, None)
+        if batch is None:
+            break
+        key, decoder = decoders[batch.group]
+        with foreign(key[0]):
+            decoder.add(batch)
+        if enough is not None and decoder.count >= enough:
+            break
+    return {key: _stream(key, [decoder for other, decoder in decoders if other == key]) for key in asked}
+
+
+def _is_cdr(source: Source) -> bool:
+    if source.encoding not in ("ros1", "cdr"):
+        raise BagError(f"its messages are encoded as '{source.encoding[:20]}', which is not supported")
+    return source.encoding == "cdr"
+
+
+def _stream(key: Key, decoders: list[Decoder]) -> Stream:
+    """What the decoders of one topic gathered; there are several where its definition changes."""
+    receipts, blocks = [], []
+    count = 0
+    for decoder in decoders:
+        receipt_ns, found = decoder.result()
+        receipts.append(receipt_ns)
+        blocks += [Block(block.rows + count, block.columns) for block in found]
+        count += len(receipt_ns)
+    stream = Stream(*key, np.concatenate(receipts), tuple(blocks))
+    return stream if len(decoders) == 1 else stream.select(np.argsort(stream.receipt_ns, kind="stable"))

@@ -1,0 +1,257 @@
+"""Which clock of a bag is taken: header stamps or receipt stamps, and what is done where one steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.clock import in_order, repair_together
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.ros.messages import Stream
+from terrafusion.datasets.recording import ClockJump
+
+TimesNs = NDArray[np.int64]
+Times = dict[str, TimesNs]
+"""Times (N,) by channel."""
+
+CLOCK_TOLERANCE_S = 1.0
+"""Header clocks whose distance to the recorder differs by more are not one clock."""
+SAME_RATE = 0.1
+REPAIR = "have the clock repaired (--repair-clock)"
+RECEIPT = "read with stamps='receipt' (--stamps receipt)"
+
+
+@dataclass
+class Timing:
+    """Streams in order of time and their times, both by channel; and what was done for it."""
+
+    streams: dict[str, Stream]
+    times: Times = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    jumps: tuple[ClockJump, ...] = ()
+
+
+def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool, file: Path) -> Timing:
+    """Times of every stream on one clock.
+
+    Header stamps are used unless `stamps` is "receipt", or they are all zero, or the topics'
+    header clocks do not agree. Messages without a header then take their receipt time, brought
+    onto the header clock when the two clocks are more than a second apart.
+
+    Args:
+        streams: by channel, in the order of the file.
+        stamps: "header" or "receipt".
+        repair_clock: take steps of the clock out, and sort messages out of order, instead of refusing.
+        file: for errors.
+
+    Raises:
+        DataError: stamps that run backwards, or header stamps that are zero in part.
+    """
+    timing = Timing({kind: _in_file_order(stream) for kind, stream in streams.items()})
+    receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
+    received_jumps: tuple[ClockJump, ...] = ()
+    if repair_clock:
+        with _told_of(file):
+            receipt, received_jumps = repair_together(receipt)
+    headed = _headed(timing, stamps)
+    headed, header_jumps = _on_one_clock(timing, headed, receipt, repair_clock, file)
+    others = {kind: t for kind, t in receipt.items() if kind not in headed}
+    for kind, t_ns in others.items():
+        _refuse_backwards(timing.streams[kind], t_ns, "receipt", REPAIR, file)
+    timing.times = headed | _onto(headed, receipt, others)
+    timing.jumps = (*header_jumps, *(jump for jump in received_jumps if jump.channel in others))
+    _sort(timing)
+    return timing
+
+
+def _in_file_order(stream: Stream) -> Stream:
+    """The stream, sorted by receipt where the file holds it in an order that is not that of arrival.
+
+    Recorders write what arrives, but bags that were merged, or written by several threads, are
+    shuffled in pieces: sorting them takes at most three cuts for each place where time runs back.
+    Where the recorder's clock was set back, sorting would mix two stretches row by row: that is
+    left to the repair of clocks.
+    """
+    order = in_order(stream.receipt_ns)
+    if order is None:
+        return stream
+    header = stream.header_ns
+    if header is not None and header.any() and in_order(header) is None:
+        return stream
+    cuts, backwards = int((np.diff(order) != 1).sum()), int((np.diff(stream.receipt_ns) < 0).sum())
+    return stream.select(order) if cuts <= 3 * backwards else stream
+
+
+def _headed(timing: Timing, stamps: str) -> Times:
+    """Header stamps of the streams that have some, unless receipt stamps are asked for."""
+    found = {kind: t for kind, s in timing.streams.items() if (t := s.header_ns) is not None}
+    headed = {kind: t for kind, t in found.items() if t.any()}
+    if stamps == "receipt":
+        late = _latencies(timing, headed, {kind: timing.streams[kind].receipt_ns for kind in headed})
+        timing.notes.append("times are receipt stamps, as asked" + (f"; {late}" if late else ""))
+        return {}
+    for kind in (kind for kind in found if kind not in headed):
+        topic = timing.streams[kind].topic
+        timing.notes.append(f"{topic}: header stamps are all zero; receipt stamps are used")
+    if not found:
+        timing.notes.append("times are receipt stamps: no message has a header")
+    return headed
+
+
+def _on_one_clock(
+    timing: Timing, headed: Times, receipt: Times, repair_clock: bool, file: Path
+) -> tuple[Times, tuple[ClockJump, ...]]:
+    """Header stamps that can be used together, repaired where that is asked for; none where they differ."""
+    if not headed:
+        return {}, ()
+    for kind, t_ns in headed.items():
+        _refuse_zeros(timing.streams[kind], t_ns, file)
+        if not repair_clock:
+            in_time = in_order(receipt[kind]) is None
+            _refuse_backwards(
+                timing.streams[kind], t_ns, "header", f"{RECEIPT} or {REPAIR}" if in_time else REPAIR, file
+            )
+    jumps: tuple[ClockJump, ...] = ()
+    beside = {kind: receipt[kind] for kind, t in headed.items() if _same_rate(t, receipt[kind])}
+    if repair_clock:
+        with _told_of(file):
+            headed, jumps = repair_together(headed, beside=beside)
+    else:
+        timing.notes += _leaps(headed, beside)
+    spread_s, far = _spread(headed, receipt)
+    if spread_s > CLOCK_TOLERANCE_S:
+        timing.notes.append(
+            f"header clocks differ by {spread_s:.3g} s between topics ({timing.streams[far].topic}); "
+            "receipt stamps used for all"
+        )
+        return {}, ()
+    timing.notes.append(f"times are header stamps; {_latencies(timing, headed, receipt)}")
+    return headed, jumps
+
+
+@contextmanager
+def _told_of(file: Path) -> Iterator[None]:
+    """Errors that name the file too."""
+    try:
+        yield
+    except DataError as error:
+        raise DataError(error.what, file=file, channel=error.channel, remedy=error.remedy) from None
+
+
+def _leaps(headed: Times, beside: Times) -> list[str]:
+    """A note on header stamps that leap ahead where the receipt stamps do not."""
+    try:
+        _, jumps = repair_together(headed, beside=beside)
+    except DataError:
+        return ["the header clock leaps ahead of the recorder's all the time"]
+    if not jumps:
+        return []
+    return [
+        f"the header clock leaps ahead by {jumps[0].step_s:.3f} s and the recorder's does not "
+        f"({len(jumps)} such steps); to take that out, {REPAIR}"
+    ]
+
+
+def _refuse_zeros(stream: Stream, header_ns: TimesNs, file: Path) -> None:
+    zero = np.flatnonzero(header_ns == 0)
+    if zero.size:
+        raise DataError(
+            f"{zero.size} of {len(stream)} header stamps are zero",
+            file=file,
+            channel=stream.topic,
+            time_s=_since(stream, int(zero[0])),
+            remedy=RECEIPT,
+        )
+
+
+def _refuse_backwards(stream: Stream, t_ns: TimesNs, which: str, remedy: str, file: Path) -> None:
+    step = np.diff(t_ns)
+    back = np.flatnonzero(step < 0)
+    if back.size:
+        raise DataError(
+            f"{which} stamps run backwards by {-step[back[0]] * 1e-9:.6f} s",
+            file=file,
+            channel=stream.topic,
+            time_s=_since(stream, int(back[0]) + 1) if which == "header" else _since(stream, int(back[0])),
+            remedy=remedy,
+        )
+
+
+def _since(stream: Stream, row: int) -> float:
+    return float(stream.receipt_ns[row] - stream.receipt_ns[0]) * 1e-9
+
+
+def _same_rate(a_ns: TimesNs, b_ns: TimesNs) -> bool:
+    if len(a_ns) < 2:
+        return False
+    a, b = np.median(np.diff(a_ns)), np.median(np.diff(b_ns))
+    return bool(abs(a - b) <= SAME_RATE * b)
+
+
+def _offset_at(headed: Times, receipt: Times, t_ns: TimesNs) -> NDArray[np.float64]:
+    """How many ns the header clock was behind the recorder's at these receipt times."""
+    best = _most_frequent(headed)
+    order = np.argsort(receipt[best], kind="stable")
+    at, offset = receipt[best][order], (receipt[best] - headed[best])[order]
+    return np.asarray(
+        np.interp((t_ns - at[0]).astype(float), (at - at[0]).astype(float), offset.astype(float))
+    )
+
+
+def _most_frequent(times: Times) -> str:
+    return max(times, key=lambda kind: len(times[kind]))
+
+
+def _spread(headed: Times, receipt: Times) -> tuple[float, str]:
+    """Largest distance (s) of a header clock to that of the most frequent one, and whose it is."""
+    far = dict.fromkeys(headed, 0.0)
+    for kind in (kind for kind in headed if kind != _most_frequent(headed)):
+        apart = receipt[kind] - headed[kind] - _offset_at(headed, receipt, receipt[kind])
+        far[kind] = abs(float(np.median(apart))) * 1e-9
+    worst = max(far, key=far.__getitem__)
+    return far[worst], worst
+
+
+def _onto(headed: Times, receipt: Times, others: Times) -> Times:
+    """Receipt stamps of streams without usable header stamps, on the header clock where that is another."""
+    out = {}
+    for kind, t_ns in others.items():
+        offset = _offset_at(headed, receipt, t_ns) if headed else np.zeros(len(t_ns))
+        apart = abs(float(np.median(offset))) > CLOCK_TOLERANCE_S * 1e9
+        out[kind] = t_ns - np.rint(offset).astype(np.int64) if apart else t_ns
+    return out
+
+
+def _latencies(timing: Timing, headed: Times, receipt: Times) -> str:
+    """What was measured of receipt against header stamps, in words."""
+    told = []
+    for kind, t_ns in headed.items():
+        late_s = (receipt[kind] - t_ns) * 1e-9
+        median, most = np.percentile(late_s, [50, 95])
+        topic = timing.streams[kind].topic
+        if abs(median) > CLOCK_TOLERANCE_S:
+            told.append(f"{topic} on another clock, {median:.6g} s away")
+        else:
+            told.append(f"{topic} {median * 1e3:.3g} and {most * 1e3:.3g} ms")
+    return f"received later by (median, 95 %): {', '.join(told)}" if told else ""
+
+
+def _sort(timing: Timing) -> None:
+    """Bring messages into the order of their times; a note tells which were not."""
+    for kind, order in _disorders(timing.times):
+        moved = int((order != np.arange(len(order))).sum())
+        timing.notes.append(f"{kind}: {moved} messages out of order were sorted")
+        timing.streams[kind] = timing.streams[kind].select(order)
+        timing.times[kind] = timing.times[kind][order]
+
+
+def _disorders(times: Times) -> Iterator[tuple[str, NDArray[np.intp]]]:
+    for kind, t_ns in list(times.items()):
+        order = in_order(t_ns)
+        if order is not None:
+            yield kind, order

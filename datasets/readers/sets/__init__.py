@@ -1,0 +1,1 @@
+"""Files of public sets, as their authors published them."""

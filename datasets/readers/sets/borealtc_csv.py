@@ -1,0 +1,124 @@
+"""CSV pairs of BorealTC, and of sets in its form: `TERRAIN/imu_NN.csv` and `TERRAIN/pro_NN.csv`.
+
+`imu_NN`: time s, wx wy wz rad/s, ax ay az m/s2. `pro_NN`: time s, curL curR A, velL velR m/s. The two
+of one number are one run, the folder names its ground, and both begin at 0: no absolute time.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.text.delimited import head_lines, split
+from terrafusion.datasets.readers.text.number_rows import Rows, put_in_time, read_rows
+from terrafusion.datasets.recording import TERRAINS, Imu, Motor, Recording, Terrain, Wheels
+
+COLUMNS = {
+    "imu": ("time", "wx", "wy", "wz", "ax", "ay", "az"),
+    "pro": ("time", "curL", "curR", "velL", "velR"),
+}
+NAME = re.compile(r"(?P<kind>imu|pro)_(?P<run>\w{1,40})\.csv")
+FOLDER = re.compile(r"[A-Z][A-Z0-9]*(_[A-Z0-9]+)*")
+CLASS_OF_FOLDER = {"PLOUGHED": "ploughed_soil"}
+"""Grounds whose class in this library has another name than the folder."""
+EVEN_NS = 1000
+"""Stamps of a clock scatter by more than this."""
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What the folder says of the ground: its label ("" for nothing), and a note."""
+
+    label: str
+    note: str
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether the name and the header are those of the form, the columns in any order."""
+    named = NAME.fullmatch(path.name) if path.is_file() else None
+    if named is None:
+        return False
+    header = next((line for _, line in head_lines(head, 1)), "")
+    return sorted(split(header, ",")) == sorted(COLUMNS[named["kind"]])
+
+
+def read(request: Request) -> list[Recording]:
+    """The one run that the file belongs to; its times count from the start of the run.
+
+    Raises:
+        DataError: a file of the run is bad, or a time runs backwards.
+    """
+    named = NAME.fullmatch(request.path.name)
+    assert named is not None, "claimed by its name"
+    folder = request.path.parent
+    files = {kind: folder / f"{kind}_{named['run']}.csv" for kind in COLUMNS}
+    rows = {
+        kind: read_rows(path, COLUMNS[kind], separator=",", header=True)
+        for kind, path in files.items()
+        if path.is_file()
+    }
+    rows, jumps, clock = put_in_time(rows, repair_clock=request.repair_clock)
+    ground = _ground(folder.resolve().name)
+    notes = [*_pairing(rows), *clock, *(note for r in rows.values() for note in r.notes), ground.note]
+    label = np.array([ground.label], dtype=object)
+    recording = Recording(
+        name=f"{folder.resolve().name}/{named['run']}",
+        start_ns=0,
+        wheels=_wheels(rows["pro"]) if "pro" in rows else None,
+        imu=_imu(rows["imu"]) if "imu" in rows else None,
+        motor=_motor(rows["pro"]) if "pro" in rows else None,
+        terrain=Terrain(np.zeros(1, dtype=np.int64), label) if ground.label else None,
+        terrain_name=ground.label,
+        clock_jumps=jumps,
+        notes=tuple(notes),
+    )
+    return [recording]
+
+
+def _ground(folder: str) -> Ground:
+    if not FOLDER.fullmatch(folder):
+        return Ground("", f"the folder '{folder}' names no ground (such as SNOW): no terrain label")
+    label = CLASS_OF_FOLDER.get(folder, folder.lower())
+    known = "" if label in TERRAINS else "; the library has no class for it"
+    return Ground(label, f"terrain: '{label}' from the folder {folder}{known}")
+
+
+def _pairing(rows: dict[str, Rows]) -> list[str]:
+    """How the two files were put together, and what their times are worth."""
+    notes = ["times count from the start of the run; the set has no absolute ones"]
+    if len(rows) == 1:
+        alone = next(iter(rows.values()))
+        return [f"{alone.path.name} stands alone", *notes]
+    imu, pro = rows["imu"], rows["pro"]
+    ends = abs(int(imu.t_ns[-1]) - int(pro.t_ns[-1])) * 1e-9
+    notes.append(
+        f"{imu.path.name} and {pro.path.name} are assumed to start together; they end {ends:.2f} s apart"
+    )
+    even = [r.path.name for r in rows.values() if _is_even(r.t_ns)]
+    if even:
+        notes.append(
+            f"times of {' and '.join(even)} are exactly even: counted from a nominal rate, not stamped; "
+            "the two may drift apart"
+        )
+    return notes
+
+
+def _is_even(t_ns: NDArray[np.int64]) -> bool:
+    return len(t_ns) > 2 and int(np.ptp(np.diff(t_ns))) <= EVEN_NS
+
+
+def _imu(rows: Rows) -> Imu:
+    return Imu(rows.t_ns, rows.values[:, :3], rows.values[:, 3:])
+
+
+def _wheels(rows: Rows) -> Wheels:
+    return Wheels(rows.t_ns, rows.values[:, 2:], ("left", "right"), "mps")
+
+
+def _motor(rows: Rows) -> Motor:
+    return Motor(rows.t_ns, rows.values[:, :2])

@@ -1,0 +1,268 @@
+"""Calibration drives of Norlab's DRIVE as pickled DataFrames: whole drives, and windows of 2 s.
+
+A drive (`raw_dataframe.pkl`) has one row every 50 ms with what was last received on each topic; a
+window file (`slip_dataset_all.pkl`) has one row a window, 40 columns a signal. A pickle is opened
+where its SHA-256 is in a catalogue, and even then by `safe_pickle` only.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.catalog import CATALOG_VARIABLE, sha256_of
+from terrafusion.datasets.conventions import Conventions
+from terrafusion.datasets.errors import DataError, errors_of
+from terrafusion.datasets.frames import rpy_to_quaternion
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.sets.safe_pickle import MAX_BYTES, numbers, read_table
+from terrafusion.datasets.recording import Command, Imu, Motor, Recording, Terrain, Wheels
+from terrafusion.datasets.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Table = dict[str, NDArray[Any]]
+
+SUFFIXES = (".pkl", ".pickle")
+ROBOT = "warthog"
+GROUNDS = {"asphalt": "asphalt", "grass": "grass", "gravel": "gravel", "ice": "ice", "sand": "loose_sand"}
+"""Ground in the folder's name -> terrain."""
+WINDOW_SAMPLES, SAMPLE_NS = 40, 50_000_000
+WINDOWS_A_STEP = 3
+UNIT_TOLERANCE = 0.1
+SIGNALS = {
+    "sides": ("left_wheel_vel", "right_wheel_vel"),
+    "commanded": ("cmd_left", "cmd_right"),
+    "rate": ("imu_yaw",),
+    "accel": ("imu_acceleration_x", "imu_acceleration_y", "imu_acceleration_z"),
+    "position": ("icp_x", "icp_y", "icp_z"),
+    "rpy": ("icp_roll", "icp_pitch", "icp_yaw"),
+}
+"""Columns of a window file, each numbered 0 to 39; `imu_yaw` is a rate despite its name."""
+TRUTH_CHANNELS = ("position", "yaw", "orientation")
+COMMANDING = "calib"
+"""State of the calibration driver in which its command drives; otherwise a person does."""
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether it is a pickle: by its first bytes, or its name."""
+    return path.is_file() and ((head[:1] == b"\x80" and b"DataFrame" in head) or path.suffix in SUFFIXES)
+
+
+def read(request: Request) -> list[Recording]:
+    """The drive, or all windows in their order.
+
+    Raises:
+        DataError: the file's hash is in no catalogue, it holds anything but a DataFrame, or its
+            columns are not those of a drive or of windows.
+    """
+    path = request.path
+    if not request.trusted:
+        size = path.stat().st_size
+        which = f"SHA-256 {sha256_of(path)}" if size <= MAX_BYTES else f"{size >> 20} MiB"
+        raise DataError(
+            f"a pickle can run code, and this one ({which}) is in no catalogue",
+            file=path,
+            remedy=f"if you trust its source, add it to a catalogue of your own ({CATALOG_VARIABLE})",
+        )
+    table = read_table(path)
+    try:
+        with errors_of(path):
+            if "ros_time" in table:
+                return [_drive(path, table, request.conventions)]
+            if "imu_yaw_0" in table:
+                return _windows(path, table, request.conventions)
+    except KeyError as error:
+        raise DataError(f"column {error} is missing", file=path, remedy="give an unchanged table") from None
+    except (ValueError, TypeError, OverflowError) as error:
+        raise DataError(f"cannot be read: {error}", file=path, remedy="give an unchanged table") from None
+    raise DataError(
+        "has neither the columns of a drive (ros_time) nor those of windows (imu_yaw_0)",
+        file=path,
+        remedy="give a raw_dataframe.pkl or a slip_dataset_all.pkl of the DRIVE data",
+    )
+
+
+def _drive(path: Path, table: Table, conventions: Conventions) -> Recording:
+    terrain, notes = _of_folder(path.parent.name, conventions)
+    stamps = table["ros_time"]
+    first = next((row for row, cell in enumerate(stamps.tolist()) if float(cell) > 0.0), len(stamps))
+    if first == len(stamps):
+        raise DataError("no row has a time", remedy="give an unchanged table")
+    if stamps.dtype.kind == "f":
+        notes.append("times are stored as doubles: exact to 0.3 microseconds")
+    if first:
+        notes.append(f"the first {first} row{'s' * (first > 1)}, without a time, left out")
+    table = {name: column[first:] for name, column in table.items()}
+    t_ns = np.array([int(cell) for cell in table["ros_time"].tolist()], dtype=np.int64)
+    imu = Imu(
+        t_ns,
+        _stack(table, "imu_x", "imu_y", "imu_z"),
+        _stack(table, *(f"imu_acceleration_{axis}" for axis in "xyz")),
+    )
+    motor, live = _motor(t_ns, table, notes)
+    speed = _stack(table, "meas_left_vel", "meas_right_vel")
+    return Recording(
+        name=path.parent.name,
+        start_ns=int(t_ns[0]),
+        command=_command_of_drive(t_ns, table, notes),
+        wheels=Wheels(t_ns[live], speed[live], ("left", "right"), "radps"),
+        imu=imu.select(_since_first(imu.accel_mps2.any(axis=1), "imu", "its first message", notes)),
+        motor=motor,
+        terrain=_labels(int(t_ns[0]), terrain),
+        terrain_name=terrain,
+        truth=_truth_of_drive(t_ns, table, notes),
+        truth_channels=TRUTH_CHANNELS,
+        description="a whole drive, by hand and by the calibration driver",
+        notes=tuple(notes),
+    )
+
+
+def _stack(table: Table, *names: str) -> Array:
+    return np.stack([numbers(table[name]) for name in names], axis=-1)
+
+
+def _since_first(known: Any, channel: str, what: str, notes: list[str]) -> slice:
+    """Rows from the first true one of (N,) on: before it the log holds zeros for what it has not received."""
+    first = int(np.argmax(known)) if known.any() else len(known)
+    if first:
+        rows = f"{first} row{'s' * (first > 1)}"
+        notes.append(f"{channel}: {rows} of zeros before {what} left out")
+    return slice(first, None)
+
+
+def _motor(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> tuple[Motor | None, slice]:
+    """The motors, and the rows from which on they, and the wheels' encoders with them, are on."""
+    if not {f"{side}_wheel_{what}" for side in ("left", "right") for what in ("voltage", "current")} <= set(
+        table
+    ):
+        notes.append("motor: no currents and voltages in the file")
+        return None, slice(None)
+    voltage = _stack(table, "left_wheel_voltage", "right_wheel_voltage")
+    on = (voltage != 0.0).all(axis=1)
+    if not on.any():
+        notes.append("motor: the voltages are zero throughout; left out")
+        return None, slice(None)
+    live = _since_first(on, "wheels, motor", "the motors were on", notes)
+    current = _stack(table, "left_wheel_current", "right_wheel_current")
+    return Motor(t_ns[live], current[live], voltage[live]), live
+
+
+def _command_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> Command | None:
+    state = table.get("calib_state")
+    driving = np.ones(len(t_ns), dtype=bool) if state is None else state == COMMANDING
+    if not driving.any():
+        notes.append("command: none, a person drove all the time")
+        return None
+    when = "at all times, for all the file tells" if state is None else f"in {driving.mean():.0%} of the rows"
+    notes.append(f"command: the calibration driver's, {when}; what a person commanded is not in the log")
+    twist = _stack(table, "cmd_vel_x", "cmd_vel_omega")[driving]
+    return Command(t_ns[driving], twist[:, 0], twist[:, 1])
+
+
+def _truth_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -> Trajectory:
+    position = _stack(table, "icp_pos_x", "icp_pos_y", "icp_pos_z")
+    quaternion = _stack(table, "icp_quat_x", "icp_quat_y", "icp_quat_z", "icp_quat_w")
+    placed = position.any(axis=1) | quaternion[:, :3].any(axis=1)
+    rows = _since_first(placed, "truth", "the first pose in the map", notes)
+    truth = Trajectory(t_ns[rows], position[rows], quaternion[rows])
+    turned = np.abs(np.linalg.norm(quaternion[rows], axis=1) - 1.0) < UNIT_TOLERANCE
+    if not turned.all():
+        notes.append(f"truth: {int((~turned).sum())} poses without a unit quaternion left out")
+    return truth.select(turned)
+
+
+def _windows(path: Path, table: Table, conventions: Conventions) -> list[Recording]:
+    terrain, notes = _of_folder(path.parent.name, conventions)
+    signals = {name: _signals(table, *columns) for name, columns in SIGNALS.items()}
+    notes.append("windows have no absolute time: it counts from the start of the command step")
+    notes.extend(_against_the_wheels(signals, conventions))
+    begins = numbers(table["transitory_state_mask"]) == 1.0
+    if not len(begins):
+        raise DataError("holds no windows", remedy="give an unchanged table")
+    return [
+        dataclasses.replace(
+            _window({name: signal[k] for name, signal in signals.items()}, begins[: k + 1], conventions),
+            name=f"{path.parent.name}#{k}",
+            terrain=_labels(0, terrain),
+            terrain_name=terrain,
+            notes=tuple(notes),
+        )
+        for k in range(len(begins))
+    ]
+
+
+def _window(signals: dict[str, Array], begins: NDArray[np.bool_], conventions: Conventions) -> Recording:
+    """The last window of those whose command `begins` (k,) there."""
+    part = _part_of_step(begins)
+    t_ns = (part * WINDOW_SAMPLES + np.arange(WINDOW_SAMPLES, dtype=np.int64)) * SAMPLE_NS
+    gyro = np.full((WINDOW_SAMPLES, 3), np.nan)
+    gyro[:, 2:] = signals["rate"]
+    state = "the command just changed" if begins[-1] else "steady command"
+    return Recording(
+        name="",
+        start_ns=int(t_ns[0]),
+        command=_command_of_window(t_ns, signals["commanded"], conventions),
+        wheels=Wheels(t_ns, signals["sides"], ("left", "right"), "radps"),
+        imu=Imu(t_ns, gyro, signals["accel"]),
+        truth=Trajectory(t_ns, signals["position"], rpy_to_quaternion(signals["rpy"])),
+        truth_channels=TRUTH_CHANNELS,
+        description=f"step {int(begins.sum())}, window {part + 1} of {WINDOWS_A_STEP}, {state}; "
+        "the truth starts at its own origin",
+    )
+
+
+def _signals(table: Table, *names: str) -> Array:
+    """The 40 samples of some signals in every window, (windows, 40, signals)."""
+    columns = [_stack(table, *(f"{name}_{i}" for i in range(WINDOW_SAMPLES))) for name in names]
+    return np.stack(columns, axis=-1)
+
+
+def _part_of_step(begins: NDArray[np.bool_]) -> int:
+    """Windows since the command changed; a log that begins inside a step counts from its start."""
+    before = np.flatnonzero(begins)
+    return min(len(begins) - 1 - int(before[-1]) if before.size else len(begins) - 1, WINDOWS_A_STEP - 1)
+
+
+def _command_of_window(t_ns: NDArray[np.int64], sides: Array, conventions: Conventions) -> Command | None:
+    """The commanded wheel rates (40, 2) as a twist, by the geometry that the robot's own driver uses."""
+    radius, track = conventions.wheel_radius_m, conventions.track_m
+    if radius is None or track is None:
+        return None
+    left, right = sides.T * radius
+    return Command(t_ns, (left + right) / 2.0, (right - left) / track)
+
+
+def _against_the_wheels(signals: dict[str, Array], conventions: Conventions) -> list[str]:
+    """A note where the yaw rate turns against the wheels: 2 s are too short to see it in one window."""
+    left, right = signals["sides"].mean(axis=1).T
+    turn, rate = right - left, conventions.gyro_z_sign * signals["rate"][:, :, 0].mean(axis=1)
+    if len(turn) < 8 or not turn.std() > 0.0 or not rate.std() > 0.0:
+        return []
+    r = float(np.corrcoef(turn, rate)[0, 1])
+    if r > -0.5:
+        return []
+    return [
+        f"imu: over the {len(turn)} windows the yaw rate turns against the wheels (r {r:.2f}): "
+        "its sign is wrong in this file"
+    ]
+
+
+def _of_folder(name: str, conventions: Conventions) -> tuple[str, list[str]]:
+    """Terrain by the folder's name, "" where the catalogue or nobody says; what to say about the name."""
+    words, notes = name.split("_"), []
+    if words[0] != ROBOT and len(words) > 3:
+        notes.append(f"the folder's name does not begin with {ROBOT}: the geometry may be another robot's")
+    terrain = next((GROUNDS[word] for word in words if word in GROUNDS), "")
+    if conventions.terrain or not terrain:
+        return "", notes
+    return terrain, [*notes, f"terrain: {terrain} by the folder's name"]
+
+
+def _labels(start_ns: int, terrain: str) -> Terrain | None:
+    if not terrain:
+        return None
+    return Terrain(np.array([start_ns], dtype=np.int64), np.array([terrain], dtype=object))

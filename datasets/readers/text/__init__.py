@@ -1,0 +1,1 @@
+"""Text that receivers and programs write, and tables of any columns."""

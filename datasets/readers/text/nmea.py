@@ -1,0 +1,114 @@
+"""NMEA 0183 logs: GGA, RMC, GST, VTG and ZDA of any talker, also between other lines and bytes."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.text.delimited import MAX_BYTES
+from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
+from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, Epochs, collect
+from terrafusion.datasets.readers.text.row_times import row_times
+from terrafusion.datasets.recording import Fix, Recording
+from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
+
+Array = NDArray[np.float64]
+
+SENTENCE = re.compile(rb"\$(?:G[PNLABQI]|BD|QZ|IN)(?:GGA|RMC|GST|ZDA|VTG|GLL|GSA|GSV),")
+WEEKS_1024_DAYS = 1024 * 7
+UNKNOWN_HDOP = 99.0
+"""Receivers write 99.99 where they have none."""
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether the name ends in .nmea, or a sentence of a GNSS receiver stands in the first bytes."""
+    return (path.suffix.lower() == ".nmea" and bool(head)) or bool(SENTENCE.search(head))
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a log: its GNSS channel."""
+    path = request.path
+    if path.stat().st_size > MAX_BYTES:
+        raise DataError(f"has more than {MAX_BYTES // 2**20} MB", file=path, remedy="split it")
+    epochs, notes = collect(path, path.read_bytes().decode("latin-1"))
+    t_ns, told = _dated(path, epochs)
+    times = row_times(request, "gnss", t_ns)
+    fixes, more = _fixes(request, epochs, t_ns)
+    fixes = dataclasses.replace(fixes.select(times.order), t_ns=times.t_ns)
+    gnss, datum, rest = gnss_channel(request, fixes)
+    if gnss is None:
+        raise DataError("no sentence holds a fix", file=path, remedy="record it again under open sky")
+    recording = Recording(
+        name=path.stem,
+        start_ns=int(gnss.t_ns[0]),
+        gnss=gnss,
+        datum=datum,
+        source="NMEA 0183 log",
+        notes=(*notes, *told, *times.notes, *more, *rest),
+        clock_jumps=times.jumps,
+    )
+    return [recording]
+
+
+def _dated(path: Path, epochs: Epochs) -> tuple[NDArray[np.int64], list[str]]:
+    """Unix nanoseconds of the epochs: their day counts from the log's first, and who tells its date."""
+    day = epochs.day
+    if np.isfinite(epochs.date).any():
+        said = epochs.date - day  # the date of the log's first day, as each dated epoch has it
+        known = np.flatnonzero(np.isfinite(said))
+        nearest = known[np.clip(np.searchsorted(known, np.arange(len(day)), side="right") - 1, 0, None)]
+        first, notes = said[nearest], _date_notes(said[known])
+        off = first[0] - _receipt_days(epochs)
+        weeks = round(off / WEEKS_1024_DAYS) if np.isfinite(off) else 0
+        if weeks and abs(off - weeks * WEEKS_1024_DAYS) <= 1.0:
+            first = first - weeks * WEEKS_1024_DAYS
+            notes.append(
+                f"gnss: dates are {weeks * 1024} GPS weeks off the log's own time stamps "
+                "(the receiver's week counter rolled over); mended"
+            )
+        elif abs(off) > 1.0:
+            notes.append(f"gnss: dates are {off:.0f} days off the log's own time stamps; kept")
+    elif np.isfinite(epochs.receipt_s).any():
+        first = np.full(len(day), _receipt_days(epochs))
+        notes = ["gnss: no sentence tells a date; that of the log's own time stamps is taken"]
+    else:
+        first = np.zeros(len(day))
+        notes = ["gnss: no sentence tells a date: times are those of day 0, 1970-01-01"]
+    return (day + first).astype(np.int64) * DAY_NS + epochs.of_day_ns, notes
+
+
+def _date_notes(said: Array) -> list[str]:
+    changes = int((np.diff(said) != 0).sum())
+    return [f"gnss: the date jumps {changes} times beyond midnights"] if changes else []
+
+
+def _receipt_days(epochs: Epochs) -> float:
+    """Date of the log's first day by the time stamps in front of the sentences, days since 1970."""
+    stamped = np.flatnonzero(np.isfinite(epochs.receipt_s))
+    if not stamped.size:
+        return float("nan")
+    i = int(stamped[0])
+    return float(np.rint((epochs.receipt_s[i] - epochs.of_day_ns[i] * 1e-9) / 86400.0) - epochs.day[i])
+
+
+def _fixes(request: Request, epochs: Epochs, t_ns: NDArray[np.int64]) -> tuple[Fixes, list[str]]:
+    """The fixes, with HDOP for the sigmas that no GST tells."""
+    notes = []
+    fix, sigma = epochs.fix, epochs.sigma_enu_m.copy()
+    spec = request.rig.sensors.gnss if request.rig else None
+    at_one = np.array([spec.sigma_horizontal_m if spec else ASSUMED_SIGMA_M[Fix(k)] for k in range(len(Fix))])
+    counted = np.isnan(sigma[:, :2]).any(axis=1) & (fix > Fix.NONE) & (epochs.hdop < UNKNOWN_HDOP)
+    if counted.any():
+        flat = (epochs.hdop * at_one[fix])[counted]
+        sigma[counted] = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
+        used = ", ".join(f"{Fix(k).name.lower()} {at_one[k]:g} m" for k in np.unique(fix[counted]))
+        notes.append(f"gnss: {int(counted.sum())} fixes without GST: sigma is HDOP times an assumed {used}")
+    if epochs.left_out:
+        notes.append(f"gnss: {epochs.left_out} estimated, manual or simulated positions left out")
+    return Fixes(t_ns, epochs.llh, fix, sigma, epochs.velocity_enu_mps), notes

@@ -1,0 +1,181 @@
+"""Files of nothing but numbers, one row a time, of known columns: every cell there and finite."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.clock import in_order, repair_together
+from terrafusion.datasets.config import shown
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.text.delimited import (
+    BLANKS,
+    MAX_LINE,
+    Columns,
+    Layout,
+    head_lines,
+    read_columns,
+    read_text,
+    split,
+)
+from terrafusion.datasets.recording import ClockJump
+
+Array = NDArray[np.float64]
+
+MAX_LINES = 1_000_000
+"""83 minutes of a 200 Hz IMU, read in some 8 s and 0.6 GB; longer files are refused."""
+MAX_T_NS = 4 * 10**18
+"""A time beyond this (year 2096) is none of a recording, and differences of times stay within 64 bits."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """What a file holds.
+
+    Attributes:
+        path: the file.
+        t_ns: (N,) int64, as written, in the order of the lines.
+        values: (N, k) of the other columns, all finite.
+        lines: (N,) line numbers where no line is blank.
+        notes: what was odd about the file, in sentences.
+    """
+
+    path: Path
+    t_ns: NDArray[np.int64]
+    values: Array
+    lines: NDArray[np.int64]
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Rows:
+        """The rows of a mask or of indices."""
+        return Rows(self.path, self.t_ns[rows], self.values[rows], self.lines[rows], self.notes)
+
+    def error(self, row: int, what: str, remedy: str) -> DataError:
+        """An error at a row, with its line and the seconds since the first row."""
+        time_s = (int(self.t_ns[row]) - int(self.t_ns[0])) * 1e-9
+        return DataError(f"line {self.lines[row]}: {what}", file=self.path, time_s=time_s, remedy=remedy)
+
+
+def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, header: bool = False) -> Rows:
+    """Read a file whose first column is time in seconds.
+
+    Args:
+        path: the file.
+        columns: names of all its columns, the time first.
+        separator: what stands between numbers.
+        header: whether the first line names the columns, in any order.
+
+    Raises:
+        DataError: unreadable, too large, no rows, a wrong header, a line that has too few or too
+            many numbers, a cell that is no finite number, with its line and, where that can be read,
+            its time. Times are not checked for order: `put_in_time` does that.
+    """
+    data = read_text(path)
+    if data.count(b"\n") > MAX_LINES:
+        remedy = "split it into shorter recordings"
+        raise DataError(f"has more than {MAX_LINES} lines", file=path, remedy=remedy)
+    names = _header(path, data, columns, separator) if header else tuple(columns)
+    layout = Layout(names, separator, first_line=2 if header else 1)
+    try:
+        table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
+    except DataError as error:
+        time_s = _time_of_line(error.what, data, layout, columns[0])
+        raise DataError(error.what, file=path, time_s=time_s, remedy=error.remedy) from None
+    t_ns = table.times_ns(columns[0])
+    far = np.flatnonzero(np.abs(t_ns) > MAX_T_NS)
+    if far.size:
+        raise table.bad_cell(columns[0], int(far[0]), "give a time in seconds")
+    rows = Rows(
+        path,
+        t_ns,
+        table.stack(columns[1:]),
+        np.arange(len(t_ns)) + layout.first_line,
+        table.notes,
+    )
+    _refuse_missing(table, rows, columns)
+    return rows
+
+
+def put_in_time(
+    parts: Mapping[str, Rows], *, repair_clock: bool
+) -> tuple[dict[str, Rows], tuple[ClockJump, ...], tuple[str, ...]]:
+    """Rows of channels that may share a clock, brought into order of time.
+
+    Returns:
+        The rows by channel, the steps of the clock that were taken out, and notes.
+
+    Raises:
+        DataError: a time runs backwards, and `repair_clock` is not asked for.
+    """
+    if not repair_clock:
+        for name, rows in parts.items():
+            back = np.flatnonzero(np.diff(rows.t_ns) < 0)
+            if back.size:
+                by_s = (rows.t_ns[back[0]] - rows.t_ns[back[0] + 1]) * 1e-9
+                what = f"the time of {name} runs backwards by {by_s:.6f} s"
+                remedy = "sort the rows, split the log there, or have the clock repaired (--repair-clock)"
+                raise rows.error(int(back[0]) + 1, what, remedy)
+        return dict(parts), (), ()
+    times, jumps = repair_together({name: rows.t_ns for name, rows in parts.items()})
+    notes, out = [], {}
+    for name, rows in parts.items():
+        out[name] = Rows(rows.path, times[name], rows.values, rows.lines, rows.notes)
+        order = in_order(times[name])
+        if order is not None:
+            moved = int((order != np.arange(len(order))).sum())
+            notes.append(f"{name}: {moved} rows out of order were sorted")
+            out[name] = out[name].select(order)
+    return out, jumps, tuple(notes)
+
+
+def are_numbers(head: bytes) -> bool:
+    """Whether the first line of a file is numbers between blanks."""
+    cells = next((line.split() for _, line in head_lines(head, 1)), [])
+    try:
+        return bool(np.isfinite([float(cell) for cell in cells]).all()) and bool(cells)
+    except ValueError:
+        return False
+
+
+def _header(path: Path, data: bytes, columns: Sequence[str], separator: str) -> tuple[str, ...]:
+    line = next((line for _, line in head_lines(data, 1)), "")
+    names = tuple(split(line, separator))
+    if sorted(names) != sorted(columns):
+        raise DataError(f"the header is '{shown(line)}'", file=path, remedy=f"give {', '.join(columns)}")
+    return names
+
+
+def _time_of_line(what: str, data: bytes, layout: Layout, time: str) -> float | None:
+    """Seconds from the first row to the line that a message names."""
+    named = re.search(r"\bline (\d+)", what)
+    column = layout.names.index(time)
+    if named is None:
+        return None
+    seconds = []
+    for number in (layout.first_line, int(named[1])):
+        line = next(islice(io.BytesIO(data), number - 1, None), b"")[:MAX_LINE]
+        try:
+            seconds.append(float(split(line.decode("utf-8", "replace"), layout.separator)[column]))
+        except (ValueError, IndexError):
+            return None
+    return seconds[1] - seconds[0] if np.isfinite(seconds).all() else None
+
+
+def _refuse_missing(table: Columns, rows: Rows, columns: Sequence[str]) -> None:
+    missing = np.argwhere(np.isnan(rows.values))
+    if not missing.size:
+        return
+    row, column = (int(i) for i in missing[0])
+    told = table.bad_cell(columns[column + 1], row, "give a finite number")
+    time_s = (int(rows.t_ns[row]) - int(rows.t_ns[0])) * 1e-9
+    raise DataError(told.what, file=told.file, time_s=time_s, remedy=told.remedy)

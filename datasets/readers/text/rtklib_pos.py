@@ -1,0 +1,329 @@
+"""Solutions of RTKLIB (`.pos`): a header of `%` lines, then a row a fix.
+
+Positions come as latitude/longitude/height (degrees, or degrees, minutes and seconds), as ECEF, or
+as a baseline east/north/up of the base station; times as calendar or as GPS week and seconds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.decimals import NS_PER, NotADecimal, dates_to_ns
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns, leap_note
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.text.delimited import (
+    BLANKS,
+    Columns,
+    Layout,
+    head_lines,
+    read_columns,
+    read_text,
+    split,
+)
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
+from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
+from terrafusion.datasets.recording import Fix, Gnss, Recording
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+
+DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
+POSITIONS = {
+    DEGREES: (DEGREES, "longitude(deg)", "height(m)"),
+    DMS: (DMS, "longitude(d'\")", "height(m)"),
+    ECEF: (ECEF, "y-ecef(m)", "z-ecef(m)"),
+    BASELINE: (BASELINE, "n-baseline(m)", "u-baseline(m)"),
+}
+TIME_SYSTEMS = ("GPST", "UTC", "JST")
+JST_AHEAD_NS = 9 * 3600 * 10**9
+
+FIX_OF_Q = {0: Fix.NONE, 1: Fix.FIXED, 2: Fix.FLOAT, 3: Fix.DGPS, 4: Fix.DGPS, 5: Fix.SINGLE, 6: Fix.FLOAT}
+"""Q: 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP (taken as float)."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the `%` lines say: names of the columns, where they stand, and the base station."""
+
+    line: int
+    names: tuple[str, ...]
+    kind: str
+    separator: str
+    time_system: str
+    base: tuple[float, ...] | None
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether a `%` line names columns of a position, or the name ends in .pos and the text is RTKLIB's."""
+    if any(word.encode() in head for word in POSITIONS) and head.lstrip().startswith(b"%"):
+        return True
+    return path.suffix.lower() == ".pos" and (head.lstrip().startswith(b"%") or _is_row(head))
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a solution file: its GNSS channel."""
+    path, data = request.path, read_text(request.path)
+    header = _header(path, data)
+    columns = _columns(path, data, header)
+    t_ns, notes = _times(path, columns, header)
+    times = row_times(request, "gnss", t_ns)
+    notes += [*columns.notes, *times.notes]
+    if b"/geodetic" in data[:4096] and header.kind != BASELINE:
+        notes.append("gnss: heights are above the geoid; taken as they are")
+    solution = _Solution(request, columns, header, times)
+    gnss, datum, more = solution.baseline() if header.kind == BASELINE else solution.geodetic()
+    if gnss is None:
+        raise DataError("no row holds a fix", file=path, remedy="process the observations again")
+    recording = Recording(
+        name=path.stem,
+        start_ns=int(gnss.t_ns[0]),
+        gnss=gnss,
+        datum=datum,
+        source="RTKLIB solution",
+        notes=(*notes, *more),
+        clock_jumps=times.jumps,
+    )
+    return [recording]
+
+
+def _is_row(head: bytes) -> bool:
+    words = head.split(b"\n", 1)[0].split()
+    return len(words) >= 7 and (words[0].count(b"/") == 2 or words[0].isdigit())
+
+
+def _header(path: Path, data: bytes) -> Header:
+    base: tuple[float, ...] | None = None
+    found: Header | None = None
+    for number, line in head_lines(data):
+        if not line.startswith("%"):
+            if line.strip():
+                break
+            continue
+        if "ref pos" in line:
+            base = _numbers(line.partition(":")[2])
+        kind = next((kind for kind in POSITIONS if kind in line), None)
+        if kind is None:
+            continue
+        mark = line[line.index(kind) + len(kind) :][:1]
+        separator = mark if mark and not mark.isspace() else ("\t" if mark == "\t" else BLANKS)
+        time_system, *names = split(line[1:].strip(), separator)
+        found = Header(number, tuple(names), kind, separator, time_system, base)
+    if found is None:
+        raise DataError(
+            "no `%` line names the columns, so neither time system nor position is known",
+            file=path,
+            remedy="write the solution with its header (out-outhead = on)",
+        )
+    if found.time_system not in TIME_SYSTEMS:
+        raise DataError(
+            f"unknown time system '{found.time_system[:20]}'",
+            file=path,
+            remedy=f"known are {', '.join(TIME_SYSTEMS)}",
+        )
+    return found
+
+
+def _numbers(text: str) -> tuple[float, ...] | None:
+    try:
+        return tuple(float(word) for word in text.replace(",", " ").split())
+    except ValueError:
+        return None
+
+
+def _columns(path: Path, data: bytes, header: Header) -> Columns:
+    """All columns; dates take one cell or two, angles in degrees, minutes and seconds three each."""
+    names: list[str] = []
+    for name in header.names:
+        names += [f"{name} {part}" for part in "dms"] if name in POSITIONS[DMS][:2] else [name]
+    repeated = [name for i, name in enumerate(names) if name in names[:i]]
+    if repeated or not set(POSITIONS[header.kind][1:]) <= set(header.names):
+        raise DataError("the line of column names is damaged", file=path, remedy="write the solution again")
+    row = next((x for n, x in head_lines(data) if n > header.line and x.strip() and x[0] != "%"), "")
+    cells = split(row, header.separator)
+    one_cell = bool(cells) and "/" in cells[0] and ":" in cells[0]
+    time = ["date"] if one_cell else ["date", "clock"] if "/" in row[:11] else ["week", "tow"]
+    layout = Layout((*time, *names), header.separator, header.line + 1, "%")
+    return read_columns(path, data, layout, names, time)
+
+
+def _times(path: Path, columns: Columns, header: Header) -> tuple[TimesNs, list[str]]:
+    """Unix nanoseconds of the rows as the file has them, and how UTC was got."""
+    gps_epoch_ns = np.datetime64("1980-01-06", "ns").astype(np.int64)
+    if "week" in columns.texts:
+        weeks = columns.times_ns("week", "ns")
+        tow = columns.times_ns("tow", "s")
+        bad = np.flatnonzero((weeks < 0) | (weeks > 10_000) | (tow < 0) | (tow >= WEEK_S * NS_PER["s"]))
+        if bad.size:
+            raise columns.bad_cell("week", int(bad[0]), "give GPS week and seconds of the week")
+        if weeks.min() < FULL_WEEK_MIN:
+            raise columns.bad_cell(
+                "week", int(np.argmin(weeks)), "a week before August 1999 looks like one counted modulo 1024"
+            )
+        since_gps = weeks * WEEK_S * NS_PER["s"] + tow
+    else:
+        since_gps = _calendar_ns(columns) - gps_epoch_ns
+    if header.time_system == "GPST":
+        t_ns = gps_to_unix_ns(since_gps)
+        return t_ns, [leap_note(t_ns)]
+    t_ns = since_gps + gps_epoch_ns
+    if header.time_system == "JST":
+        return t_ns - JST_AHEAD_NS, ["gnss: times are in JST; 9 h taken off"]
+    return t_ns, []
+
+
+def _calendar_ns(columns: Columns) -> TimesNs:
+    text = columns.texts["date"]
+    if "clock" in columns.texts:
+        text = text + " " + columns.texts["clock"]
+    try:
+        return dates_to_ns(text.tolist())
+    except NotADecimal as bad:
+        raise columns.bad_cell("date", bad.row, "give YYYY/MM/DD HH:MM:SS.SSS") from None
+
+
+class _Solution:
+    """The rows of a file, in the order of their times."""
+
+    def __init__(self, request: Request, columns: Columns, header: Header, times: RowTimes) -> None:
+        self.request, self.columns, self.header, self.times = request, columns, header, times
+        self.notes: list[str] = []
+        self.fix = self._fix()
+
+    def stack(self, *names: str) -> Array:
+        return self.columns.stack(names)[self.times.order]
+
+    def baseline(self) -> tuple[Gnss | None, Datum | None, list[str]]:
+        """East, north and up of the base station are ENU about it."""
+        base = self.header.base
+        datum: Datum | None = None
+        if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
+            datum = (base[0], base[1], base[2])
+        else:
+            self.notes.append("gnss: baselines of a base station whose position the file does not tell")
+        enu = self.stack(*POSITIONS[BASELINE])
+        held = np.isfinite(enu[:, :2]).all(axis=1) & (self.fix > Fix.NONE)
+        if not held.all():
+            self.notes.append(f"gnss: {int((~held).sum())} of {len(held)} rows hold no fix; left out")
+        if not held.any():
+            return None, None, self.notes
+        sigma, more = with_assumed_sigma(
+            self.request, self.stack("sde(m)", "sdn(m)", "sdu(m)")[held], self.fix[held]
+        )
+        velocity = self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)")[held]
+        known = bool(np.isfinite(velocity).any())
+        sigma_v = _horizontal(self.stack("sdve", "sdvn")[held]) if known else None
+        gnss = Gnss(
+            self.times.t_ns[held], enu[held], sigma, self.fix[held], velocity if known else None, sigma_v
+        )
+        return gnss, datum, [*self.notes, *more]
+
+    def geodetic(self) -> tuple[Gnss | None, Datum | None, list[str]]:
+        """Latitude, longitude and height, also of ECEF positions."""
+        if self.header.kind == ECEF:
+            fixes = self._ecef()
+        else:
+            velocity = self.stack("ve(m/s)", "vn(m/s)", "vu(m/s)")
+            fixes = Fixes(
+                self.times.t_ns,
+                np.column_stack([*self._angles(), self.stack("height(m)")[:, 0]]),
+                self.fix,
+                self.stack("sde(m)", "sdn(m)", "sdu(m)"),
+                velocity,
+                _horizontal(self.stack("sdve", "sdvn")),
+            )
+        gnss, datum, more = gnss_channel(self.request, fixes)
+        return gnss, datum, [*self.notes, *more]
+
+    def _angles(self) -> tuple[Array, Array]:
+        """Latitude and longitude, deg."""
+        latitude, longitude, _ = POSITIONS[self.header.kind]
+        if self.header.kind == DEGREES:
+            both = self.stack(latitude, longitude)
+            return both[:, 0], both[:, 1]
+        angles = []
+        for name in (latitude, longitude):
+            degrees, minutes, seconds = self.stack(*(f"{name} {part}" for part in "dms")).T
+            sign = np.where(np.signbit(degrees), -1.0, 1.0)  # -0 degrees are south or west too
+            angles.append(sign * (np.abs(degrees) + minutes / 60.0 + seconds / 3600.0))
+        return angles[0], angles[1]
+
+    def _ecef(self) -> Fixes:
+        import pymap3d
+
+        xyz = self.stack(*POSITIONS[ECEF])
+        far = np.flatnonzero(~(np.abs(np.linalg.norm(xyz, axis=1) - 6.37e6) < 1e5))
+        if far.size:
+            i = int(far[0])
+            raise DataError(
+                f"the ECEF position {xyz[i, 0]:g}, {xyz[i, 1]:g}, {xyz[i, 2]:g} m is not near the ground",
+                file=self.request.path,
+                channel="gnss",
+                time_s=float(self.times.t_ns[i] - self.times.t_ns[0]) * 1e-9,
+                remedy="process the observations again",
+            )
+        llh = np.stack(pymap3d.ecef2geodetic(*xyz.T), axis=1)
+        R = _enu_from_ecef(llh[0, 0], llh[0, 1])  # one rotation: a robot stays near its first fix
+        velocity = self.stack("vx(m/s)", "vy(m/s)", "vz(m/s)") @ R.T
+        P = _covariances(
+            self.stack("sdx(m)", "sdy(m)", "sdz(m)"), self.stack("sdxy(m)", "sdyz(m)", "sdzx(m)")
+        )
+        V = _covariances(self.stack("sdvx", "sdvy", "sdvz"), self.stack("sdvxy", "sdvyz", "sdvzx"))
+        return Fixes(
+            self.times.t_ns,
+            llh,
+            self.fix,
+            _sigmas(R @ P @ R.T),
+            velocity,
+            _horizontal(_sigmas(R @ V @ R.T)[:, :2]),
+        )
+
+    def _fix(self) -> NDArray[np.uint8]:
+        if "Q" not in self.columns.numbers:
+            self.notes.append("gnss: the solution has no Q; all fixes are taken as 'single'")
+            return np.full(len(self.times.t_ns), Fix.SINGLE, dtype=np.uint8)
+        q = self.stack("Q")[:, 0]
+        strange = np.flatnonzero(~np.isin(q, list(FIX_OF_Q)))
+        if strange.size:
+            raise DataError(
+                f"Q is {q[strange[0]]:g} at data row {int(strange[0]) + 1}",
+                file=self.request.path,
+                remedy="known are 1 fix, 2 float, 3 SBAS, 4 DGPS, 5 single, 6 PPP",
+            )
+        if (q == 6).any():
+            self.notes.append(f"gnss: {int((q == 6).sum())} PPP fixes are taken as 'float'")
+        return np.array([FIX_OF_Q[k] for k in range(7)], dtype=np.uint8)[q.astype(np.int64)]
+
+
+def _horizontal(sigma: Array) -> Array:
+    """One sigma (N,) for both horizontal axes of (N, 2)."""
+    return np.asarray(np.sqrt((sigma**2).mean(axis=1)))
+
+
+def _enu_from_ecef(lat_deg: float, lon_deg: float) -> Array:
+    lat, lon = np.radians([lat_deg, lon_deg])
+    return np.array(
+        [
+            [-np.sin(lon), np.cos(lon), 0.0],
+            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
+            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
+        ]
+    )
+
+
+def _covariances(sigma: Array, cross: Array) -> Array:
+    """Matrices (N, 3, 3) of sigmas (N, 3) and of RTKLIB's xy, yz, zx: the root of a covariance, signed."""
+    P = np.zeros((len(sigma), 3, 3))
+    P[:, range(3), range(3)] = sigma**2
+    for k, (i, j) in enumerate(((0, 1), (1, 2), (2, 0))):
+        P[:, i, j] = P[:, j, i] = np.sign(cross[:, k]) * cross[:, k] ** 2
+    return P
+
+
+def _sigmas(P: Array) -> Array:
+    """Sigmas (N, 3) of matrices (N, 3, 3)."""
+    return np.asarray(np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0)))

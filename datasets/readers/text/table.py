@@ -1,0 +1,258 @@
+"""Plain tables, text or Parquet, by a column map that says what their columns are."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.conventions import apply
+from terrafusion.datasets.decimals import NotADecimal, dates_to_ns
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import rpy_to_quaternion
+from terrafusion.datasets.gnss_time import gps_to_unix_ns, leap_note
+from terrafusion.datasets.readers.channel_tables import GNSS_VELOCITY, QUATERNION, ChannelReader
+from terrafusion.datasets.readers.csv_table import Table
+from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
+from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
+from terrafusion.datasets.readers.text.column_map import (
+    GEODETIC,
+    TEXT_FIELDS,
+    ColumnMap,
+    ColumnOf,
+    contract_map,
+    read_column_map,
+    starter_map,
+)
+from terrafusion.datasets.readers.text.delimited import head_lines, separator_of, split
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
+from terrafusion.datasets.readers.text.parquet import ParquetColumns
+from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
+from terrafusion.datasets.readers.text.text_columns import TextColumns
+from terrafusion.datasets.readers.text.units import units_of
+from terrafusion.datasets.recording import Fix, Gnss, Recording
+
+Array = NDArray[np.float64]
+
+SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
+
+FIX_WORDS = {
+    "nmea": {0: "none", 1: "single", 2: "dgps", 3: "single", 4: "fixed", 5: "float", 6: "none"},
+    "rtklib": {0: "none", 1: "fixed", 2: "float", 3: "dgps", 4: "dgps", 5: "single", 6: "float"},
+    "navsatfix": {-1: "none", 0: "single", 1: "dgps", 2: "fixed"},
+}
+SHOWN_COLUMNS = 60
+MAX_NS = 8 * 10**18
+"""Leaves room for any epoch in int64."""
+
+
+class AnyColumns(Protocol):
+    """A file's columns, text or Parquet."""
+
+    path: Path
+    names: list[str]
+
+    def read(self, names: list[str]) -> None: ...
+    def numbers(self, name: str) -> Array: ...
+    def texts(self, name: str) -> NDArray[Any]: ...
+    def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None: ...
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether a file is Parquet, or text that ends as tables do (.txt, .dat: with rows of one length)."""
+    if head.startswith(PARQUET_MAGIC):
+        return True
+    if path.suffix.lower() not in (*SUFFIXES, *LOOSE_SUFFIXES) or b"\0" in head:
+        return False
+    try:
+        head.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.start < len(head) - 3:  # else the head ends inside a character
+            return False
+    if path.suffix.lower() in SUFFIXES:
+        return True
+    lines = [line for _, line in head_lines(head, 20) if line.strip() and not line.startswith("#")]
+    lengths = {len(split(line, separator_of(lines[0]))) for line in lines[: max(len(lines) - 1, 2)]}
+    return len(lines) > 1 and len(lengths) == 1 and lengths.pop() > 1
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a table."""
+    path = request.path
+    given = request.columns or path.with_name(path.name + MAP_SUFFIX)
+    found = read_column_map(given) if request.columns or given.is_file() else None
+    columns: AnyColumns
+    with path.open("rb") as file:
+        parquet = file.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
+    columns = ParquetColumns(path) if parquet else TextColumns(path, found)
+    notes = [] if found is None else [f"columns as {given.name} says"]
+    if found is None:
+        found = contract_map(columns.names)
+        notes = ["columns are known by the log folder's names for them"]
+    if found is None:
+        raise _mapless(path, columns.names)
+    for name in found.columns():
+        if name not in columns.names:
+            few = ", ".join(columns.names[:SHOWN_COLUMNS])
+            raise DataError(f"there is no column '{name}'", file=path, remedy=f"the file has {few}")
+    columns.read(found.columns())
+    return [_recording(request, columns, found, notes)]
+
+
+def _mapless(path: Path, names: list[str]) -> DataError:
+    if len(names) > SHOWN_COLUMNS or sum(map(len, names)) > 20 * SHOWN_COLUMNS:
+        names = [name[:40] for name in names[:SHOWN_COLUMNS]]
+    return DataError(
+        f"nothing says what the columns {', '.join(names)} are",
+        file=path,
+        remedy=f"mend this and save it as {path.name}{MAP_SUFFIX}: {{{starter_map(names)}}}",
+    )
+
+
+def _recording(request: Request, columns: AnyColumns, found: ColumnMap, notes: list[str]) -> Recording:
+    t_ns, told = _times(columns, found)
+    times = row_times(request, "table", t_ns)
+    if not len(t_ns):
+        raise DataError("holds no rows", file=request.path, remedy="record or copy it again")
+    start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
+    meta = dataclasses.replace(found.meta, start_ns=start_ns)
+    reader = _Reader(_Source(request.path, columns, found, times, start_ns), meta, request)
+    channels = {name: getattr(reader, name)() for name in CHANNELS}
+    if not any(channel is not None and len(channel) for channel in channels.values()):
+        raise DataError("no channel holds a sample", file=request.path, remedy="check the column map")
+    of_text = columns.notes if isinstance(columns, TextColumns) else ()
+    notes = [*notes, *told, *of_text, *times.notes, *reader.notes]
+    recording = recording_of(channels, meta, request.path.stem, notes)
+    held = [name for name, channel in channels.items() if channel is not None]
+    recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
+    return apply(recording, found.conventions())
+
+
+def _times(columns: AnyColumns, found: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
+    """Nanoseconds of the rows, since 1970 where the map tells the epoch."""
+    time = found.time
+    t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
+    if t_ns is None:
+        return _iso_ns(columns, time.column)
+    late = np.flatnonzero(np.abs(t_ns) > MAX_NS)
+    if late.size:
+        raise DataError(
+            f"the time of row {int(late[0]) + 1} is {t_ns[late[0]] * 1e-9:.9g} s",
+            file=columns.path,
+            remedy=f"is the unit {time.unit}?",
+        )
+    if time.epoch == "none":
+        return t_ns, ["times have no calendar"]
+    if time.epoch == "gps":
+        t_ns = gps_to_unix_ns(t_ns)
+        return t_ns, [leap_note(t_ns)] if len(t_ns) else []
+    if time.epoch != "unix":
+        t_ns = t_ns + dates_to_ns([time.epoch])[0]
+    return t_ns, []
+
+
+def _iso_ns(columns: AnyColumns, name: str) -> tuple[NDArray[np.int64], list[str]]:
+    texts = columns.texts(name).tolist()
+    try:
+        t_ns = dates_to_ns(texts)
+    except NotADecimal as bad:
+        raise DataError(
+            f"column '{name}' is '{texts[bad.row][:40]}' in row {bad.row + 1}",
+            file=columns.path,
+            remedy="give ISO 8601 times such as 2024-05-01T12:00:00.25Z, or another time unit in the map",
+        ) from None
+    zoned = bool(texts) and re.search(r"(Z|[+-]\d\d:?\d\d)$", texts[0].strip())
+    return t_ns, [] if zoned else ["times without an offset are taken as UTC"]
+
+
+class _Source:
+    """The mapped columns of a file as tables of channels, in SI units."""
+
+    def __init__(
+        self, path: Path, columns: AnyColumns, found: ColumnMap, times: RowTimes, start_ns: int
+    ) -> None:
+        self.path, self.columns, self.found, self.times = path, columns, found, times
+        self.t_ns = times.t_ns - start_ns
+
+    def place(self, channel: str) -> Path:
+        return self.path
+
+    def table(
+        self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
+    ) -> Table | None:
+        fields = self.found.channels.get(channel, {})
+        if not fields:
+            return None
+        numbers = {name: self._numbers(name, of) for name, of in fields.items() if name not in TEXT_FIELDS}
+        words = {name: self._texts(name, of) for name, of in fields.items() if name in TEXT_FIELDS}
+        if "yaw_rad" in numbers:
+            yaw = numbers.pop("yaw_rad")
+            zero = np.zeros(len(yaw))
+            numbers |= dict(
+                zip(QUATERNION, rpy_to_quaternion(np.stack([zero, zero, yaw], axis=1)).T, strict=True)
+            )
+        return Table(self.t_ns, numbers, words)
+
+    def _numbers(self, name: str, of: ColumnOf) -> Array:
+        values = self.columns.numbers(of.column)[self.times.order]
+        factor = units_of(name).get(of.unit, 1.0) * (-1.0 if of.sign == "-" else 1.0)
+        return values if factor == 1.0 else values * factor
+
+    def _texts(self, name: str, of: ColumnOf) -> NDArray[Any]:
+        texts = self.columns.texts(of.column)[self.times.order]
+        if name != "fix" or not of.unit:
+            return texts
+        words, inverse = np.unique(texts.astype(str), return_inverse=True)
+        codes = FIX_WORDS[of.unit]
+        told = [codes.get(_whole(word), "") for word in words]
+        for word, meant in zip(words, told, strict=True):
+            if word.strip() and not meant:
+                raise DataError(
+                    f"column '{of.column}' is '{word[:40]}'",
+                    file=self.path,
+                    remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
+                )
+        return np.array(told, dtype=object)[inverse]
+
+
+def _whole(word: str) -> int:
+    """A whole number as text, -99 where it is none: no receiver has that code."""
+    try:
+        number = float(word)
+    except ValueError:
+        return -99
+    return int(number) if number.is_integer() else -99
+
+
+class _Reader(ChannelReader):
+    """Channels of a table; a GNSS channel may be in latitude and longitude, and without sigmas."""
+
+    def __init__(self, source: _Source, meta: Any, request: Request) -> None:
+        super().__init__(source, meta)
+        self.request = request
+        self.datum: Datum | None = meta.datum
+
+    def gnss(self) -> Gnss | None:
+        table = self._table("gnss", (), texts=("fix",))
+        if table is None:
+            return None
+        fix = self._fix(table)
+        sigma = table.stack(("sigma_e_m", "sigma_n_m", "sigma_u_m"))
+        velocity = table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None
+        sigma_v = table.numbers.get("sigma_v_mps")
+        if "latitude_deg" in table.numbers:
+            fixes = Fixes(self._t(table), table.stack(GEODETIC), fix, sigma, velocity, sigma_v)
+            channel, self.datum, notes = gnss_channel(self.request, fixes, self.datum)
+            self.notes += notes
+            return channel
+        sigma, notes = with_assumed_sigma(self.request, sigma, fix)
+        self.notes += notes
+        held = fix > Fix.NONE
+        if not held.all():
+            self.notes.append(f"gnss: {int((~held).sum())} rows hold no fix")
+        return Gnss(self._t(table), table.stack(("east_m", "north_m", "up_m")), sigma, fix, velocity, sigma_v)

@@ -1,0 +1,241 @@
+"""Text exports of Xsens MT Manager: one file a device, a row a packet.
+
+Column names and units are those of the MT Manager manual (Acc m/s2, Gyr rad/s, SampleTimeFine in
+ticks of 10 kHz that wrap at 32 bits). The position is the device's own, fused with its IMU; its
+attitude is left out altogether: the output of a filter is no truth.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.text.delimited import (
+    Columns,
+    Layout,
+    head_lines,
+    read_columns,
+    read_text,
+    separator_of,
+    split,
+)
+from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
+from terrafusion.datasets.readers.text.row_times import row_times
+from terrafusion.datasets.readers.text.xsens_clock import UTC, clock_of
+from terrafusion.datasets.readers.text.xsens_motion import ACC, ATTITUDES, GYR, INCREMENTS, inertial
+from terrafusion.datasets.recording import Fix, Gnss, Recording
+
+Array = NDArray[np.float64]
+
+COUNTERS = ("PacketCounter", "Counter")
+TICKS = "SampleTimeFine"
+POSITION = ("Latitude", "Longitude", "Altitude")
+VELOCITIES = (("Vel_X", "Vel_Y", "Vel_Z"), ("Vel_E", "Vel_N", "Vel_U"))
+STATUS = ("StatusWord", "Status")
+OTHER_DEVICES = ("Euler_X", "dq_W", "dv[1]")
+"""Columns of Xsens DOT exports, whose units differ (us, deg/s)."""
+
+ENU_OF = {"ENU": (0, 1, 2), "NED": (1, 0, 2), "NWU": (1, 0, 2)}
+ENU_SIGNS = {"ENU": (1, 1, 1), "NED": (1, 1, -1), "NWU": (-1, 1, 1)}
+
+GNSS_FIX_BIT, RTK_SHIFT = 0x4, 27
+"""StatusWord: bit 2 is the GNSS fix, bits 27 and 28 the RTK state (1 float, 2 fixed)."""
+UNUSED_BITS = 1 << 7 | 1 << 17 | 0xE0000000
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether the first line that is no `//` line names columns of an MTi."""
+    found = _header(head)
+    if found is None:
+        return False
+    _, line, settings = found
+    names = set(map(_bare, split(line, separator_of(line))))
+    counted = names & {*COUNTERS, TICKS, "UTC_Year"}
+    measured = names & {*ACC, *GYR, *POSITION, *INCREMENTS[0], *INCREMENTS[1]}
+    return bool(counted and measured and (settings or not names & set(OTHER_DEVICES)))
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of an export: IMU, and GNSS where the device has it."""
+    columns, settings, notes = _columns(request.path)
+    clock = clock_of(request.path, columns, settings)
+    times = row_times(request, "imu", clock.t_ns)
+    columns = _select(columns, clock.rows, times.order)
+    notes += [*columns.notes, *clock.notes, *times.notes]
+    imu, more = inertial(request.path, columns, times.t_ns, settings)
+    gnss, datum, of_gnss = _gnss(request, columns, times.t_ns, settings)
+    if imu is None and gnss is None:
+        raise DataError("no row holds an IMU sample or a fix", file=request.path, remedy="export it again")
+    start_ns = int(times.t_ns[0])
+    recording = Recording(
+        name=request.path.stem,
+        start_ns=start_ns,
+        imu=imu,
+        gnss=gnss,
+        datum=datum,
+        source=_device(settings),
+        notes=(*notes, *more, *of_gnss),
+    )
+    return [dataclasses.replace(recording, clock_jumps=times.jumps_of(recording.channels()))]
+
+
+def _header(data: bytes) -> tuple[int, str, dict[str, str]] | None:
+    """Line number and text of the column names, and what the `//` lines before them say."""
+    settings: dict[str, str] = {}
+    for number, line in head_lines(data, 100):
+        if line.startswith("//"):
+            key, colon, value = line[2:].partition(":")
+            if colon:
+                settings[key.strip().lower()] = value.strip()
+        elif line.strip():
+            return number, line, settings
+    return None
+
+
+def _bare(name: str) -> str:
+    """A column's name without a unit behind it, such as in `Gyr_X [deg/s]`."""
+    return re.sub(r"\s*[\[(](?:rad/s|deg/s|m/s2|m/s\^2|deg|m|m/s)[\])]$", "", name)
+
+
+def _columns(path: Path) -> tuple[Columns, dict[str, str], list[str]]:
+    data = read_text(path)
+    found = _header(data)
+    if found is None:
+        raise DataError("no line of column names", file=path, remedy="export it again, with the header")
+    number, line, settings = found
+    separator = separator_of(line)
+    raw = split(line, separator)
+    if raw and not raw[-1]:
+        raw.pop()
+    names = [_bare(name) for name in raw]
+    for full, name in zip(raw, names, strict=True):
+        if full != name:
+            settings[f"unit of {name}"] = full[len(name) :].strip(" []()")
+    repeated = [name for i, name in enumerate(names) if name in names[:i]]
+    if repeated:
+        raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="export it again")
+    layout = Layout((*names, *_unnamed(data, number, separator, len(names))), separator, number + 1)
+    attitudes = [name for group in ATTITUDES for name in group]
+    wanted = {*COUNTERS, TICKS, *ACC, *GYR, *INCREMENTS[0], *INCREMENTS[1], *attitudes, *POSITION, *UTC}
+    wanted |= {name for group in VELOCITIES for name in group}
+    numbers = [name for name in names if name in wanted]
+    texts = [name for name in names if name in STATUS]
+    columns = read_columns(path, data, layout, numbers, texts)
+    attitude = [name for name in names if name in {*attitudes, *INCREMENTS[1]} or name.startswith("Mat[")]
+    left = [name for name in names if name not in (*numbers, *texts, *attitude)]
+    notes = []
+    if attitude:
+        notes.append("the device's attitude is the output of its own filter, no truth: left out")
+    if left:
+        notes.append(f"columns left out: {', '.join(left)}")
+    return columns, settings, notes
+
+
+def _unnamed(data: bytes, header: int, separator: str, count: int) -> list[str]:
+    """A nameless last column where the rows end with a separator and the header does not."""
+    row = next((line for n, line in head_lines(data, header + 20) if n > header and line.strip()), "")
+    return [""] if row.endswith(separator) and row.count(separator) == count else []
+
+
+def _select(columns: Columns, rows: NDArray[np.bool_], order: Any) -> Columns:
+    return dataclasses.replace(
+        columns,
+        numbers={name: values[rows][order] for name, values in columns.numbers.items()},
+        texts={name: values[rows][order] for name, values in columns.texts.items()},
+    )
+
+
+def _device(settings: dict[str, str]) -> str:
+    keys = ("deviceid", "device id", "productcode", "firmware version", "filter profile")
+    told = [f"{key} {settings[key]}" for key in keys if settings.get(key)]
+    return f"Xsens MT Manager export ({', '.join(told)})" if told else "Xsens MT Manager export"
+
+
+def _gnss(
+    request: Request, columns: Columns, t_ns: NDArray[np.int64], settings: dict[str, str]
+) -> tuple[Gnss | None, tuple[float, float, float] | None, list[str]]:
+    if not {"Latitude", "Longitude"} <= columns.numbers.keys():
+        return None, None, []
+    llh = columns.stack(POSITION)
+    rows = np.asarray(np.isfinite(llh[:, :2]).all(axis=1))
+    if not rows.any():
+        return None, None, ["gnss: no row holds a position; the channel is absent"]
+    notes = ["gnss: the position is the device's own, fused with its IMU: errors of near fixes go together"]
+    fix, told = _fix(request.path, columns, rows)
+    velocity, more = _velocity(columns, settings)
+    fixes = Fixes(
+        t_ns[rows],
+        llh[rows],
+        fix,
+        np.full((int(rows.sum()), 3), np.nan),
+        None if velocity is None else velocity[rows],
+    )
+    gnss, datum, rest = gnss_channel(request, fixes)
+    return gnss, datum, [*notes, *told, *more, *rest]
+
+
+def _fix(path: Path, columns: Columns, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
+    name = next((name for name in STATUS if name in columns.texts), None)
+    if name is None:
+        return np.full(int(rows.sum()), Fix.SINGLE, dtype=np.uint8), [
+            "gnss: the export has no StatusWord; all fixes are taken as 'single'"
+        ]
+    words, inverse = np.unique(columns.texts[name].astype(str), return_inverse=True)
+    codes = np.array([_class_of(status) for status in _status_words(path, name, words)], dtype=np.uint8)
+    fix = codes[inverse]
+    if (words == "").any():  # the status may come at a lower rate than the position
+        last = np.maximum.accumulate(np.where(words[inverse] != "", np.arange(len(fix)), 0))
+        fix = fix[last]
+    return fix[rows], []
+
+
+def _status_words(path: Path, name: str, words: NDArray[np.str_]) -> list[int]:
+    """Status words written as 32 binary digits, in hexadecimal, or in decimal."""
+    cells = [word.strip() for word in words]
+    told = [cell for cell in cells if cell]
+    base = _base_of(told)
+    try:
+        return [int(cell, base) if cell else 0 for cell in cells]
+    except ValueError:
+        bad = next(cell for cell in told if not re.fullmatch("(0[xX])?[0-9a-fA-F]+", cell) or base == 10)
+        raise DataError(
+            f"column '{name}' holds '{bad[:40]}'", file=path, remedy="it must be a number or hexadecimal"
+        ) from None
+
+
+def _base_of(told: list[str]) -> int:
+    if told and all(len(cell) == 32 and set(cell) <= {"0", "1"} for cell in told):
+        return 2
+    if any(re.search("[xXa-fA-F]", cell) for cell in told):
+        return 16
+    if told and all(len(cell) == 8 and cell.isdigit() for cell in told):  # either, but for unused bits
+        padded = any(cell[0] == "0" for cell in told)
+        decimal, other = (any(int(cell, base) & UNUSED_BITS for cell in told) for base in (10, 16))
+        return 16 if padded or (decimal and not other) else 10
+    return 10
+
+
+def _class_of(status: int) -> Fix:
+    rtk = status >> RTK_SHIFT & 3
+    if not status & GNSS_FIX_BIT:
+        return Fix.NONE
+    return {1: Fix.FLOAT, 2: Fix.FIXED}.get(rtk, Fix.SINGLE)
+
+
+def _velocity(columns: Columns, settings: dict[str, str]) -> tuple[Array | None, list[str]]:
+    if all(name in columns.numbers for name in VELOCITIES[1][:2]):
+        return columns.stack(VELOCITIES[1]), []
+    if not all(name in columns.numbers for name in VELOCITIES[0]):
+        return None, []
+    told = settings.get("coordinate system", "").upper()
+    frame = told if told in ENU_OF else "ENU"
+    velocity = columns.stack(VELOCITIES[0])[:, ENU_OF[frame]] * ENU_SIGNS[frame]
+    said = "as the export says" if told in ENU_OF else "which the export does not say"
+    return velocity, [f"gnss: velocity columns are taken as {frame}, {said}"]
