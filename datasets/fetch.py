@@ -74,8 +74,8 @@ def fetch(
 
     Args:
         names: sets, recordings (`set/recording`) or files of the catalogue.
-        folder: where the files are wanted. When None, a file that is in `TERRAFUSION_DATA` or in
-            the cache folder with the right hash is here already, and others go to the cache.
+        folder: where the files are wanted; the cache folder when None. A file that is in
+            `TERRAFUSION_DATA` or in the cache with the right hash is not downloaded.
         offline: take what is here; download nothing.
         progress: told how far each download is.
 
@@ -89,7 +89,7 @@ def fetch(
     catalog = load_catalog()
     chosen = {entry.file: entry for name in names for entry in entries_of(catalog, name)}
     for entry in chosen.values():
-        here = _at_hand(entry, data_folders() if folder is None else [folder])
+        here = _at_hand(entry, data_folders()) if folder is None else _brought(entry, folder)
         if here is None and offline:
             raise DataError(
                 "is not on this machine",
@@ -106,6 +106,29 @@ def _at_hand(entry: CatalogFile, folders: list[Path]) -> Path | None:
         if path.is_file() and path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256:
             return path
     return None
+
+
+def _brought(entry: CatalogFile, folder: Path) -> Path | None:
+    """The file in `folder`, copied from where this machine has it; None where it has none."""
+    there = _at_hand(entry, [folder])
+    here = _at_hand(entry, data_folders()) if there is None else None
+    if here is None:
+        return there
+    target = folder / entry.file
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(here, target)
+    except OSError as error:
+        raise _unwritable(target, error) from None
+    return target
+
+
+def _unwritable(path: Path, error: OSError) -> DataError:
+    return DataError(
+        f"cannot be written: {error.strerror or error}",
+        file=path,
+        remedy="choose a folder you may write to, with room on the disk",
+    )
 
 
 def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Path:
@@ -125,11 +148,7 @@ def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Pa
             remedy="run it again, which goes on where it stopped, or put the file into TERRAFUSION_DATA",
         ) from None
     except OSError as error:
-        raise DataError(
-            f"cannot be written: {error.strerror or error}",
-            file=folder / entry.file,
-            remedy="choose a folder you may write to, with room on the disk",
-        ) from None
+        raise _unwritable(folder / entry.file, error) from None
     except ValueError:  # pooch found another hash, and has removed what came
         raise DataError(
             f"what came from {entry.url()} has another SHA-256 than the catalogue",

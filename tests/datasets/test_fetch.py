@@ -110,6 +110,18 @@ def test_a_local_copy_is_used(server: type[Server], tmp_path: Path, monkeypatch:
     assert not server.requests
 
 
+def test_a_local_copy_is_brought_where_it_is_wanted(
+    server: type[Server], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "mine" / "toys").mkdir(parents=True)
+    (tmp_path / "mine" / "toys" / "good.bin").write_bytes(CONTENT)
+    monkeypatch.setenv(catalog.DATA_VARIABLE, str(tmp_path / "mine"))
+    (got,) = get("good", tmp_path / "to")
+    assert got.path == tmp_path / "to" / "toys" / "good.bin"
+    assert got.path.read_bytes() == CONTENT
+    assert not server.requests
+
+
 def test_a_spoilt_local_copy_is_not(server: type[Server], tmp_path: Path) -> None:
     (tmp_path / "to" / "toys").mkdir(parents=True)
     (tmp_path / "to" / "toys" / "good.bin").write_bytes(CONTENT[:-1] + b"x")
