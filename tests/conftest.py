@@ -8,12 +8,15 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import hypothesis
 import pytest
+
+# The same examples in every run: a change that breaks something is told from bad luck.
+hypothesis.settings.register_profile("fixed", derandomize=True)
+hypothesis.settings.load_profile("fixed")
 
 # The matrices here are small: threads of the linear algebra only wait for each other on a busy machine.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-
-from terrafusion.fusion.cli.main import main
 
 
 @dataclass(frozen=True)
@@ -42,6 +45,8 @@ Terrafusion = Callable[..., Outcome]
 @pytest.fixture
 def terrafusion(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> Terrafusion:
     """Runs the console script's own `main`, with the descriptors captured, so that C++ is heard too."""
+
+    from terrafusion.fusion.cli.main import main
 
     def run(*words: object) -> Outcome:
         monkeypatch.setattr(sys, "argv", ["terrafusion", *map(str, words)])
