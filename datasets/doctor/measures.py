@@ -18,7 +18,7 @@ from terrafusion.datasets.doctor.accounts import speeds, yaw_rates
 from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.magnitude import check_magnitude
 from terrafusion.datasets.doctor.offsets import opposed
-from terrafusion.datasets.doctor.pairs import far_lag
+from terrafusion.datasets.doctor.pairs import far_lag, near_lag
 from terrafusion.datasets.doctor.path import Places, Windows, compare, dead_reckoned, places, scale_of
 from terrafusion.datasets.doctor.turning import LEAST_WINDOWS, WINDOW_S, accounts
 from terrafusion.datasets.lag import held_rows
@@ -245,7 +245,8 @@ def _lags(patient: Patient) -> Iterator[PairLag]:
         for one, other in pairs:
             if one not in signals or other not in signals:
                 continue
-            lag = far_lag(signals[one], signals[other])
+            # A command is followed, not told late: far off there is only the next step that is like it.
+            lag = (near_lag if one == "command" else far_lag)(signals[one], signals[other])
             if lag is None or lag.r < LEAST_R or opposed(lag, signals[one], signals[other]):
                 continue
             late, low, high = float(lag.seconds), float(lag.low_s), float(lag.high_s)
