@@ -150,6 +150,10 @@ def _is_disorder(t_ns: TimesNs, row: int, period: float) -> bool:
     """
     start, stop = max(row - DISORDER_ROWS, 0), min(row + DISORDER_ROWS, len(t_ns))
     t, at = t_ns[start:stop] - t_ns[row], row - start
+    steady = np.diff(t)
+    steady = steady[np.abs(steady - period) < 0.5 * period]
+    if steady.size:  # over many rows the mean counts them, where the median adds up its own error
+        period = float(steady.mean())
     high = int(t[:at].max())
     has_earlier, has_later = bool((t[:at] < 0).any()), bool((t[at:] > high).any())
     if (not has_earlier and start > 0) or (not has_later and stop < len(t_ns)):

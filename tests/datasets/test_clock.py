@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import assume, given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.clock import DISORDER_ROWS, in_order, repair, repair_together
+from terrafusion.datasets.clock import in_order, repair, repair_together
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import ClockJump
 
@@ -47,6 +47,7 @@ def test_short_channels(n: int) -> None:
 
 
 @settings(max_examples=200, deadline=None)
+@example(steps={999: 0.5}, jitter=0.1)  # about as many rows back as may come out of order
 @given(
     steps=st.dictionaries(st.integers(1, 999), st.floats(0.02, 1e6), min_size=1, max_size=5),
     jitter=st.sampled_from([0.0, 0.1]),
@@ -55,8 +56,6 @@ def test_steps_back_are_taken_out(steps: dict[int, float], jitter: float) -> Non
     """Any rows, the first and the last too: each step is right to within a period."""
     t = ticks(jitter=jitter)
     rows = sorted(steps)
-    # A few last rows of half a second before look like rows that came late.
-    assume(all(steps[row] > 0.01 * (DISORDER_ROWS + 5) for row in rows if row > 990))
     repaired, jumps = repair(stepped(t, *((row, -steps[row]) for row in rows)), "imu")
     assert [jump.t_ns for jump in jumps] == repaired[rows].tolist()
     for jump, row in zip(jumps, rows, strict=True):
