@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Iterator
 
 import numpy as np
@@ -66,8 +67,8 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
             f"{int(rows.sum())} of {len(rows)} fixes have a sigma that is zero, negative or missing",
             f"first at t = {at_s:.2f} s: {said} m",
             "take the median of the other fixes of the class; where there is none, the usual value "
-            f"({usual} m, heights twice)",
-            _with_usual_sigma,
+            f"({usual} m, heights twice), or the scatter about wheels and gyro where that is larger",
+            functools.partial(_with_usual_sigma, least_m=scatter_m(patient) or 0.0),
         )
 
 
@@ -78,12 +79,12 @@ def _impossible(gnss: Gnss) -> Mask:
     return np.asarray(counts & ~(gnss.sigma_enu_m > 0.0))
 
 
-def _with_usual_sigma(recording: Recording) -> Recording:
+def _with_usual_sigma(recording: Recording, least_m: float) -> Recording:
     gnss = recording.gnss
     assert gnss is not None
     sigma, bad = gnss.sigma_enu_m.copy(), _impossible(gnss)
     for fix in np.unique(gnss.fix).tolist():
-        usual = ASSUMED_SIGMA_M[Fix(fix)]
+        usual = max(ASSUMED_SIGMA_M[Fix(fix)], least_m)
         for k, factor in enumerate((1.0, 1.0, 2.0)):
             of_class = gnss.fix == fix
             good = sigma[of_class & (sigma[:, k] > 0.0), k]

@@ -311,9 +311,7 @@ CLOCK_CASES: dict[str, Case] = {
 }  # fmt: skip
 
 GNSS_CASES: dict[str, Case] = {
-    "gnss: sigma zero": Case(
-        change("gnss", sigma_enu_m=lambda s: s * 0), "sigma-impossible", "gnss", good=sigmas(0.02, 0.04)
-    ),
+    "gnss: sigma zero": Case(change("gnss", sigma_enu_m=lambda s: s * 0), "sigma-impossible", "gnss"),
     "gnss: some sigmas negative": Case(
         change("gnss", sigma_enu_m=at((slice(50, 60), slice(None)), np.negative)), "sigma-impossible", "gnss"
     ),
