@@ -141,5 +141,5 @@ def test_sparse_logs_do_not_trip_it(drive: Recording) -> None:
         channel = getattr(drive, name)
         for n in (1, 2, 5):
             alone = Recording("x", drive.start_ns, **{name: channel.select(slice(0, n))})
-            examine(alone)
-    examine(Recording("x", 0))
+            assert examine(alone) == [], (name, n)
+    assert examine(Recording("x", 0)) == []

@@ -253,6 +253,9 @@ def test_plots_bear_gaps_nan_and_single_keyframes(drive):
             plots_map.plot_map_runs({"a": estimate}, recording, outages=OUTAGES)[0],
         ):
             fig.draw_without_rendering()
+            assert fig.axes
+            for ax in fig.axes:
+                assert np.isfinite([*ax.get_xlim(), *ax.get_ylim()]).all(), ax.get_ylabel()
 
 
 def test_important_changes_are_the_largest_apart_and_in_order():
