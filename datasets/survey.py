@@ -95,10 +95,11 @@ class Row:
     found: tuple[Value | None, ...]
 
     def verdict(self) -> str:
-        """`agrees`, `otherwise` (as `Fact.instead` says), or `WRONG`; what cannot be told does not count."""
+        """`agrees`, `as before` (nobody told it, but it was measured here), `otherwise` (as `Fact.instead`
+        says), or `WRONG`; recordings where it cannot be measured do not count."""
         known = [value for value in self.found if value is not None]
         if known and all(self.fact.holds(value) for value in known):
-            return "agrees"
+            return "agrees" if self.fact.is_told() else "as before"
         if known and self.fact.instead and all(self.fact.instead.holds(value) for value in known):
             return f"otherwise: {self.fact.instead.told}"
         return WRONG
