@@ -155,7 +155,7 @@ def _lags(recording: Recording, c: Conventions) -> Recording:
         if channel is None or lag_s == 0.0:
             continue
         shifted = dataclasses.replace(channel, t_ns=channel.t_ns - round(lag_s * 1e9))
-        note = f"{name}: times are late by {lag_s:g} s; brought forward"
+        note = f"{name}: times are {'late' if lag_s > 0 else 'early'} by {abs(lag_s):g} s; corrected"
         recording = dataclasses.replace(recording, **{name: shifted}).with_notes(note)
     return recording
 

@@ -133,6 +133,8 @@ class Wheels(Channel):
             raise ValueError(f"wheels: unknown layout {self.names} in {self.unit}")
         if self.speed.shape != (len(self), len(self.names)):
             raise ValueError(f"wheels: speed has shape {self.speed.shape} for {len(self.names)} wheels")
+        if self.angle_rad is not None and self.angle_rad.shape != self.speed.shape:
+            raise ValueError(f"wheels: angle_rad has shape {self.angle_rad.shape}, speed {self.speed.shape}")
 
     def columns(self) -> dict[str, NDArray[Any]]:
         table: dict[str, NDArray[Any]] = {
@@ -239,6 +241,12 @@ class Terrain(Channel):
     source: str = "annotation"
     classes: tuple[str, ...] = ()
     probabilities: Array | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wanted = (len(self), len(set(self.classes)))
+        if self.probabilities is not None and self.probabilities.shape != wanted:
+            raise ValueError(f"terrain: probabilities have shape {self.probabilities.shape}, not {wanted}")
 
     def columns(self) -> dict[str, NDArray[Any]]:
         table: dict[str, NDArray[Any]] = {"label": self.label}

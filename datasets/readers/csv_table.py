@@ -6,6 +6,7 @@ import csv
 import difflib
 import gzip
 import io
+import re
 import warnings
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
@@ -90,7 +91,7 @@ def read_table(
     header = _header(path, data, [*known], texts, prefixes)
     numeric = [name for name in header if name not in texts]
     table = _fast_parse(data, header, numeric)
-    if table is None or not all(np.isfinite(table[name]).all() for name in numeric):
+    if table is None or _is_odd(table, header, numeric, data):
         _check_cells(path, data, header, numeric)
     if table is None:
         raise DataError("cannot be read as a table", file=path, remedy="write plain comma-separated numbers")
@@ -175,6 +176,15 @@ def _fast_parse(data: bytes, header: list[str], numeric: list[str]) -> dict[str,
     return {name: frame[name].to_numpy() for name in header}
 
 
+def _is_odd(table: dict[str, NDArray[Any]], header: list[str], numeric: list[str], data: bytes) -> bool:
+    """Whether cells are missing, or may have been made up by the parser: a short line's last text, a truth
+    value taken for a number."""
+    last = header[-1]
+    missing = not all(np.isfinite(table[name]).all() for name in numeric)
+    cut = last not in numeric and bool((table[last] == "").any())
+    return missing or cut or bool(re.search(rb"(?i)true|false", data))
+
+
 def _check_cells(path: Path, data: bytes, header: list[str], numeric: list[str]) -> None:
     """Raise for the first line or cell that is neither a finite number nor empty."""
     rows = _lines(path, data)
@@ -187,7 +197,7 @@ def _check_cells(path: Path, data: bytes, header: list[str], numeric: list[str])
                 remedy="an unknown value is an empty cell between commas",
             )
         for name, cell in zip(header, cells, strict=True):
-            if name in numeric and (cell.strip() or name == "t_s") and not _is_finite(cell):
+            if name in numeric and (cell or name == "t_s") and not _is_finite(cell):
                 time_s = cells[header.index("t_s")]
                 _bad_cell(path, name, cell, line, float(time_s) if _is_finite(time_s) else None)
 
@@ -198,7 +208,7 @@ def _lines(path: Path, data: bytes) -> Iterator[tuple[int, list[str]]]:
     begun = 1
     try:
         for cells in reader:
-            if cells:
+            if len(cells) > 1 or "".join(cells).strip(" \t"):
                 yield reader.line_num, cells
             begun = reader.line_num + 1
     except csv.Error as error:

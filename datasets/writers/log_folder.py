@@ -19,7 +19,7 @@ from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
 from terrafusion.datasets.recording import Recording, Wheels
-from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of
+from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
 
 BLOCK_ROWS = 100_000
 """Rows that are turned into text at a time, which bounds the memory."""
@@ -39,6 +39,8 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     """
     folder = Path(folder)
     tables = tables_of(recording)
+    if not any(len(table.t_ns) for table in tables.values()):
+        raise DataError("the recording holds no sample", file=folder, remedy="write one that does")
     _check_wheels(recording.wheels, folder)
     for name, table in tables.items():
         _check_table(table, recording.start_ns, folder, name)
@@ -47,7 +49,7 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
         meta["keep_empty"] = True
     text = _meta_text(meta, folder)
     _check_room(folder)
-    try:
+    with writing(folder):
         folder.parent.mkdir(parents=True, exist_ok=True)
         beside = folder if folder.is_dir() else folder.parent
         with tempfile.TemporaryDirectory(dir=beside, prefix=".log-") as scratch:
@@ -57,36 +59,18 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
                 _write_table(whole / f"{name}.csv", recording.start_ns, table)
             (whole / META).write_text(text, encoding="utf-8", newline="\n")
             _put_in_place(whole, folder)
-    except UnicodeEncodeError as error:
-        raise DataError(
-            f"a text holds {error.object[error.start : error.end]!r}, which is no character",
-            file=folder,
-            remedy="take it out of the texts of the recording",
-        ) from None
-    except OSError as error:
-        raise _unwritable(folder, error) from None
     return folder
-
-
-def _unwritable(folder: Path, error: OSError) -> DataError:
-    return DataError(
-        f"cannot be written: {error.strerror or error}",
-        file=folder,
-        remedy="choose a folder you may write to, with room on the disk",
-    )
 
 
 def _check_room(folder: Path) -> None:
     """Refuse a place that holds something other than a log."""
-    try:
+    with writing(folder):
         if folder.exists() and not folder.is_dir():
             raise DataError("is a file", file=folder, remedy="give a folder to write the log into")
         if folder.is_dir() and any(folder.iterdir()) and not (folder / META).is_file():
             raise DataError(
                 "the folder is not empty and holds no log", file=folder, remedy="give an empty or new folder"
             )
-    except OSError as error:
-        raise _unwritable(folder, error) from None
 
 
 def _put_in_place(whole: Path, folder: Path) -> None:

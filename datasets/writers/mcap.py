@@ -18,7 +18,7 @@ from terrafusion.datasets.recording import Fix, Gnss, Imu, Recording, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.mcap_file import Definition, Topic, write_mcap_file
-from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of
+from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
 
 if TYPE_CHECKING:
     from terrafusion.datasets.sensors import Rig
@@ -64,35 +64,29 @@ def write_mcap(
             a text, position or datum that the log folder would not take either.
     """
     path = Path(path)
-    if path.is_dir() or (path.exists() and not overwrite):
-        raise DataError("exists already", file=path, remedy="remove it or give another name")
-    saved = meta_of(recording, path, path.stem)
-    shift_ns = _shift_ns(recording)
-    recording = _later(recording, shift_ns)
-    parts = _Parts(recording, rig)
-    if shift_ns:
-        parts.unseen.append(f"times before 1970: stamps are {shift_ns // 10**9} s later")
-    topics = list(parts.standard())
-    if estimate is not None:
-        estimate = dataclasses.replace(estimate, t_ns=estimate.t_ns + shift_ns)
-        topics.append(ros.trajectory("/odometry/filtered", estimate, "base_link"))
-    saved |= {**parts.saved(), "shift_ns": shift_ns}
-    start_ns = min([recording.start_ns, *(int(t.t_ns[0]) for t in topics if len(t.t_ns))])
-    topics = [ros.text(META[0], start_ns, json.dumps(saved)), *parts.once(start_ns), *topics]
-    for topic in topics:
-        _check_times(topic, path)
-    try:
+    with writing(path):
+        if path.is_dir() or (path.exists() and not overwrite):
+            raise DataError("exists already", file=path, remedy="remove it or give another name")
+        saved = meta_of(recording, path, path.stem)
+        shift_ns = _shift_ns(recording)
+        recording = _later(recording, shift_ns)
+        parts = _Parts(recording, rig)
+        if shift_ns:
+            parts.unseen.append(f"times before 1970: stamps are {shift_ns // 10**9} s later")
+        topics = list(parts.standard())
+        if estimate is not None:
+            estimate = dataclasses.replace(estimate, t_ns=estimate.t_ns + shift_ns)
+            topics.append(ros.trajectory("/odometry/filtered", estimate, "base_link"))
+        saved |= {**parts.saved(), "shift_ns": shift_ns}
+        start_ns = min([recording.start_ns, *(int(t.t_ns[0]) for t in topics if len(t.t_ns))])
+        topics = [ros.text(META[0], start_ns, json.dumps(saved)), *parts.once(start_ns), *topics]
+        for topic in topics:
+            _check_times(topic, path)
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap-") as scratch:
             whole = Path(scratch) / path.name
             write_mcap_file(whole, topics, _definitions(topics), "terrafusion")
             whole.replace(path)
-    except OSError as error:
-        raise DataError(
-            f"cannot be written: {error.strerror or error}",
-            file=path,
-            remedy="choose a folder you may write to, with room on the disk",
-        ) from None
     return tuple(parts.unseen)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -9,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,
     COVARIANCE,
@@ -22,6 +25,25 @@ from terrafusion.datasets.recording import Imu, Recording
 from terrafusion.datasets.trajectory import Trajectory
 
 PLANAR_TWIST = ("u_mps", "v_mps", "r_radps")
+
+
+@contextmanager
+def writing(path: Path) -> Iterator[None]:
+    """Turns what goes wrong while a log is written into a DataError of the path."""
+    try:
+        yield
+    except UnicodeEncodeError as error:
+        raise DataError(
+            f"a text holds {error.object[error.start : error.end]!r}, which is no character",
+            file=path,
+            remedy="take it out of the texts of the recording",
+        ) from None
+    except OSError as error:
+        raise DataError(
+            f"cannot be written: {error.strerror or error}",
+            file=path,
+            remedy="choose a folder you may write to, with room on the disk",
+        ) from None
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +64,11 @@ class Columns:
 
 
 def tables_of(recording: Recording) -> dict[str, Columns]:
-    """The table of every channel that is there, empty ones too, and of the truth."""
+    """The table of every channel that is there, empty ones too, and of the truth.
+
+    Raises:
+        DataError: the truth holds quaternions that a reader would refuse.
+    """
     tables = {}
     for name in Recording.CHANNELS:
         channel = getattr(recording, name)
@@ -50,6 +76,9 @@ def tables_of(recording: Recording) -> dict[str, Columns]:
             columns = _all_axes(channel) if isinstance(channel, Imu) else channel.columns()
             tables[name] = Columns(channel.t_ns, columns)
     if recording.truth is not None:
+        q = recording.truth.quaternion
+        if q is not None and (np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01).any():
+            raise DataError("quaternions are not of norm 1", channel="truth", remedy="normalise them")
         tables["truth"] = Columns(recording.truth.t_ns, truth_columns(recording.truth))
     return tables
 

@@ -182,7 +182,7 @@ class Builder:
                 f"gnss: {dropped} of {len(valid)} messages of {stream.topic} hold no fix; left out"
             )
         if not valid.any():
-            return None, None
+            return None, datum
         llh, t_ns, status = llh[valid], t_ns[valid], status[valid]
         if datum is None:
             heights = llh[np.isfinite(llh[:, 2]), 2]
@@ -278,7 +278,10 @@ class Builder:
             position[:, 2][covariance[:, 2, 2] >= UNKNOWN_VARIANCE] = np.nan
             if (covariance[:, 5, 5] >= UNKNOWN_VARIANCE).all():
                 orientation = None
-            if not covariance.any() or covariance.diagonal(axis1=1, axis2=2).max() >= UNKNOWN_VARIANCE:
+            if not covariance.any():
+                covariance = None
+            elif covariance.diagonal(axis1=1, axis2=2).max() >= UNKNOWN_VARIANCE:
+                self.notes.append(f"truth: {stream.topic}: covariance left out, a part of it is unknown")
                 covariance = None
         twist = self._truth_twist(stream)
         child = str(stream.column("child_frame_id")[0]) if stream.has("child_frame_id") else ""

@@ -104,7 +104,7 @@ def _parse(stream: Stream, file: Path) -> Saved:
                 raise TypeError("tables and words are lists of texts")
         if not 0 <= int(shift_ns) < 2**62:
             raise ValueError("not a time")
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError, OverflowError):
         raise DataError(
             "is not what this library writes", file=file, channel=META[0], remedy=REMEDY
         ) from None

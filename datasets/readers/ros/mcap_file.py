@@ -85,15 +85,22 @@ class McapFile:
         self._counts: dict[int, int] | None = None
         try:
             self._walk()
-            if self._counts is None or not self._counts.keys() <= self._channels.keys():
+            if not self._is_summed_up():
                 self._count()
+            self.sources = [self._source(number) for number in sorted(self._channels)]
         except BaseException:
             self.close()
             raise
-        self.sources = [self._source(number) for number in sorted(self._channels)]
 
     def close(self) -> None:
         self._file.close()
+
+    def _is_summed_up(self) -> bool:
+        """Whether the summary tells of every channel its messages and, where it has one, its schema."""
+        told = (
+            bool(self._counts) and self._counts is not None and self._counts.keys() <= self._channels.keys()
+        )
+        return told and all(not s or s in self._schemas for s, _, _ in self._channels.values())
 
     def _walk(self) -> None:
         """Go over all records of the file, without unpacking chunks."""

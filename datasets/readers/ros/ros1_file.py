@@ -60,10 +60,10 @@ class Ros1File:
         self._connections: dict[int, tuple[dict[str, bytes], dict[str, bytes]]] = {}
         try:
             self._walk()
+            self.sources = [self._source(number) for number in sorted(self._connections)]
         except BaseException:
             self.close()
             raise
-        self.sources = [self._source(number) for number in sorted(self._connections)]
 
     def close(self) -> None:
         self._file.close()

@@ -125,10 +125,11 @@ def _unpacked_messages(batch: Batch) -> Batch:
 
 
 def _counts(said: dict[str, Any]) -> dict[str, int] | None:
-    """Numbers of messages by topic, as the metadata tell them."""
+    """Numbers of messages by topic, as the metadata tell them; None where they tell of none on a topic."""
     try:
         topics = said["topics_with_message_count"]
-        return {str(t["topic_metadata"]["name"]): int(t["message_count"]) for t in topics}
+        found = {str(t["topic_metadata"]["name"]): int(t["message_count"]) for t in topics}
+        return found if found and all(count > 0 for count in found.values()) else None
     except (KeyError, TypeError, ValueError):
         return None
 

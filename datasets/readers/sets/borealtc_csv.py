@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.delimited import head_lines, split
 from terrafusion.datasets.readers.text.number_rows import Rows, put_in_time, read_rows
@@ -26,6 +27,8 @@ NAME = re.compile(r"(?P<kind>imu|pro)_(?P<run>\w{1,40})\.csv")
 FOLDER = re.compile(r"[A-Z][A-Z0-9]*(_[A-Z0-9]+)*")
 CLASS_OF_FOLDER = {"PLOUGHED": "ploughed_soil"}
 """Grounds whose class in this library has another name than the folder."""
+LATEST_START_NS = 60 * 10**9
+"""Times count from the start of the run; what begins later is of another clock."""
 EVEN_NS = 1000
 """Stamps of a clock scatter by more than this."""
 
@@ -63,6 +66,13 @@ def read(request: Request) -> list[Recording]:
         if path.is_file()
     }
     rows, jumps, clock = put_in_time(rows, repair_clock=request.repair_clock)
+    for r in rows.values():
+        if abs(int(r.t_ns[0])) > LATEST_START_NS:
+            raise DataError(
+                f"begins at {r.t_ns[0] * 1e-9:.6g} s, not at 0",
+                file=r.path,
+                remedy="subtract the start of the run from both files",
+            )
     ground = _ground(folder.resolve().name)
     notes = [*_pairing(rows), *clock, *(note for r in rows.values() for note in r.notes), ground.note]
     label = np.array([ground.label], dtype=object)

@@ -67,7 +67,7 @@ def _recording(file: MatlabFile, request: Request) -> Recording:
     )
     recording = Recording(
         name=request.path.stem,
-        start_ns=int(min(imu.t_ns[0], wheels.t_ns[0])),
+        start_ns=max(int(min(imu.t_ns[0], wheels.t_ns[0])), 0),  # no recording starts before 1970
         wheels=wheels,
         imu=imu,
         description="the rover's own dead reckoning is left out",

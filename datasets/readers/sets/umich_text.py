@@ -80,13 +80,13 @@ def read(request: Request) -> list[Recording]:
     wheels, spoken = _wheels(rows.get("wheels"), given.kind == "wheels")
     recording = Recording(
         name=name or request.path.resolve().parent.name,
-        start_ns=min(int(r.t_ns[0]) for r in rows.values()),
+        start_ns=max(min(int(r.t_ns[0]) for r in rows.values()), 0),  # no recording starts before 1970
         wheels=wheels,
         imu=_imu(rows["imu"]) if "imu" in rows else None,
         truth=truth,
         truth_channels=_truth_channels(rows, truth),
         clock_jumps=tuple(
-            replace(jump, channel="truth") if jump.channel == "center" else jump for jump in jumps
+            replace(jump, channel="truth") if jump.channel == _truth_of(rows) else jump for jump in jumps
         ),
         notes=(*notes, *said, *spoken),
     )
@@ -231,6 +231,10 @@ def _gaps(t_ns: NDArray[np.int64]) -> list[str]:
     lost = int(np.round(gaps / period_s - 1.0).sum())
     share = lost / (len(t_ns) + lost)
     return [f"{lost} frames lost ({share:.1%}) in {gaps.size} gaps, the longest {gaps.max():.2f} s"]
+
+
+def _truth_of(rows: dict[str, Rows]) -> str:
+    return "center" if "center" in rows else "front"
 
 
 def _front_note(center: Trajectory, front: Trajectory) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import io
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -252,8 +253,8 @@ def _parse(
     options: dict[str, Any] = {"float_precision": "round_trip"} if old else {}
     options["dtype"] = {positions[name]: "float64" if name in numbers else "object" for name in asked}
     options["na_values"] = {positions[name]: list(MISSING) for name in numbers}
-    if layout.comment:
-        options["comment"] = layout.comment
+    if layout.comment:  # whole lines only: pandas would also cut a cell there
+        data = re.sub(rb"(?m)^" + re.escape(layout.comment.encode()) + rb"[^\n]*", b"", data)
     try:
         frame = pd.read_csv(
             io.BytesIO(data),

@@ -46,7 +46,7 @@ def read(request: Request) -> list[Recording]:
         raise DataError("no sentence holds a fix", file=path, remedy="record it again under open sky")
     recording = Recording(
         name=path.stem,
-        start_ns=int(gnss.t_ns[0]),
+        start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
         gnss=gnss,
         datum=datum,
         source="NMEA 0183 log",

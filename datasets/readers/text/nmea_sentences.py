@@ -45,6 +45,7 @@ NO_FIX = (6, 7, 8)
 NEAR_EPOCHS = 3
 """Sentences of an epoch may come this many epochs late."""
 CENTURY = 80
+CENTURIES_END = 2200
 """Two-digit years from here on are of the 1900s."""
 
 
@@ -132,7 +133,7 @@ def collect(path: Path, text: str) -> tuple[Epochs, list[str]]:
         except _NoTimeError:
             timeless += 1
             continue
-        except (ValueError, IndexError):
+        except (ValueError, IndexError, OverflowError):
             damaged += 1
             continue
         if epoch is not None and math.isnan(epoch.receipt_s):
@@ -214,6 +215,8 @@ def _gst(log: _Log, f: list[str]) -> _Epoch:
 
 
 def _zda(log: _Log, f: list[str]) -> _Epoch:
+    if f[3] and not 1980 <= int(f[3]) < CENTURIES_END:  # GPS begins in 1980, 64 bits of ns end in 2262
+        raise ValueError(f[3])
     day = _date(int(f[3]), f[2], f[1]) if f[3] else np.nan
     epoch = log.at(f[0])
     epoch.date = day

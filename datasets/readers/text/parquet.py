@@ -39,6 +39,8 @@ class ParquetColumns:
             raise self._damaged(error) from None
         self.names: list[str] = list(self._file.schema_arrow.names)
         self.rows: int = self._file.metadata.num_rows
+        if not self.names or len(set(self.names)) < len(self.names):
+            raise DataError("has no columns, or two of one name", file=path, remedy="name each column once")
         self._table: Any = None
 
     def read(self, names: list[str]) -> None:
@@ -94,7 +96,7 @@ class ParquetColumns:
                 return np.asarray(column.cast(pa.timestamp("ns", kind.tz)).cast(pa.int64()).to_numpy())
             if pa.types.is_integer(kind):
                 whole = column.cast(pa.int64()).to_numpy()
-                if np.abs(whole).max(initial=0) < 2**63 // NS_PER.get(unit, 1):
+                if max(int(whole.max(initial=0)), -int(whole.min(initial=0))) < 2**63 // NS_PER.get(unit, 1):
                     return np.asarray(whole * NS_PER.get(unit, 1))
                 raise OverflowError
         except self._refused:

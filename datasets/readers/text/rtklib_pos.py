@@ -81,7 +81,7 @@ def read(request: Request) -> list[Recording]:
         raise DataError("no row holds a fix", file=path, remedy="process the observations again")
     recording = Recording(
         name=path.stem,
-        start_ns=int(gnss.t_ns[0]),
+        start_ns=max(int(gnss.t_ns[0]), 0),  # no recording starts before 1970
         gnss=gnss,
         datum=datum,
         source="RTKLIB solution",

@@ -241,6 +241,11 @@ class _Reader(ChannelReader):
         table = self._table("gnss", (), texts=("fix",))
         if table is None:
             return None
+        for a, b in (("latitude_deg", "longitude_deg"), ("east_m", "north_m")):
+            if (a in table.numbers) != (b in table.numbers):
+                raise DataError(
+                    f"has only one of {a} and {b}", file=self.request.path, channel="gnss", remedy="give both"
+                )
         fix = self._fix(table)
         sigma = table.stack(("sigma_e_m", "sigma_n_m", "sigma_u_m"))
         velocity = table.stack(GNSS_VELOCITY) if "v_e_mps" in table.numbers else None
@@ -252,7 +257,11 @@ class _Reader(ChannelReader):
             return channel
         sigma, notes = with_assumed_sigma(self.request, sigma, fix)
         self.notes += notes
+        channel = Gnss(
+            self._t(table), table.stack(("east_m", "north_m", "up_m")), sigma, fix, velocity, sigma_v
+        )
         held = fix > Fix.NONE
-        if not held.all():
-            self.notes.append(f"gnss: {int((~held).sum())} rows hold no fix")
-        return Gnss(self._t(table), table.stack(("east_m", "north_m", "up_m")), sigma, fix, velocity, sigma_v)
+        if held.all():
+            return channel
+        self.notes.append(f"gnss: {int((~held).sum())} rows hold no fix; left out")
+        return channel.select(held) if held.any() else None

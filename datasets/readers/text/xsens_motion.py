@@ -63,7 +63,15 @@ def _in_radps(
     path: Path, gyro: Array, columns: Columns, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Array, list[str]]:
     """Rates in rad/s: as the column's name says, else as the attitude shows, else as documented."""
-    said = settings.get(f"unit of {GYR[2]}", "")
+    units = {settings.get(f"unit of {name}", "") for name in GYR}
+    if len(units) > 1 or not units <= {"", "deg/s", "rad/s"}:
+        raise DataError(
+            f"rates are in {', '.join(sorted(unit or 'no unit' for unit in units))}",
+            file=path,
+            channel="imu",
+            remedy="give all three in rad/s or in deg/s",
+        )
+    said = units.pop()
     if said:
         return gyro * (DEG if said == "deg/s" else 1.0), [f"imu: rates are in {said}, as the header says"]
     ratio = _rate_ratio(gyro, columns, t_ns)

@@ -204,7 +204,8 @@ def _status_words(path: Path, name: str, words: NDArray[np.str_]) -> list[int]:
     try:
         return [int(cell, base) if cell else 0 for cell in cells]
     except ValueError:
-        bad = next(cell for cell in told if not re.fullmatch("(0[xX])?[0-9a-fA-F]+", cell) or base == 10)
+        pattern = r"[+-]?[0-9]+" if base == 10 else r"(0[xX])?[0-9a-fA-F]+"
+        bad = next((cell for cell in told if not re.fullmatch(pattern, cell)), told[0])
         raise DataError(
             f"column '{name}' holds '{bad[:40]}'", file=path, remedy="it must be a number or hexadecimal"
         ) from None
