@@ -111,7 +111,8 @@ def _wheels(recording: Recording, c: Conventions) -> Recording:
     )
     angle = None if wheels.angle_rad is None else wheels.angle_rad * signs
     turned = dataclasses.replace(wheels, speed=wheels.speed * signs, angle_rad=angle)
-    sides = " and ".join(side for side, s in (("left", signs[0]), ("right", signs[1])) if s < 0)
+    told = (("left", c.left_wheels_sign), ("right", c.right_wheels_sign))
+    sides = " and ".join(side for side, s in told if s < 0)
     note = f"wheels: the {sides} side was negative when driving forward; its sign is changed"
     return dataclasses.replace(recording, wheels=turned).with_notes(note)
 

@@ -24,11 +24,11 @@ def yaw_rates(recording: Recording, wheel_radius_m: float) -> dict[str, Signal]:
     if wheels is not None and wheels.has_sides():
         sides = wheels.side_speeds_mps(wheel_radius_m)
         found["wheels"] = wheels.t_ns, sides[:, 1] - sides[:, 0]
-    if truth is not None and truth.quaternion is not None and len(truth) > 2:
-        found["truth"] = (
-            truth.t_ns,
-            np.gradient(np.unwrap(truth.yaw_rad()), (truth.t_ns - truth.t_ns[0]) * 1e-9),
-        )
+    if truth is not None and truth.quaternion is not None:
+        yaw = truth.yaw_rad()
+        t_ns, yaw = truth.t_ns[np.isfinite(yaw)], yaw[np.isfinite(yaw)]
+        if len(yaw) > 2:
+            found["truth"] = t_ns, np.gradient(np.unwrap(yaw), (t_ns - t_ns[0]) * 1e-9)
     if command is not None:
         found["command"] = command.t_ns, command.yaw_rate_radps
     return {name: signal for name, signal in found.items() if np.isfinite(signal[1]).sum() > 1}

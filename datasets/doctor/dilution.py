@@ -14,11 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.doctor.finding import Finding, Patient
+from terrafusion.datasets.doctor.gnss import scatter_m
 from terrafusion.datasets.recording import Fix, Gnss, Recording
 from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
 
 LEAST_FIXES, LEAST_VALUES, SHARE = 20, 3, 0.99
 LEAST_DOP, LARGEST_DOP, STEP = 0.4, 50.0, 0.1
+HONEST = 0.5
+"""Fixes that scatter by this share of what they claim, about the path by wheels and gyro, claim metres."""
 CARRIER_PHASE_M = 0.3
 """Fixes of class "fixed" are good to centimetres; with more than this, class and sigma contradict."""
 
@@ -36,6 +39,9 @@ def check_dilution(patient: Patient) -> Iterator[Finding]:
     contradicts = bool(fixed.mean() > 0.5 and np.median(sigma[fixed, 0]) > CARRIER_PHASE_M)
     if not contradicts and not _in_steps(sigma):
         return
+    scatter = scatter_m(patient)
+    if scatter is not None and scatter > HONEST * np.median(sigma[:, :2]):
+        return
     classes = [Fix(k) for k in np.unique(gnss.fix[rows])]
     worth = ", ".join(f"{fix.name.lower()} {ASSUMED_SIGMA_M[fix]:g} m" for fix in classes)
     same = all(ASSUMED_SIGMA_M[fix] == 1.0 for fix in classes)
@@ -48,7 +54,7 @@ def check_dilution(patient: Patient) -> Iterator[Finding]:
         + ("for fixes of class fixed" if contradicts else "in steps of a tenth, the same east and north"),
         "as metres they would be those of a receiver good to 1 m; give the accuracy of yours"
         if same
-        else f"multiply them by what a fix of the class is worth ({worth}); better, give the receiver's own",
+        else f"multiply them by what the class is assumed to be worth ({worth}); better, give the receiver's",
         None if same else _scaled,
     )
 
@@ -68,6 +74,7 @@ def _in_steps(sigma: NDArray[np.float64]) -> bool:
         and east.min() >= LEAST_DOP
         and east.max() <= LARGEST_DOP
         and len(np.unique(np.rint(steps))) >= LEAST_VALUES
+        and np.gcd.reduce(np.unique(np.rint(steps)).astype(int)) == 1  # a mended log has larger steps
     )
 
 

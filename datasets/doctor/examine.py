@@ -69,6 +69,7 @@ LARGEST = 1e6
 """Numbers up to this may be small units (mm/s, deg/s); larger ones are not computed with."""
 
 MAX_ROUNDS = 20
+SEVERAL = ("wheel-odd", "clock-jump")
 
 
 def examine(recording: Recording, rig: Rig | None = None) -> list[Finding]:
@@ -100,6 +101,11 @@ def _may_be_units(recording: Recording, impossible: list[Finding]) -> bool:
     return explicable and largest < LARGEST
 
 
+def _fault(finding: Finding) -> tuple[str, str, str]:
+    """What is mended once; of some kinds a channel can have several, which are told apart by their words."""
+    return finding.code, finding.channel, finding.what if finding.code in SEVERAL else ""
+
+
 def treat(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:
     """Make the repairs that the findings propose, one after the other, looking again after each.
 
@@ -109,8 +115,8 @@ def treat(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list
     """
     mended: list[Finding] = []
     for _ in range(MAX_ROUNDS):
-        done = {(finding.code, finding.channel) for finding in mended}
-        open_findings = [f for f in examine(recording, rig) if f.repair and (f.code, f.channel) not in done]
+        done = {_fault(finding) for finding in mended}
+        open_findings = [f for f in examine(recording, rig) if f.repair and _fault(f) not in done]
         if not open_findings:
             break
         first = open_findings[0]

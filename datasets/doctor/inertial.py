@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.doctor.finding import Finding, Patient
 from terrafusion.datasets.doctor.mounting import gravity, is_metric
+from terrafusion.datasets.doctor.timing import GAP_PERIODS, GAP_S
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.recording import Recording
 
@@ -92,7 +93,10 @@ def at_rest(patient: Patient) -> NDArray[np.bool_]:
     standing = (np.abs(wheels.speed) <= 1e-3 * top).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], standing, [False]]).astype(int)))
     begins, ends = wheels.t_ns[edges[::2]], wheels.t_ns[edges[1::2] - 1]
-    rests = (ends - begins) * 1e-9 >= REST_S
+    steps = np.diff(wheels.t_ns)
+    gaps = wheels.t_ns[:-1][steps > max(GAP_PERIODS * float(np.median(steps)), GAP_S * 1e9)]
+    whole = np.searchsorted(gaps, begins) == np.searchsorted(gaps, ends)  # what happens in a gap nobody knows
+    rests = whole & ((ends - begins) * 1e-9 >= REST_S)
     margin = round(MARGIN_S * 1e9)
     begins, ends = begins[rests] + margin, ends[rests] - margin
     if not len(begins):

@@ -222,7 +222,8 @@ def _check_forward(patient: Patient) -> Iterator[Finding]:
 def wheels_turn_backwards(patient: Patient) -> bool:
     """Whether the wheels turn against gyro z; on a straight drive, whether they mostly run backwards."""
     driven = wheel_speed(patient, patient.wheel_radius_m() or ANY_RADIUS_M)
-    axis = turning_axis(patient)
+    wheels = patient.recording.wheels
+    axis = turning_axis(patient) if wheels is not None and wheels.has_sides() else None
     return axis == "-z" or (axis is None and driven is not None and float(driven[1].mean()) < 0.0)
 
 

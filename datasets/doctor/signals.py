@@ -251,7 +251,12 @@ def check_dead(patient: Patient) -> Iterator[Finding]:
     constant = [bool((v[1:] == v[:-1]).all()) for v in imu.gyro_radps.T if np.isfinite(v).any()]
     lively = [bool((v[1:] != v[:-1]).mean() > 0.5) for v in imu.accel_mps2.T if np.isfinite(v).any()]
     turn = _turn_radps(patient)
-    if all(constant) and (turn > LEAST_TURN_RADPS or (len(lively) == 3 and all(lively))):
+    still = (
+        wheels is not None
+        and not np.nan_to_num(wheels.speed).any()
+        and _extent_m(recording) <= LEAST_EXTENT_M
+    )
+    if all(constant) and not still and (turn > LEAST_TURN_RADPS or (len(lively) == 3 and all(lively))):
         yield Finding(
             "dead",
             "error",

@@ -90,7 +90,7 @@ def check_steps(patient: Patient) -> Iterator[Finding]:
 
 
 def check_coarse(patient: Patient) -> Iterator[Finding]:
-    """Stamps finer than the rate of the channel."""
+    """Stamps coarser than the rate of the channel."""
     for name, channel in _clocked(patient.recording):
         tick_s = coarse_tick_s(channel)
         if not tick_s:

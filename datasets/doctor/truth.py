@@ -108,7 +108,7 @@ def check_unit(patient: Patient) -> Iterator[Finding]:
                 "truth",
                 f"positions look like {unit}",
                 f"the truth spreads {ratio:.4g} times as far as the path of the wheels",
-                f"divide them by {factor:.6g}",
+                f"divide them by {factor:.6g}, and leave velocities and covariances out",
                 partial(_scaled, factor=1.0 / factor),
             )
             return
@@ -117,6 +117,8 @@ def check_unit(patient: Patient) -> Iterator[Finding]:
 def _scaled(recording: Recording, factor: float) -> Recording:
     truth: Trajectory | None = recording.truth
     assert truth is not None
-    return dataclasses.replace(
-        recording, truth=dataclasses.replace(truth, position_m=truth.position_m * factor, covariance=None)
+    scaled = dataclasses.replace(
+        truth, position_m=truth.position_m * factor, twist_body=None, covariance=None
     )
+    held = tuple(name for name in recording.truth_channels if name != "velocity")
+    return dataclasses.replace(recording, truth=scaled, truth_channels=held)

@@ -131,9 +131,6 @@ def check_direction(patient: Patient) -> Iterator[Finding]:
 
 def _signs(*, left: bool, right: bool) -> Repair:
     def mended(recording: Recording) -> Recording:
-        wheels = recording.wheels
-        if wheels is not None and not wheels.has_sides():
-            return dataclasses.replace(recording, wheels=dataclasses.replace(wheels, speed=-wheels.speed))
         signs = Conventions(left_wheels_sign=-1.0 if left else 1.0, right_wheels_sign=-1.0 if right else 1.0)
         return apply(recording, signs)
 

@@ -10,6 +10,8 @@ import pytest
 from terrafusion.datasets.doctor import examine, treat
 from terrafusion.datasets.recording import Fix, Recording
 
+from .test_doctor_physics import lively_drive
+
 RNG = np.random.default_rng(5)
 TENTHS = RNG.integers(7, 15, 300) / 10
 
@@ -57,8 +59,19 @@ def test_the_repair_takes_the_class_for_its_worth(drive: Recording) -> None:
     assert mended.gnss is not None
     np.testing.assert_allclose(mended.gnss.sigma_enu_m[:, 0], 3.0 * TENTHS)
     np.testing.assert_allclose(mended.gnss.sigma_enu_m[:, 2], 6.0 * TENTHS)
+    assert treat(mended) == (mended, [])
 
 
 def test_what_would_change_nothing_is_no_repair(drive: Recording) -> None:
     (found,) = examine(with_sigma(drive, TENTHS, Fix.DGPS))
     assert found.repair is None
+
+
+def test_fixes_that_scatter_as_they_claim_claim_metres() -> None:
+    good = lively_drive()
+    assert good.gnss is not None
+    noise = np.random.default_rng(6).normal(0.0, 0.4, good.gnss.enu_m.shape)
+    noisy = dataclasses.replace(good, gnss=dataclasses.replace(good.gnss, enu_m=good.gnss.enu_m + noise))
+    claims = with_sigma(noisy, np.full(len(good.gnss), 0.4), Fix.FIXED)
+    assert "sigma-dilution" not in codes(claims)
+    assert "sigma-dilution" in codes(with_sigma(good, np.full(len(good.gnss), 0.4), Fix.FIXED))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.recording import Imu, Recording, Wheels
+from terrafusion.datasets.recording import Imu, Recording
 
 from .test_doctor_physics import (
     EFFECTIVE_TRACK_M,
@@ -16,6 +16,7 @@ from .test_doctor_physics import (
     START_NS,
     Fault,
     after,
+    body_speed,
     gnss_with,
     imu_with,
     lively_drive,
@@ -40,9 +41,7 @@ BARE: dict[str, Fault] = {
     ),
     "no gyro": imu_with(gyro_radps=lambda g: np.full_like(g, np.nan)),
     "accelerometer lacks z": imu_with(accel_mps2=times(1.0, 1.0, np.nan)),
-    "body speed": lambda r: dataclasses.replace(
-        r, wheels=Wheels(r.wheels.t_ns, r.wheels.speed.mean(axis=1, keepdims=True), ("speed",), "radps")
-    ),
+    "body speed": body_speed,
     "no wheels": lambda r: without(r, "wheels"),
     "wheels unknown": wheels_with(lambda s: np.full_like(s, np.nan)),
     "no fixes": lambda r: without(r, "gnss"),

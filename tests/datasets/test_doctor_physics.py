@@ -403,3 +403,32 @@ def test_the_gyro_is_assumed_where_nothing_tells() -> None:
     assert "assumed" in found[0].fix
     mended, _ = treat(gyro_only)
     assert any("assumed" in note for note in mended.notes)
+
+
+def test_two_faults_of_one_kind_are_both_mended() -> None:
+    """A second dead wheel must not be taken for a wrong radius."""
+    good = four_wheels(lively_drive())
+    assert good.wheels is not None
+    dead = good.wheels.speed * [0.0, 0.0, 1.0, 1.0]
+    spoilt = dataclasses.replace(good, wheels=dataclasses.replace(good.wheels, speed=dead))
+    mended, done = treat(spoilt)
+    assert [finding.code for finding in done].count("wheel-odd") == 2
+    assert mended.overrides.wheel_radius_m == good.overrides.wheel_radius_m
+    assert "wheel-odd" not in {finding.code for finding in examine(mended)}
+
+
+def test_one_reversed_speed_is_the_wheels_own() -> None:
+    good = body_speed(lively_drive())
+    assert good.wheels is not None
+    spoilt = dataclasses.replace(good, wheels=dataclasses.replace(good.wheels, speed=-good.wheels.speed))
+    mended, done = treat(spoilt)
+    assert [finding.code for finding in done] == ["wheel-reversed"]
+    assert examine(mended) == []
+    assert mended.wheels is not None
+    np.testing.assert_allclose(mended.wheels.speed, good.wheels.speed)
+
+
+def body_speed(r: Recording) -> Recording:
+    assert r.wheels is not None
+    mean = r.wheels.speed.mean(axis=1, keepdims=True)
+    return dataclasses.replace(r, wheels=Wheels(r.wheels.t_ns, mean, ("speed",), "radps"))
