@@ -164,12 +164,27 @@ def _read_sets(path: Path) -> dict[str, DataSet]:
             raise ConfigError(
                 what, file=path, channel=name, remedy=f"a set has {', '.join(texts)}, conventions, cases"
             )
+        held, raw_cases = raw.get("conventions") or {}, raw.get("cases") or {}
+        good = isinstance(held, dict) and isinstance(raw_cases, dict)
+        if not good or not all(_is_case(case) for case in raw_cases.values()):
+            raise ConfigError(
+                "conventions or cases are no mapping, or have an unknown key",
+                file=path,
+                channel=name,
+                remedy="a case has conventions and note",
+            )
         cases = {
             str(p): Case(c.get("conventions") or {}, c.get("note", ""))
             for p, c in (raw.get("cases") or {}).items()
         }
         sets[name] = DataSet(name=name, **texts, conventions=raw.get("conventions") or {}, cases=cases)
     return sets
+
+
+def _is_case(case: Any) -> bool:
+    if not isinstance(case, dict) or not set(case) <= {"conventions", "note"}:
+        return False
+    return isinstance(case.get("note", ""), str) and isinstance(case.get("conventions") or {}, dict)
 
 
 def _read_files(path: Path, sets: set[str]) -> list[CatalogFile]:
@@ -182,11 +197,15 @@ def _read_files(path: Path, sets: set[str]) -> list[CatalogFile]:
         raise ConfigError(
             "the columns are not those of a catalogue", file=path, remedy=f"give {', '.join(FILE_COLUMNS)}"
         )
-    return [_entry(path, number, row, sets) for number, row in enumerate(rows[1:], 2)]
+    return [_entry(path, number, row, sets) for number, row in enumerate(rows[1:], 2) if row]
 
 
 def _entry(path: Path, number: int, row: list[str], sets: set[str]) -> CatalogFile:
     """A row as an entry; its file must stay inside the folder it is downloaded to."""
+    if len(row) > len(FILE_COLUMNS):
+        raise ConfigError(
+            f"has {len(row)} cells at line {number}", file=path, remedy=f"give {', '.join(FILE_COLUMNS)}"
+        )
     fields = dict(zip(FILE_COLUMNS, row, strict=False))
     wrong = next((name for name in FILE_COLUMNS if name not in fields), "")
     if not wrong:
@@ -220,14 +239,34 @@ def locate(name: str) -> Path | None:
     entries = [entry for entry in catalog.files if entry.file == name] or catalog.recordings().get(name, [])
     if not entries:
         return None
-    for folder in data_folders():
-        if (folder / entries[0].file).is_file():
-            return folder / entries[0].file
+    entry = entries[0]
+    found = at_hand(entry, data_folders())
+    if found is not None:
+        return found
+    other = next((path for folder in data_folders() if (path := folder / entry.file).is_file()), None)
+    if other is not None:
+        raise DataError(
+            "has other bytes than the catalogue's",
+            file=other,
+            remedy=f"fetch it again with `terrafusion fetch {entry.set_name}`, or give its path",
+        )
     raise DataError(
         "is in the catalogue, but not on this machine",
         file=name,
         remedy=f"download it with `terrafusion fetch {entries[0].set_name}`, or set {DATA_VARIABLE}",
     )
+
+
+def at_hand(entry: CatalogFile, folders: list[Path]) -> Path | None:
+    """The copy of a file in one of the folders whose bytes are the catalogue's; None where there is none."""
+    for folder in folders:
+        path = folder / entry.file
+        try:
+            if path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256:
+                return path
+        except OSError:  # not there, or it cannot be read
+            continue
+    return None
 
 
 def data_folders() -> list[Path]:

@@ -20,10 +20,10 @@ import requests
 from terrafusion.datasets.catalog import (
     Catalog,
     CatalogFile,
+    at_hand,
     cache_folder,
     data_folders,
     load_catalog,
-    sha256_of,
 )
 from terrafusion.datasets.errors import DataError
 
@@ -89,7 +89,7 @@ def fetch(
     catalog = load_catalog()
     chosen = {entry.file: entry for name in names for entry in entries_of(catalog, name)}
     for entry in chosen.values():
-        here = _at_hand(entry, data_folders()) if folder is None else _brought(entry, folder)
+        here = at_hand(entry, data_folders()) if folder is None else _brought(entry, folder)
         if here is None and offline:
             raise DataError(
                 "is not on this machine",
@@ -100,18 +100,10 @@ def fetch(
         yield Fetched(entry, path, downloaded=here is None)
 
 
-def _at_hand(entry: CatalogFile, folders: list[Path]) -> Path | None:
-    for folder in folders:
-        path = folder / entry.file
-        if path.is_file() and path.stat().st_size == entry.bytes and sha256_of(path) == entry.sha256:
-            return path
-    return None
-
-
 def _brought(entry: CatalogFile, folder: Path) -> Path | None:
     """The file in `folder`, copied from where this machine has it; None where it has none."""
-    there = _at_hand(entry, [folder])
-    here = _at_hand(entry, data_folders()) if there is None else None
+    there = at_hand(entry, [folder])
+    here = at_hand(entry, data_folders()) if there is None else None
     if here is None:
         return there
     target = folder / entry.file

@@ -34,7 +34,7 @@ that claims even less has fixes of a better class (RTK), which drift in proporti
 
 class GnssUpdater:
     """Holds fixes until a keyframe has passed them, tests position and height apart (a wrong
-    height must not cost a good position) them and adds their factors.
+    height must not cost a good position) and adds their factors.
 
     Attributes:
         waiting: fixes not yet used, oldest first.

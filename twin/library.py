@@ -29,7 +29,11 @@ def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dic
     if text in known_names(folder):
         return _own_file(folder, text), f"{folder}/{text}.yaml"
     path = Path(text).expanduser()
-    if path.suffix in (".yaml", ".yml") or path.is_file():
+    try:
+        is_file = path.is_file()
+    except OSError:  # a name that no file can have
+        is_file = False
+    if path.suffix in (".yaml", ".yml") or is_file:
         return read_yaml(path), text
     raise ConfigError(
         f"unknown {kind} '{text}'",

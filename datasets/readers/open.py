@@ -92,10 +92,23 @@ def find_log(path: Path | str) -> tuple[Path, int | None]:
     """The file or folder that a LOG means, and the number behind `#` where there is one.
 
     Raises:
-        DataError: it is in the catalogue, but not on this machine, or a document of a set.
+        DataError: it cannot be read; or it is in the catalogue, but not on this machine, or a document.
     """
+    try:
+        return _find_log(path)
+    except OSError as error:
+        raise DataError(
+            f"cannot be read: {error.strerror or error}",
+            file=path,
+            remedy="check the path and its permissions",
+        ) from None
+
+
+def _find_log(path: Path | str) -> tuple[Path, int | None]:
     text, mark, number = str(path).rpartition("#")
-    numbered = bool(mark) and number.isdigit() and len(number) < 9 and not Path(path).exists()
+    numbered = (
+        bool(mark) and number.isascii() and number.isdigit() and len(number) < 9 and not Path(path).exists()
+    )
     name = text if numbered else str(path)
     place = Path(name)
     if not place.exists():

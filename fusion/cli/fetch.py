@@ -81,8 +81,8 @@ def _print_catalog(rows: list[dict[str, Any]]) -> None:
     for row in rows:
         count = len(row["recordings"])
         console.print(
-            f"[bold]{row['name']}[/bold]  {count} recording{'s' if count > 1 else ''}, "
-            f"{row['bytes'] / 1e6:.1f} MB, {row['licence']}, "
+            f"[bold]{escape(row['name'])}[/bold]  {count} recording{'s' if count > 1 else ''}, "
+            f"{row['bytes'] / 1e6:.1f} MB, {escape(row['licence'])}, "
             f"{row['files_here']} of {row['files']} files here"
         )
         for key in ("title", "holds", "citation", "homepage"):

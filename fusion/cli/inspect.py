@@ -50,6 +50,8 @@ def inspect(
     from terrafusion.fusion.cli.page import page_lines, print_lines
     from terrafusion.fusion.cli.trials import trials_lines, trials_of
 
+    load_rig(vehicle)
+    reading(None, topic, stamps, columns, repair_clock=True)  # wrong usage is told whatever the log is
     trials = trials_of(log) if columns is None else None
     page = trials or examined(log, vehicle, topic, stamps, columns)
     if as_json:

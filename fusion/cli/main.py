@@ -6,6 +6,7 @@ Heavy packages are imported inside the command that needs them, so that
 
 from __future__ import annotations
 
+import errno
 import sys
 
 import typer
@@ -41,4 +42,9 @@ def main() -> None:
         print("error: interrupted; results already written are kept", file=sys.stderr)
         sys.exit(1)
     except BrokenPipeError:
+        sys.exit(1)
+    except OSError as error:
+        if error.errno != errno.ENOSPC:
+            raise
+        print("error: there is no room to write to; make some, or write elsewhere", file=sys.stderr)
         sys.exit(1)

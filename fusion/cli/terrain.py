@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -84,9 +85,10 @@ def checked_output(path: Path) -> None:
     """Refuse an output file that cannot be written before the long work starts.
 
     Raises:
-        TerrafusionError: its folder does not exist, or it is a folder itself.
+        TerrafusionError: its folder does not exist, it is a folder itself, or it may not be written.
     """
-    if path.is_dir() or not path.absolute().parent.is_dir():
+    folder = path.absolute().parent
+    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
         raise TerrafusionError("cannot be written", file=path, remedy="give a file in an existing folder")
 
 

@@ -15,13 +15,16 @@ def trials_of(log: str) -> dict[str, Any] | None:
         TerrafusionError: the log cannot be read.
     """
     from terrafusion.datasets.catalog import load_catalog
+    from terrafusion.datasets.errors import DataError
     from terrafusion.datasets.readers.formats import format_of
     from terrafusion.datasets.readers.open import find_log
     from terrafusion.datasets.single_wheel import read_wheel_trials
 
-    path, _ = find_log(log)
+    path, number = find_log(log)
     if format_of(path).name != "single_wheel_mat":
         return None
+    if number is not None:
+        raise DataError("trials have no numbers", file=path, remedy=f"leave #{number} out")
     trials = read_wheel_trials(path)
     entry = load_catalog().find(path)
     return {

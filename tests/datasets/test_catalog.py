@@ -114,6 +114,23 @@ def test_a_folder_of_logs_names_them(tmp_path: Path) -> None:
         open_recording(tmp_path)
 
 
+def test_another_file_under_a_catalogued_name_is_not_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "husky_parkinglot").mkdir()
+    (tmp_path / "husky_parkinglot" / "test1.bag").write_bytes(b"#ROSBAG V2.0\nanother")
+    monkeypatch.setenv(catalog.DATA_VARIABLE, str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with pytest.raises(DataError, match="other bytes than the catalogue's"):
+        open_recording("husky_parkinglot/test1")
+
+
+@pytest.mark.parametrize("name", ["a" * 300, "husky_parkinglot/test2#\u00b2"])
+def test_names_that_no_file_has(name: str) -> None:
+    with pytest.raises(DataError):
+        open_recording(name)
+
+
 def test_a_misspelt_key_of_a_set_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "catalog.yaml").write_text("mine: {titel: x}\n")
     (tmp_path / "catalog_files.csv").write_text(",".join(catalog.FILE_COLUMNS) + "\n")

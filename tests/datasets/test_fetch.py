@@ -232,6 +232,27 @@ def test_a_hostile_catalogue_is_refused(
         catalog.load_catalog()
 
 
+@pytest.mark.parametrize(
+    "line", ["cases: [a]", "cases: {f: text}", "conventions: [1]", "cases: {f: {notes: x}}"]
+)
+def test_a_set_of_wrong_shape_is_told(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_catalog(tmp_path / "own", "http://127.0.0.1:9")
+    text = (tmp_path / "own" / "catalog.yaml").read_text().replace("format: ''}", f"format: '', {line}}}")
+    (tmp_path / "own" / "catalog.yaml").write_text(text)
+    monkeypatch.setenv(catalog.CATALOG_VARIABLE, str(tmp_path / "own"))
+    with pytest.raises(ConfigError, match="no mapping, or have an unknown key"):
+        catalog.load_catalog()
+
+
+def test_a_row_too_long_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write_catalog(tmp_path / "own", "http://127.0.0.1:9")
+    with (tmp_path / "own" / "catalog_files.csv").open("a") as out:
+        out.write("\n" + ",".join("x" * 9) + "\n")
+    monkeypatch.setenv(catalog.CATALOG_VARIABLE, str(tmp_path / "own"))
+    with pytest.raises(ConfigError, match="has 9 cells"):
+        catalog.load_catalog()
+
+
 def test_the_command(server: type[Server], tmp_path: Path, terrafusion: Any) -> None:
     listed = terrafusion("fetch")
     assert listed.status == 0

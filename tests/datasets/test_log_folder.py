@@ -241,6 +241,29 @@ def test_both_packed_and_plain(tmp_path: Path) -> None:
         open_recording(folder)
 
 
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("t_s,east_m,north_m,sigma_e_m,sigma_n_m,fix\n0,1,1,1,1,single\n1,1,1,1,1\n", ("line 3", "5 cells")),
+        ("t_s,east_m,north_m,sigma_e_m,sigma_n_m\n0,True,1,1,1\n", ("east_m", "True")),
+        ("t_s,east_m,north_m,sigma_e_m,sigma_n_m\n0, ,1,1,1\n", ("east_m", "line 2")),
+    ],
+    ids=["a short last line of text", "a truth value", "a blank cell"],
+)
+def test_no_cell_is_made_up(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
+    with pytest.raises(TerrafusionError) as caught:
+        open_recording(folder_with(tmp_path, gnss=text))
+    one_line(caught.value, "gnss.csv", *words)
+
+
+def test_a_line_of_blanks_late_in_a_log(tmp_path: Path) -> None:
+    r = open_recording(
+        folder_with(tmp_path, command="t_s,v_mps,yaw_rate_radps\n1000001,1,1\n   \n1000002,1,1\n")
+    )
+    assert r.command is not None
+    assert len(r.command) == 2
+
+
 def test_a_packed_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A few kilobytes of gzip can stand for gigabytes."""
     monkeypatch.setattr(csv_table, "MAX_BYTES", 2**20)

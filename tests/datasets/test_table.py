@@ -407,3 +407,16 @@ def test_notes_are_no_tables(tmp_path: Path, text: str) -> None:
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(DataError, match="unknown kind of file"):
         open_recording(path)
+
+
+def test_a_comment_mark_inside_a_cell_is_no_comment(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="2#5"):
+        open_recording(table(tmp_path, "t,wz\n0.0,1.0\n0.1,2#5\n"))
+    read = open_recording(table(tmp_path, "# recorded on Monday\nt,wz\n# begin\n0.0,1.0\n0.1,2.0\n"))
+    assert read.imu is not None
+    assert read.imu.gyro_radps[:, 2].tolist() == [1.0, 2.0]
+
+
+def test_half_a_position_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="only one of latitude_deg and longitude_deg"):
+        open_recording(table(tmp_path, "t_s,latitude_deg,gyro_z_radps\n0,48.0,0.1\n1,48.0,0.1\n", None))
