@@ -38,7 +38,7 @@ def test_data_files_are_installed() -> None:
     for package, pattern in (("twin.params", "vehicles/husky.yaml"), ("fusion", "policy.yaml")):
         assert resources.files(f"terrafusion.{package}").joinpath(pattern).is_file()
     assert resources.files("terrafusion.fusion.terrain").joinpath("model.yaml").is_file()
-    assert resources.files("terrafusion.twin").joinpath("driver.c").is_file()
+    assert resources.files("terrafusion.twin.engine").joinpath("driver.c").is_file()
 
 
 @pytest.mark.parametrize("path", sources(), ids=lambda p: str(p.relative_to(ROOT)))

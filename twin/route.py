@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.dynamics import soil_vector
-from terrafusion.twin.integrate import RouteTable
+from terrafusion.twin.engine.integrate import RouteTable
 from terrafusion.twin.scenario import Scenario
 from terrafusion.twin.soil import SoilParams, load_soil
 

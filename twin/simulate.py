@@ -17,7 +17,7 @@ from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.twin import sensors
 from terrafusion.twin.drive import Driven, drive
 from terrafusion.twin.dynamics import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
-from terrafusion.twin.integrate import compiled, integrate
+from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.motion import Motion, motion_of
 from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import Scenario, load_scenario

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.dynamics import STATES, soil_vector, vehicle_vector
-from terrafusion.twin.integrate import RouteTable, integrate
+from terrafusion.twin.engine.integrate import RouteTable, integrate
 from terrafusion.twin.soil import SoilParams, load_soil
 from terrafusion.twin.vehicle import load_vehicle
 

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin import codegen, integrate, simulate
+from terrafusion.twin import simulate
 from terrafusion.twin.dynamics import INDEX, rhs, soil_vector, vehicle_vector
+from terrafusion.twin.engine import codegen, integrate
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import load_soil, soil_names

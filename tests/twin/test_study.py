@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study import imu_speed, speed_errors
+from terrafusion.twin.study.table import imu_speed, speed_errors
 
 
 def test_exact_sensors_have_small_speed_errors_on_firm_ground() -> None:

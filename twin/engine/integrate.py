@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin.codegen import driver
 from terrafusion.twin.dynamics import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, rhs
+from terrafusion.twin.engine.codegen import driver
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.dynamics import INDEX, soil_vector, vehicle_vector
-from terrafusion.twin.integrate import RouteTable, compiled, integrate
+from terrafusion.twin.engine.integrate import RouteTable, compiled, integrate
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
 from terrafusion.twin.simulate import MOVING_MPS, simulate_run
 from terrafusion.twin.soil import load_soil
@@ -176,7 +176,3 @@ def main() -> None:
     """Print the table and the numerics."""
     for line in (*study_table(), "", *convergence_lines(), creep_line(), *speed_lines()):
         print(line)
-
-
-if __name__ == "__main__":
-    main()

@@ -81,7 +81,7 @@ def _source() -> str:
         "TF_TRAVEL": INDEX["travel"],
     }
     defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
-    loop = (resources.files("terrafusion.twin") / "driver.c").read_text(encoding="utf-8")
+    loop = (resources.files("terrafusion.twin.engine") / "driver.c").read_text(encoding="utf-8")
     return f"{_generate(rhs())}\n{defines}{loop}"
 
 
