@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.dynamics import INDEX, STATES, state_slice
+from terrafusion.twin.layout import INDEX, INPUTS, STATES, state_slice
 from terrafusion.twin.scenario import Scenario
 from terrafusion.twin.vehicle import VehicleParams
 
 Array = NDArray[np.float64]
 Integrator = Callable[[Array, Array, float], Array]
-"""(state (38,), side speeds (N + 1, 2) rad/s, start time s) -> states (N + 1, 38)."""
+"""(state (X,), inputs (N + 1, U), start time s) -> states (N + 1, X)."""
 
 SETTLE_S = 10.0
 """The robot stands this long before the run starts, so that it starts from rest in equilibrium."""
@@ -56,13 +56,28 @@ def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
     return np.stack([twist[:, 0] - half, twist[:, 0] + half], axis=1) / vehicle.odometry.wheel_radius_m
 
 
+def told(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
+    """Inputs (N, 4), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, that arrive late.
+
+    Linear between samples; before the first sample the first one held. The
+    rates are those of the interval that ends at the delayed time: the late
+    command's derivative by the dead time is minus the rate.
+    """
+    count = len(sides)
+    at = np.arange(count) - dead_time_s / dt_s
+    steps = np.diff(sides, axis=0, prepend=sides[:1]) / dt_s
+    whole = np.clip(np.ceil(at).astype(int), 0, count - 1)
+    late = np.stack([np.interp(at, np.arange(count), side) for side in sides.T], axis=1)
+    return np.hstack([late, np.where(at[:, None] > 0.0, steps[whole], 0.0)])
+
+
 def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
     """Initial state (38,): standing at the origin with the scenario's heading, settled on the slope."""
     x0 = np.zeros(len(STATES))
     heading = math.radians(scenario.heading_deg)
     x0[INDEX["yaw"]] = heading
     count = max(1, round(SETTLE_S / dt_s))
-    x = integrate(x0, np.zeros((count + 1, 2)), -SETTLE_S)[-1].copy()
+    x = integrate(x0, np.zeros((count + 1, len(INPUTS))), -SETTLE_S)[-1].copy()
     for name in ("x", "y", "travel", "clog", "motor_work", "electric_energy"):
         x[INDEX[name]] = 0.0
     x[state_slice("wheel_angle")] = 0.0
@@ -78,7 +93,8 @@ def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Int
         return _steer(scenario, t_s, vehicle, integrate, start)
     wanted = scenario.commanded(t_s)
     twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
-    return Driven(wanted, integrate(start, side_speeds(twist, vehicle), 0.0))
+    inputs = told(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
+    return Driven(wanted, integrate(start, inputs, 0.0))
 
 
 def _steer(
@@ -86,11 +102,12 @@ def _steer(
 ) -> Driven:
     """Steer along the waypoints by the true pose, renewed every `STEERING_PERIOD_S`."""
     dt = float(t_s[-1]) / (len(t_s) - 1)
-    period = max(1, round(STEERING_PERIOD_S / dt))
+    period, reach = max(1, round(STEERING_PERIOD_S / dt)), math.ceil(vehicle.drive.dead_time_s / dt) + 2
     points = np.array([(0.0, 0.0), *scenario.waypoints])
     states, wanted = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
     states[0], wanted[0] = start, 0.0
-    twist, goal, first = np.zeros(2), 1, 0
+    twists = np.zeros((len(t_s), 2))
+    goal, first = 1, 0
     while first < len(t_s) - 1:
         last = min(first + period, len(t_s) - 1)
         pose = states[first, :3]
@@ -98,10 +115,12 @@ def _steer(
             goal += 1
         wish = _towards(points, goal, pose, scenario.waypoint_speed_mps)
         block = np.tile(wish, (last - first, 1))
-        limited = np.vstack([twist, limit_slew(block, dt, vehicle, scenario, twist)])
-        states[first : last + 1] = integrate(states[first], side_speeds(limited, vehicle), float(t_s[first]))
+        twists[first + 1 : last + 1] = limit_slew(block, dt, vehicle, scenario, twists[first])
+        known = max(0, first - reach)
+        inputs = told(side_speeds(twists[known : last + 1], vehicle), dt, vehicle.drive.dead_time_s)
+        states[first : last + 1] = integrate(states[first], inputs[first - known :], float(t_s[first]))
         wanted[first + 1 : last + 1] = wish
-        twist, first = limited[-1], last
+        first = last
     return Driven(wanted, states)
 
 

@@ -9,99 +9,10 @@ parameters, so one compiled graph serves every soil and vehicle.
 from __future__ import annotations
 
 import functools
-import math
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.soil import SoilParams
-from terrafusion.twin.vehicle import VehicleParams
-
-Array = NDArray[np.float64]
-
-WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
-"""Order of the wheels in every array."""
-
-STATES = (
-    "x", "y", "yaw", "u", "v", "r",
-    *(f"wheel_speed_{w}" for w in WHEELS),
-    *(f"shear_x_{w}" for w in WHEELS),
-    *(f"shear_y_{w}" for w in WHEELS),
-    *(f"torque_{w}" for w in WHEELS),
-    *(f"speed_error_{w}" for w in WHEELS),
-    *(f"brake_{w}" for w in WHEELS),
-    *(f"wheel_angle_{w}" for w in WHEELS),
-    "clog", "travel", "motor_work", "electric_energy",
-)  # fmt: skip
-"""State names: m, rad, m/s, rad/s, N m (`torque`, at the wheel), rad (`speed_error`, integrated), J.
-
-`shear_x`, `shear_y` and `brake` are displacements of the soil and of the rim's
-friction bristle (m), `travel` the path driven forward (m), `clog` from 0 to 1.
-"""
-
-INPUTS = ("left_radps", "right_radps")
-"""Commanded wheel speeds of the two sides, rad/s."""
-
-VEHICLE_PARAMETERS = (
-    "mass_kg", "yaw_inertia_kgm2", "wheelbase_m", "track_m", "cg_forward_m", "cg_left_m", "cg_height_m",
-    "radius_m", "width_m", "wheel_inertia_kgm2", "gear_ratio", "gear_efficiency", "no_load_radps",
-    "stall_torque_nm", "torque_limit_nm", "supply_v", "loop_p_nms", "loop_i_nm", "lag_s",
-    "gravity_x_mps2", "gravity_y_mps2", "gravity_normal_mps2",
-)  # fmt: skip
-"""Parameters that hold for a whole run; gravity is given along the plane's x and y and into it."""
-
-SOIL_PARAMETERS = (
-    "k_c", "k_phi", "exponent", "slip_sinkage", "contact_floor_m", "cohesion_pa", "tan_friction",
-    "shear_modulus_m", "friction_cap", "rolling", "viscous_ns_per_m", "pickup_per_m", "churn_gain",
-    "shed_per_m", "clog_torque_nm", "clog_sinkage_m",
-)  # fmt: skip
-"""Parameters that change along the route."""
-
-INDEX = {name: i for i, name in enumerate(STATES)}
-
-
-def state_slice(prefix: str) -> slice:
-    """The four wheels' entries of a state, e.g. `state_slice("wheel_speed")`."""
-    first = INDEX[f"{prefix}_{WHEELS[0]}"]
-    return slice(first, first + 4)
-
-
-def vehicle_vector(
-    vehicle: VehicleParams, *, slope_rad: float = 0.0, aspect_rad: float = 0.0, payload_kg: float = 0.0
-) -> Array:
-    """Values (22,) of `VEHICLE_PARAMETERS`; `aspect_rad` is the way uphill (0 east, left positive).
-
-    The payload rides at the centre of gravity and adds yaw inertia in proportion to its mass.
-    """
-    body, wheel, drive = vehicle.body, vehicle.wheel, vehicle.drive
-    mass = body.mass_kg + payload_kg
-    downhill = -GRAVITY_MPS2 * math.sin(slope_rad)
-    return np.array(
-        [
-            mass, body.yaw_inertia_kgm2 * mass / body.mass_kg, body.wheelbase_m, body.track_m,
-            body.cg_forward_m, body.cg_left_m, body.cg_height_m,
-            wheel.radius_m, wheel.width_m, wheel.inertia_kgm2,
-            drive.gear_ratio, drive.gear_efficiency, drive.no_load_speed_radps, drive.stall_torque_nm,
-            drive.torque_limit_nm, drive.supply_v, drive.speed_loop_p_nms, drive.speed_loop_i_nm, drive.lag_s,
-            downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad),
-            GRAVITY_MPS2 * math.cos(slope_rad),
-        ]
-    )  # fmt: skip
-
-
-def soil_vector(soil: SoilParams) -> Array:
-    """Values (16,) of `SOIL_PARAMETERS`."""
-    return np.array(
-        [
-            soil.pressure.k_c_n_per_m_n1, soil.pressure.k_phi_n_per_m_n2, soil.pressure.exponent,
-            soil.pressure.slip_sinkage, soil.pressure.contact_length_floor_m, soil.shear.cohesion_pa,
-            math.tan(soil.shear.friction_angle_rad), soil.shear.shear_modulus_m, soil.shear.friction_cap,
-            soil.resistance.rolling, soil.resistance.viscous_ns_per_m, soil.mud.pickup_per_m,
-            soil.mud.churn_gain, soil.mud.shed_per_m, soil.mud.torque_nm, soil.mud.sinkage_m,
-        ]
-    )  # fmt: skip
+from terrafusion.twin.layout import INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
+from terrafusion.twin.motors import motor_current, motor_torque, motor_voltage
 
 
 def wheel_positions(p: dict[str, Any]) -> list[tuple[Any, Any]]:
@@ -128,53 +39,24 @@ def wheel_loads(p: dict[str, Any], gravity_x: Any, gravity_y: Any) -> list[Any]:
     return [smooth_max(weight * share, 1.0, 1.0) for share in shares]
 
 
-def motor_torque(p: dict[str, Any], speed_radps: Any, error_radps: Any, integral_rad: Any) -> tuple[Any, Any]:
-    """Torque at the wheel the speed loop asks for within the motor's limits, N m, and d(integral)/dt, rad/s.
-
-    A PI loop, clipped smoothly to the torque-speed line of a DC motor and to
-    its current limit; back-calculation keeps the integral from winding up.
-    """
-    from terrafusion.twin.wheel import smooth_max, smooth_min
-
-    wanted = p["loop_p_nms"] * error_radps + p["loop_i_nm"] * integral_rad
-    at_wheel = p["gear_ratio"] * p["gear_efficiency"]
-    relative = speed_radps * p["gear_ratio"] / p["no_load_radps"]
-    limit, stall = p["torque_limit_nm"] * at_wheel, p["stall_torque_nm"] * at_wheel
-    upper = smooth_min(limit, stall * (1.0 - relative), 0.05)
-    lower = -smooth_min(limit, stall * (1.0 + relative), 0.05)
-    clipped = smooth_max(smooth_min(wanted, upper, 0.05), lower, 0.05)
-    return clipped, error_radps - (wanted - clipped) / p["loop_p_nms"]
-
-
-def motor_current(p: Any, torque_nm: Any, speed_radps: Any) -> Any:
-    """Motor current, A, from the torque (N m) and speed (rad/s) at the wheel.
-
-    The gearbox takes its share of the power that flows through it, whichever
-    way it flows. Works on CasADi expressions and numpy arrays alike.
-    """
-    power = torque_nm * speed_radps
-    way = power / (power * power + 1e-2) ** 0.5
-    loss = 0.5 * (1.0 + way) / p["gear_efficiency"] + 0.5 * (1.0 - way) * p["gear_efficiency"]
-    return torque_nm / p["gear_ratio"] * loss * p["no_load_radps"] / p["supply_v"]
-
-
-def motor_voltage(p: Any, current_a: Any, speed_radps: Any) -> Any:
-    """Motor voltage, V: winding drop plus back-EMF of an ideal DC motor (k_t = k_e = U / no-load speed)."""
-    k_e = p["supply_v"] / p["no_load_radps"]
-    resistance = p["supply_v"] * k_e / p["stall_torque_nm"]
-    return resistance * current_a + k_e * p["gear_ratio"] * speed_radps
-
-
 @functools.cache
-def rhs() -> Any:
-    """The CasADi `Function` f(x (38,), u (2,), vehicle (22,), soil (16,)) -> dx/dt (38,)."""
+def rhs(effects: tuple[str, ...] = ()) -> Any:
+    """The CasADi `Function` f(x, u, vehicle, soil, effects) -> dx/dt.
+
+    x, u and vehicle are in the order of `STATES`, `INPUTS` and
+    `VEHICLE_PARAMETERS`; soil holds `SOIL_PARAMETERS` four times, wheel by
+    wheel; effects the values of the named optional parameters. A graph made
+    without an optional parameter does not hold its term at all.
+    """
     import casadi as ca
 
     x, u = ca.SX.sym("x", len(STATES)), ca.SX.sym("u", len(INPUTS))
-    pv, ps = ca.SX.sym("vehicle", len(VEHICLE_PARAMETERS)), ca.SX.sym("soil", len(SOIL_PARAMETERS))
+    pv = ca.SX.sym("vehicle", len(VEHICLE_PARAMETERS))
+    ps = ca.SX.sym("soil", len(SOIL_PARAMETERS), len(WHEELS))
+    pe = ca.SX.sym("effects", len(effects))
     derivative = _derivative(x, u, pv, ps)
-    names = ["x", "u", "vehicle", "soil"]
-    return ca.Function("tf_rhs", [x, u, pv, ps], [derivative], names, ["dx"], {"cse": True})
+    names = ["x", "u", "vehicle", "soil", "effects"]
+    return ca.Function("tf_rhs", [x, u, pv, ca.vec(ps), pe], [derivative], names, ["dx"], {"cse": True})
 
 
 def _derivative(x: Any, u: Any, pv: Any, ps: Any) -> Any:
@@ -183,16 +65,19 @@ def _derivative(x: Any, u: Any, pv: Any, ps: Any) -> Any:
     from terrafusion.twin.wheel import Ground, clog_rate, contact, smooth_max
 
     p = {name: pv[i] for i, name in enumerate(VEHICLE_PARAMETERS)}
-    ground = Ground(*(ps[i] for i in range(len(SOIL_PARAMETERS))))
     s = {name: x[i] for i, name in enumerate(STATES)}
     cos, sin = ca.cos(s["yaw"]), ca.sin(s["yaw"])
     gravity_x = cos * p["gravity_x_mps2"] + sin * p["gravity_y_mps2"]
     gravity_y = -sin * p["gravity_x_mps2"] + cos * p["gravity_y_mps2"]
     d: dict[str, Any] = dict.fromkeys(STATES, 0.0)
     force_x, force_y, moment = 0.0, 0.0, 0.0
-    commands = (u[0], u[1], u[0], u[1])
+    late = p["dead_time_s"] - p["dead_time_applied_s"]
+    left, right = u[0] - late * u[2], u[1] - late * u[3]
+    commands = (left, right, left, right)
     loads = wheel_loads(p, gravity_x, gravity_y)
-    for name, load, (px, py), command in zip(WHEELS, loads, wheel_positions(p), commands, strict=True):
+    for i, name in enumerate(WHEELS):
+        load, (px, py), command = loads[i], wheel_positions(p)[i], commands[i]
+        ground = Ground(*(ps[k, i] for k in range(len(SOIL_PARAMETERS))))
         speed, torque = s[f"wheel_speed_{name}"], s[f"torque_{name}"]
         rim = speed * p["radius_m"]
         c = contact(

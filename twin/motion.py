@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrafusion.twin.dynamics import INDEX
+from terrafusion.twin.layout import INDEX
 from terrafusion.twin.vehicle import VehicleParams
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.dynamics import soil_vector
-from terrafusion.twin.engine.integrate import RouteTable
+from terrafusion.twin.engine.plant import RouteTable
+from terrafusion.twin.layout import soil_vector
 from terrafusion.twin.scenario import Scenario
 from terrafusion.twin.soil import SoilParams, load_soil
 

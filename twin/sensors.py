@@ -22,8 +22,9 @@ from numpy.typing import NDArray
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.recording import Fix, Gnss, Imu, Motor, Wheels
 from terrafusion.datasets.sensors import GnssSpec
-from terrafusion.twin.dynamics import WHEELS, motor_current, motor_voltage, state_slice
+from terrafusion.twin.layout import WHEELS, state_slice
 from terrafusion.twin.motion import Motion
+from terrafusion.twin.motors import motor_current, motor_voltage
 from terrafusion.twin.scenario import Interval
 from terrafusion.twin.soil import SoilParams
 from terrafusion.twin.vehicle import VehicleParams

@@ -16,8 +16,9 @@ from terrafusion.datasets.recording import Command, Recording, Terrain
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.twin import sensors
 from terrafusion.twin.drive import Driven, drive
-from terrafusion.twin.dynamics import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
 from terrafusion.twin.engine.integrate import compiled, integrate
+from terrafusion.twin.engine.plant import Plant
+from terrafusion.twin.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
 from terrafusion.twin.motion import Motion, motion_of
 from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import Scenario, load_scenario
@@ -67,7 +68,7 @@ class SimulatedRun:
     Attributes:
         recording: the drive as sensors report it, with truth.
         t_s: (N,) seconds, at the IMU's rate.
-        states: (N, 38) in the order of `dynamics.STATES`.
+        states: (N, 38) in the order of `layout.STATES`.
         slip: (N, 4) slip ratio of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest.
         summary: the run in a few numbers.
     """
@@ -134,10 +135,10 @@ def simulate_run(
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
     t_s = np.arange(count) / rate
-    table = route.table()
+    plant = Plant(parameters, route.table())
 
     def run(x0: Array, inputs: Array, t0_s: float) -> Array:
-        return integrate(x0, inputs, 1.0 / rate, parameters, table, t0_s=t0_s, backend=backend)
+        return integrate(x0, inputs, 1.0 / rate, plant, t0_s=t0_s, backend=backend)
 
     driven = drive(scenario, t_s, vehicle, run)
     motion = motion_of(t_s, driven.states, vehicle, slope, aspect)

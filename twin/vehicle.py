@@ -59,6 +59,7 @@ class Drive:
     speed_loop_p_nms: Annotated[float, Quantity("N m s/rad at the wheel", 0.01, 10000.0)]
     speed_loop_i_nm: Annotated[float, Quantity("N m/rad at the wheel", 0.0, 10000.0)]
     lag_s: Annotated[float, Quantity("s", 0.001, 1.0)]
+    dead_time_s: Annotated[float, Quantity("s", 0.0, 2.0)]
     max_speed_mps: Annotated[float, Quantity("m/s", 0.05, 50.0)]
     max_accel_mps2: Annotated[float, Quantity("m/s2", 0.05, 50.0)]
     max_yaw_accel_radps2: Annotated[float, Quantity("rad/s2", 0.05, 50.0)]

@@ -8,8 +8,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.twin.dynamics import STATES, soil_vector, vehicle_vector
-from terrafusion.twin.engine.integrate import RouteTable, integrate
+from terrafusion.twin.drive import told
+from terrafusion.twin.engine.integrate import integrate
+from terrafusion.twin.engine.plant import Plant, RouteTable
+from terrafusion.twin.layout import STATES, soil_vector, vehicle_vector
 from terrafusion.twin.soil import SoilParams, load_soil
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -41,6 +43,6 @@ def run() -> Callable[..., np.ndarray]:
         route = RouteTable("travel", np.zeros(1), soil_vector(soil)[None])
         vehicle = vehicle_vector(load_vehicle("elevate"), slope_rad=slope_rad)
         x0 = np.zeros(len(STATES)) if start is None else start
-        return integrate(x0, sides, 0.01, vehicle, route, **kw)
+        return integrate(x0, told(sides, 0.01), 0.01, Plant(vehicle, route), **kw)
 
     return call

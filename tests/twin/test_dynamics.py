@@ -8,15 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.dynamics import (
-    INDEX,
-    STATES,
-    VEHICLE_PARAMETERS,
-    motor_current,
-    state_slice,
-    vehicle_vector,
-    wheel_loads,
-)
+from terrafusion.twin.dynamics import wheel_loads
+from terrafusion.twin.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.motors import motor_current
 from terrafusion.twin.soil import load_soil, soil_names
 from terrafusion.twin.vehicle import load_vehicle
 from terrafusion.twin.wheel import Ground, sinkage

@@ -9,8 +9,9 @@ import pytest
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin import simulate
-from terrafusion.twin.dynamics import INDEX, rhs, soil_vector, vehicle_vector
+from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine import codegen, integrate
+from terrafusion.twin.layout import INDEX, INPUTS, soil_vector, vehicle_vector
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import load_soil, soil_names
@@ -51,7 +52,7 @@ def test_order_of_convergence_is_four_where_inputs_are_smooth(run) -> None:
 
 
 def test_longer_lag_allows_longer_steps_and_shorter_lag_asks_for_shorter() -> None:
-    from terrafusion.twin.dynamics import VEHICLE_PARAMETERS
+    from terrafusion.twin.layout import VEHICLE_PARAMETERS
 
     vehicle = np.ones(len(VEHICLE_PARAMETERS))
     lag = VEHICLE_PARAMETERS.index("lag_s")
@@ -92,7 +93,7 @@ def test_the_library_is_compiled_once_and_found_again(monkeypatch, tmp_path) -> 
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
     for _ in range(2):
         codegen.driver.cache_clear()
-        assert codegen.driver() is not None
+        assert codegen.driver(()) is not None
     codegen.driver.cache_clear()
     files = list((tmp_path / "cache").iterdir())
     assert len(files) == 1
@@ -103,7 +104,7 @@ def test_a_compiler_that_fails_is_told_and_replaced(monkeypatch, tmp_path, caplo
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(codegen, "FLAGS", ("-no-such-flag",))
     codegen.driver.cache_clear()
-    assert codegen.driver() is None
+    assert codegen.driver(()) is None
     codegen.driver.cache_clear()
     assert "could not be compiled" in caplog.text
 
@@ -120,7 +121,7 @@ def test_a_home_that_cannot_be_written_still_gets_compiled_code(monkeypatch, tmp
     blocked.write_text("not a folder")
     monkeypatch.setenv("TERRAFUSION_CACHE", str(blocked / "cache"))
     codegen.driver.cache_clear()
-    assert codegen.driver() is not None
+    assert codegen.driver(()) is not None
     codegen.driver.cache_clear()
 
 
@@ -132,9 +133,10 @@ def test_the_motor_lag_is_the_fastest_mode(terrain, vehicle) -> None:
 
     f = rhs()
     x, u, p, s = (ca.SX.sym(name, f.size1_in(i)) for i, name in enumerate(("x", "u", "p", "s")))
-    jacobian = ca.Function("jacobian", [x, u, p, s], [ca.jacobian(f(x, u, p, s), x)])
+    jacobian = ca.Function("jacobian", [x, u, p, s], [ca.jacobian(f(x, u, p, s, []), x)])
     params = load_vehicle(vehicle)
-    vectors = vehicle_vector(params), soil_vector(load_soil(terrain))
+    vectors = vehicle_vector(params), np.tile(soil_vector(load_soil(terrain)), 4)
     states = simulate_run("figure_eight", vehicle=params, terrain=terrain).states[::200]
-    rates = [np.abs(np.linalg.eigvals(np.array(jacobian(row, [0.0, 0.0], *vectors)))).max() for row in states]
+    rest = np.zeros(len(INPUTS))
+    rates = [np.abs(np.linalg.eigvals(np.array(jacobian(row, rest, *vectors)))).max() for row in states]
     assert max(rates) < 1.01 / params.drive.lag_s

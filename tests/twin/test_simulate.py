@@ -10,7 +10,7 @@ import pytest
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.datasets.recording import TERRAINS, Recording
-from terrafusion.twin.dynamics import INDEX
+from terrafusion.twin.layout import INDEX
 from terrafusion.twin.scenario import Interval, load_scenario, scenario_names
 from terrafusion.twin.simulate import simulate, simulate_run
 from terrafusion.twin.soil import load_soil, soil_names

@@ -22,6 +22,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from terrafusion.twin.engine.plant import Plant
+
 LOG = logging.getLogger("terrafusion.twin")
 
 # No fast-math and no contraction: a run gives the same bits with every compiler of a platform.
@@ -52,15 +56,15 @@ def find_compiler() -> tuple[str, ...] | None:
 
 
 @functools.cache
-def driver() -> ctypes.CDLL | None:
-    """The compiled driver with the right-hand side inside, or None where it cannot be made (said once)."""
+def driver(effects: tuple[str, ...]) -> ctypes.CDLL | None:
+    """The compiled driver around `dynamics.rhs(effects)`, or None where it cannot be made (said once)."""
     compiler = find_compiler()
     if compiler is None:
         LOG.warning("no C compiler: the twin runs in CasADi's virtual machine, several times slower; "
                     "install a compiler or the ziglang package")  # fmt: skip
         return None
     try:
-        library = ctypes.CDLL(str(_compiled(_source(), compiler)))
+        library = ctypes.CDLL(str(_compiled(_source(effects), compiler)))
     except (OSError, subprocess.SubprocessError) as error:
         LOG.warning(
             "the twin's C code could not be compiled (%s): it runs in CasADi's virtual machine", error
@@ -70,19 +74,17 @@ def driver() -> ctypes.CDLL | None:
     return library
 
 
-def _source() -> str:
+def _source(effects: tuple[str, ...]) -> str:
     """The C source: CasADi's function `tf_rhs`, the sizes of its arguments, and the RK4 driver."""
-    from terrafusion.twin.dynamics import INDEX, INPUTS, SOIL_PARAMETERS, STATES, rhs
+    from terrafusion.twin.dynamics import rhs
+    from terrafusion.twin.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 
-    sizes = {
-        "TF_NX": len(STATES),
-        "TF_NU": len(INPUTS),
-        "TF_NP": len(SOIL_PARAMETERS),
-        "TF_TRAVEL": INDEX["travel"],
-    }
+    sizes = {"TF_NX": len(STATES), "TF_NU": len(INPUTS), "TF_NP": len(SOIL_PARAMETERS)}
+    sizes |= {f"TF_{name.upper()}": INDEX[name] for name in ("x", "y", "yaw", "travel")}
+    sizes |= {f"TF_{name.upper()}": VEHICLE_PARAMETERS.index(f"{name}_m") for name in ("wheelbase", "track")}
     defines = "".join(f"#define {name} {value}\n" for name, value in sizes.items())
     loop = (resources.files("terrafusion.twin.engine") / "driver.c").read_text(encoding="utf-8")
-    return f"{_generate(rhs())}\n{defines}{loop}"
+    return f"{_generate(rhs(effects))}\n{defines}{loop}"
 
 
 def _generate(function: Any) -> str:
@@ -124,10 +126,42 @@ def _compile_into(target: Path, source: str, compiler: tuple[str, ...]) -> Path:
     return target
 
 
+_DOUBLE_P = ctypes.POINTER(ctypes.c_double)
+
+
+class _PlantStruct(ctypes.Structure):
+    """`tf_plant` of driver.c."""
+
+    _fields_ = (
+        ("vehicle", _DOUBLE_P), ("effects", _DOUBLE_P),
+        ("time_weight", ctypes.c_double), ("travel_weight", ctypes.c_double),
+        ("knots", ctypes.c_long), ("at", _DOUBLE_P), ("table", _DOUBLE_P),
+        ("rows", ctypes.c_long), ("columns", ctypes.c_long), ("cell", ctypes.c_double),
+        ("log_gain", _DOUBLE_P), ("patch_share", _DOUBLE_P),
+        ("response", _DOUBLE_P), ("patch_soil", _DOUBLE_P),
+    )  # fmt: skip
+
+
+class CPlant:
+    """A `Plant` as the C driver reads it; keeps the arrays alive that `struct` points into."""
+
+    def __init__(self, plant: Plant) -> None:
+        route, field = plant.route, plant.route.field
+        arrays = [plant.vehicle, plant.effect_values(), route.at, route.soil]
+        if field is not None:
+            arrays += [field.log_gain, field.patch_share, field.response, field.patch_soil]
+        self._arrays = [np.ascontiguousarray(a, dtype=float) for a in arrays]
+        pointers = [a.ctypes.data_as(_DOUBLE_P) for a in self._arrays] + [None] * (8 - len(arrays))
+        rows, columns = (0, 0) if field is None else field.log_gain.shape
+        self.struct = _PlantStruct(
+            *pointers[:2], *route.weights(), len(route.at), *pointers[2:4], rows, columns,
+            1.0 if field is None else field.cell_m, *pointers[4:],
+        )  # fmt: skip
+
+
 def _declare(library: ctypes.CDLL) -> None:
-    double_p = ctypes.POINTER(ctypes.c_double)
     library.tf_simulate.restype = ctypes.c_long
     library.tf_simulate.argtypes = [
-        ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_double, double_p, double_p, double_p,
-        ctypes.c_double, ctypes.c_double, ctypes.c_long, double_p, double_p,
+        ctypes.POINTER(_PlantStruct), ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_double,
+        _DOUBLE_P, _DOUBLE_P,
     ]  # fmt: skip

@@ -1,43 +1,95 @@
-/* Fixed-step RK4 around the generated right-hand side tf_rhs(x, u, vehicle, soil).
+/* Fixed-step RK4 around the generated right-hand side tf_rhs(x, u, vehicle, soil, effects).
  *
- * Inputs are linear between samples. Soil parameters follow the route: at the
- * coordinate c = time_weight * t + travel_weight * travel they are joined
- * smoothly (3 w^2 - 2 w^3) between the knots of the route table.
+ * Inputs are linear between samples. Each wheel has its own soil: at the coordinate
+ * c = time_weight * t + travel_weight * (travel + its distance ahead of the body origin) the
+ * parameters are joined smoothly (3 w^2 - 2 w^3) between the knots of the route table, then
+ * varied by the field of the plane, whose value is taken at the start of a step.
  */
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
 
-/* TF_NX states, TF_NU inputs, TF_NP soil parameters and the index TF_TRAVEL are
- * defined ahead of this file from the names in dynamics.py. */
+/* The sizes TF_NX, TF_NU, TF_NP (soil parameters) and the indices TF_X, TF_Y, TF_YAW, TF_TRAVEL,
+ * TF_WHEELBASE and TF_TRACK are defined ahead of this file from the names in layout.py. */
+#define TF_WHEELS 4
 
 typedef struct {
-  const double *vehicle;
+  const double *vehicle, *effects;
   double time_weight, travel_weight;
   long knots;
   const double *at;    /* (knots,) coordinates, increasing */
   const double *table; /* (knots, TF_NP) soil parameters */
-  double soil[TF_NP];
+  long rows, columns;  /* of the field's grid; no field where rows is 0 */
+  double cell;
+  const double *log_gain, *patch_share; /* (rows, columns), periodic */
+  const double *response, *patch_soil;  /* (TF_NP,) */
+} tf_plant;
+
+typedef struct {
+  const tf_plant *plant;
+  double ahead[TF_WHEELS], left[TF_WHEELS]; /* hubs from the body origin */
+  double gain[TF_WHEELS][TF_NP], share[TF_WHEELS];
+  double soil[TF_WHEELS * TF_NP];
   int *iw;
   double *w;
 } tf_run;
 
-static void tf_soil(tf_run *run, double t, const double *x) {
-  const double c = run->time_weight * t + run->travel_weight * x[TF_TRAVEL];
-  long k = 0;
-  while (k < run->knots - 1 && c >= run->at[k + 1]) ++k;
-  const double *row = run->table + k * TF_NP;
-  if (k == run->knots - 1 || c <= run->at[0]) {
-    memcpy(run->soil, row, sizeof run->soil);
-    return;
+static void tf_start(tf_run *run, const tf_plant *plant) {
+  static const double sx[TF_WHEELS] = {0.5, 0.5, -0.5, -0.5}, sy[TF_WHEELS] = {0.5, -0.5, 0.5, -0.5};
+  run->plant = plant;
+  for (int k = 0; k < TF_WHEELS; ++k) {
+    run->ahead[k] = sx[k] * plant->vehicle[TF_WHEELBASE];
+    run->left[k] = sy[k] * plant->vehicle[TF_TRACK];
+    memcpy(run->soil + k * TF_NP, plant->table, sizeof(double) * TF_NP);
   }
-  double s = (c - run->at[k]) / (run->at[k + 1] - run->at[k]);
-  s = s * s * (3.0 - 2.0 * s);
-  for (int i = 0; i < TF_NP; ++i) run->soil[i] = row[i] + s * (row[i + TF_NP] - row[i]);
+}
+
+/* Value of a periodic grid at cell coordinates (column, row), bilinear. */
+static double tf_grid(const tf_plant *plant, const double *grid, double column, double row) {
+  const double c0 = floor(column), r0 = floor(row), fc = column - c0, fr = row - r0;
+  const long w = plant->columns, h = plant->rows;
+  const long i = (long)(c0 - (double)w * floor(c0 / (double)w)), j = (long)(r0 - (double)h * floor(r0 / (double)h));
+  const long i1 = (i + 1) % w, j1 = (j + 1) % h;
+  return (1.0 - fr) * ((1.0 - fc) * grid[j * w + i] + fc * grid[j * w + i1]) +
+         fr * ((1.0 - fc) * grid[j1 * w + i] + fc * grid[j1 * w + i1]);
+}
+
+static void tf_field(tf_run *run, const double *x) {
+  const tf_plant *plant = run->plant;
+  const double cosine = cos(x[TF_YAW]), sine = sin(x[TF_YAW]);
+  for (int k = 0; k < TF_WHEELS; ++k) {
+    const double px = (x[TF_X] + cosine * run->ahead[k] - sine * run->left[k]) / plant->cell;
+    const double py = (x[TF_Y] + sine * run->ahead[k] + cosine * run->left[k]) / plant->cell;
+    const double g = tf_grid(plant, plant->log_gain, px, py);
+    run->share[k] = tf_grid(plant, plant->patch_share, px, py);
+    for (int i = 0; i < TF_NP; ++i) run->gain[k][i] = plant->response[i] == 0.0 ? 1.0 : exp(plant->response[i] * g);
+  }
+}
+
+static void tf_soil(tf_run *run, double t, const double *x) {
+  const tf_plant *plant = run->plant;
+  if (plant->knots == 1 && plant->rows == 0) return; /* set once in tf_start */
+  for (int wheel = 0; wheel < TF_WHEELS; ++wheel) {
+    double *soil = run->soil + wheel * TF_NP;
+    const double c = plant->time_weight * t + plant->travel_weight * (x[TF_TRAVEL] + run->ahead[wheel]);
+    long k = 0;
+    while (k < plant->knots - 1 && c >= plant->at[k + 1]) ++k;
+    const double *row = plant->table + k * TF_NP;
+    if (k == plant->knots - 1 || c <= plant->at[0]) {
+      memcpy(soil, row, sizeof(double) * TF_NP);
+    } else {
+      double s = (c - plant->at[k]) / (plant->at[k + 1] - plant->at[k]);
+      s = s * s * (3.0 - 2.0 * s);
+      for (int i = 0; i < TF_NP; ++i) soil[i] = row[i] + s * (row[i + TF_NP] - row[i]);
+    }
+    if (plant->rows > 0)
+      for (int i = 0; i < TF_NP; ++i)
+        soil[i] = run->gain[wheel][i] * soil[i] + run->share[wheel] * (plant->patch_soil[i] - run->gain[wheel][i] * soil[i]);
+  }
 }
 
 static void tf_slope(tf_run *run, double t, const double *x, const double *u, double *dx) {
-  const double *arg[16] = {x, u, run->vehicle, run->soil};
+  const double *arg[32] = {x, u, run->plant->vehicle, run->soil, run->plant->effects};
   double *res[8] = {dx};
   tf_soil(run, t, x);
   tf_rhs(arg, res, run->iw, run->w, 0);
@@ -46,6 +98,7 @@ static void tf_slope(tf_run *run, double t, const double *x, const double *u, do
 static void tf_rk4(tf_run *run, double t, double h, double *x, double u[3][TF_NU]) {
   double k1[TF_NX], k2[TF_NX], k3[TF_NX], k4[TF_NX], y[TF_NX];
   int i;
+  if (run->plant->rows > 0) tf_field(run, x);
   tf_slope(run, t, x, u[0], k1);
   for (i = 0; i < TF_NX; ++i) y[i] = x[i] + 0.5 * h * k1[i];
   tf_slope(run, t + 0.5 * h, y, u[1], k2);
@@ -61,10 +114,9 @@ static void tf_rk4(tf_run *run, double t, double h, double *x, double u[3][TF_NU
 #if defined(_WIN32)
 __declspec(dllexport)
 #endif
-long tf_simulate(long n, long substeps, double t0, double dt, const double *inputs, const double *vehicle,
-                 double *out, double time_weight, double travel_weight, long knots, const double *at,
-                 const double *table) {
-  tf_run run = {vehicle, time_weight, travel_weight, knots, at, table, {0}, 0, 0};
+long tf_simulate(const tf_plant *plant, long n, long substeps, double t0, double dt, const double *inputs,
+                 double *out) {
+  tf_run run;
   casadi_int sz_arg, sz_res, sz_iw, sz_w;
   tf_rhs_work(&sz_arg, &sz_res, &sz_iw, &sz_w);
   run.iw = malloc(sizeof(int) * (size_t)(sz_iw + 1));
@@ -74,6 +126,7 @@ long tf_simulate(long n, long substeps, double t0, double dt, const double *inpu
     free(run.w);
     return -1;
   }
+  tf_start(&run, plant);
   const double h = dt / (double)substeps;
   long i = 0;
   for (; i < n; ++i) {

@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
-from terrafusion.twin.dynamics import INDEX, soil_vector, vehicle_vector
-from terrafusion.twin.engine.integrate import RouteTable, compiled, integrate
+from terrafusion.twin.drive import told
+from terrafusion.twin.engine.integrate import compiled, integrate
+from terrafusion.twin.engine.plant import Plant, RouteTable
+from terrafusion.twin.layout import INDEX, STATES, soil_vector, vehicle_vector
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
 from terrafusion.twin.simulate import MOVING_MPS, simulate_run
 from terrafusion.twin.soil import load_soil
@@ -136,7 +138,8 @@ def _path(scenario: str, terrain: str, substeps: int) -> Array:
     t = np.arange(round(plan.duration_s * 100) + 1) / 100.0
     sides = side_speeds(limit_slew(plan.commanded(t), 0.01, vehicle, plan, np.zeros(2)), vehicle)
     route = RouteTable("travel", np.zeros(1), soil_vector(load_soil(terrain))[None])
-    states = integrate(np.zeros(38), sides, 0.01, vehicle_vector(vehicle), route, substeps=substeps)
+    plant = Plant(vehicle_vector(vehicle), route)
+    states = integrate(np.zeros(len(STATES)), told(sides, 0.01), 0.01, plant, substeps=substeps)
     return states[:, :2]
 
 
@@ -154,11 +157,12 @@ def speed_lines() -> list[str]:
     """Wall time of a 300 s run, motion alone and with sensors, by backend."""
     vehicle = load_vehicle("elevate")
     route = RouteTable("travel", np.zeros(1), soil_vector(load_soil("loose_sand"))[None])
+    plant = Plant(vehicle_vector(vehicle), route)
     sides = np.tile(1.0 + 0.5 * np.sin(np.arange(30001)[:, None] * 0.001), (1, 2)) / 0.175
     lines = []
     for backend in ("c", "vm") if compiled() else ("vm",):
         best = min(
-            _seconds(integrate, np.zeros(38), sides, 0.01, vehicle_vector(vehicle), route, backend=backend)
+            _seconds(integrate, np.zeros(len(STATES)), told(sides, 0.01), 0.01, plant, backend=backend)
             for _ in range(3)
         )
         lines.append(f"300 s of motion, backend {backend}: {best:.2f} s ({300 / best:.0f} x real time)")

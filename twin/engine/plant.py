@@ -1,0 +1,78 @@
+"""What an integrator drives: the vehicle's numbers, the ground under its wheels, the optional effects."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class SoilField:
+    """Ground that varies over the plane, on a grid that repeats in both directions.
+
+    Between grid points the field is bilinear; a wheel meets the value under its
+    hub at the start of an integration step.
+
+    Attributes:
+        cell_m: spacing of the grid.
+        log_gain: (H, W) logarithm of the soil's local strength over its mean, rows along y, columns along x.
+        response: (S,) how each of `SOIL_PARAMETERS` follows: value exp(response log_gain).
+        patch_share: (H, W) from 0 to 1, share of the other ground `patch_soil`.
+        patch_soil: (S,) `SOIL_PARAMETERS` of the patches.
+    """
+
+    cell_m: float
+    log_gain: Array
+    response: Array
+    patch_share: Array
+    patch_soil: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RouteTable:
+    """Soil parameters along the route.
+
+    Attributes:
+        coordinate: "travel" (metres driven forward; an axle ahead of the body origin meets it earlier) or
+            "time" (seconds).
+        at: (K,) increasing knots of the coordinate.
+        soil: (K, S) `SOIL_PARAMETERS` at the knots, joined smoothly between them.
+        field: how the ground varies about these numbers, None where it does not.
+    """
+
+    coordinate: str
+    at: Array
+    soil: Array
+    field: SoilField | None = None
+
+    def weights(self) -> tuple[float, float]:
+        """Factors of time and travel that make the coordinate."""
+        return (1.0, 0.0) if self.coordinate == "time" else (0.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Plant:
+    """Everything that holds for a whole run.
+
+    Attributes:
+        vehicle: (V,) `VEHICLE_PARAMETERS`.
+        route: ground along the way.
+        effects: values of the optional parameters; one that is not named is absent.
+    """
+
+    vehicle: Array
+    route: RouteTable
+    effects: Mapping[str, float] = field(default_factory=dict)
+
+    def effect_names(self) -> tuple[str, ...]:
+        """Names of the optional parameters that are not zero, sorted: they choose the graph."""
+        return tuple(sorted(name for name, value in self.effects.items() if value != 0.0))
+
+    def effect_values(self) -> Array:
+        """Values (E,) in the order of `effect_names`."""
+        return np.array([self.effects[name] for name in self.effect_names()], dtype=float)

@@ -1,0 +1,105 @@
+"""Names and order of the model's states, inputs and parameters; vectors made from a vehicle or a soil.
+
+Nothing else knows a position in these vectors: look entries up by name.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.twin.soil import SoilParams
+from terrafusion.twin.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+
+WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
+"""Order of the wheels in every array."""
+
+STATES = (
+    "x", "y", "yaw", "u", "v", "r",
+    *(f"wheel_speed_{w}" for w in WHEELS),
+    *(f"shear_x_{w}" for w in WHEELS),
+    *(f"shear_y_{w}" for w in WHEELS),
+    *(f"torque_{w}" for w in WHEELS),
+    *(f"speed_error_{w}" for w in WHEELS),
+    *(f"brake_{w}" for w in WHEELS),
+    *(f"wheel_angle_{w}" for w in WHEELS),
+    "clog", "travel", "motor_work", "electric_energy",
+)  # fmt: skip
+"""State names: m, rad, m/s, rad/s, N m (`torque`, at the wheel), rad (`speed_error`, integrated), J.
+
+`shear_x`, `shear_y` and `brake` are displacements of the soil and of the rim's
+friction bristle (m), `travel` the path driven forward (m), `clog` from 0 to 1.
+"""
+
+INPUTS = ("left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2")
+"""Wheel speeds the two sides are told, rad/s, and their time derivatives (see `drive.delayed`)."""
+
+VEHICLE_PARAMETERS = (
+    "mass_kg", "yaw_inertia_kgm2", "wheelbase_m", "track_m", "cg_forward_m", "cg_left_m", "cg_height_m",
+    "radius_m", "width_m", "wheel_inertia_kgm2", "gear_ratio", "gear_efficiency", "no_load_radps",
+    "stall_torque_nm", "torque_limit_nm", "supply_v", "loop_p_nms", "loop_i_nm", "lag_s",
+    "dead_time_s", "dead_time_applied_s",
+    "gravity_x_mps2", "gravity_y_mps2", "gravity_normal_mps2",
+)  # fmt: skip
+"""Parameters that hold for a whole run; gravity is given along the plane's x and y and into it.
+
+The command arrives `dead_time_applied_s` late already; the graph adds the first-order term of
+`dead_time_s - dead_time_applied_s`, which is zero, but whose derivative by `dead_time_s` is right.
+"""
+
+SOIL_PARAMETERS = (
+    "k_c", "k_phi", "exponent", "slip_sinkage", "contact_floor_m", "cohesion_pa", "tan_friction",
+    "shear_modulus_m", "friction_cap", "rolling", "viscous_ns_per_m", "pickup_per_m", "churn_gain",
+    "shed_per_m", "clog_torque_nm", "clog_sinkage_m",
+)  # fmt: skip
+"""Parameters of the ground under one wheel; the graph takes them once a wheel, in the order of `WHEELS`."""
+
+INDEX = {name: i for i, name in enumerate(STATES)}
+
+
+def state_slice(prefix: str) -> slice:
+    """The four wheels' entries of a state, e.g. `state_slice("wheel_speed")`."""
+    first = INDEX[f"{prefix}_{WHEELS[0]}"]
+    return slice(first, first + 4)
+
+
+def vehicle_vector(
+    vehicle: VehicleParams, *, slope_rad: float = 0.0, aspect_rad: float = 0.0, payload_kg: float = 0.0
+) -> Array:
+    """Values of `VEHICLE_PARAMETERS`; `aspect_rad` is the way uphill (0 east, left positive).
+
+    The payload rides at the centre of gravity and adds yaw inertia in proportion to its mass.
+    """
+    body, wheel, drive = vehicle.body, vehicle.wheel, vehicle.drive
+    mass = body.mass_kg + payload_kg
+    downhill = -GRAVITY_MPS2 * math.sin(slope_rad)
+    return np.array(
+        [
+            mass, body.yaw_inertia_kgm2 * mass / body.mass_kg, body.wheelbase_m, body.track_m,
+            body.cg_forward_m, body.cg_left_m, body.cg_height_m,
+            wheel.radius_m, wheel.width_m, wheel.inertia_kgm2,
+            drive.gear_ratio, drive.gear_efficiency, drive.no_load_speed_radps, drive.stall_torque_nm,
+            drive.torque_limit_nm, drive.supply_v, drive.speed_loop_p_nms, drive.speed_loop_i_nm, drive.lag_s,
+            drive.dead_time_s, drive.dead_time_s,
+            downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad),
+            GRAVITY_MPS2 * math.cos(slope_rad),
+        ]
+    )  # fmt: skip
+
+
+def soil_vector(soil: SoilParams) -> Array:
+    """Values of `SOIL_PARAMETERS`."""
+    return np.array(
+        [
+            soil.pressure.k_c_n_per_m_n1, soil.pressure.k_phi_n_per_m_n2, soil.pressure.exponent,
+            soil.pressure.slip_sinkage, soil.pressure.contact_length_floor_m, soil.shear.cohesion_pa,
+            math.tan(soil.shear.friction_angle_rad), soil.shear.shear_modulus_m, soil.shear.friction_cap,
+            soil.resistance.rolling, soil.resistance.viscous_ns_per_m, soil.mud.pickup_per_m,
+            soil.mud.churn_gain, soil.mud.shed_per_m, soil.mud.torque_nm, soil.mud.sinkage_m,
+        ]
+    )  # fmt: skip

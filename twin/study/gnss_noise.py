@@ -1,0 +1,129 @@
+"""Which Gaussian position noise the study's GNSS errors imply.
+
+The study adds zero-mean Gaussian noise to the GNSS and does not say how much.
+Here white noise of one size is added to the true positions of the twin's three
+runs, sampled at a rate, processed as in the study, and the size is sought at
+which the mean speed error is the study's: for each run alone, and one for all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.recording import Recording
+from terrafusion.twin.study.processing import Profiles, differenced_speed, speed_errors, with_gnss
+
+Array = NDArray[np.float64]
+
+RATES_HZ = (1.0, 5.0, 10.0, 100.0)
+"""Rates at which positions may have been differenced; the study names none."""
+SIGMAS_M = (1e-4, 10.0)
+"""Sizes of noise that are searched."""
+DATA_SHEET_M = 0.02
+"""Tab. 2 of the study: RTK below this."""
+
+
+@dataclass(frozen=True)
+class NoiseFit:
+    """White position noise at one rate that gives the study's errors.
+
+    Attributes:
+        rate_hz: of the positions.
+        alone_m: sigma of each horizontal axis that fits a terrain's error alone, m.
+        common_m: the one sigma with the least squared logarithm of error / study's error over all terrains.
+        common_error: mean percent of each terrain with `common_m`.
+        data_sheet_error: the same with 0.02 m.
+    """
+
+    rate_hz: float
+    alone_m: Mapping[str, float]
+    common_m: float
+    common_error: Mapping[str, float]
+    data_sheet_error: Mapping[str, float]
+
+    def worst_factor(self, wanted: Mapping[str, float]) -> float:
+        """By what factor the worst terrain's error misses the wanted one with the common noise."""
+        return max(
+            math.exp(abs(math.log(self.common_error[terrain] / wanted[terrain]))) for terrain in wanted
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class NoisyPositions:
+    """A run's true positions at one rate, with unit noise to be scaled: one draw (n, 2) a seed."""
+
+    profiles: Profiles
+    t_s: Array
+    enu_m: Array
+    draws: tuple[Array, ...]
+
+    @classmethod
+    def of(
+        cls, recording: Recording, profiles: Profiles, rate_hz: float, seeds: Sequence[int]
+    ) -> NoisyPositions:
+        """Positions of the recording's truth at `rate_hz`; the antenna moves as the body origin does."""
+        truth = recording.truth
+        if truth is None:
+            raise ValueError("the recording has no truth")
+        count = int(recording.duration_s() * rate_hz)
+        t_s = np.arange(count + 1) / rate_hz
+        clock = (truth.t_ns - recording.start_ns) * 1e-9
+        enu = np.stack([np.interp(t_s, clock, truth.position_m[:, axis]) for axis in range(2)], axis=1)
+        draws = tuple(np.random.default_rng([seed, round(rate_hz)]).normal(size=enu.shape) for seed in seeds)
+        return cls(profiles, t_s, enu, draws)
+
+    def speed(self, sigma_m: float, draw: int = 0) -> tuple[Array, Array]:
+        """Times and speed of one draw with noise of `sigma_m`, processed as in the study."""
+        return differenced_speed(self.t_s, self.enu_m + sigma_m * self.draws[draw])
+
+    def errors(self, sigma_m: float) -> list[float]:
+        """Mean speed error of each draw, percent."""
+        return [
+            speed_errors(with_gnss(self.profiles, *self.speed(sigma_m, draw))).gnss
+            for draw in range(len(self.draws))
+        ]
+
+    def error(self, sigma_m: float) -> float:
+        """Mean speed error over the draws, percent."""
+        return float(np.mean(self.errors(sigma_m)))
+
+
+def fit_noise(runs: Mapping[str, NoisyPositions], wanted: Mapping[str, float], rate_hz: float) -> NoiseFit:
+    """The sizes of noise that give the `wanted` errors (percent, by terrain)."""
+    from scipy.optimize import minimize_scalar
+
+    low, high = (math.log(sigma) for sigma in SIGMAS_M)
+
+    def misfit(log_sigma: float) -> float:
+        sigma = math.exp(log_sigma)
+        return sum(math.log(runs[name].error(sigma) / wanted[name]) ** 2 for name in wanted)
+
+    common = math.exp(
+        minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 1e-3}).x
+    )
+    return NoiseFit(
+        rate_hz=rate_hz,
+        alone_m={name: _sigma_for(runs[name], error) for name, error in wanted.items()},
+        common_m=common,
+        common_error={name: runs[name].error(common) for name in wanted},
+        data_sheet_error={name: runs[name].error(DATA_SHEET_M) for name in wanted},
+    )
+
+
+def _sigma_for(run: NoisyPositions, error: float) -> float:
+    """The size of noise with this mean error (it grows with the noise); NaN outside the searched sizes."""
+    from scipy.optimize import brentq
+
+    low, high = (math.log(sigma) for sigma in SIGMAS_M)
+
+    def excess(log_sigma: float) -> float:
+        return math.log(run.error(math.exp(log_sigma)) / error)
+
+    if excess(low) > 0.0 or excess(high) < 0.0:
+        return math.nan
+    return math.exp(brentq(excess, low, high, xtol=1e-3))

@@ -1,0 +1,176 @@
+"""What a sweep is: a scenario, a vehicle and axes, and the runs they make.
+
+The runs are the cross product of the axes, the last axis of `AXES` running
+fastest; a random sweep is a Latin hypercube of so many runs instead.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata, resources
+
+import numpy as np
+
+from terrafusion.twin.scenario import Scenario
+from terrafusion.twin.soil import SoilParams
+from terrafusion.twin.vehicle import VehicleParams
+
+AXES = ("terrain", "friction", "slope_deg", "payload_kg", "speed_scale", "speed_mps", "seed")
+"""Names of the axes, in the order of the cross product; `speed_scale` and `speed_mps` exclude each other."""
+MAX_RUNS = 100_000
+"""A sweep of more runs is refused unless it is asked for."""
+
+Level = str | float | int
+
+
+@dataclass(frozen=True)
+class Axis:
+    """One axis: its levels, or for a random sweep the span (low, high) it is drawn from.
+
+    A span of whole numbers (`seed`) includes both ends.
+    """
+
+    name: str
+    levels: tuple[Level, ...] = ()
+    span: tuple[float, float] | None = None
+
+    def at(self, share: float) -> Level:
+        """The value at a share from 0 to below 1 of the axis."""
+        if self.span is None:
+            return self.levels[int(share * len(self.levels))]
+        low, high = self.span
+        if self.name == "seed":
+            return int(low) + int(share * (high - low + 1.0))
+        return low + share * (high - low)
+
+
+@dataclass(frozen=True)
+class Case:
+    """One run of a sweep; None stands for what the scenario and its soils say themselves."""
+
+    run: int
+    terrain: str | None = None
+    friction: float | None = None
+    slope_deg: float | None = None
+    payload_kg: float = 0.0
+    speed_scale: float | None = None
+    speed_mps: float | None = None
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Sweep:
+    """A sweep with everything its runs need, so that it can travel to another machine.
+
+    Attributes:
+        axes: in the order of `AXES`, those that the file names.
+        random: number of runs of a Latin hypercube, None for the cross product.
+        soils: (name, parameters) of every ground that the scenario or the axis `terrain` names.
+        sensors: whether sensors are simulated and their errors measured.
+    """
+
+    name: str
+    description: str
+    scenario: Scenario
+    vehicle: VehicleParams
+    axes: tuple[Axis, ...]
+    random: int | None
+    random_seed: int
+    sensors: bool
+    soils: tuple[tuple[str, SoilParams], ...]
+
+    @property
+    def runs(self) -> int:
+        """Number of runs."""
+        if self.random is not None:
+            return self.random
+        return math.prod(len(axis.levels) for axis in self.axes)
+
+    def cases(self) -> Iterator[Case]:
+        """All runs in their order."""
+        if self.random is None:
+            shape = tuple(len(axis.levels) for axis in self.axes)
+            for run, place in enumerate(np.ndindex(shape)):
+                values = {a.name: a.levels[i] for a, i in zip(self.axes, place, strict=True)}
+                yield Case(run, **values)  # type: ignore[arg-type]
+        else:
+            for run, shares in enumerate(_hypercube(self.random, len(self.axes), self.random_seed)):
+                values = {a.name: a.at(s) for a, s in zip(self.axes, shares, strict=True)}
+                yield Case(run, **values)  # type: ignore[arg-type]
+
+    def sha256(self) -> str:
+        """Hash of all that decides the rows: axes, scenario, vehicle, soils, version and the twin's code."""
+        content = dataclasses.asdict(self) | {"terrafusion": version(), "model": model_sha256()}
+        del content["name"], content["description"]
+        text = json.dumps(content, sort_keys=True, default=str, allow_nan=False)
+        return hashlib.sha256(text.encode()).hexdigest()
+
+    def design(self) -> str:
+        """The runs in words: their number, the axes and the driving."""
+        if self.random is not None:
+            how = f"Latin hypercube over {', '.join(axis.name for axis in self.axes)}"
+        else:
+            how = " x ".join(f"{axis.name} {len(axis.levels)}" for axis in self.axes)
+        hours = self.runs * self.scenario.duration_s / 3600.0
+        return (
+            f"{self.runs} runs of {self.scenario.duration_s:g} s ({how}; {hours:.3g} h of driving), "
+            f"{'with' if self.sensors else 'without'} sensors"
+        )
+
+
+def version() -> str:
+    """Version of terrafusion."""
+    try:
+        return metadata.version("terrafusion")
+    except metadata.PackageNotFoundError:
+        return "not installed"
+
+
+@functools.cache
+def model_sha256() -> str:
+    """Hash of the twin's Python and C sources: runs of two versions of the model are not mixed."""
+    digest = hashlib.sha256()
+    root = resources.files("terrafusion.twin")
+    with resources.as_file(root) as folder:
+        files = sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c"))
+        for file in files:
+            digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
+            digest.update(file.read_bytes().replace(b"\r\n", b"\n") + b"\0")
+    return digest.hexdigest()
+
+
+def top_speed_mps(scenario: Scenario) -> float:
+    """The fastest forward speed the scenario commands, by its segments' mean and amplitude."""
+    if scenario.waypoints:
+        return scenario.waypoint_speed_mps
+    return max(abs(s.v_mps) + abs(s.v_amplitude_mps) for s in scenario.drive)
+
+
+def at_speed(scenario: Scenario, scale: float) -> Scenario:
+    """The same drive at `scale` times its speeds; yaw rates scale along, so that curves keep their radius."""
+    if scale == 1.0:
+        return scenario
+    drive = tuple(
+        dataclasses.replace(
+            s,
+            v_mps=scale * s.v_mps,
+            v_amplitude_mps=scale * s.v_amplitude_mps,
+            yaw_rate_radps=scale * s.yaw_rate_radps,
+            yaw_rate_amplitude_radps=scale * s.yaw_rate_amplitude_radps,
+        )
+        for s in scenario.drive
+    )
+    return dataclasses.replace(scenario, drive=drive, waypoint_speed_mps=scale * scenario.waypoint_speed_mps)
+
+
+def _hypercube(runs: int, axes: int, seed: int) -> list[list[float]]:
+    """Shares (runs, axes) from 0 to below 1, one a stratum on each axis (McKay and others, 1979)."""
+    from scipy.stats.qmc import LatinHypercube
+
+    return np.asarray(LatinHypercube(axes, rng=seed).random(runs)).tolist()
