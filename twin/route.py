@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,13 +27,15 @@ class Route:
     transition: float
 
     @classmethod
-    def of(cls, scenario: Scenario) -> Route:
-        """The scenario's route with its soils loaded.
+    def of(cls, scenario: Scenario, soils: Mapping[str, SoilParams] | None = None) -> Route:
+        """The scenario's route with its soils: those given by name, the others loaded.
 
         Raises:
             ConfigError: unknown terrain, or a leg shorter than the transition between two grounds.
         """
-        soils = tuple(load_soil(leg.terrain) for leg in scenario.route)
+        known = soils or {}
+        names = [leg.terrain for leg in scenario.route]
+        grounds = tuple(known[name] if name in known else load_soil(name) for name in names)
         lengths = np.array([leg.length for leg in scenario.route[:-1]], dtype=float)
         if (lengths < scenario.transition).any():
             raise ConfigError(
@@ -40,7 +43,7 @@ class Route:
                 file=scenario.name,
                 remedy="lengthen the leg or lower 'transition'",
             )
-        return cls(soils, np.cumsum(lengths), scenario.route_over, scenario.transition)
+        return cls(grounds, np.cumsum(lengths), scenario.route_over, scenario.transition)
 
     def table(self) -> RouteTable:
         """Knots of the soil parameters: each border is crossed within `transition`."""

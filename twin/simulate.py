@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -22,6 +23,7 @@ from terrafusion.twin.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehi
 from terrafusion.twin.motion import Motion, motion_of
 from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import Scenario, load_scenario
+from terrafusion.twin.soil import SoilParams
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 Array = NDArray[np.float64]
@@ -108,6 +110,7 @@ def simulate_run(
     seed: int = 0,
     noiseless: bool = False,
     backend: str = "auto",
+    soils: Mapping[str, SoilParams] | None = None,
 ) -> SimulatedRun:
     """Drive a scenario and keep the states, too.
 
@@ -120,6 +123,7 @@ def simulate_run(
         seed: of all noise; the motion does not depend on it.
         noiseless: exact sensors (no noise, bias, quantisation, vibration, latency).
         backend: "c", "vm" or "auto", see `integrate.integrate`.
+        soils: grounds by name, in place of the library's.
 
     Raises:
         ConfigError: unknown name, bad file, or a number out of range.
@@ -129,7 +133,7 @@ def simulate_run(
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     scenario = scenario.with_ground(terrain, slope_deg)
     _check(vehicle, payload_kg, seed)
-    route = Route.of(scenario)
+    route = Route.of(scenario, soils)
     slope, aspect = math.radians(scenario.slope_deg), math.radians(scenario.aspect_deg)
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect, payload_kg=payload_kg)
     rate = vehicle.sensors.imu.rate_hz
@@ -149,8 +153,8 @@ def simulate_run(
     )
     if backend != "c" and (backend == "vm" or not compiled()):
         recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
-    slip = _slip(driven.states, motion, vehicle)
-    return SimulatedRun(recording, t_s, driven.states, slip, _summary(driven, motion, vehicle, slip))
+    slip = slip_ratios(driven.states, motion, vehicle)
+    return SimulatedRun(recording, t_s, driven.states, slip, summarise(driven, motion, vehicle, slip))
 
 
 def _check(vehicle: VehicleParams, payload_kg: float, seed: int) -> None:
@@ -213,7 +217,8 @@ def _description(scenario: Scenario, payload_kg: float, seed: int, noiseless: bo
     )
 
 
-def _slip(states: Array, motion: Motion, vehicle: VehicleParams) -> Array:
+def slip_ratios(states: Array, motion: Motion, vehicle: VehicleParams) -> Array:
+    """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest."""
     rim = states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
     half = 0.5 * vehicle.body.track_m * np.array([1.0, -1.0, 1.0, -1.0])
     hub = motion.velocity_body_mps[:, :1] - motion.yaw_rate_radps[:, None] * half
@@ -221,7 +226,8 @@ def _slip(states: Array, motion: Motion, vehicle: VehicleParams) -> Array:
     return np.where(larger > 1e-3, (rim - hub) / np.maximum(larger, 1e-3), 0.0)
 
 
-def _summary(driven: Driven, motion: Motion, vehicle: VehicleParams, slip: Array) -> RunSummary:
+def summarise(driven: Driven, motion: Motion, vehicle: VehicleParams, slip: Array) -> RunSummary:
+    """The run in a few numbers, from its states and slip ratios (N, 4)."""
     states, t_s = driven.states, motion.t_s
     speed = motion.velocity_body_mps[:, 0]
     odometry = states[:, state_slice("wheel_speed")].mean(axis=1) * vehicle.odometry.wheel_radius_m
