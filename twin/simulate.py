@@ -73,6 +73,7 @@ class SimulatedRun:
         states: (N, 38) in the order of `layout.STATES`.
         slip: (N, 4) slip ratio of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest.
         summary: the run in a few numbers.
+        wanted: (N, 2) commanded twist before limits, m/s and rad/s.
     """
 
     recording: Recording
@@ -80,6 +81,23 @@ class SimulatedRun:
     states: Array
     slip: Array
     summary: RunSummary
+    wanted: Array
+
+
+@dataclass(frozen=True, eq=False)
+class RunSetup:
+    """A run before it is driven; `t_s` (N,) are the samples, at the IMU's rate from 0."""
+
+    scenario: Scenario
+    vehicle: VehicleParams
+    route: Route
+    plant: Plant
+    t_s: Array
+
+    def motion(self, states: Array) -> Motion:
+        """The body's motion in the world from the states (N, 38)."""
+        slope, aspect = math.radians(self.scenario.slope_deg), math.radians(self.scenario.aspect_deg)
+        return motion_of(self.t_s, states, self.vehicle, slope, aspect)
 
 
 def simulate(
@@ -129,6 +147,34 @@ def simulate_run(
         ConfigError: unknown name, bad file, or a number out of range.
         TerrafusionError: the integration diverged.
     """
+    setup = set_up(
+        scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, payload_kg=payload_kg, seed=seed,
+        soils=soils,
+    )  # fmt: skip
+    driven = drive_through(setup, backend)
+    motion = setup.motion(driven.states)
+    recording = _record(setup, driven, motion, sensors.Noise(seed, noiseless))
+    recording = dataclasses.replace(
+        recording, description=_description(setup.scenario, payload_kg, seed, noiseless)
+    )
+    if backend != "c" and (backend == "vm" or not compiled()):
+        recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
+    slip = slip_ratios(driven.states, motion, setup.vehicle)
+    summary = summarise(driven, motion, setup.vehicle, slip)
+    return SimulatedRun(recording, setup.t_s, driven.states, slip, summary, driven.wanted)
+
+
+def set_up(
+    scenario: str | Path | Scenario,
+    *,
+    vehicle: str | Path | VehicleParams = "elevate",
+    terrain: str | None = None,
+    slope_deg: float | None = None,
+    payload_kg: float = 0.0,
+    seed: int = 0,
+    soils: Mapping[str, SoilParams] | None = None,
+) -> RunSetup:
+    """What `simulate_run` drives with the same arguments."""
     vehicle = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
     scenario = scenario.with_ground(terrain, slope_deg)
@@ -138,23 +184,17 @@ def simulate_run(
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect, payload_kg=payload_kg)
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
-    t_s = np.arange(count) / rate
-    plant = Plant(parameters, route.table())
+    return RunSetup(scenario, vehicle, route, Plant(parameters, route.table()), np.arange(count) / rate)
+
+
+def drive_through(setup: RunSetup, backend: str = "auto") -> Driven:
+    """The run's motion, without any sensor."""
+    dt_s = 1.0 / setup.vehicle.sensors.imu.rate_hz
 
     def run(x0: Array, inputs: Array, t0_s: float) -> Array:
-        return integrate(x0, inputs, 1.0 / rate, plant, t0_s=t0_s, backend=backend)
+        return integrate(x0, inputs, dt_s, setup.plant, t0_s=t0_s, backend=backend)
 
-    driven = drive(scenario, t_s, vehicle, run)
-    motion = motion_of(t_s, driven.states, vehicle, slope, aspect)
-    noise = sensors.Noise(seed, noiseless)
-    recording = _record(scenario, vehicle, route, driven, motion, parameters, noise)
-    recording = dataclasses.replace(
-        recording, description=_description(scenario, payload_kg, seed, noiseless)
-    )
-    if backend != "c" and (backend == "vm" or not compiled()):
-        recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
-    slip = slip_ratios(driven.states, motion, vehicle)
-    return SimulatedRun(recording, t_s, driven.states, slip, summarise(driven, motion, vehicle, slip))
+    return drive(setup.scenario, setup.t_s, setup.vehicle, run)
 
 
 def _check(vehicle: VehicleParams, payload_kg: float, seed: int) -> None:
@@ -167,21 +207,14 @@ def _check(vehicle: VehicleParams, payload_kg: float, seed: int) -> None:
         raise ConfigError(f"seed {seed} is negative", remedy="give a whole number from 0")
 
 
-def _record(
-    scenario: Scenario,
-    vehicle: VehicleParams,
-    route: Route,
-    driven: Driven,
-    motion: Motion,
-    parameters: Array,
-    noise: sensors.Noise,
-) -> Recording:
+def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Noise) -> Recording:
     """The channels at their own rates, all on the clock of the IMU."""
+    scenario, vehicle, route = setup.scenario, setup.vehicle, setup.route
     states, rate = driven.states, vehicle.sensors.imu.rate_hz
     t_ns = START_NS + np.round(motion.t_s * 1e9).astype(np.int64)
     along = route.along(motion.t_s, states[:, INDEX["travel"]])
     rim = np.abs(states[:, state_slice("wheel_speed")]).mean(axis=1) * vehicle.wheel.radius_m
-    named = dict(zip(VEHICLE_PARAMETERS, parameters.tolist(), strict=True))
+    named = dict(zip(VEHICLE_PARAMETERS, setup.plant.vehicle.tolist(), strict=True))
     told = sensors.rows_at_rate(len(t_ns), rate, _COMMAND_HZ)
     seen = sensors.rows_at_rate(len(t_ns), rate, _TERRAIN_HZ)
     return Recording(
