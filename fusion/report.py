@@ -6,16 +6,11 @@ script. Everything that comes from a log is escaped.
 
 from __future__ import annotations
 
-import base64
-import io
-import platform
-import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from importlib import metadata, resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from terrafusion.datasets.recording import Gnss, Recording
 from terrafusion.fusion import plot_style as style
@@ -23,10 +18,7 @@ from terrafusion.fusion import plots, plots_map
 from terrafusion.fusion import report_text as words
 from terrafusion.fusion.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics import Outage, Scores
-from terrafusion.fusion.outputs import write_atomically
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
 
 MOST_REASONS = 20
 """How many of the changes of weight the report lists; `weights.jsonl` has them all."""
@@ -82,36 +74,7 @@ def write_report(
         _notes(runs),
         _provenance(recording, provenance or {}),
     ]
-    page = _PAGE.format(title=escape(title), css=_stylesheet(), body="\n".join(body))
-    return write_atomically(path, lambda part: part.write_text(page, encoding="utf-8"))
-
-
-def versions() -> dict[str, str]:
-    """Versions of this library, of Python and of what the numbers depend on."""
-    found = {"Python": platform.python_version()}
-    for name in ("terrafusion", "gtsam", "numpy", "scipy"):
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{css}
-</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
+    return write_page(path, title, body)
 
 
 def _head(title: str, runs: Sequence[ReportRun], ours: int, theirs: int) -> str:
@@ -166,10 +129,10 @@ def _maps(
             held_out=held_out,
             outages=outages,
         )
-        parts.append(_figure(fig, "The paths of all runs, from above."))
+        parts.append(figure(fig, "The paths of all runs, from above."))
     fig, _ = plots_map.plot_map(shown.estimate, recording, held_out=held_out, outages=outages)
     parts.append(
-        _figure(
+        figure(
             fig,
             f"The path as estimated ({shown.name}), coloured by the most probable ground. The rings hold "
             "the true position with 95 % probability, if the claimed uncertainty is right.",
@@ -189,12 +152,12 @@ def _errors(
         fig, _ = plots_map.plot_error_runs(
             scored, recording.start_ns, colours=_colours(runs), outages=outages
         )
-        parts.append(_figure(fig, "Horizontal distance between estimate and reference."))
+        parts.append(figure(fig, "Horizontal distance between estimate and reference."))
     if shown.scores.errors is not None:
         fig, _ = plots.plot_errors(shown.scores.errors, recording.start_ns, outages=outages)
         reference = words.REFERENCE[shown.scores.against or "truth"]
         parts.append(
-            _figure(
+            figure(
                 fig,
                 f"Errors of {shown.name} against {reference}. "
                 "An honest estimate stays inside its band about 95 % of the time.",
@@ -210,8 +173,8 @@ def _ground(shown: ReportRun, recording: Recording, outages: Sequence[Outage]) -
     return "\n".join(
         [
             "<h2>Ground and slip</h2>",
-            _figure(terrain, f"Probability of each class of ground ({shown.name}).{strip}"),
-            _figure(slip, "Slip as estimated, with two sigma; the background is the most probable ground."),
+            figure(terrain, f"Probability of each class of ground ({shown.name}).{strip}"),
+            figure(slip, "Slip as estimated, with two sigma; the background is the most probable ground."),
         ]
     )
 
@@ -221,7 +184,7 @@ def _weights(shown: ReportRun, recording: Recording, marked: Sequence[WeightChan
     caption = f"The noise each sensor was given ({shown.name}): above as 1 sigma, below as a factor."
     if marked:
         caption += " The numbers are those of the table."
-    parts = ["<h2>Weights and their reasons</h2>", _figure(fig, caption), _reasons(shown, recording, marked)]
+    parts = ["<h2>Weights and their reasons</h2>", figure(fig, caption), _reasons(shown, recording, marked)]
     return "\n".join(parts)
 
 
@@ -254,13 +217,13 @@ def _sensors(
     biases, _ = plots.plot_biases(shown.estimate, start)
     parts = [
         "<h2>Sensors</h2>",
-        _figure(speeds, "Forward speed. Where the wheels run ahead of the estimate, they slip."),
-        _figure(biases, f"Biases of the IMU as estimated ({shown.name})."),
+        figure(speeds, "Forward speed. Where the wheels run ahead of the estimate, they slip."),
+        figure(biases, f"Biases of the IMU as estimated ({shown.name})."),
     ]
     if shown.estimate.innovations:
         innovations, _ = plots.plot_innovations(shown.estimate, start)
         parts.append(
-            _figure(
+            figure(
                 innovations,
                 "Normalised innovations: how surprising each measurement was. "
                 "With right weights they scatter around 1; those at the foot are 0.01 or less.",
@@ -277,7 +240,7 @@ def _notes(runs: Sequence[ReportRun]) -> str:
         items += [
             f"{escape(run.name)}: {escape(note)}" for note in dict.fromkeys(notes) if note not in shared
         ]
-    text = _list(items) if items else "<p>Nothing was noted.</p>"
+    text = bullets(items) if items else "<p>Nothing was noted.</p>"
     return f"<h2>Notes of the run</h2>\n{text}"
 
 
@@ -287,16 +250,7 @@ def _provenance(recording: Recording, more: Mapping[str, object]) -> str:
         if getattr(recording, label):
             lines[label] = getattr(recording, label)
     lines |= more
-    lines["versions"] = ", ".join(f"{name} {version}" for name, version in versions().items())
-    pairs = "".join(
-        f"<dt>{escape(str(label))}</dt><dd><code>{escape(str(text))}</code></dd>"
-        for label, text in lines.items()
-    )
-    return f"<h2>Where this comes from</h2>\n<dl>{pairs}</dl>"
-
-
-def _list(items: Iterable[str]) -> str:
-    return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
+    return where_from(lines)
 
 
 def _colours(runs: Sequence[ReportRun]) -> dict[str, str]:
@@ -306,31 +260,3 @@ def _colours(runs: Sequence[ReportRun]) -> dict[str, str]:
         run.name: style.colour_of(mode if modes.count(mode) == 1 else run.name, style.MODE_COLOURS)
         for run, mode in zip(runs, modes, strict=True)
     }
-
-
-def _figure(fig: Figure, caption: str) -> str:
-    """The figure inside the page; the caption serves as its description too."""
-    source = base64.b64encode(_svg(fig)).decode("ascii")
-    text = escape(caption)
-    return (
-        f'<figure><div class="scroll"><img alt="{text}" src="data:image/svg+xml;base64,{source}"></div>'
-        f"<figcaption>{text}</figcaption></figure>"
-    )
-
-
-_PATH_DATA = re.compile(rb' d="[^"]*"')
-_LONG_NUMBER = re.compile(rb"(\.\d\d)\d+")
-
-
-def _svg(fig: Figure) -> bytes:
-    """The figure as SVG, the same bytes each time, with paths to a hundredth of a point."""
-    import matplotlib
-
-    buffer = io.BytesIO()
-    with matplotlib.rc_context({"svg.hashsalt": "terrafusion", "svg.fonttype": "path"}):
-        fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return _PATH_DATA.sub(lambda found: _LONG_NUMBER.sub(rb"\1", found[0]), buffer.getvalue())
-
-
-def _stylesheet() -> str:
-    return (resources.files("terrafusion.fusion") / "report.css").read_text(encoding="utf-8")
