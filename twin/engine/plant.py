@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -69,10 +69,10 @@ class Plant:
     route: RouteTable
     effects: Mapping[str, float] = field(default_factory=dict)
 
-    def effect_names(self) -> tuple[str, ...]:
-        """Names of the optional parameters that are not zero, sorted: they choose the graph."""
-        return tuple(sorted(name for name, value in self.effects.items() if value != 0.0))
+    def effect_names(self, also: Iterable[str] = ()) -> tuple[str, ...]:
+        """Names of the optional parameters that are not zero, and `also`, sorted: they choose the graph."""
+        return tuple(sorted({*also, *(name for name, value in self.effects.items() if value != 0.0)}))
 
-    def effect_values(self) -> Array:
-        """Values (E,) in the order of `effect_names`."""
-        return np.array([self.effects[name] for name in self.effect_names()], dtype=float)
+    def effect_values(self, also: Iterable[str] = ()) -> Array:
+        """Values (E,) in the order of `effect_names(also)`."""
+        return np.array([self.effects.get(name, 0.0) for name in self.effect_names(also)], dtype=float)

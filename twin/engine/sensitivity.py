@@ -1,0 +1,104 @@
+"""Forward sensitivities: the derivatives of a run's states by its start, vehicle, soils and effects.
+
+The tangents S = dx/dtheta follow dS/dt = f_x S + f_theta D, integrated together with the states by the same
+RK4 steps: the result is the exact derivative of the discrete run, up to rounding (Hairer, Norsett and Wanner
+1993, sec. II.6, internal differentiation).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.engine import vm
+from terrafusion.twin.engine.integrate import checked, raise_if_diverged, steps_a_sample
+from terrafusion.twin.engine.plant import Plant
+from terrafusion.twin.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Directions:
+    """M directions in the space of everything a run depends on smoothly.
+
+    Attributes:
+        start: (X, M) change of the initial state.
+        vehicle: (V, M) change of `Plant.vehicle`.
+        soil: (K, S, M) change of the route's soil parameters at its knots; the knots and the field stay.
+        effects: (M,) change of each named optional parameter. A named one is in the graph even where its
+            value is 0.
+    """
+
+    start: Array
+    vehicle: Array
+    soil: Array
+    effects: Mapping[str, Array] = field(default_factory=dict)
+
+    @classmethod
+    def zeros(cls, plant: Plant, count: int, effects: Iterable[str] = ()) -> Directions:
+        """`count` directions that change nothing yet: fill in what each of them changes."""
+        return cls(
+            np.zeros((len(STATES), count)), np.zeros((len(VEHICLE_PARAMETERS), count)),
+            np.zeros((*plant.route.soil.shape, count)), {name: np.zeros(count) for name in effects},
+        )  # fmt: skip
+
+    @property
+    def count(self) -> int:
+        """M."""
+        return int(np.shape(self.start)[1])
+
+
+def integrate_with_sensitivity(
+    x0: Array,
+    inputs: Array,
+    dt_s: float,
+    plant: Plant,
+    directions: Directions,
+    *,
+    t0_s: float = 0.0,
+    backend: str = "auto",
+    substeps: int | None = None,
+) -> tuple[Array, Array]:
+    """States (N + 1, X), as `integrate` gives them, and their derivatives (N + 1, X, M) along M directions.
+
+    The ground's dependence on the travel (borders of a route) and on the pose (a field) is part of the
+    derivative. A field's gradient is that of its bilinear cells: it jumps where a wheel crosses from one cell
+    into the next, and the derivative of such a run is that of the run as computed.
+
+    Args:
+        x0, inputs, dt_s, plant, t0_s, backend, substeps: as for `integrate.integrate`.
+        directions: what changes in each direction.
+
+    Raises:
+        TerrafusionError: the state or a derivative ceased to be finite (the message names the time).
+        ValueError: an array is misshapen.
+    """
+    x0, inputs = checked(x0, inputs)
+    steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
+    effects = plant.effect_names(directions.effects)
+    tangents = _tangents(plant, directions, effects)
+    out = vm.run_with_tangents(x0, inputs, dt_s, plant, t0_s, steps, tangents, effects)
+    raise_if_diverged(out, t0_s, dt_s)
+    nx = len(STATES)
+    return out[:, :nx], out[:, nx:].reshape(len(out), directions.count, nx).transpose(0, 2, 1)
+
+
+def _tangents(plant: Plant, d: Directions, effects: tuple[str, ...]) -> tuple[Array, Array, Array, Array]:
+    """Tangents of start (X, M), vehicle (V, M), route table (K S, M) and effects (E, M)."""
+    count = d.count
+    wanted = {
+        "start": (d.start, (len(STATES), count)),
+        "vehicle": (d.vehicle, (len(VEHICLE_PARAMETERS), count)),
+        "soil": (d.soil, (len(plant.route.at), len(SOIL_PARAMETERS), count)),
+        **{name: (values, (count,)) for name, values in d.effects.items()},
+    }
+    for name, (values, shape) in wanted.items():
+        if np.shape(values) != shape:
+            raise ValueError(f"directions of '{name}' have shape {np.shape(values)}, not {shape}")
+    effect = np.array([d.effects.get(name, np.zeros(count)) for name in effects]).reshape(-1, count)
+    arrays = (d.start, d.vehicle, np.reshape(d.soil, (-1, count)), effect)
+    return tuple(np.ascontiguousarray(a, dtype=float) for a in arrays)  # type: ignore[return-value]
