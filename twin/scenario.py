@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.config import Quantity, checked_number
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Fix
+from terrafusion.twin.ground import Patches, Variation
 from terrafusion.twin.library import known_names, read_named
 
 Array = NDArray[np.float64]
@@ -84,7 +85,8 @@ class Scenario:
     """One drive.
 
     `route_over` is "travel" (legs in metres driven) or "time" (in seconds);
-    grounds join smoothly over `transition` metres or seconds. With `waypoints`
+    grounds join smoothly over `transition` metres or seconds. `variation` and `patches`
+    make the whole plane uneven, another way for each seed (see `ground`). With `waypoints`
     ((x, y) m in the plane from the start, x east on flat ground) the robot steers by
     its true pose at `waypoint_speed_mps` instead of following `drive`.
     `gnss_fix` is the receiver's fix class, None for its best.
@@ -101,6 +103,8 @@ class Scenario:
     route: tuple[RouteLeg, ...] = (RouteLeg("asphalt"),)
     route_over: str = "travel"
     transition: float = 0.3
+    variation: Variation | None = None
+    patches: Patches | None = None
     slope_deg: float = 0.0
     aspect_deg: float = 0.0
     heading_deg: float = 0.0
@@ -175,12 +179,15 @@ _NUMBERS = {
     "transition": Quantity("m or s", 0.01, 100.0),
 }
 _INTERVAL = {"start_s": _SECONDS, "duration_s": _DURATION}
+_LENGTH = Quantity("m", 0.1, 1000.0)
+_VARIATION = {"strength_sigma": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
+_PATCHES = {"share": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
 
 
 def _scenario(raw: dict[str, Any], file: str, stem: str) -> Scenario:
     lists = ("drive", "stops", "waypoints", "route", "gnss_outages")
     words = ("name", "description", "route_over", "gnss_fix")
-    _known(raw, (*_NUMBERS, *lists, *words), file, "")
+    _known(raw, (*_NUMBERS, *lists, *words, "variation", "patches"), file, "")
     values: dict[str, Any] = {
         "name": str(raw.get("name", stem)),
         "description": str(raw.get("description", "")),
@@ -201,6 +208,10 @@ def _scenario(raw: dict[str, Any], file: str, stem: str) -> Scenario:
     values["gnss_fix"] = None if fix == "best" else Fix[fix.upper()]
     if "route" in raw:
         values["route"] = _route(raw, values["route_over"], file)
+    if "variation" in raw:
+        values["variation"] = Variation(**_section(raw, "variation", _VARIATION, file))
+    if "patches" in raw:
+        values["patches"] = Patches(**_section(raw, "patches", _PATCHES, file, "terrain"))
     if not values["drive"] and not points:
         raise ConfigError(
             "the scenario drives nowhere", file=file, remedy="add 'drive' segments or 'waypoints'"
@@ -250,6 +261,23 @@ def _rows(
             {n: checked_number(v, quantities[n], file=file, key=f"{here}.{n}") for n, v in row.items()}
         )
     return out
+
+
+def _section(
+    raw: dict[str, Any], key: str, quantities: dict[str, Quantity], file: str, word: str | None = None
+) -> dict[str, Any]:
+    """A mapping of numbers, and of one `word` where given; every entry is needed."""
+    words = () if word is None else (word,)
+    section = raw[key]
+    _known(section, (*words, *quantities), file, key)
+    for name in (*words, *quantities):
+        if name not in section:
+            raise ConfigError(f"'{key}.{name}' is missing", file=file, remedy="add it")
+    for name in words:
+        if not isinstance(section[name], str):
+            raise ConfigError(f"'{key}.{name}' is '{section[name]}'", file=file, remedy="give a name")
+    numbers = {n: checked_number(section[n], q, file=file, key=f"{key}.{n}") for n, q in quantities.items()}
+    return numbers | {name: section[name] for name in words}
 
 
 def _list(raw: dict[str, Any], key: str, file: str) -> list[Any]:

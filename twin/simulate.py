@@ -19,6 +19,7 @@ from terrafusion.twin import sensors
 from terrafusion.twin.drive import Driven, drive
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.plant import Plant
+from terrafusion.twin.ground import patch_share
 from terrafusion.twin.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
 from terrafusion.twin.motion import Motion, motion_of
 from terrafusion.twin.route import Route
@@ -138,7 +139,7 @@ def simulate_run(
         terrain: ground of the whole route, in place of the scenario's.
         slope_deg: slope of the plane, 0 to 25 deg, in place of the scenario's.
         payload_kg: mass carried at the centre of gravity.
-        seed: of all noise; the motion does not depend on it.
+        seed: of all noise, and of ground that varies; on even ground the motion does not depend on it.
         noiseless: exact sensors (no noise, bias, quantisation, vibration, latency).
         backend: "c", "vm" or "auto", see `integrate.integrate`.
         soils: grounds by name, in place of the library's.
@@ -184,7 +185,7 @@ def set_up(
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect, payload_kg=payload_kg)
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
-    return RunSetup(scenario, vehicle, route, Plant(parameters, route.table()), np.arange(count) / rate)
+    return RunSetup(scenario, vehicle, route, Plant(parameters, route.table(seed)), np.arange(count) / rate)
 
 
 def drive_through(setup: RunSetup, backend: str = "auto") -> Driven:
@@ -213,6 +214,7 @@ def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Nois
     states, rate = driven.states, vehicle.sensors.imu.rate_hz
     t_ns = START_NS + np.round(motion.t_s * 1e9).astype(np.int64)
     along = route.along(motion.t_s, states[:, INDEX["travel"]])
+    patch = patch_share(setup.plant.route.field, states[:, INDEX["x"]], states[:, INDEX["y"]])
     rim = np.abs(states[:, state_slice("wheel_speed")]).mean(axis=1) * vehicle.wheel.radius_m
     named = dict(zip(VEHICLE_PARAMETERS, setup.plant.vehicle.tolist(), strict=True))
     told = sensors.rows_at_rate(len(t_ns), rate, _COMMAND_HZ)
@@ -223,14 +225,14 @@ def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Nois
         vehicle=vehicle.name,
         command=Command(t_ns[told], driven.wanted[told, 0], driven.wanted[told, 1]),
         wheels=sensors.wheels_channel(t_ns, motion, states, vehicle, noise),
-        imu=sensors.imu_channel(t_ns, motion, vehicle, route.shares(along), rim, noise),
+        imu=sensors.imu_channel(t_ns, motion, vehicle, route.shares(along, patch), rim, noise),
         gnss=sensors.gnss_channel(t_ns, motion, vehicle, scenario.gnss_fix, scenario.gnss_outages, noise),
         motor=sensors.motor_channel(t_ns, motion, states, named, vehicle, noise),
-        terrain=Terrain(t_ns[seen], route.labels(along[seen]), source="simulation"),
+        terrain=Terrain(t_ns[seen], route.labels(along[seen], patch[seen]), source="simulation"),
         truth=_truth(t_ns, motion),
         datum=DATUM,
         truth_channels=("position", "yaw", "orientation", "velocity"),
-        terrain_name=route.soils[0].name if len(route.soils) == 1 else "mixed",
+        terrain_name=route.soils[0].name if len(route.soils) == 1 and not patch.any() else "mixed",
         source="terrafusion twin",
     )
 
@@ -242,7 +244,8 @@ def _truth(t_ns: NDArray[np.int64], motion: Motion) -> Trajectory:
 
 
 def _description(scenario: Scenario, payload_kg: float, seed: int, noiseless: bool) -> str:
-    grounds = ", ".join(dict.fromkeys(leg.terrain for leg in scenario.route))
+    patches = [scenario.patches.terrain] if scenario.patches else []
+    grounds = ", ".join(dict.fromkeys([*(leg.terrain for leg in scenario.route), *patches]))
     extras = "exact sensors" if noiseless else f"seed {seed}"
     return (
         f"simulated: {scenario.description or scenario.name}; {grounds}; slope {scenario.slope_deg:g} deg; "
