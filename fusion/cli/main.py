@@ -12,7 +12,7 @@ import sys
 import typer
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.fusion.cli import convert, demo, fetch, inspect, policy, replay, simulate, terrain
+from terrafusion.fusion.cli import convert, demo, fetch, inspect, policy, replay, simulate, sweep, terrain
 
 app = typer.Typer(
     name="terrafusion",
@@ -26,6 +26,7 @@ app.command("inspect")(inspect.inspect)
 app.command("fetch")(fetch.fetch)
 app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
+app.command("sweep")(sweep.sweep)
 app.command("replay")(replay.replay)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")

@@ -175,7 +175,7 @@ def _whole(raw: dict[str, Any], key: str, low: int, high: int, file: str, prefix
     number = checked_number(raw[key], Quantity("", low, high), file=file, key=prefix + key)
     if int(number) != number:  # type: ignore[arg-type]
         raise ConfigError(f"'{prefix}{key}' is {number:g}", file=file, remedy="give a whole number")
-    return int(number)  # type: ignore[arg-type]
+    return int(number)
 
 
 def _flag(raw: dict[str, Any], key: str, file: str) -> bool:

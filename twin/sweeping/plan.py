@@ -7,6 +7,7 @@ fastest; a random sweep is a Latin hypercube of so many runs instead.
 from __future__ import annotations
 
 import dataclasses
+import enum
 import functools
 import hashlib
 import json
@@ -14,6 +15,7 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata, resources
+from typing import Any
 
 import numpy as np
 
@@ -25,6 +27,13 @@ AXES = ("terrain", "friction", "slope_deg", "payload_kg", "speed_scale", "speed_
 """Names of the axes, in the order of the cross product; `speed_scale` and `speed_mps` exclude each other."""
 MAX_RUNS = 100_000
 """A sweep of more runs is refused unless it is asked for."""
+
+CHUNK_S = 4000.0
+"""Driving in a chunk, s: some seconds of work, lost when a process is killed."""
+MIN_CHUNKS = 32
+"""A sweep is cut into so many chunks at least, so that many workers have something to do."""
+CHUNK_STEP = 8
+"""Chunks hold a multiple of so many runs, which a vector unit may drive side by side."""
 
 Level = str | float | int
 
@@ -98,17 +107,33 @@ class Sweep:
             shape = tuple(len(axis.levels) for axis in self.axes)
             for run, place in enumerate(np.ndindex(shape)):
                 values = {a.name: a.levels[i] for a, i in zip(self.axes, place, strict=True)}
-                yield Case(run, **values)  # type: ignore[arg-type]
+                yield Case(run, **values)
         else:
             for run, shares in enumerate(_hypercube(self.random, len(self.axes), self.random_seed)):
                 values = {a.name: a.at(s) for a, s in zip(self.axes, shares, strict=True)}
-                yield Case(run, **values)  # type: ignore[arg-type]
+                yield Case(run, **values)
+
+    def speed_scale(self, case: Case) -> float:
+        """Commanded speeds of a run over the scenario's."""
+        if case.speed_mps is not None:
+            return case.speed_mps / top_speed_mps(self.scenario)
+        return 1.0 if case.speed_scale is None else case.speed_scale
+
+    def chunks(self) -> list[range]:
+        """Runs that are computed together, whatever the number of workers: the rows hang on nothing else."""
+        most = int(CHUNK_S / self.scenario.duration_s)
+        size = max(1, min(most, self.runs // MIN_CHUNKS) // CHUNK_STEP) * CHUNK_STEP
+        return [range(i, min(i + size, self.runs)) for i in range(0, self.runs, size)]
+
+    def config(self) -> dict[str, Any]:
+        """The sweep as plain data that JSON can hold."""
+        return dict(_plain(dataclasses.asdict(self)))
 
     def sha256(self) -> str:
         """Hash of all that decides the rows: axes, scenario, vehicle, soils, version and the twin's code."""
-        content = dataclasses.asdict(self) | {"terrafusion": version(), "model": model_sha256()}
+        content = self.config() | {"terrafusion": version(), "model": model_sha256()}
         del content["name"], content["description"]
-        text = json.dumps(content, sort_keys=True, default=str, allow_nan=False)
+        text = json.dumps(content, sort_keys=True, allow_nan=False)
         return hashlib.sha256(text.encode()).hexdigest()
 
     def design(self) -> str:
@@ -167,6 +192,19 @@ def at_speed(scenario: Scenario, scale: float) -> Scenario:
         for s in scenario.drive
     )
     return dataclasses.replace(scenario, drive=drive, waypoint_speed_mps=scale * scenario.waypoint_speed_mps)
+
+
+def _plain(value: Any) -> Any:
+    """The same value for JSON: enumerations by name, numbers that are not finite as words."""
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(value)
+    return value
 
 
 def _hypercube(runs: int, axes: int, seed: int) -> list[list[float]]:

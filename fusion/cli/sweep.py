@@ -1,0 +1,103 @@
+"""`terrafusion sweep`: many runs of the twin on one machine or a Dask cluster, as one table."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from terrafusion.fusion.cli.common import progress_bar
+
+if TYPE_CHECKING:
+    from terrafusion.twin.sweep import Sweep
+
+RecordingsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="N|all", help="Also write run N, or all, with its sensors as a log; repeat for more."
+    ),
+]
+
+
+def sweep(
+    sweep: Annotated[str, typer.Argument(help="Name of a built-in sweep, or a YAML file.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the results; an unfinished one goes on.")],
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes on this machine; by default one a processor.")
+    ] = None,
+    backend: Annotated[str, typer.Option(help="loky: this machine; dask: a cluster.")] = "loky",
+    address: Annotated[
+        str | None, typer.Option(metavar="tcp://HOST:PORT", help="The Dask cluster's scheduler.")
+    ] = None,
+    max_runs: Annotated[int, typer.Option(min=1, help="Refuse a sweep of more runs.")] = 100_000,
+    plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html and plots.")] = True,
+    recordings: RecordingsOption = None,
+    recordings_format: Annotated[str, typer.Option(help="folder: log folders; mcap: ROS 2 bags.")] = "folder",
+) -> None:
+    """Run a scenario over friction, terrain, slope, payload, speed and seeds.
+
+    Writes runs.parquet (a row a run), sweep.json, report.html and plots. A sweep that was stopped
+    continues with the same command. Built-in sweeps: friction_slope, payload_energy, random_ground,
+    sensors_by_ground.
+
+    Example: terrafusion sweep friction_slope --out results --jobs 2
+    """
+    from terrafusion.twin.sweep import check_runs, load_sweep, run_sweep, write_recordings
+
+    if backend not in ("loky", "dask"):
+        raise typer.BadParameter(f"'{backend}' is neither 'loky' nor 'dask'", param_hint="--backend")
+    if (address is not None) != (backend == "dask"):
+        raise typer.BadParameter("goes with --backend dask, which needs it", param_hint="--address")
+    if recordings_format not in ("folder", "mcap"):
+        raise typer.BadParameter(
+            f"'{recordings_format}' is neither 'folder' nor 'mcap'", param_hint="--recordings-format"
+        )
+    plan = load_sweep(sweep)
+    chosen = _numbers(recordings or [], plan)
+    check_runs(plan, chosen)
+    count = jobs if jobs is not None else _processors()
+    print(f"{plan.name}: {plan.design()}", flush=True)
+    with progress_bar(f"sweep {plan.name}") as progress:
+        table = run_sweep(
+            plan, out, jobs=count, backend=backend, address=address, max_runs=max_runs, progress=progress
+        )
+    failures = []
+    if chosen:
+        with progress_bar("recordings") as progress:
+            failures = write_recordings(
+                plan, chosen, out / "recordings", form=recordings_format, jobs=count, progress=progress
+            )
+    if plots:
+        from terrafusion.fusion.sweep_report import write_sweep_report
+
+        write_sweep_report(out, plan, table, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
+    for line in [*summary_lines(table.column("status").to_pylist()), *failures]:
+        print(line)
+    print(f"written to {out}")
+
+
+def summary_lines(statuses: Sequence[str]) -> list[str]:
+    """How the runs ended, in a line."""
+    from terrafusion.twin.sweeping.rows import STATUSES
+
+    told = [f"{statuses.count(word)} {word}" for word in STATUSES if word in statuses]
+    return [f"{len(statuses)} runs: {', '.join(told)}"]
+
+
+def _numbers(entries: list[str], plan: Sweep) -> list[int]:
+    """Numbers of the runs to record."""
+    if "all" in entries:
+        return list(range(plan.runs))
+    for entry in entries:
+        if not entry.isdecimal():
+            raise typer.BadParameter(f"'{entry}' is neither a number nor 'all'", param_hint="--recordings")
+    return sorted({int(entry) for entry in entries})
+
+
+def _processors() -> int:
+    import joblib
+
+    return int(joblib.cpu_count())

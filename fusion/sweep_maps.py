@@ -1,0 +1,109 @@
+"""What the plots of a sweep show, as numbers: its runs gathered in cells of two axes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Columns = Mapping[str, NDArray[Any]]
+"""The table of a sweep by column, (N,) each; NaN where a number is null."""
+
+NUMERIC_AXES = ("friction", "slope_deg", "payload_kg", "speed_mps", "seed")
+MAX_LEVELS = 40
+"""An axis with more distinct values, as in a random sweep, is cut into `BINS` bins."""
+BINS = 12
+
+
+def columns_of(table: Any) -> dict[str, NDArray[Any]]:
+    """The columns of a pyarrow `Table`: texts as objects, numbers as floats with NaN for null."""
+    out: dict[str, NDArray[Any]] = {}
+    for name in table.column_names:
+        values = table.column(name).to_pylist()
+        is_text = str(table.schema.field(name).type) == "string"
+        out[name] = np.array(values, dtype=object if is_text else float)
+    return out
+
+
+def select(columns: Columns, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]:
+    """The rows (N,) that are True."""
+    return {name: values[rows] for name, values in columns.items()}
+
+
+def varied(columns: Columns) -> list[str]:
+    """Numeric axes with more than one value, but for seeds."""
+    names = [name for name in NUMERIC_AXES if name != "seed"]
+    return [name for name in names if len(levels(columns[name])) > 1]
+
+
+def plane_of(columns: Columns) -> tuple[str, str] | None:
+    """The two axes of the maps: friction and slope where both vary, else those with most levels."""
+    names = varied(columns)
+    if "friction" in names and "slope_deg" in names:
+        return "friction", "slope_deg"
+    names = sorted(names, key=lambda name: -len(levels(columns[name])))
+    return (names[0], names[1]) if len(names) > 1 else None
+
+
+def levels(values: Array) -> Array:
+    """Distinct values, sorted, without NaN."""
+    return np.unique(values[np.isfinite(values)])
+
+
+@dataclass(frozen=True, eq=False)
+class CellAxis:
+    """Cells of one axis: centres (n,), edges (n + 1,)."""
+
+    centres: Array
+    edges: Array
+
+    @classmethod
+    def of(cls, values: Array) -> CellAxis:
+        """One cell a level where there are few; equal bins otherwise."""
+        found = levels(values)
+        if len(found) > MAX_LEVELS:
+            edges = np.linspace(found[0], found[-1], BINS + 1)
+            return cls(0.5 * (edges[1:] + edges[:-1]), edges)
+        middle = 0.5 * (found[1:] + found[:-1])
+        first = found[0] - (middle[0] - found[0] if len(middle) else 0.5)
+        last = found[-1] + (found[-1] - middle[-1] if len(middle) else 0.5)
+        return cls(found, np.concatenate([[first], middle, [last]]))
+
+    def cells(self, values: Array) -> NDArray[np.int64]:
+        """Number of the cell (N,) of each value; -1 for NaN."""
+        found = np.clip(np.searchsorted(self.edges, values, side="right") - 1, 0, len(self.centres) - 1)
+        return np.where(np.isfinite(values), found, -1)
+
+
+def in_cells(columns: Columns, name: str, x: CellAxis, y: CellAxis, plane: tuple[str, str]) -> Array:
+    """Median (rows of y, columns of x) of a column's finite values in each cell; NaN where there is none."""
+    column, row = x.cells(columns[plane[0]]), y.cells(columns[plane[1]])
+    values = columns[name]
+    out = np.full((len(y.centres), len(x.centres)), np.nan)
+    good = np.isfinite(values) & (column >= 0) & (row >= 0)
+    cell = row * len(x.centres) + column
+    for number in np.unique(cell[good]):
+        out.flat[number] = np.median(values[good & (cell == number)])
+    return out
+
+
+def mobile(columns: Columns) -> Array:
+    """1 for a run (N,) that got on, 0 for one that did not, NaN for one that failed."""
+    status = columns["status"]
+    return np.where(status == "failed", np.nan, np.where(status == "done", 1.0, 0.0))
+
+
+def share_mobile(columns: Columns, x: CellAxis, y: CellAxis, plane: tuple[str, str]) -> Array:
+    """Share (rows of y, columns of x) of the runs in each cell that got on; NaN where there is none."""
+    column, row = x.cells(columns[plane[0]]), y.cells(columns[plane[1]])
+    got_on = mobile(columns)
+    good = np.isfinite(got_on) & (column >= 0) & (row >= 0)
+    shape = (len(y.centres), len(x.centres))
+    total, of_those = np.zeros(shape), np.zeros(shape)
+    np.add.at(total, (row[good], column[good]), 1.0)
+    np.add.at(of_those, (row[good], column[good]), got_on[good])
+    return np.divide(of_those, total, out=np.full(shape, np.nan), where=total > 0.0)

@@ -1,0 +1,212 @@
+"""Where chunks of runs are computed: in this process, in processes of this machine, or on a Dask cluster.
+
+joblib's loky and a Dask client both offer the executor of `concurrent.futures`,
+so that all backends run the same code. (joblib's own Dask backend has no word
+for a cluster that lost its workers; the client has.)
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import platform
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any, TypeVar
+
+from terrafusion.datasets.errors import ConfigError, TerrafusionError
+from terrafusion.twin.sweeping.plan import model_sha256, version
+
+T = TypeVar("T")
+
+BACKENDS = ("loky", "dask")
+CONNECT_S = 8.0
+"""A scheduler or its first worker that has not answered by then is told as missing."""
+WORKERLESS_S = 10.0
+"""A cluster without any worker for so long is given up."""
+_POLL_S = 1.0
+_CONTINUE = "finished runs are kept, and the same command continues"
+
+
+@dataclass(frozen=True)
+class Pool:
+    """An executor (None: this process) and a check that raises when its workers are gone for good."""
+
+    executor: Executor | None
+    check: Callable[[], None] = lambda: None
+
+    def results(self, function: Callable[..., T], jobs: Iterable[tuple[Any, ...]]) -> Iterator[T]:
+        """`function(*job)` of every job, in the order in which they finish.
+
+        Raises:
+            TerrafusionError: workers died or the connection was lost.
+        """
+        if self.executor is None:
+            for job in jobs:
+                yield function(*job)
+            return
+        waiting: set[Future[T]] = {self.executor.submit(function, *job) for job in jobs}
+        try:
+            while waiting:
+                done, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+                for future in done:
+                    yield _result(future)
+                if not done:
+                    self.check()
+        finally:
+            for future in waiting:
+                future.cancel()
+
+
+@contextlib.contextmanager
+def open_pool(backend: str, jobs: int, address: str | None = None) -> Iterator[Pool]:
+    """A pool of `jobs` processes on this machine, or of the workers of the Dask scheduler at `address`.
+
+    Raises:
+        ConfigError: unknown backend, no jobs, or an address missing or out of place.
+        TerrafusionError: the package is not installed; nobody answers at the address; or the
+            workers run another version of this library.
+    """
+    if backend not in BACKENDS:
+        raise ConfigError(f"unknown backend '{backend}'", remedy=f"known are {', '.join(BACKENDS)}")
+    if jobs < 1:
+        raise ConfigError(f"{jobs} jobs", remedy="give a whole number from 1")
+    if (address is not None) != (backend == "dask"):
+        raise ConfigError(
+            "the backend 'dask' needs an address, and no other has one",
+            remedy="give the scheduler's address, such as tcp://10.0.0.5:8786",
+        )
+    if address is not None:
+        with _dask(address) as pool:
+            yield pool
+    elif jobs == 1:
+        yield Pool(None)
+    else:
+        with _loky(jobs) as executor:
+            yield Pool(executor)
+
+
+def _result(future: Future[T]) -> T:
+    try:
+        return future.result()
+    except CancelledError:
+        raise TerrafusionError("the connection to the cluster was lost", remedy=_CONTINUE) from None
+    except BrokenExecutor as error:
+        raise TerrafusionError(
+            f"a worker process died ({_first_line(error)})",
+            remedy=f"it may have run out of memory: give fewer --jobs; {_CONTINUE}",
+        ) from None
+    except Exception as error:
+        if type(error).__name__ != "KilledWorker":  # of distributed, which need not be installed
+            raise
+        raise TerrafusionError(
+            "the cluster's workers died again and again over the same runs",
+            remedy=f"look into their logs (memory?); {_CONTINUE}",
+        ) from None
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+
+
+@contextlib.contextmanager
+def _loky(jobs: int) -> Iterator[Executor]:
+    from joblib.externals.loky import get_reusable_executor
+
+    # The arrays are small: threads of the linear algebra would only fight over the processors.
+    threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    executor = get_reusable_executor(max_workers=jobs, reuse=False, env=threads)
+    try:
+        yield executor
+    finally:
+        executor.shutdown(wait=True, kill_workers=True)
+
+
+@contextlib.contextmanager
+def _dask(address: str) -> Iterator[Pool]:
+    try:
+        from distributed import Client
+    except ImportError:
+        raise TerrafusionError(
+            "the package distributed is not installed", remedy="pip install 'terrafusion[cluster]'"
+        ) from None
+    with _quiet("distributed"), contextlib.ExitStack() as stack:
+        try:
+            client = stack.enter_context(Client(address, timeout=CONNECT_S, set_as_default=False))
+        except (OSError, ValueError, TypeError) as error:
+            raise TerrafusionError(
+                f"no Dask scheduler answers ({_first_line(error)})",
+                file=address,
+                remedy="start one with `dask scheduler` and give the address it prints",
+            ) from None
+        _check_workers(client, address)
+        yield Pool(client.get_executor(pure=False), _Watch(client, address))
+
+
+@contextlib.contextmanager
+def _quiet(name: str) -> Iterator[None]:
+    """Keep the log of a package off the terminal: what matters in it is raised as an error."""
+    logger = logging.getLogger(name)
+    before = logger.level
+    logger.setLevel(logging.CRITICAL + 1)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+
+
+def installed() -> dict[str, str]:
+    """What must be the same on all machines of a sweep."""
+    found = {"Python": ".".join(platform.python_version_tuple()[:2])}
+    for name in ("numpy", "scipy", "casadi"):
+        found[name] = metadata.version(name)
+    return found | {"terrafusion": version(), "the twin's sources": model_sha256()[:12]}
+
+
+def _check_workers(client: Any, address: str) -> None:
+    """Refuse a cluster without workers, or with workers that would compute something else."""
+    try:
+        client.wait_for_workers(1, timeout=CONNECT_S)
+    except TimeoutError:
+        raise TerrafusionError(
+            "the Dask scheduler has no worker", file=address, remedy=f"start some: `dask worker {address}`"
+        ) from None
+    own = installed()
+    for worker, found in client.run(installed, on_error="return").items():
+        if not isinstance(found, dict):
+            raise TerrafusionError(
+                f"the worker {worker} cannot run the twin ({_first_line(found)})",
+                file=address,
+                remedy="install the same terrafusion there",
+            )
+        for name, mine in own.items():
+            if found[name] != mine:
+                raise TerrafusionError(
+                    f"the worker {worker} has {name} {found[name]}, here it is {mine}",
+                    file=address,
+                    remedy="install the same versions on all machines",
+                )
+
+
+class _Watch:
+    """Raises when the cluster has had no worker for `WORKERLESS_S`, or the scheduler is gone."""
+
+    def __init__(self, client: Any, address: str) -> None:
+        self.client, self.address, self.seen_s = client, address, time.monotonic()
+
+    def __call__(self) -> None:
+        alive = False
+        with contextlib.suppress(OSError):
+            alive = self.client.status == "running" and bool(self.client.scheduler_info()["workers"])
+        now = time.monotonic()
+        if alive:
+            self.seen_s = now
+        elif now - self.seen_s > WORKERLESS_S:
+            raise TerrafusionError(
+                "the cluster has no workers any more",
+                file=self.address,
+                remedy=f"start some: `dask worker {self.address}`; {_CONTINUE}",
+            )

@@ -1,0 +1,204 @@
+"""The runs of a sweep as rows of its table."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.recording import Recording
+from terrafusion.twin.engine.integrate import compiled
+from terrafusion.twin.layout import INDEX, state_slice
+from terrafusion.twin.simulate import (
+    RunSetup,
+    RunSummary,
+    drive_through,
+    set_up,
+    simulate_run,
+    slip_ratios,
+    summarise,
+)
+from terrafusion.twin.soil import SoilParams
+from terrafusion.twin.sweeping.plan import Case, Sweep, at_speed, top_speed_mps
+from terrafusion.twin.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+Row = dict[str, str | float | int | None]
+
+DONE, SPINNING, IMMOBILISED, SLID, FAILED = "done", "spinning", "immobilised", "slid", "failed"
+STATUSES = (DONE, SPINNING, IMMOBILISED, SLID, FAILED)
+"""How a run ended: it drove on; its wheels turned, but it made less than a tenth of its way; it came
+to rest for good; it ended behind its start, as on too steep a slope; it could not be computed."""
+MOBILE_RATIO = 0.1
+"""A robot that makes less than this share of its commanded way spins (assumed; the share falls
+from about a half to a twentieth within one step of friction or slope)."""
+MIN_COMMANDED_M = 0.5
+"""A drive that is told to cover less has no travel ratio."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table: "int", "float" or "text", and what it holds."""
+
+    name: str
+    kind: str
+    about: str
+
+
+_AXES = (
+    Column("run", "int", "number of the run, from 0"),
+    Column("terrain", "text", "ground, or the grounds of the route"),
+    Column("friction", "float", "effective friction cap; null where the route's grounds differ in it"),
+    Column("slope_deg", "float", "slope of the plane, deg"),
+    Column("payload_kg", "float", "payload at the centre of gravity, kg"),
+    Column("speed_scale", "float", "commanded speeds over the scenario's"),
+    Column("speed_mps", "float", "fastest forward speed commanded, m/s"),
+    Column("seed", "int", "seed of the sensors' noise"),
+)
+_RESULTS = (
+    Column("status", "text", f"one of {', '.join(STATUSES)}"),
+    Column("duration_s", "float", "length of the run, s"),
+    Column("distance_m", "float", "length of the path of the body origin, m"),
+    Column("travel_m", "float", "net way forward, m"),
+    Column("travel_ratio", "float", "net way forward over the way commanded; null where none is"),
+    Column("mean_abs_slip", "float", "mean |1 - v_odom / v_truth| while moving; null if it never moved"),
+    Column("mean_slip_ratio", "float", "mean |w R - u| / max(|w R|, |u|) while moving; null likewise"),
+    Column("energy_j", "float", "energy drawn from the battery, J"),
+    Column("energy_per_m_j", "float", "energy over distance, J/m; null below 0.1 m"),
+    Column("mean_power_w", "float", "energy over duration, W"),
+    Column("motor_work_j", "float", "work of the motors at the wheels, J"),
+    Column("immobilised_at_s", "float", "when the robot came to rest for good, s; null if it did not"),
+    Column("yaw_error_rad", "float", "heading turned by the wheels' odometry less the true one, at the end"),
+)
+_SENSORS = (
+    Column("odometry_error_pct", "float", "mean speed error of the odometry, % of the true speed"),
+    Column("imu_error_pct", "float", "mean speed error of the integrated IMU, %"),
+    Column("gnss_error_pct", "float", "mean speed error of the differenced GNSS positions, %"),
+)
+_ERROR = Column("error", "text", "why the run failed; null if it did not")
+
+
+def columns(sensors: bool) -> tuple[Column, ...]:
+    """The columns of a table with or without sensors."""
+    return (*_AXES, *_RESULTS, *(_SENSORS if sensors else ()), _ERROR)
+
+
+_BUILDING = threading.Lock()
+
+
+def run_chunk(sweep: Sweep, cases: Sequence[Case]) -> list[Row]:
+    """The rows of some runs, in their order. A run that fails is a row that says why."""
+    with _BUILDING:  # a Dask worker may have several threads, and CasADi builds graphs in one
+        compiled()
+    return [_row(sweep, case) for case in cases]
+
+
+def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
+    """The arguments of `simulate_run` for a run of the sweep."""
+    soils = dict(sweep.soils)
+    if case.friction is not None:
+        soils = {name: _capped(soil, case.friction) for name, soil in soils.items()}
+    return {
+        "scenario": at_speed(sweep.scenario, sweep.speed_scale(case)),
+        "vehicle": sweep.vehicle,
+        "terrain": case.terrain,
+        "slope_deg": case.slope_deg,
+        "payload_kg": case.payload_kg,
+        "seed": case.seed,
+        "soils": soils,
+    }
+
+
+def _capped(soil: SoilParams, friction: float) -> SoilParams:
+    return dataclasses.replace(soil, shear=dataclasses.replace(soil.shear, friction_cap=friction))
+
+
+def _row(sweep: Sweep, case: Case) -> Row:
+    row: Row = dict.fromkeys(column.name for column in columns(sweep.sensors))
+    row |= _axes(sweep, case)
+    try:
+        if sweep.sensors:
+            run = simulate_run(**arguments(sweep, case))
+            row |= _results(run.t_s, run.states, run.wanted, run.summary, sweep.vehicle)
+            row |= _sensor_errors(run.recording, sweep.vehicle)
+        else:
+            row |= results(set_up(**arguments(sweep, case)))
+    except Exception as error:  # whatever goes wrong in one run, the others are worth having
+        told = error if isinstance(error, TerrafusionError) else f"{type(error).__name__}: {error}"
+        row |= {"status": FAILED, "error": str(told)}
+    return {name: _plain(value) for name, value in row.items()}
+
+
+def _axes(sweep: Sweep, case: Case) -> Row:
+    """The conditions of a run, those that no axis names among them."""
+    legs = [case.terrain] if case.terrain is not None else [leg.terrain for leg in sweep.scenario.route]
+    soils = dict(sweep.soils)
+    caps = {soils[name].shear.friction_cap for name in legs} if case.friction is None else {case.friction}
+    scale = sweep.speed_scale(case)
+    return {
+        "run": case.run,
+        "terrain": " + ".join(dict.fromkeys(legs)),
+        "friction": caps.pop() if len(caps) == 1 else None,
+        "slope_deg": sweep.scenario.slope_deg if case.slope_deg is None else case.slope_deg,
+        "payload_kg": case.payload_kg,
+        "speed_scale": scale,
+        "speed_mps": scale * top_speed_mps(sweep.scenario),
+        "seed": case.seed,
+    }
+
+
+def results(setup: RunSetup) -> Row:
+    """What comes of driving a run without sensors."""
+    driven = drive_through(setup)
+    motion = setup.motion(driven.states)
+    slip = slip_ratios(driven.states, motion, setup.vehicle)
+    summary = summarise(driven, motion, setup.vehicle, slip)
+    return _results(setup.t_s, driven.states, driven.wanted, summary, setup.vehicle)
+
+
+def _results(t_s: Array, states: Array, wanted: Array, summary: RunSummary, vehicle: VehicleParams) -> Row:
+    travel = float(states[-1, INDEX["travel"]])
+    commanded = float(np.sum(wanted[:, 0])) * float(t_s[1] - t_s[0])
+    ratio = travel / commanded if abs(commanded) >= MIN_COMMANDED_M else None
+    status = DONE
+    if summary.immobilised_at_s is not None:
+        status = IMMOBILISED
+    elif ratio is not None and ratio < MOBILE_RATIO:
+        status = SLID if ratio < 0.0 else SPINNING
+    return dataclasses.asdict(summary) | {
+        "status": status,
+        "travel_m": travel,
+        "travel_ratio": ratio,
+        "mean_power_w": summary.energy_j / summary.duration_s,
+        "yaw_error_rad": _odometry_yaw(states, vehicle)
+        - float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]]),
+    }
+
+
+def _odometry_yaw(states: Array, vehicle: VehicleParams) -> float:
+    """Angle the robot turned by its wheels' angles, rad."""
+    left, right = (states[-1] - states[0])[state_slice("wheel_angle")].reshape(2, 2).mean(axis=0)
+    return float(right - left) * vehicle.odometry.wheel_radius_m / vehicle.odometry.track_m
+
+
+def _sensor_errors(recording: Recording, vehicle: VehicleParams) -> Row:
+    from terrafusion.twin.study.processing import profiles_of, speed_errors
+
+    errors = speed_errors(profiles_of(recording, vehicle.odometry.wheel_radius_m))
+    return {
+        "odometry_error_pct": errors.odometry,
+        "imu_error_pct": errors.imu,
+        "gnss_error_pct": errors.gnss,
+    }
+
+
+def _plain(value: Any) -> Any:
+    """None for a number that is not finite: the table has no NaN."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
