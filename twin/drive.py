@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.layout import INDEX, INPUTS, STATES, state_slice
+from terrafusion.twin.layout import ENERGIES, INDEX, INPUTS, STATES, state_slice
 from terrafusion.twin.scenario import Scenario
 from terrafusion.twin.vehicle import VehicleParams
 
@@ -44,7 +44,8 @@ def limit_slew(wanted: Array, dt_s: float, vehicle: VehicleParams, scenario: Sce
     for column, (goal, step) in enumerate(zip((goal_v, wanted[:, 1]), steps, strict=True)):
         now, row = float(start[column]), []
         for target in goal.tolist():
-            now += min(max(target - now, -step), step)
+            missing = target - now
+            now = target if -step <= missing <= step else now + (step if missing > 0.0 else -step)
             row.append(now)
         out[:, column] = row
     return out
@@ -78,7 +79,7 @@ def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
     x0[INDEX["yaw"]] = heading
     count = max(1, round(SETTLE_S / dt_s))
     x = integrate(x0, np.zeros((count + 1, len(INPUTS))), -SETTLE_S)[-1].copy()
-    for name in ("x", "y", "travel", "clog", "motor_work", "electric_energy"):
+    for name in ("x", "y", "travel", "clog", *ENERGIES):
         x[INDEX[name]] = 0.0
     x[state_slice("wheel_angle")] = 0.0
     x[INDEX["yaw"]] = heading

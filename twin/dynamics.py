@@ -12,7 +12,7 @@ import functools
 from typing import Any
 
 from terrafusion.twin.layout import INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
-from terrafusion.twin.motors import motor_current, motor_torque, motor_voltage
+from terrafusion.twin.motors import battery, drawn_power, motor_torque
 
 
 def wheel_positions(p: dict[str, Any]) -> list[tuple[Any, Any]]:
@@ -62,7 +62,7 @@ def rhs(effects: tuple[str, ...] = ()) -> Any:
 def _derivative(x: Any, u: Any, pv: Any, ps: Any) -> Any:
     import casadi as ca
 
-    from terrafusion.twin.wheel import Ground, clog_rate, contact, smooth_max
+    from terrafusion.twin.wheel import Ground, clog_rate, contact
 
     p = {name: pv[i] for i, name in enumerate(VEHICLE_PARAMETERS)}
     s = {name: x[i] for i, name in enumerate(STATES)}
@@ -75,19 +75,22 @@ def _derivative(x: Any, u: Any, pv: Any, ps: Any) -> Any:
     left, right = u[0] - late * u[2], u[1] - late * u[3]
     commands = (left, right, left, right)
     loads = wheel_loads(p, gravity_x, gravity_y)
+    power = sum(drawn_power(p, s[f"torque_{name}"], s[f"wheel_speed_{name}"]) for name in WHEELS)
+    supply, d["electric_energy"] = battery(p, power, s["electric_energy"])
     for i, name in enumerate(WHEELS):
         load, (px, py), command = loads[i], wheel_positions(p)[i], commands[i]
         ground = Ground(*(ps[k, i] for k in range(len(SOIL_PARAMETERS))))
         speed, torque = s[f"wheel_speed_{name}"], s[f"torque_{name}"]
-        rim = speed * p["radius_m"]
+        rim, hub = speed * p["radius_m"], (s["u"] - s["r"] * py, s["v"] + s["r"] * px)
         c = contact(
-            ground, load, rim, (s["u"] - s["r"] * py, s["v"] + s["r"] * px),
-            (s[f"shear_x_{name}"], s[f"shear_y_{name}"]), s[f"brake_{name}"], s["clog"],
-            p["radius_m"], p["width_m"],
+            ground, load, rim, hub, (s[f"shear_x_{name}"], s[f"shear_y_{name}"]), s[f"brake_{name}"],
+            s["clog"], p["radius_m"], p["width_m"],
         )  # fmt: skip
         force_x, force_y = force_x + c.force_x_n, force_y + c.force_y_n
         moment = moment + px * c.force_y_n - py * c.force_x_n
-        wanted, d[f"speed_error_{name}"] = motor_torque(p, speed, command - speed, s[f"speed_error_{name}"])
+        wanted, d[f"speed_error_{name}"] = motor_torque(
+            p, speed, command - speed, s[f"speed_error_{name}"], supply / p["supply_v"]
+        )
         d[f"wheel_speed_{name}"] = (torque - c.traction_x_n * p["radius_m"] - c.drag_torque_nm) / p[
             "wheel_inertia_kgm2"
         ]
@@ -96,11 +99,13 @@ def _derivative(x: Any, u: Any, pv: Any, ps: Any) -> Any:
         d[f"torque_{name}"] = (wanted - torque) / p["lag_s"]
         d[f"wheel_angle_{name}"] = speed
         d["clog"] = d["clog"] + 0.25 * clog_rate(ground, s["clog"], rim, c.slip)
-        current = motor_current(p, torque, speed)
         d["motor_work"] = d["motor_work"] + torque * speed
-        # A bridge without recovery: power never flows back to the battery.
-        power = motor_voltage(p, current, speed) * current
-        d["electric_energy"] = d["electric_energy"] + smooth_max(power, 0.0, 1e-3)
+        slipping = c.traction_x_n * (rim - hub[0]) - c.traction_y_n * hub[1]
+        arriving = (
+            c.traction_x_n * rim + c.drag_torque_nm * speed - c.force_x_n * hub[0] - c.force_y_n * hub[1]
+        )
+        d["slip_work"] = d["slip_work"] + slipping
+        d["resistance_work"] = d["resistance_work"] + arriving - slipping
     d["u"] = force_x / p["mass_kg"] + gravity_x + s["r"] * s["v"]
     d["v"] = force_y / p["mass_kg"] + gravity_y - s["r"] * s["u"]
     d["r"] = moment / p["yaw_inertia_kgm2"]

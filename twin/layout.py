@@ -12,12 +12,15 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.twin.soil import SoilParams
-from terrafusion.twin.vehicle import VehicleParams
+from terrafusion.twin.vehicle import Battery, VehicleParams, with_payload
 
 Array = NDArray[np.float64]
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheels in every array."""
+
+ENERGIES = ("motor_work", "electric_energy", "slip_work", "resistance_work")
+"""States that sum up energies, J, and drive nothing but the battery's charge."""
 
 STATES = (
     "x", "y", "yaw", "u", "v", "r",
@@ -28,12 +31,15 @@ STATES = (
     *(f"speed_error_{w}" for w in WHEELS),
     *(f"brake_{w}" for w in WHEELS),
     *(f"wheel_angle_{w}" for w in WHEELS),
-    "clog", "travel", "motor_work", "electric_energy",
+    "clog", "travel", *ENERGIES,
 )  # fmt: skip
 """State names: m, rad, m/s, rad/s, N m (`torque`, at the wheel), rad (`speed_error`, integrated), J.
 
 `shear_x`, `shear_y` and `brake` are displacements of the soil and of the rim's
 friction bristle (m), `travel` the path driven forward (m), `clog` from 0 to 1.
+Energies are sums from the start: `motor_work` at the wheels, `electric_energy` taken from the
+battery's store, `slip_work` spent in the slip of the wheels and `resistance_work` in all that
+resists motion between motor and body.
 """
 
 INPUTS = ("left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2")
@@ -45,6 +51,7 @@ VEHICLE_PARAMETERS = (
     "stall_torque_nm", "torque_limit_nm", "supply_v", "loop_p_nms", "loop_i_nm", "lag_s",
     "dead_time_s", "dead_time_applied_s",
     "gravity_x_mps2", "gravity_y_mps2", "gravity_normal_mps2",
+    "battery_full_v", "battery_empty_v", "battery_ohm", "battery_j", "battery_charge",
 )  # fmt: skip
 """Parameters that hold for a whole run; gravity is given along the plane's x and y and into it.
 
@@ -73,14 +80,15 @@ def vehicle_vector(
 ) -> Array:
     """Values of `VEHICLE_PARAMETERS`; `aspect_rad` is the way uphill (0 east, left positive).
 
-    The payload rides at the centre of gravity and adds yaw inertia in proportion to its mass.
+    The payload rides at the centre of gravity; see `vehicle.with_payload` for other places.
     """
+    vehicle = with_payload(vehicle, payload_kg)
     body, wheel, drive = vehicle.body, vehicle.wheel, vehicle.drive
-    mass = body.mass_kg + payload_kg
+    battery = vehicle.battery or Battery(drive.supply_v, drive.supply_v, 0.0, 1e6, 1.0)
     downhill = -GRAVITY_MPS2 * math.sin(slope_rad)
     return np.array(
         [
-            mass, body.yaw_inertia_kgm2 * mass / body.mass_kg, body.wheelbase_m, body.track_m,
+            body.mass_kg, body.yaw_inertia_kgm2, body.wheelbase_m, body.track_m,
             body.cg_forward_m, body.cg_left_m, body.cg_height_m,
             wheel.radius_m, wheel.width_m, wheel.inertia_kgm2,
             drive.gear_ratio, drive.gear_efficiency, drive.no_load_speed_radps, drive.stall_torque_nm,
@@ -88,6 +96,8 @@ def vehicle_vector(
             drive.dead_time_s, drive.dead_time_s,
             downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad),
             GRAVITY_MPS2 * math.cos(slope_rad),
+            battery.full_v, battery.empty_v, battery.resistance_ohm, 3600.0 * battery.capacity_wh,
+            battery.charge,
         ]
     )  # fmt: skip
 

@@ -17,6 +17,7 @@ from terrafusion.datasets.config import Quantity, structure
 from terrafusion.datasets.recording import Overrides
 from terrafusion.datasets.sensors import Rig, SensorSuite
 from terrafusion.twin.library import known_names, read_named
+from terrafusion.twin.sensing.realism import SensorRealism
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,24 @@ class Drive:
 
 
 @dataclass(frozen=True)
+class Battery:
+    """What feeds all motors: open-circuit voltage, linear from full to empty, behind a resistance.
+
+    `charge` is the share of `capacity_wh` it holds at the start of a run.
+    """
+
+    full_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
+    empty_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
+    resistance_ohm: Annotated[float, Quantity("ohm", 0.0, 10.0)]
+    capacity_wh: Annotated[float, Quantity("W h", 1.0, 1e6)]
+    charge: Annotated[float, Quantity("", 0.0, 1.0)]
+
+    def __post_init__(self) -> None:
+        if self.empty_v > self.full_v:
+            raise ValueError(f"battery: empty_v {self.empty_v:g} is above full_v {self.full_v:g}")
+
+
+@dataclass(frozen=True)
 class Odometry:
     """Geometry the robot's own wheel odometry assumes (it need not be the true one)."""
 
@@ -78,27 +97,11 @@ class Odometry:
 
 
 @dataclass(frozen=True)
-class SensorRealism:
-    """What the twin adds to the data-sheet noise of `SensorSuite`.
-
-    `vibration_gain` scales the soil's vibration for the IMU's mounting.
-    A GNSS position error is white for `gnss_white_share` of its variance and
-    Gauss-Markov for the rest; `gnss_single_sigma_m` and
-    `gnss_single_correlation_s` hold for stand-alone fixes, the numbers of
-    `GnssSpec` for the receiver's best mode.
-    """
-
-    vibration_gain: Annotated[float, Quantity("", 0.0, 100.0)]
-    gnss_white_share: Annotated[float, Quantity("", 0.0, 1.0)]
-    gnss_single_sigma_m: Annotated[float, Quantity("m", 0.01, 100.0)]
-    gnss_single_correlation_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
-    gnss_latency_s: Annotated[float, Quantity("s", 0.0, 10.0)]
-    current_noise_a: Annotated[float, Quantity("A", 0.0, 100.0)]
-
-
-@dataclass(frozen=True)
 class VehicleParams:
-    """A four-wheel differential-drive robot: body, drive, odometry and sensors."""
+    """A four-wheel differential-drive robot: body, drive, odometry and sensors.
+
+    Without a battery the motors are fed with `drive.supply_v`, whatever they draw.
+    """
 
     name: str
     description: str
@@ -108,6 +111,7 @@ class VehicleParams:
     odometry: Odometry
     sensors: SensorSuite
     realism: SensorRealism
+    battery: Battery | None = None
     topics: dict[str, str] = field(default_factory=dict)
 
     def rig(self) -> Rig:
@@ -134,6 +138,31 @@ def load_vehicle(name_or_path: str | Path) -> VehicleParams:
     """
     raw, file = read_named("vehicles", name_or_path, kind="vehicle")
     return structure(VehicleParams, raw, file=file)
+
+
+def with_payload(
+    vehicle: VehicleParams, payload_kg: float, at_m: tuple[float, float, float] | None = None
+) -> VehicleParams:
+    """The vehicle with a payload whose centre of gravity is at `at_m` (body frame), or at the vehicle's own.
+
+    The payload is taken to spread as the vehicle does: it has the vehicle's radius of gyration about
+    its own centre of gravity (assumed), and both turn about the common one by the parallel axis theorem.
+    """
+    body = vehicle.body
+    own = (body.cg_forward_m, body.cg_left_m, body.cg_height_m)
+    share = payload_kg / (body.mass_kg + payload_kg)
+    way = tuple(a - b for a, b in zip(at_m or own, own, strict=True))
+    forward, left, height = (b + share * w for b, w in zip(own, way, strict=True))
+    spread = body.yaw_inertia_kgm2 * (1.0 + payload_kg / body.mass_kg)
+    loaded = dataclasses.replace(
+        body,
+        mass_kg=body.mass_kg + payload_kg,
+        yaw_inertia_kgm2=spread + body.mass_kg * share * (way[0] ** 2 + way[1] ** 2),
+        cg_forward_m=forward,
+        cg_left_m=left,
+        cg_height_m=height,
+    )
+    return dataclasses.replace(vehicle, body=loaded)
 
 
 def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParams:

@@ -55,7 +55,7 @@ class Contact(NamedTuple):
     """What the ground does to one wheel.
 
     `force_x_n`, `force_y_n` act on the body at the hub (traction less motion
-    resistance and drag, body axes), `traction_x_n` turns the wheel back,
+    resistance and drag, body axes), `traction_x_n` turns the wheel back (`traction_y_n` is its side part),
     `drag_torque_nm` brakes it. `shear_rate_x`, `shear_rate_y` are the time
     derivatives of the shear displacement, m/s, `brake_rate` that of the bristle
     deflection behind the braking torque.
@@ -70,6 +70,7 @@ class Contact(NamedTuple):
     brake_rate: Scalar
     slip: Scalar
     sinkage_m: Scalar
+    traction_y_n: Scalar
 
 
 def smooth_abs(value: Scalar, width: float) -> Scalar:
@@ -189,6 +190,7 @@ def contact(
         shear_rate_y=slip_y - shear_m[1] * transport / length,
         slip=slip,
         sinkage_m=z,
+        traction_y_n=traction_y,
     )
 
 
