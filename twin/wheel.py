@@ -124,6 +124,15 @@ def shear_fraction_over_displacement(ratio: Scalar) -> Scalar:
     return (ratio - 1.0 + ca.exp(-ratio)) / (ratio * ratio)
 
 
+def slipping(rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+    """Slip velocity along body x and y, transport speed of the soil (both m/s), and the slip ratio."""
+    u, v = hub_mps
+    hub = ca.sqrt(u * u + v * v + REST_SPEED_MPS**2)
+    transport = smooth_max(smooth_abs(rim_mps, REST_SPEED_MPS), hub, REST_SPEED_MPS)
+    slip_x = rim_mps - u
+    return slip_x, -v, transport, slip_x / smooth_abs(transport, SLIP_SPEED_MPS)
+
+
 def contact(
     ground: Ground,
     load_n: Scalar,
@@ -155,11 +164,8 @@ def contact(
     (Dahl 1968) that deflects within `BRAKE_BRISTLE_M` of rim travel.
     """
     u, v = hub_mps
-    slip_x, slip_y = rim_mps - u, -v
     rim = smooth_abs(rim_mps, REST_SPEED_MPS)
-    hub = ca.sqrt(u * u + v * v + REST_SPEED_MPS**2)
-    transport = smooth_max(rim, hub, REST_SPEED_MPS)
-    slip = slip_x / smooth_abs(transport, SLIP_SPEED_MPS)
+    slip_x, slip_y, transport, slip = slipping(rim_mps, hub_mps)
     z = sinkage(ground, load_n, slip, clog, radius_m, width_m)
     length = ca.sqrt(2.0 * radius_m * z - z * z + ground.contact_floor_m**2)
 
