@@ -63,6 +63,7 @@ SOIL_PARAMETERS = (
     "k_c", "k_phi", "exponent", "slip_sinkage", "contact_floor_m", "cohesion_pa", "tan_friction",
     "shear_modulus_m", "friction_cap", "rolling", "viscous_ns_per_m", "pickup_per_m", "churn_gain",
     "shed_per_m", "clog_torque_nm", "clog_sinkage_m",
+    "unit_weight_n_per_m3", "bulldozing", "suction_pa", "multipass",
 )  # fmt: skip
 """Parameters of the ground under one wheel; the graph takes them once a wheel, in the order of `WHEELS`."""
 
@@ -111,5 +112,7 @@ def soil_vector(soil: SoilParams) -> Array:
             math.tan(soil.shear.friction_angle_rad), soil.shear.shear_modulus_m, soil.shear.friction_cap,
             soil.resistance.rolling, soil.resistance.viscous_ns_per_m, soil.mud.pickup_per_m,
             soil.mud.churn_gain, soil.mud.shed_per_m, soil.mud.torque_nm, soil.mud.sinkage_m,
+            soil.passive.unit_weight_n_per_m3, soil.passive.bulldozing, soil.mud.suction_pa,
+            soil.pressure.multipass,
         ]
     )  # fmt: skip

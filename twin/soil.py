@@ -18,13 +18,17 @@ from terrafusion.twin.library import known_names, read_named
 
 @dataclass(frozen=True)
 class PressureSinkage:
-    """Bekker: pressure p = (k_c / b + k_phi) z^n; rigid-wheel sinkage grows with slip by 1 + k_ss |s|."""
+    """Bekker: pressure p = (k_c / b + k_phi) z^n; rigid-wheel sinkage grows with slip by 1 + k_ss |s|.
+
+    `multipass` is the part of the sinkage that a wheel in the rut of the one before it does not make again.
+    """
 
     k_c_n_per_m_n1: Annotated[float, Quantity("N/m^(n+1)", 0.0, 1e7)]
     k_phi_n_per_m_n2: Annotated[float, Quantity("N/m^(n+2)", 1e3, 1e12)]
     exponent: Annotated[float, Quantity("", 0.1, 1.8)]
     slip_sinkage: Annotated[float, Quantity("", 0.0, 10.0)]
     contact_length_floor_m: Annotated[float, Quantity("m", 0.005, 0.5)]
+    multipass: Annotated[float, Quantity("", 0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,14 @@ class Shear:
     friction_angle_rad: Annotated[float, Quantity("rad", 0.0, 0.9)]
     shear_modulus_m: Annotated[float, Quantity("m", 2e-4, 0.2)]
     friction_cap: Annotated[float, Quantity("", 0.01, 2.0)]
+
+
+@dataclass(frozen=True)
+class Passive:
+    """Soil pushed by the front and the side of a sunken wheel; `bulldozing` scales Rankine's passive pressure."""
+
+    unit_weight_n_per_m3: Annotated[float, Quantity("N/m3", 0.0, 3e4)] = 0.0
+    bulldozing: Annotated[float, Quantity("", 0.0, 20.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -51,6 +63,7 @@ class Mud:
 
     dq/ds = pickup (1 + churn_gain q slip^2)(1 - q) - shed q per metre of wheel travel;
     q adds the torque `torque_nm` q^4 to each wheel and the sinkage `sinkage_m` q^4.
+    `suction_pa` is the pull per area of wet soil on the rear of the contact.
     """
 
     pickup_per_m: Annotated[float, Quantity("1/m", 0.0, 10.0)]
@@ -58,6 +71,7 @@ class Mud:
     shed_per_m: Annotated[float, Quantity("1/m", 0.0, 10.0)]
     torque_nm: Annotated[float, Quantity("N m", 0.0, 1000.0)]
     sinkage_m: Annotated[float, Quantity("m", 0.0, 0.5)]
+    suction_pa: Annotated[float, Quantity("Pa", 0.0, 1e5)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -81,6 +95,7 @@ class SoilParams:
     resistance: Resistance
     mud: Mud
     vibration: Vibration
+    passive: Passive = Passive()
 
     def __post_init__(self) -> None:
         if self.vibration.high_hz <= self.vibration.low_hz:

@@ -36,11 +36,16 @@ class Body:
 
 @dataclass(frozen=True)
 class Wheel:
-    """One of the four equal wheels; `inertia_kgm2` includes the reflected rotor."""
+    """One of the four equal wheels; `inertia_kgm2` includes the reflected rotor.
+
+    Grousers stand out by `grouser_height_m`, `grouser_count` around the rim; 0 is a smooth wheel.
+    """
 
     radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
     width_m: Annotated[float, Quantity("m", 0.005, 1.0)]
     inertia_kgm2: Annotated[float, Quantity("kg m2", 1e-5, 100.0)]
+    grouser_height_m: Annotated[float, Quantity("m", 0.0, 0.3)] = 0.0
+    grouser_count: Annotated[float, Quantity("", 0.0, 200.0)] = 0.0
 
 
 @dataclass(frozen=True)

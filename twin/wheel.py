@@ -49,6 +49,10 @@ class Ground(NamedTuple):
     shed_per_m: Scalar
     clog_torque_nm: Scalar
     clog_sinkage_m: Scalar
+    unit_weight_n_per_m3: Scalar
+    bulldozing: Scalar
+    suction_pa: Scalar
+    multipass: Scalar
 
 
 class Contact(NamedTuple):

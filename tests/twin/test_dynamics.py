@@ -143,7 +143,7 @@ def test_wheel_loads_carry_the_weight_and_lean_downhill() -> None:
 def test_sinkage_is_bekkers_where_nothing_saturates() -> None:
     soil = load_soil("loose_sand")
     k_c, k_phi, n = soil.pressure.k_c_n_per_m_n1, soil.pressure.k_phi_n_per_m_n2, soil.pressure.exponent
-    ground = Ground(k_c, k_phi, n, 0.0, *[0.0] * 12)
+    ground = Ground(k_c, k_phi, n, 0.0, *[0.0] * 16)
     bekker = (3 * 78.5 / ((3 - n) * (k_c + 0.145 * k_phi) * np.sqrt(0.35))) ** (2 / (2 * n + 1))
     assert float(sinkage(ground, 78.5, 0.0, 0.0, 0.175, 0.145)) == pytest.approx(bekker, rel=1e-4)
 
