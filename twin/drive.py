@@ -79,7 +79,7 @@ def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
     x0[INDEX["yaw"]] = heading
     count = max(1, round(SETTLE_S / dt_s))
     x = integrate(x0, np.zeros((count + 1, len(INPUTS))), -SETTLE_S)[-1].copy()
-    for name in ("x", "y", "travel", "clog", *ENERGIES):
+    for name in ("x", "y", "travel", "clog", "elapsed", *ENERGIES):
         x[INDEX[name]] = 0.0
     x[state_slice("wheel_angle")] = 0.0
     x[INDEX["yaw"]] = heading

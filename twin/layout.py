@@ -32,6 +32,9 @@ STATES = (
     *(f"brake_{w}" for w in WHEELS),
     *(f"wheel_angle_{w}" for w in WHEELS),
     "clog", "travel", *ENERGIES,
+    "elapsed",
+    *(f"command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
+    *(f"play_{w}" for w in WHEELS),
 )  # fmt: skip
 """State names: m, rad, m/s, rad/s, N m (`torque`, at the wheel), rad (`speed_error`, integrated), J.
 
@@ -40,6 +43,9 @@ friction bristle (m), `travel` the path driven forward (m), `clog` from 0 to 1.
 Energies are sums from the start: `motor_work` at the wheels, `electric_energy` taken from the
 battery's store, `slip_work` spent in the slip of the wheels and `resistance_work` in all that
 resists motion between motor and body.
+The last rows serve optional effects: `elapsed` is the time driven (s); at rest where the effect is absent are
+`command_lag` and `command_delay`, the filtered rate of a side's command (rad/s2), and `play`, where a gear
+stands in its backlash (-1 to 1).
 """
 
 INPUTS = ("left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2")
@@ -66,6 +72,18 @@ SOIL_PARAMETERS = (
     "unit_weight_n_per_m3", "bulldozing", "suction_pa", "multipass",
 )  # fmt: skip
 """Parameters of the ground under one wheel; the graph takes them once a wheel, in the order of `WHEELS`."""
+
+OUTPUTS = (
+    "wheel_left_radps", "wheel_right_radps", "yaw_rate_radps", "accel_x_mps2", "accel_y_mps2",
+    "gnss_east_m", "gnss_north_m", "gnss_v_e_mps", "gnss_v_n_mps", "current_left_a", "current_right_a",
+    "speed_mps", "side_speed_mps",
+)  # fmt: skip
+"""What can be measured: mean wheel speed of a side, specific force at the IMU along body x and y, position
+and horizontal velocity of the antenna in the world, current of a side (two motors), velocity of the body
+origin along body x and y."""
+
+MOUNTING = ("imu_x_m", "imu_y_m", "antenna_x_m", "antenna_y_m", "antenna_z_m")
+"""Where the sensors sit, from the body origin, body axes."""
 
 INDEX = {name: i for i, name in enumerate(STATES)}
 
@@ -116,3 +134,9 @@ def soil_vector(soil: SoilParams) -> Array:
             soil.pressure.multipass,
         ]
     )  # fmt: skip
+
+
+def mounting_vector(vehicle: VehicleParams) -> Array:
+    """Values of `MOUNTING`."""
+    imu, antenna = vehicle.sensors.imu.position_m, vehicle.sensors.gnss.antenna_m
+    return np.array([imu[0], imu[1], *antenna])

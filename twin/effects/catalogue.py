@@ -1,0 +1,130 @@
+"""All forms of all effects by name; forms of the user's own join by `register`."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.effects.form import STAGES, Form, Parameter
+
+_OWN: dict[str, Form] = {}
+
+
+@functools.cache
+def built_in() -> dict[str, Form]:
+    """The forms that come with the library, by key `effect/form`."""
+    from terrafusion.twin.effects import environment, sensing, terrain, vehicle
+
+    forms = (*terrain.FORMS, *vehicle.FORMS, *sensing.FORMS, *environment.FORMS)
+    return {form.key: form for form in forms}
+
+
+def catalogue() -> dict[str, Form]:
+    """All known forms by key, the user's own last."""
+    return {**built_in(), **_OWN}
+
+
+def register(form: Form) -> Form:
+    """Adds a form of the user's own; it takes part in everything that goes by names. Returns the form.
+
+    A process that is to know the form must register it (do so where a module is imported).
+
+    Raises:
+        ConfigError: another form has this key, or two parameters have one name.
+    """
+    known = catalogue().get(form.key)
+    if known is not None and known is not form:
+        raise ConfigError("a form of this name exists already", channel=form.key, remedy="name it otherwise")
+    if len({p.name for p in form.parameters}) != len(form.parameters):
+        raise ConfigError("two parameters have one name", channel=form.key, remedy="name each of several")
+    _OWN[form.key] = form
+    return form
+
+
+def effect_names() -> tuple[str, ...]:
+    """Names of all effects, in the order of the catalogue."""
+    return tuple(dict.fromkeys(form.effect for form in catalogue().values()))
+
+
+def forms_of(effect: str) -> tuple[Form, ...]:
+    """The functional forms of one effect."""
+    return tuple(form for form in catalogue().values() if form.effect == effect)
+
+
+def parameters() -> dict[str, tuple[Form, Parameter]]:
+    """Every parameter by its key."""
+    return {form.parameter_key(p): (form, p) for form in catalogue().values() for p in form.parameters}
+
+
+def lookup(key: str) -> tuple[Form, Parameter]:
+    """Form and parameter of a key.
+
+    Raises:
+        ConfigError: there is none; the nearest ones are named.
+    """
+    known = parameters()
+    if key in known:
+        return known[key]
+    near = [name for name in known if name.split("/")[0] == key.split("/")[0]]
+    near = near or difflib.get_close_matches(key, list(known), n=3, cutoff=0.4)
+    remedy = f"did you mean {' or '.join(near)}" if near else "see docs/effects.md"
+    raise ConfigError(f"unknown effect '{key}'", remedy=remedy)
+
+
+def checked(values: Mapping[str, float]) -> dict[str, float]:
+    """The values as floats, sorted by key, those of zero left out.
+
+    Raises:
+        ConfigError: an unknown key, or a value that is no number or out of its range.
+    """
+    out = {}
+    for key, value in sorted(values.items()):
+        _, parameter = lookup(key)
+        if not (math.isfinite(value) and parameter.low <= value <= parameter.high):
+            raise ConfigError(
+                f"effect '{key}' is {value:g}, out of range",
+                remedy=f"give {parameter.low:g} to {parameter.high:g} {parameter.unit}".rstrip(),
+            )
+        if value != 0.0:
+            out[key] = float(value)
+    return out
+
+
+def moves(key: str) -> bool:
+    """Whether a parameter changes how the robot moves (and not only what is measured)."""
+    return not lookup(key)[0].senses_only()
+
+
+class Terms:
+    """The terms of some parameters, as a graph is built: `symbols` are their expressions."""
+
+    def __init__(self, keys: Iterable[str], symbols: Any) -> None:
+        given = {key: symbols[i] for i, key in enumerate(keys)}
+        forms = {lookup(key)[0].key: lookup(key)[0] for key in given}
+        self._active = [
+            (form, tuple(given.get(form.parameter_key(p), 0.0) for p in form.parameters))
+            for form in (catalogue()[key] for key in catalogue() if key in forms)
+        ]
+
+    def at(self, stage: str) -> bool:
+        """Whether anything acts at a stage."""
+        return any(stage in form.terms for form, _ in self._active)
+
+    def apply(self, stage: str, quantities: Mapping[str, Any]) -> dict[str, Any]:
+        """The quantities after the terms of a stage, one after the other in the order of the catalogue."""
+        out = dict(quantities)
+        for form, values in self._active:
+            if stage in form.terms:
+                changes = form.terms[stage](out, *values)
+                foreign = set(changes) - set(STAGES[stage])
+                if foreign:
+                    raise ConfigError(
+                        f"sets {', '.join(sorted(foreign))} in the stage '{stage}'", channel=form.key,
+                        remedy=f"it may set {', '.join(STAGES[stage])}",
+                    )  # fmt: skip
+                out.update(changes)
+        return out

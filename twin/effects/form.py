@@ -1,0 +1,122 @@
+"""What an optional effect is: a functional form, its parameters, and the stages of the model where it acts.
+
+The model is built in stages (see `STAGES`). At a stage a form's term reads any quantity known
+there by its name and gives new values of quantities of that stage. With a parameter of zero a
+term must give back what was there before; a graph made without the parameter does not hold the
+term at all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS
+
+Term = Callable[..., Mapping[str, Any]]
+"""term(quantities by name, *values of the parameters) -> new values of some of the stage's quantities."""
+
+STAGES: dict[str, tuple[str, ...]] = {
+    "vehicle": VEHICLE_PARAMETERS,
+    "command": (
+        "command_left_radps", "command_right_radps",
+        *(f"d_command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
+    ),
+    "corner": ("radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m"),
+    "ground": (*SOIL_PARAMETERS, "shear_x_m", "shear_y_m"),
+    "motor": (
+        "command_radps", "loop_speed_radps", "voltage_share", "d_play",
+        "gear_efficiency", "no_load_radps", "stall_torque_nm", "torque_limit_nm", "loop_p_nms", "loop_i_nm",
+        "lag_s",
+    ),
+    "wheel": ("drive_torque_nm", "force_x_n", "force_y_n", "traction_x_n", "traction_y_n", "drag_torque_nm"),
+    "body": ("body_force_x_n", "body_force_y_n", "body_moment_nm"),
+    "mounting": MOUNTING,
+    "measurement": OUTPUTS,
+    "stamp": OUTPUTS,
+}  # fmt: skip
+"""Stages in the order in which they are built, and the quantities a term may set there.
+
+`corner`, `ground`, `motor` and `wheel` are built once a wheel. In the stage `stamp` the time
+derivative of an output is known as `d_<output>`.
+"""
+
+SENSOR_STAGES = ("mounting", "measurement", "stamp")
+"""Stages that change what is measured and not how the robot moves."""
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A number of a form; zero means that its term is absent.
+
+    Attributes:
+        unit: "" for a pure number.
+        scale: what counts as one unit of "typical" (a prior's standard deviation).
+        low, high: closed range of values a run may be made with.
+        name: within the form; "" where it is the only one.
+    """
+
+    unit: str
+    scale: float
+    low: float
+    high: float
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Form:
+    """One functional form of an effect.
+
+    Attributes:
+        effect: contract name, or a name of the user's own.
+        name: of this functional form.
+        parameters: in the order in which the terms take them.
+        terms: what it does at each stage where it acts.
+        equation: the law, in words of the docs.
+        source: author and year, or "ours" for a phenomenological law.
+    """
+
+    effect: str
+    name: str
+    parameters: tuple[Parameter, ...]
+    terms: Mapping[str, Term]
+    equation: str
+    source: str = "ours"
+
+    def __post_init__(self) -> None:
+        unknown = [stage for stage in self.terms if stage not in STAGES]
+        if unknown or not self.terms:
+            raise ConfigError(
+                f"unknown stage '{', '.join(unknown)}'",
+                channel=self.key,
+                remedy=f"known are {', '.join(STAGES)}",
+            )
+        for parameter in self.parameters:
+            if not parameter.low <= 0.0 <= parameter.high or not parameter.scale > 0.0:
+                raise ConfigError("a range must hold zero, a scale be positive", channel=self.key)
+
+    @property
+    def key(self) -> str:
+        """`effect/form`."""
+        return f"{self.effect}/{self.name}"
+
+    def parameter_key(self, parameter: Parameter) -> str:
+        """Name of a parameter: `effect/form`, or `effect/form/parameter` where there are several."""
+        return f"{self.key}/{parameter.name}" if parameter.name else self.key
+
+    def senses_only(self) -> bool:
+        """Whether it leaves the robot's motion as it is."""
+        return all(stage in SENSOR_STAGES for stage in self.terms)
+
+
+def one(unit: str, scale: float, low: float, high: float) -> tuple[Parameter, ...]:
+    """The parameters of a form that has a single one."""
+    return (Parameter(unit, scale, low, high),)
+
+
+def two(names: tuple[str, str], unit: str, scale: float, limit: float) -> tuple[Parameter, ...]:
+    """Two parameters with one unit, scale and range -limit to limit."""
+    first, second = names
+    return Parameter(unit, scale, -limit, limit, first), Parameter(unit, scale, -limit, limit, second)
