@@ -1,5 +1,6 @@
-"""`python -m terrafusion.twin.study`."""
+"""`python -m terrafusion.twin.study`: the study's tables beside the twin's, as text."""
 
-from terrafusion.twin.study.table import main
+from terrafusion.twin.study.study import StudyPlan, run_study
+from terrafusion.twin.study.text import study_lines
 
-main()
+print("\n".join(study_lines(run_study(StudyPlan()))))

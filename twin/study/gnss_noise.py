@@ -8,6 +8,7 @@ which the mean speed error is the study's: for each run alone, and one for all.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.twin.study.processing import Profiles, differenced_speed, speed_errors, with_gnss
+from terrafusion.twin.study.cases import CaseRun
+from terrafusion.twin.study.processing import Profiles, differenced_speed, match, mean_percent
 
 Array = NDArray[np.float64]
 
@@ -54,46 +55,41 @@ class NoiseFit:
 
 
 @dataclass(frozen=True, eq=False)
-class NoisyPositions:
-    """A run's true positions at one rate, with unit noise to be scaled: one draw (n, 2) a seed."""
+class NoisyRun:
+    """A run's true positions (n, 2) at one rate, with unit noise (n, 2) that waits for its size."""
 
     profiles: Profiles
     t_s: Array
     enu_m: Array
-    draws: tuple[Array, ...]
+    unit: Array
 
     @classmethod
-    def of(
-        cls, recording: Recording, profiles: Profiles, rate_hz: float, seeds: Sequence[int]
-    ) -> NoisyPositions:
-        """Positions of the recording's truth at `rate_hz`; the antenna moves as the body origin does."""
-        truth = recording.truth
-        if truth is None:
-            raise ValueError("the recording has no truth")
-        count = int(recording.duration_s() * rate_hz)
-        t_s = np.arange(count + 1) / rate_hz
-        clock = (truth.t_ns - recording.start_ns) * 1e-9
-        enu = np.stack([np.interp(t_s, clock, truth.position_m[:, axis]) for axis in range(2)], axis=1)
-        draws = tuple(np.random.default_rng([seed, round(rate_hz)]).normal(size=enu.shape) for seed in seeds)
-        return cls(profiles, t_s, enu, draws)
+    def of(cls, run: CaseRun, rate_hz: float) -> NoisyRun:
+        """The run's positions at `rate_hz` (the antenna moves as the body does), with noise by its seed."""
+        t_s = np.arange(int(run.truth_t_s[-1] * rate_hz) + 1) / rate_hz
+        enu = np.stack([np.interp(t_s, run.truth_t_s, axis) for axis in run.truth_enu_m.T], axis=1)
+        unit = np.random.default_rng([run.seed, round(rate_hz)]).normal(size=enu.shape)
+        return cls(run.profiles, t_s, enu, unit)
 
-    def speed(self, sigma_m: float, draw: int = 0) -> tuple[Array, Array]:
-        """Times and speed of one draw with noise of `sigma_m`, processed as in the study."""
-        return differenced_speed(self.t_s, self.enu_m + sigma_m * self.draws[draw])
-
-    def errors(self, sigma_m: float) -> list[float]:
-        """Mean speed error of each draw, percent."""
-        return [
-            speed_errors(with_gnss(self.profiles, *self.speed(sigma_m, draw))).gnss
-            for draw in range(len(self.draws))
-        ]
+    def noisy(self, sigma_m: float) -> Profiles:
+        """The run with GNSS speed from positions with noise of `sigma_m` on each axis."""
+        t_s, speed = differenced_speed(self.t_s, self.enu_m + sigma_m * self.unit)
+        return dataclasses.replace(self.profiles, gnss=match(t_s, speed, self.profiles.t_s))
 
     def error(self, sigma_m: float) -> float:
-        """Mean speed error over the draws, percent."""
-        return float(np.mean(self.errors(sigma_m)))
+        """Mean GNSS speed error, percent."""
+        noisy = self.noisy(sigma_m)
+        return mean_percent(noisy.error(noisy.gnss))
 
 
-def fit_noise(runs: Mapping[str, NoisyPositions], wanted: Mapping[str, float], rate_hz: float) -> NoiseFit:
+def mean_error(runs: Sequence[NoisyRun], sigma_m: float) -> float:
+    """Mean of the runs' errors, percent."""
+    return float(np.mean([run.error(sigma_m) for run in runs]))
+
+
+def fit_noise(
+    runs: Mapping[str, Sequence[NoisyRun]], wanted: Mapping[str, float], rate_hz: float
+) -> NoiseFit:
     """The sizes of noise that give the `wanted` errors (percent, by terrain)."""
     from scipy.optimize import minimize_scalar
 
@@ -101,7 +97,7 @@ def fit_noise(runs: Mapping[str, NoisyPositions], wanted: Mapping[str, float], r
 
     def misfit(log_sigma: float) -> float:
         sigma = math.exp(log_sigma)
-        return sum(math.log(runs[name].error(sigma) / wanted[name]) ** 2 for name in wanted)
+        return sum(math.log(mean_error(runs[name], sigma) / wanted[name]) ** 2 for name in wanted)
 
     common = math.exp(
         minimize_scalar(misfit, bounds=(low, high), method="bounded", options={"xatol": 1e-3}).x
@@ -110,19 +106,19 @@ def fit_noise(runs: Mapping[str, NoisyPositions], wanted: Mapping[str, float], r
         rate_hz=rate_hz,
         alone_m={name: _sigma_for(runs[name], error) for name, error in wanted.items()},
         common_m=common,
-        common_error={name: runs[name].error(common) for name in wanted},
-        data_sheet_error={name: runs[name].error(DATA_SHEET_M) for name in wanted},
+        common_error={name: mean_error(runs[name], common) for name in wanted},
+        data_sheet_error={name: mean_error(runs[name], DATA_SHEET_M) for name in wanted},
     )
 
 
-def _sigma_for(run: NoisyPositions, error: float) -> float:
+def _sigma_for(runs: Sequence[NoisyRun], error: float) -> float:
     """The size of noise with this mean error (it grows with the noise); NaN outside the searched sizes."""
     from scipy.optimize import brentq
 
     low, high = (math.log(sigma) for sigma in SIGMAS_M)
 
     def excess(log_sigma: float) -> float:
-        return math.log(run.error(math.exp(log_sigma)) / error)
+        return math.log(mean_error(runs, math.exp(log_sigma)) / error)
 
     if excess(low) > 0.0 or excess(high) < 0.0:
         return math.nan

@@ -9,7 +9,6 @@ threshold and kind of smoothing are not stated: those here are assumed.
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -81,10 +80,10 @@ class SpeedErrors:
 def speed_errors(profiles: Profiles) -> SpeedErrors:
     """The means of a run over the samples that move."""
     return SpeedErrors(
-        slip=_percent(np.abs(profiles.slip())),
-        odometry=_percent(profiles.error(profiles.odometry)),
-        imu=_percent(profiles.error(profiles.imu)),
-        gnss=_percent(profiles.error(profiles.gnss)),
+        slip=mean_percent(np.abs(profiles.slip())),
+        odometry=mean_percent(profiles.error(profiles.odometry)),
+        imu=mean_percent(profiles.error(profiles.imu)),
+        gnss=mean_percent(profiles.error(profiles.gnss)),
     )
 
 
@@ -121,11 +120,6 @@ def profiles_of(recording: Recording, wheel_radius_m: float, cutoff_hz: float = 
     )
 
 
-def with_gnss(profiles: Profiles, t_s: Array, speed: Array) -> Profiles:
-    """The same run with another GNSS speed (M,), m/s, at times (M,) in seconds from the start."""
-    return dataclasses.replace(profiles, gnss=match(t_s, speed, profiles.t_s))
-
-
 def match(t_s: Array, values: Array, wanted_s: Array) -> Array:
     """Nearest value (M,) to each wanted time, NaN where none lies within 50 ms."""
     right = np.clip(np.searchsorted(t_s, wanted_s), 1, len(t_s) - 1)
@@ -135,7 +129,7 @@ def match(t_s: Array, values: Array, wanted_s: Array) -> Array:
 
 
 def low_pass(t_s: Array, values: Array, cutoff_hz: float = CUTOFF_HZ) -> Array:
-    """Second-order Butterworth, forwards and backwards, so that nothing is late; evenly sampled values (N,)."""
+    """Evenly sampled values (N,) through a second-order Butterworth, forwards and backwards: no lag."""
     from scipy.signal import butter, sosfiltfilt
 
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
@@ -170,6 +164,7 @@ def differenced_speed(t_s: Array, enu_m: Array, cutoff_hz: float = CUTOFF_HZ) ->
     return middle, low_pass(middle, np.hypot(step[:, 0], step[:, 1]) / np.diff(t_s), cutoff_hz)
 
 
-def _percent(values: Array) -> float:
+def mean_percent(values: Array) -> float:
+    """Mean of the finite shares, percent; NaN where there are none."""
     known = values[np.isfinite(values)]
     return 100.0 * float(known.mean()) if known.size else float("nan")

@@ -1,0 +1,155 @@
+"""`run_study`: the source study, reproduced by the twin from one plan.
+
+from terrafusion.twin.study.study import StudyPlan, run_study
+study = run_study(StudyPlan(seeds=10, jobs=2))
+study.rows          # the table of agreement
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.study.agreement import Row, judge
+from terrafusion.twin.study.batch import CellResult, grid, run_cell, slip_cells
+from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
+from terrafusion.twin.study.claims import load_claims
+from terrafusion.twin.study.evidence import (
+    Evidence,
+    batch_evidence,
+    case_evidence,
+    field_evidence,
+    noise_evidence,
+    platform_evidence,
+    uneven_evidence,
+)
+from terrafusion.twin.study.field_drive import FieldDrive, drive_field
+from terrafusion.twin.study.gnss_noise import RATES_HZ, NoiseFit, NoisyRun, fit_noise
+from terrafusion.twin.study.published import CASES, Case
+from terrafusion.twin.sweeping.pools import open_pool
+
+SEEDS, QUICK_SEEDS, MOST_SEEDS = 10, 3, 1000
+STUDY_LIKE_HZ = 5.0
+"""Rate at which the study-like Gaussian noise is shown: that of the twin's receiver."""
+FLAT_TERRAIN = "loose_sand"
+"""The terrain that is driven on level ground, too, to see what the slope adds."""
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """How much to run: seeds a case (None for the usual number), the small batch when quick, processes."""
+
+    seeds: int | None = None
+    quick: bool = False
+    jobs: int = 1
+
+    def seed_count(self) -> int:
+        """Seeds a case.
+
+        Raises:
+            ConfigError: a number out of range.
+        """
+        if self.seeds is None:
+            return QUICK_SEEDS if self.quick else SEEDS
+        if not 1 <= self.seeds <= MOST_SEEDS:
+            raise ConfigError(f"{self.seeds} seeds", remedy=f"give 1 to {MOST_SEEDS}")
+        return self.seeds
+
+
+@dataclass(frozen=True, eq=False)
+class Study:
+    """The reproduced study.
+
+    Attributes:
+        plan: what was run.
+        runs: by terrain, the three cases of Tab. 4 on even ground, one run a seed.
+        uneven: the same on ground that varies.
+        noisy: the same runs with Gaussian GNSS noise at `STUDY_LIKE_HZ` that waits for its size.
+        noise: the sizes that come closest to the study's GNSS errors, one fit a rate.
+        batch: terrain x friction x slope x payload.
+        over_slip: one load and slope with more and more slip.
+        field: drives like the study's field test, one a seed.
+        measured: every quantity a claim is held against.
+        rows: the table of agreement.
+    """
+
+    plan: StudyPlan
+    runs: Mapping[str, tuple[CaseRun, ...]]
+    uneven: Mapping[str, tuple[CaseRun, ...]]
+    noisy: Mapping[str, tuple[NoisyRun, ...]]
+    noise: tuple[NoiseFit, ...]
+    batch: tuple[CellResult, ...]
+    over_slip: tuple[CellResult, ...]
+    field: tuple[FieldDrive, ...]
+    measured: Evidence
+    rows: tuple[Row, ...]
+
+    def study_like(self) -> NoiseFit:
+        """The fit that the figures and the table show."""
+        return next(fit for fit in self.noise if fit.rate_hz == STUDY_LIKE_HZ)
+
+
+def run_study(plan: StudyPlan, progress: Progress | None = None) -> Study:
+    """Drive everything the plan asks for, measure, and judge.
+
+    Raises:
+        ConfigError: seeds or jobs out of range.
+        TerrafusionError: a worker process died.
+    """
+    seeds, level = range(plan.seed_count()), Case(FLAT_TERRAIN, 0.0, *[float("nan")] * 4)
+    cells, steps = grid(plan.quick), slip_cells()
+    work: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
+        *((run_case, (case, seed)) for case in (*CASES, level) for seed in seeds),
+        *((run_case, (case, seed, UNEVEN)) for case in CASES for seed in seeds),
+        *((run_cell, (cell,)) for cell in (*cells, *steps)),
+        *((drive_field, (seed,)) for seed in seeds),
+    ]
+    done = iter(_run_all(work, plan.jobs, progress))
+    runs = {case.terrain: tuple(next(done) for _ in seeds) for case in CASES}
+    flat = {FLAT_TERRAIN: tuple(next(done) for _ in seeds)}
+    uneven = {case.terrain: tuple(next(done) for _ in seeds) for case in CASES}
+    batch = tuple(next(done) for _ in cells)
+    over_slip = tuple(next(done) for _ in steps)
+    field = tuple(done)
+    noise = tuple(_noise_at(rate_hz, runs) for rate_hz in RATES_HZ)
+    noisy = _noisy(STUDY_LIKE_HZ, runs)
+    measured = (
+        platform_evidence()
+        | case_evidence(runs, flat)
+        | uneven_evidence(uneven)
+        | noise_evidence(noise, noisy, STUDY_LIKE_HZ)
+        | batch_evidence(batch, over_slip)
+        | field_evidence(field)
+    )
+    rows = judge(load_claims(), measured)
+    return Study(plan, runs, uneven, noisy, noise, batch, over_slip, field, measured, rows)
+
+
+def _noise_at(rate_hz: float, runs: Mapping[str, Sequence[CaseRun]]) -> NoiseFit:
+    return fit_noise(_noisy(rate_hz, runs), {case.terrain: case.gnss for case in CASES}, rate_hz)
+
+
+def _noisy(rate_hz: float, runs: Mapping[str, Sequence[CaseRun]]) -> dict[str, tuple[NoisyRun, ...]]:
+    return {terrain: tuple(NoisyRun.of(run, rate_hz) for run in of) for terrain, of in runs.items()}
+
+
+def _run_all(
+    work: Sequence[tuple[Callable[..., Any], tuple[Any, ...]]], jobs: int, progress: Progress | None
+) -> list[Any]:
+    """The results of all calls, in the order of `work` whatever the number of processes."""
+    results: list[Any] = [None] * len(work)
+    numbered = ((number, function, arguments) for number, (function, arguments) in enumerate(work))
+    with open_pool("loky", jobs) as pool:
+        for done, (number, result) in enumerate(pool.results(_numbered, numbered), 1):
+            results[number] = result
+            if progress is not None:
+                progress(done / len(work))
+    return results
+
+
+def _numbered(number: int, function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[int, Any]:
+    return number, function(*arguments)
