@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterator
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -46,3 +47,21 @@ def _own_file(folder: str, name: str) -> dict[str, Any]:
     """Content of a file of the library, read once; callers do not change it."""
     with resources.as_file(resources.files("terrafusion.twin.params") / folder / f"{name}.yaml") as path:
         return read_yaml(path)
+
+
+def assumed(folder: str, name_or_path: str | Path) -> tuple[int, int]:
+    """How many numbers of a file are assumed by their sources, and how many it has; (0, 0) for no file."""
+    try:
+        raw, _ = read_named(folder, name_or_path, kind="file")
+    except ConfigError:
+        return 0, 0
+    sources = list(_sources(raw))
+    return sum(source.startswith("assumed") for source in sources), len(sources)
+
+
+def _sources(section: dict[str, Any]) -> Iterator[str]:
+    for value in section.values():
+        if isinstance(value, dict) and "source" in value:
+            yield str(value["source"])
+        elif isinstance(value, dict):
+            yield from _sources(value)

@@ -74,3 +74,17 @@ def motion_of(
     origin = np.stack([u + r * vehicle.body.cg_left_m, v - r * vehicle.body.cg_forward_m, zero], axis=1)
     position = np.stack([x, y, zero], axis=1) @ world_plane.T
     return Motion(t_s, position, world_plane @ heading, yaw, origin, r)
+
+
+def wheel_shares(yaw_rad: ArrayLike, vehicle: VehicleParams, slope_rad: float, aspect_rad: float) -> Array:
+    """Shares (N, 4) of the weight on the wheels of a robot that stands at headings (N,) on a slope.
+
+    In the order of `layout.WHEELS`. A share that is not positive means that the wheel
+    leaves the ground: the robot tips over, which the model does not do.
+    """
+    body, yaw = vehicle.body, np.atleast_1d(np.asarray(yaw_rad, dtype=float))
+    along, across = -np.tan(slope_rad) * np.array([np.cos(aspect_rad - yaw), np.sin(aspect_rad - yaw)])
+    lean_x = (body.cg_forward_m + body.cg_height_m * along) / body.wheelbase_m
+    lean_y = (body.cg_left_m + body.cg_height_m * across) / body.track_m
+    sides = ((1, 1), (1, -1), (-1, 1), (-1, -1))
+    return np.stack([(0.5 + sx * lean_x) * (0.5 + sy * lean_y) for sx, sy in sides], axis=1)

@@ -16,10 +16,9 @@ strict keys. Its numbers are choices, so they stand plain, unit in the key::
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +32,8 @@ from terrafusion.twin.library import known_names, read_named
 Array = NDArray[np.float64]
 
 MAX_SLOPE_DEG = 25.0
+PLACE = Quantity("m", -5.0, 5.0, size=3)
+"""Where a payload may ride, body frame."""
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,35 @@ class Interval:
 
 
 @dataclass(frozen=True)
+class Stretch:
+    """From `start_m` driven forward for `length_m` metres."""
+
+    start_m: float
+    length_m: float
+
+    def covers(self, travel_m: Array) -> NDArray[np.bool_]:
+        """Which of the distances lie inside."""
+        return (travel_m >= self.start_m) & (travel_m < self.start_m + self.length_m)
+
+
+Zone = Interval | Stretch
+"""A part of the drive, by time or by travel."""
+
+
+def inside(zone: Zone, t_s: Array, travel_m: Array) -> NDArray[np.bool_]:
+    """Which samples (N,) at times and distances driven (N,) lie in the zone."""
+    return zone.covers(t_s if isinstance(zone, Interval) else travel_m)
+
+
+@dataclass(frozen=True)
+class Canopy:
+    """Trees over a part of the drive: `density` from 0 (open sky) to 1 (no class of fix lasts)."""
+
+    zone: Zone
+    density: float
+
+
+@dataclass(frozen=True)
 class Scenario:
     """One drive.
 
@@ -89,7 +119,12 @@ class Scenario:
     make the whole plane uneven, another way for each seed (see `ground`). With `waypoints`
     ((x, y) m in the plane from the start, x east on flat ground) the robot steers by
     its true pose at `waypoint_speed_mps` instead of following `drive`.
-    `gnss_fix` is the receiver's fix class, None for its best.
+
+    The ground rises by `slope_deg` towards `aspect_deg` (0 east, left positive) and by
+    `cross_slope_deg` to the left of the start heading; both make one plane. The payload's
+    centre of gravity is at `payload_at_m` (body frame), None for the vehicle's own.
+    `gnss_fix` is the receiver's fix class, None for its best; it is degraded under `canopy` and
+    silent in `gnss_outages`.
     """
 
     name: str
@@ -106,10 +141,14 @@ class Scenario:
     variation: Variation | None = None
     patches: Patches | None = None
     slope_deg: float = 0.0
+    cross_slope_deg: float = 0.0
     aspect_deg: float = 0.0
     heading_deg: float = 0.0
+    payload_kg: float = 0.0
+    payload_at_m: tuple[float, float, float] | None = None
     gnss_fix: Fix | None = None
-    gnss_outages: tuple[Interval, ...] = ()
+    gnss_outages: tuple[Zone, ...] = ()
+    canopy: tuple[Canopy, ...] = ()
 
     def commanded(self, t_s: Array) -> Array:
         """Wanted twist (N, 2) at times (N,) from the start, m/s and rad/s, before any slew limit."""
@@ -123,22 +162,61 @@ class Scenario:
             twist[stop.covers(t_s)] = 0.0
         return twist
 
-    def with_ground(self, terrain: str | None, slope_deg: float | None) -> Scenario:
+    def plane(self) -> tuple[float, float]:
+        """Slope and aspect (the way uphill), rad, of the plane that `slope_deg` and `cross_slope_deg` make.
+
+        Their tangents add as vectors: heading uphill, gravity along and across the robot, over
+        gravity into the ground, is tan(slope) and tan(cross slope).
+        """
+        if self.cross_slope_deg == 0.0:
+            return math.radians(self.slope_deg), math.radians(self.aspect_deg)
+        along, across = (math.tan(math.radians(a)) for a in (self.slope_deg, self.cross_slope_deg))
+        uphill, left = math.radians(self.aspect_deg), math.radians(self.heading_deg + 90.0)
+        east = along * math.cos(uphill) + across * math.cos(left)
+        north = along * math.sin(uphill) + across * math.sin(left)
+        return math.atan(math.hypot(east, north)), math.atan2(north, east)
+
+    def with_ground(
+        self, terrain: str | None, slope_deg: float | None, cross_slope_deg: float | None = None
+    ) -> Scenario:
         """The same drive on one terrain throughout and on another slope, where given.
 
         Raises:
-            ConfigError: slope outside 0 to 25 deg.
+            ConfigError: slope outside 0 to 25 deg, or cross-slope outside -25 to 25 deg.
         """
         changed = self
         if terrain is not None:
             changed = dataclasses.replace(changed, route=(RouteLeg(terrain),))
         if slope_deg is not None:
-            if not 0.0 <= slope_deg <= MAX_SLOPE_DEG:
-                raise ConfigError(
-                    f"slope {slope_deg:g} deg is out of range", remedy=f"give 0 to {MAX_SLOPE_DEG:g} deg"
-                )
+            _check_slope("slope", slope_deg, 0.0)
             changed = dataclasses.replace(changed, slope_deg=slope_deg)
+        if cross_slope_deg is not None:
+            _check_slope("cross-slope", cross_slope_deg, -MAX_SLOPE_DEG)
+            changed = dataclasses.replace(changed, cross_slope_deg=cross_slope_deg)
         return changed
+
+    def with_payload(
+        self, payload_kg: float | None, payload_at_m: tuple[float, float, float] | None
+    ) -> Scenario:
+        """The same drive with another payload, at another place, where given.
+
+        Raises:
+            ConfigError: the place is not three numbers within 5 m of the body origin.
+        """
+        changed = self
+        if payload_kg is not None:
+            changed = dataclasses.replace(changed, payload_kg=payload_kg)
+        if payload_at_m is not None:
+            checked_number(payload_at_m, PLACE, file="the run", key="payload_at_m")
+            changed = dataclasses.replace(changed, payload_at_m=payload_at_m)
+        return changed
+
+
+def _check_slope(name: str, value_deg: float, low_deg: float) -> None:
+    if not low_deg <= value_deg <= MAX_SLOPE_DEG:
+        raise ConfigError(
+            f"{name} {value_deg:g} deg is out of range", remedy=f"give {low_deg:g} to {MAX_SLOPE_DEG:g} deg"
+        )
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -152,152 +230,7 @@ def load_scenario(name_or_path: str | Path) -> Scenario:
     Raises:
         ConfigError: unknown name (the known ones are listed), unknown key, or a value out of range.
     """
+    from terrafusion.twin.scenario_file import scenario_of
+
     raw, file = read_named("scenarios", name_or_path, kind="scenario")
-    return _scenario(raw, file, Path(str(name_or_path)).stem)
-
-
-_SECONDS = Quantity("s", 0.0, 36000.0)
-_DURATION = Quantity("s", 0.01, 36000.0)
-_SPEED = Quantity("m/s", -20.0, 20.0)
-_YAW_RATE = Quantity("rad/s", -10.0, 10.0)
-_DRIVE = {
-    "duration_s": _DURATION,
-    "v_mps": _SPEED,
-    "yaw_rate_radps": _YAW_RATE,
-    "v_amplitude_mps": _SPEED,
-    "yaw_rate_amplitude_radps": _YAW_RATE,
-    "period_s": Quantity("s", 0.05, 36000.0),
-    "end_period_s": Quantity("s", 0.05, 36000.0),
-}
-_NUMBERS = {
-    "duration_s": _DURATION,
-    "waypoint_speed_mps": Quantity("m/s", 0.05, 20.0),
-    "max_accel_mps2": Quantity("m/s2", 0.01, 50.0),
-    "slope_deg": Quantity("deg", 0.0, MAX_SLOPE_DEG),
-    "aspect_deg": Quantity("deg", -360.0, 360.0),
-    "heading_deg": Quantity("deg", -360.0, 360.0),
-    "transition": Quantity("m or s", 0.01, 100.0),
-}
-_INTERVAL = {"start_s": _SECONDS, "duration_s": _DURATION}
-_LENGTH = Quantity("m", 0.1, 1000.0)
-_VARIATION = {"strength_sigma": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
-_PATCHES = {"share": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
-
-
-def _scenario(raw: dict[str, Any], file: str, stem: str) -> Scenario:
-    lists = ("drive", "stops", "waypoints", "route", "gnss_outages")
-    words = ("name", "description", "route_over", "gnss_fix")
-    _known(raw, (*_NUMBERS, *lists, *words, "variation", "patches"), file, "")
-    values: dict[str, Any] = {
-        "name": str(raw.get("name", stem)),
-        "description": str(raw.get("description", "")),
-    }
-    values |= {
-        key: checked_number(raw[key], q, file=file, key=key) for key, q in _NUMBERS.items() if key in raw
-    }
-    values["drive"] = tuple(DriveSegment(**r) for r in _rows(raw, "drive", _DRIVE, ("duration_s",), file))
-    for key in ("stops", "gnss_outages"):
-        values[key] = tuple(Interval(**r) for r in _rows(raw, key, _INTERVAL, tuple(_INTERVAL), file))
-    points = [
-        checked_number(point, Quantity("m", -1e4, 1e4, size=2), file=file, key=f"waypoints[{i}]")
-        for i, point in enumerate(_list(raw, "waypoints", file))
-    ]
-    values["waypoints"] = tuple(points)
-    values["route_over"] = _word(raw, "route_over", ("travel", "time"), file)
-    fix = _word(raw, "gnss_fix", ("best", "fixed", "float", "single"), file)
-    values["gnss_fix"] = None if fix == "best" else Fix[fix.upper()]
-    if "route" in raw:
-        values["route"] = _route(raw, values["route_over"], file)
-    if "variation" in raw:
-        values["variation"] = Variation(**_section(raw, "variation", _VARIATION, file))
-    if "patches" in raw:
-        values["patches"] = Patches(**_section(raw, "patches", _PATCHES, file, "terrain"))
-    if not values["drive"] and not points:
-        raise ConfigError(
-            "the scenario drives nowhere", file=file, remedy="add 'drive' segments or 'waypoints'"
-        )
-    if values["drive"] and points:
-        raise ConfigError("'drive' and 'waypoints' exclude each other", file=file, remedy="keep one of them")
-    if "duration_s" not in values:
-        if points:
-            raise ConfigError("'duration_s' is missing", file=file, remedy="say how long the robot may take")
-        values["duration_s"] = sum(segment.duration_s for segment in values["drive"])
-    return Scenario(**values)
-
-
-def _route(raw: dict[str, Any], over: str, file: str) -> tuple[RouteLeg, ...]:
-    key = "length_m" if over == "travel" else "length_s"
-    legs = []
-    rows = _list(raw, "route", file)
-    for i, row in enumerate(rows):
-        here = f"route[{i}]"
-        _known(row, ("terrain", key), file, here)
-        if not isinstance(row.get("terrain"), str):
-            raise ConfigError(f"'{here}.terrain' is missing", file=file, remedy="name a terrain")
-        length = None
-        if i < len(rows) - 1:
-            if key not in row:
-                raise ConfigError(
-                    f"'{here}.{key}' is missing", file=file, remedy="only the last leg has no length"
-                )
-            length = float(checked_number(row[key], Quantity("", 0.1, 1e6), file=file, key=f"{here}.{key}"))  # type: ignore[arg-type]
-        legs.append(RouteLeg(row["terrain"], length))
-    if not legs:
-        raise ConfigError("'route' is empty", file=file, remedy="name at least one terrain")
-    return tuple(legs)
-
-
-def _rows(
-    raw: dict[str, Any], key: str, quantities: dict[str, Quantity], needed: tuple[str, ...], file: str
-) -> list[dict[str, Any]]:
-    out = []
-    for i, row in enumerate(_list(raw, key, file)):
-        here = f"{key}[{i}]"
-        _known(row, tuple(quantities), file, here)
-        for name in needed:
-            if name not in row:
-                raise ConfigError(f"'{here}.{name}' is missing", file=file, remedy="add it")
-        out.append(
-            {n: checked_number(v, quantities[n], file=file, key=f"{here}.{n}") for n, v in row.items()}
-        )
-    return out
-
-
-def _section(
-    raw: dict[str, Any], key: str, quantities: dict[str, Quantity], file: str, word: str | None = None
-) -> dict[str, Any]:
-    """A mapping of numbers, and of one `word` where given; every entry is needed."""
-    words = () if word is None else (word,)
-    section = raw[key]
-    _known(section, (*words, *quantities), file, key)
-    for name in (*words, *quantities):
-        if name not in section:
-            raise ConfigError(f"'{key}.{name}' is missing", file=file, remedy="add it")
-    for name in words:
-        if not isinstance(section[name], str):
-            raise ConfigError(f"'{key}.{name}' is '{section[name]}'", file=file, remedy="give a name")
-    numbers = {n: checked_number(section[n], q, file=file, key=f"{key}.{n}") for n, q in quantities.items()}
-    return numbers | {name: section[name] for name in words}
-
-
-def _list(raw: dict[str, Any], key: str, file: str) -> list[Any]:
-    value = raw.get(key, [])
-    if not isinstance(value, list):
-        raise ConfigError(f"'{key}' is '{value}'", file=file, remedy="give a list")
-    return value
-
-
-def _word(raw: dict[str, Any], key: str, allowed: tuple[str, ...], file: str) -> str:
-    value = raw.get(key, allowed[0])
-    if value not in allowed:
-        raise ConfigError(f"'{key}' is '{value}'", file=file, remedy=f"give one of {', '.join(allowed)}")
-    return str(value)
-
-
-def _known(row: Any, names: tuple[str, ...], file: str, here: str) -> None:
-    if not isinstance(row, Mapping):
-        raise ConfigError(f"'{here}' is '{row}'", file=file, remedy=f"give a mapping of {', '.join(names)}")
-    for name in row:
-        if name not in names:
-            key = f"{here}.{name}" if here else str(name)
-            raise ConfigError(f"unknown key '{key}'", file=file, remedy=f"known here: {', '.join(names)}")
+    return scenario_of(raw, file, Path(str(name_or_path)).stem)

@@ -21,11 +21,13 @@ from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.ground import patch_share
 from terrafusion.twin.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
-from terrafusion.twin.motion import Motion, motion_of
+from terrafusion.twin.library import assumed
+from terrafusion.twin.motion import Motion, motion_of, wheel_shares
 from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import Scenario, load_scenario
 from terrafusion.twin.soil import SoilParams
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.summary import RunSummary, slip_ratios, summarise
+from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_payload
 
 Array = NDArray[np.float64]
 
@@ -33,35 +35,8 @@ START_NS = 1_704_067_200 * 10**9
 """Simulated drives start on 2024-01-01 00:00 UTC."""
 DATUM = (52.0, 8.0, 100.0)
 """ENU origin of simulated drives: latitude deg, longitude deg, height m."""
-MOVING_MPS = 0.1
-"""Slip is averaged over samples that move faster than this."""
-STOPPED_MPS = 0.05
-LOST_TRAVEL_M = 5.0
-"""A robot that stands while this much more travel is commanded is immobilised."""
 _TERRAIN_HZ = 10.0
 _COMMAND_HZ = 50.0
-
-
-@dataclass(frozen=True)
-class RunSummary:
-    """What a run amounts to.
-
-    `mean_abs_slip` is the mean of |1 - v_odom / v_truth| over samples with
-    |v_truth| > 0.1 m/s (the source study's proxy, eq. 2), `mean_slip_ratio`
-    that of the usual |w R - u| / max(|w R|, |u|); both NaN for a run that never
-    moves. `energy_j` is drawn from the battery, `motor_work_j` done at the
-    wheels. `immobilised_at_s` is when the robot came to rest for good although
-    more driving was commanded, None when it did not.
-    """
-
-    duration_s: float
-    distance_m: float
-    mean_abs_slip: float
-    mean_slip_ratio: float
-    energy_j: float
-    energy_per_m_j: float
-    motor_work_j: float
-    immobilised_at_s: float | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +62,7 @@ class SimulatedRun:
 
 @dataclass(frozen=True, eq=False)
 class RunSetup:
-    """A run before it is driven; `t_s` (N,) are the samples, at the IMU's rate from 0."""
+    """A run before it is driven: the vehicle with its payload; `t_s` (N,), the samples at the IMU's rate."""
 
     scenario: Scenario
     vehicle: VehicleParams
@@ -97,8 +72,7 @@ class RunSetup:
 
     def motion(self, states: Array) -> Motion:
         """The body's motion in the world from the states (N, 38)."""
-        slope, aspect = math.radians(self.scenario.slope_deg), math.radians(self.scenario.aspect_deg)
-        return motion_of(self.t_s, states, self.vehicle, slope, aspect)
+        return motion_of(self.t_s, states, self.vehicle, *self.scenario.plane())
 
 
 def simulate(
@@ -107,15 +81,17 @@ def simulate(
     vehicle: str | Path | VehicleParams = "elevate",
     terrain: str | None = None,
     slope_deg: float | None = None,
-    payload_kg: float = 0.0,
+    cross_slope_deg: float | None = None,
+    payload_kg: float | None = None,
+    payload_at_m: tuple[float, float, float] | None = None,
     seed: int = 0,
     noiseless: bool = False,
     backend: str = "auto",
 ) -> Recording:
     """One drive with all channels and its truth; see `simulate_run`."""
     return simulate_run(
-        scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, payload_kg=payload_kg, seed=seed,
-        noiseless=noiseless, backend=backend,
+        scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, cross_slope_deg=cross_slope_deg,
+        payload_kg=payload_kg, payload_at_m=payload_at_m, seed=seed, noiseless=noiseless, backend=backend,
     ).recording  # fmt: skip
 
 
@@ -125,7 +101,9 @@ def simulate_run(
     vehicle: str | Path | VehicleParams = "elevate",
     terrain: str | None = None,
     slope_deg: float | None = None,
-    payload_kg: float = 0.0,
+    cross_slope_deg: float | None = None,
+    payload_kg: float | None = None,
+    payload_at_m: tuple[float, float, float] | None = None,
     seed: int = 0,
     noiseless: bool = False,
     backend: str = "auto",
@@ -138,7 +116,9 @@ def simulate_run(
         vehicle: name, path of a YAML file, or `VehicleParams`.
         terrain: ground of the whole route, in place of the scenario's.
         slope_deg: slope of the plane, 0 to 25 deg, in place of the scenario's.
-        payload_kg: mass carried at the centre of gravity.
+        cross_slope_deg: its slope across the start heading, -25 to 25 deg, rising to the left, likewise.
+        payload_kg: mass carried, likewise.
+        payload_at_m: where its centre of gravity is (body frame), likewise; by default at the vehicle's.
         seed: of all noise, and of ground that varies; on even ground the motion does not depend on it.
         noiseless: exact sensors (no noise, bias, quantisation, vibration, latency).
         backend: "c", "vm" or "auto", see `integrate.integrate`.
@@ -149,17 +129,16 @@ def simulate_run(
         TerrafusionError: the integration diverged.
     """
     setup = set_up(
-        scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, payload_kg=payload_kg, seed=seed,
-        soils=soils,
+        scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, cross_slope_deg=cross_slope_deg,
+        payload_kg=payload_kg, payload_at_m=payload_at_m, seed=seed, soils=soils,
     )  # fmt: skip
     driven = drive_through(setup, backend)
     motion = setup.motion(driven.states)
     recording = _record(setup, driven, motion, sensors.Noise(seed, noiseless))
-    recording = dataclasses.replace(
-        recording, description=_description(setup.scenario, payload_kg, seed, noiseless)
-    )
+    recording = dataclasses.replace(recording, description=_description(setup.scenario, seed, noiseless))
     if backend != "c" and (backend == "vm" or not compiled()):
         recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
+    recording = recording.with_notes(*_notes(setup, motion, vehicle))
     slip = slip_ratios(driven.states, motion, setup.vehicle)
     summary = summarise(driven, motion, setup.vehicle, slip)
     return SimulatedRun(recording, setup.t_s, driven.states, slip, summary, driven.wanted)
@@ -171,18 +150,24 @@ def set_up(
     vehicle: str | Path | VehicleParams = "elevate",
     terrain: str | None = None,
     slope_deg: float | None = None,
-    payload_kg: float = 0.0,
+    cross_slope_deg: float | None = None,
+    payload_kg: float | None = None,
+    payload_at_m: tuple[float, float, float] | None = None,
     seed: int = 0,
     soils: Mapping[str, SoilParams] | None = None,
 ) -> RunSetup:
     """What `simulate_run` drives with the same arguments."""
     vehicle = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
     scenario = scenario if isinstance(scenario, Scenario) else load_scenario(scenario)
-    scenario = scenario.with_ground(terrain, slope_deg)
-    _check(vehicle, payload_kg, seed)
+    scenario = scenario.with_ground(terrain, slope_deg, cross_slope_deg).with_payload(
+        payload_kg, payload_at_m
+    )
+    _check(scenario, vehicle, seed)
+    vehicle = with_payload(vehicle, scenario.payload_kg, scenario.payload_at_m)
     route = Route.of(scenario, soils)
-    slope, aspect = math.radians(scenario.slope_deg), math.radians(scenario.aspect_deg)
-    parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect, payload_kg=payload_kg)
+    slope, aspect = scenario.plane()
+    _check_stands(scenario, vehicle)
+    parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect)
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
     return RunSetup(scenario, vehicle, route, Plant(parameters, route.table(seed)), np.arange(count) / rate)
@@ -198,14 +183,32 @@ def drive_through(setup: RunSetup, backend: str = "auto") -> Driven:
     return drive(setup.scenario, setup.t_s, setup.vehicle, run)
 
 
-def _check(vehicle: VehicleParams, payload_kg: float, seed: int) -> None:
-    limit = vehicle.body.payload_max_kg
-    if not 0.0 <= payload_kg <= limit:
+def _check(scenario: Scenario, vehicle: VehicleParams, seed: int) -> None:
+    limit, payload = vehicle.body.payload_max_kg, scenario.payload_kg
+    if not 0.0 <= payload <= limit:
         raise ConfigError(
-            f"payload {payload_kg:g} kg is out of range", file=vehicle.name, remedy=f"give 0 to {limit:g} kg"
+            f"payload {payload:g} kg is out of range", file=vehicle.name, remedy=f"give 0 to {limit:g} kg"
+        )
+    best = sensors.best_fix(vehicle.sensors.gnss)
+    if scenario.gnss_fix is not None and scenario.gnss_fix > best:
+        raise ConfigError(
+            f"'gnss_fix' is {scenario.gnss_fix.name.lower()}, beyond the receiver of '{vehicle.name}'",
+            file=scenario.name,
+            remedy=f"its best is {best.name.lower()}",
         )
     if seed < 0:
         raise ConfigError(f"seed {seed} is negative", remedy="give a whole number from 0")
+
+
+def _check_stands(scenario: Scenario, vehicle: VehicleParams) -> None:
+    share = wheel_shares(math.radians(scenario.heading_deg), vehicle, *scenario.plane()).min()
+    if share <= 0.0:
+        raise ConfigError(
+            f"the robot tips over where it starts: its centre of gravity at {vehicle.body.cg_height_m:.2f} m "
+            f"is not above its wheels",
+            file=scenario.name,
+            remedy="carry the payload lower or nearer to the centre, or lower the slope",
+        )
 
 
 def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Noise) -> Recording:
@@ -226,7 +229,7 @@ def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Nois
         command=Command(t_ns[told], driven.wanted[told, 0], driven.wanted[told, 1]),
         wheels=sensors.wheels_channel(t_ns, motion, states, vehicle, noise),
         imu=sensors.imu_channel(t_ns, motion, vehicle, route.shares(along, patch), rim, noise),
-        gnss=sensors.gnss_channel(t_ns, motion, vehicle, scenario.gnss_fix, scenario.gnss_outages, noise),
+        gnss=sensors.gnss_channel(t_ns, motion, states[:, INDEX["travel"]], vehicle, scenario, noise),
         motor=sensors.motor_channel(t_ns, motion, states, named, vehicle, noise),
         terrain=Terrain(t_ns[seen], route.labels(along[seen], patch[seen]), source="simulation"),
         truth=_truth(t_ns, motion),
@@ -243,49 +246,35 @@ def _truth(t_ns: NDArray[np.int64], motion: Motion) -> Trajectory:
     return Trajectory(t_ns, motion.position_m, matrix_to_quaternion(motion.rotation), twist)
 
 
-def _description(scenario: Scenario, payload_kg: float, seed: int, noiseless: bool) -> str:
+def _description(scenario: Scenario, seed: int, noiseless: bool) -> str:
     patches = [scenario.patches.terrain] if scenario.patches else []
     grounds = ", ".join(dict.fromkeys([*(leg.terrain for leg in scenario.route), *patches]))
     extras = "exact sensors" if noiseless else f"seed {seed}"
+    across = f", across {scenario.cross_slope_deg:g} deg" if scenario.cross_slope_deg else ""
+    place = f" at {', '.join(f'{x:g}' for x in scenario.payload_at_m)} m" if scenario.payload_at_m else ""
     return (
-        f"simulated: {scenario.description or scenario.name}; {grounds}; slope {scenario.slope_deg:g} deg; "
-        f"payload {payload_kg:g} kg; {extras}"
+        f"simulated: {scenario.description or scenario.name}; {grounds}; "
+        f"slope {scenario.slope_deg:g} deg{across}; payload {scenario.payload_kg:g} kg{place}; {extras}"
     )
 
 
-def slip_ratios(states: Array, motion: Motion, vehicle: VehicleParams) -> Array:
-    """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest."""
-    rim = states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
-    half = 0.5 * vehicle.body.track_m * np.array([1.0, -1.0, 1.0, -1.0])
-    hub = motion.velocity_body_mps[:, :1] - motion.yaw_rate_radps[:, None] * half
-    larger = np.maximum(np.abs(rim), np.abs(hub))
-    return np.where(larger > 1e-3, (rim - hub) / np.maximum(larger, 1e-3), 0.0)
-
-
-def summarise(driven: Driven, motion: Motion, vehicle: VehicleParams, slip: Array) -> RunSummary:
-    """The run in a few numbers, from its states and slip ratios (N, 4)."""
-    states, t_s = driven.states, motion.t_s
-    speed = motion.velocity_body_mps[:, 0]
-    odometry = states[:, state_slice("wheel_speed")].mean(axis=1) * vehicle.odometry.wheel_radius_m
-    moving = np.abs(speed) > MOVING_MPS
-    distance = float(np.sum(np.linalg.norm(np.diff(motion.position_m, axis=0), axis=1)))
-    energy = float(states[-1, INDEX["electric_energy"]])
-    proxy = np.abs(1.0 - odometry[moving] / speed[moving])
-    ratio = np.abs(slip.mean(axis=1))[moving]
-    return RunSummary(
-        duration_s=float(t_s[-1]),
-        distance_m=distance,
-        mean_abs_slip=float(proxy.mean()) if moving.any() else math.nan,
-        mean_slip_ratio=float(ratio.mean()) if moving.any() else math.nan,
-        energy_j=energy,
-        energy_per_m_j=energy / distance if distance > 0.1 else math.nan,
-        motor_work_j=float(states[-1, INDEX["motor_work"]]),
-        immobilised_at_s=_immobilised_at(t_s, motion, driven.wanted[:, 0]),
-    )
-
-
-def _immobilised_at(t_s: Array, motion: Motion, wanted_mps: Array) -> float | None:
-    moving = np.hypot(motion.velocity_body_mps[:, 0], motion.velocity_body_mps[:, 1]) > STOPPED_MPS
-    last = int(np.flatnonzero(moving)[-1]) if moving.any() else 0
-    missing = float(np.sum(np.abs(wanted_mps[last:]))) * float(t_s[1] - t_s[0])
-    return float(t_s[last]) if missing > LOST_TRAVEL_M else None
+def _notes(setup: RunSetup, motion: Motion, vehicle: str | Path | VehicleParams) -> list[str]:
+    """What the reader of a recording should know of how it was made."""
+    notes = []
+    scenario = setup.scenario
+    tipped = np.flatnonzero(wheel_shares(motion.yaw_rad, setup.vehicle, *scenario.plane()).min(axis=1) <= 0.0)
+    if tipped.size:
+        notes.append(
+            f"from {motion.t_s[tipped[0]]:.1f} s on the robot would tip over: a wheel carries no load, "
+            "and the model keeps it down"
+        )
+    parts = [("terrain", "soils", leg.terrain) for leg in scenario.route]
+    if not isinstance(vehicle, VehicleParams):
+        parts.insert(0, ("vehicle", "vehicles", str(vehicle)))
+    counts = {(kind, name): assumed(folder, name) for kind, folder, name in parts}
+    said = [
+        f"{few} of {all_} numbers of {kind} '{name}'" for (kind, name), (few, all_) in counts.items() if few
+    ]
+    if said:
+        notes.append(f"assumed, as their sources say: {', '.join(said)}")
+    return notes

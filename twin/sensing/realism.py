@@ -54,15 +54,17 @@ class GnssRealism:
     """How a receiver fares where it does not see the whole sky; see `sensing.gnss`.
 
     `reported_share` is the sigma the receiver reports over the true one of its
-    random errors. A receiver that lost its class climbs back from a stand-alone
-    fix to its best one in `refix_s` on average under open sky. Under canopy of
-    density 1 the signals are `canopy_attenuation_db` weaker, a step of fix class
-    is lost `canopy_loss_per_s` times a second, and multipath displaces a
-    stand-alone fix by `canopy_multipath_m` (1 sigma an axis), differently
-    from place to place over `multipath_length_m`.
+    random errors. A receiver that lost its signals finds a stand-alone fix again
+    in `reacquire_s`, and climbs from there to its best class in `refix_s`, both on
+    average under open sky. Under canopy of density 1 the signals are
+    `canopy_attenuation_db` weaker, a step of fix class is lost `canopy_loss_per_s`
+    times a second, and multipath displaces a stand-alone fix by
+    `canopy_multipath_m` (1 sigma an axis), differently from place to place over
+    `multipath_length_m`.
     """
 
     reported_share: Annotated[float, Quantity("", 0.05, 2.0)] = 1.0
+    reacquire_s: Annotated[float, Quantity("s", 0.0, 3600.0)] = 0.0
     refix_s: Annotated[float, Quantity("s", 0.0, 3600.0)] = 0.0
     canopy_attenuation_db: Annotated[float, Quantity("dB", 0.0, 40.0)] = 0.0
     canopy_loss_per_s: Annotated[float, Quantity("1/s", 0.0, 100.0)] = 0.0
