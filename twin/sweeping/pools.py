@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import platform
+import socket
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
@@ -18,6 +19,7 @@ from importlib import metadata
 from typing import Any, TypeVar
 
 from terrafusion.datasets.errors import ConfigError, TerrafusionError
+from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.sweeping.plan import model_sha256, version
 
 T = TypeVar("T")
@@ -28,6 +30,7 @@ CONNECT_S = 8.0
 WORKERLESS_S = 10.0
 """A cluster without any worker for so long is given up."""
 _POLL_S = 1.0
+_MAX_GREETING = 1 << 20
 _CONTINUE = "finished runs are kept, and the same command continues"
 
 
@@ -133,17 +136,40 @@ def _dask(address: str) -> Iterator[Pool]:
         raise TerrafusionError(
             "the package distributed is not installed", remedy="pip install 'terrafusion[cluster]'"
         ) from None
+    _knock(address)
     with _quiet("distributed"), contextlib.ExitStack() as stack:
         try:
             client = stack.enter_context(Client(address, timeout=CONNECT_S, set_as_default=False))
-        except (OSError, ValueError, TypeError) as error:
-            raise TerrafusionError(
-                f"no Dask scheduler answers ({_first_line(error)})",
-                file=address,
-                remedy="start one with `dask scheduler` and give the address it prints",
-            ) from None
+        except Exception as error:  # of many kinds: what answers may be anything
+            raise _no_scheduler(address, _first_line(error)) from None
         _check_workers(client, address)
         yield Pool(client.get_executor(pure=False), _Watch(client, address))
+
+
+def _knock(address: str) -> None:
+    """Refuse an address where no scheduler speaks, at once: a client that fails takes long to say so."""
+    scheme, _, place = address.rpartition("://")
+    host, _, port = place.rpartition(":")
+    if scheme not in ("tcp", "tls") or not host or not port.isdecimal():
+        raise ConfigError(
+            f"'{address}' is no address of a scheduler", remedy="give one such as tcp://10.0.0.5:8786"
+        )
+    try:
+        with socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S) as line:
+            # A scheduler speaks first: the length of its greeting, eight bytes.
+            greeting = line.recv(8, socket.MSG_WAITALL) if scheme == "tcp" else bytes(8)
+    except (OSError, OverflowError) as error:
+        raise _no_scheduler(address, _first_line(error)) from None
+    if len(greeting) < 8 or int.from_bytes(greeting, "little") > _MAX_GREETING:
+        raise _no_scheduler(address, "something else does")
+
+
+def _no_scheduler(address: str, why: str) -> TerrafusionError:
+    return TerrafusionError(
+        f"no Dask scheduler answers ({why})",
+        file=address,
+        remedy="start one with `dask scheduler` and give the address it prints",
+    )
 
 
 @contextlib.contextmanager
@@ -163,7 +189,8 @@ def installed() -> dict[str, str]:
     found = {"Python": ".".join(platform.python_version_tuple()[:2])}
     for name in ("numpy", "scipy", "casadi"):
         found[name] = metadata.version(name)
-    return found | {"terrafusion": version(), "the twin's sources": model_sha256()[:12]}
+    engine = "C" if compiled() else "CasADi's virtual machine"
+    return found | {"terrafusion": version(), "the twin's sources": model_sha256()[:12], "engine": engine}
 
 
 def _check_workers(client: Any, address: str) -> None:
@@ -187,7 +214,7 @@ def _check_workers(client: Any, address: str) -> None:
                 raise TerrafusionError(
                     f"the worker {worker} has {name} {found[name]}, here it is {mine}",
                     file=address,
-                    remedy="install the same versions on all machines",
+                    remedy="install the same versions, and a C compiler, on all machines",
                 )
 
 

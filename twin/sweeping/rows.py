@@ -16,16 +16,9 @@ from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.layout import INDEX, state_slice
-from terrafusion.twin.simulate import (
-    RunSetup,
-    RunSummary,
-    drive_through,
-    set_up,
-    simulate_run,
-    slip_ratios,
-    summarise,
-)
+from terrafusion.twin.simulate import RunSetup, drive_through, set_up, simulate_run
 from terrafusion.twin.soil import SoilParams
+from terrafusion.twin.summary import RunSummary, slip_ratios, summarise
 from terrafusion.twin.sweeping.plan import Case, Sweep, at_speed, top_speed_mps
 from terrafusion.twin.vehicle import VehicleParams
 
@@ -73,8 +66,13 @@ _RESULTS = (
     Column("energy_j", "float", "energy drawn from the battery, J"),
     Column("energy_per_m_j", "float", "energy over distance, J/m; null below 0.1 m"),
     Column("mean_power_w", "float", "energy over duration, W"),
+    Column("peak_power_w", "float", "most power drawn from the battery between two samples, W"),
     Column("motor_work_j", "float", "work of the motors at the wheels, J"),
+    Column("slip_work_j", "float", "of that, spent in the slip of the wheels, J"),
+    Column("resistance_work_j", "float", "of that, spent in rolling, compaction and drag, J"),
+    Column("heat_j", "float", "energy drawn less the motors' work, J"),
     Column("immobilised_at_s", "float", "when the robot came to rest for good, s; null if it did not"),
+    Column("immobilised_cause", "text", "traction lost (wheels turn) or motors stalled; null likewise"),
     Column("yaw_error_rad", "float", "heading turned by the wheels' odometry less the true one, at the end"),
 )
 _SENSORS = (
@@ -121,8 +119,7 @@ def _capped(soil: SoilParams, friction: float) -> SoilParams:
 
 
 def _row(sweep: Sweep, case: Case) -> Row:
-    row: Row = dict.fromkeys(column.name for column in columns(sweep.sensors))
-    row |= _axes(sweep, case)
+    row = _axes(sweep, case)
     try:
         if sweep.sensors:
             run = simulate_run(**arguments(sweep, case))
@@ -133,7 +130,7 @@ def _row(sweep: Sweep, case: Case) -> Row:
     except Exception as error:  # whatever goes wrong in one run, the others are worth having
         told = error if isinstance(error, TerrafusionError) else f"{type(error).__name__}: {error}"
         row |= {"status": FAILED, "error": str(told)}
-    return {name: _plain(value) for name, value in row.items()}
+    return {column.name: _plain(row.get(column.name)) for column in columns(sweep.sensors)}
 
 
 def _axes(sweep: Sweep, case: Case) -> Row:
@@ -176,7 +173,6 @@ def _results(t_s: Array, states: Array, wanted: Array, summary: RunSummary, vehi
         "status": status,
         "travel_m": travel,
         "travel_ratio": ratio,
-        "mean_power_w": summary.energy_j / summary.duration_s,
         "yaw_error_rad": _odometry_yaw(states, vehicle)
         - float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]]),
     }

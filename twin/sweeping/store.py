@@ -87,7 +87,8 @@ class Store:
             known = (found["sha256"], found["terrafusion"], found["model_sha256"])
         except (OSError, ValueError, KeyError, TypeError) as error:
             raise DataError(f"cannot be read ({error})", file=about, remedy="give a new folder") from None
-        if known[0] == self.sha256:
+        begun = any((self.folder / PARTS_FOLDER).glob("part-*.parquet")) or (self.folder / RUNS_FILE).exists()
+        if known[0] == self.sha256 or not begun:
             return
         same_code = known[1:] == (version(), model_sha256())
         what = "another sweep" if same_code else "a sweep of another version of terrafusion"

@@ -1,0 +1,114 @@
+"""`terrafusion sweep`: files, report, lines, and how it refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+SWEEP = """\
+description: climbing <sand> & co
+scenario: drive.yaml
+axes:
+  terrain: [asphalt, loose_sand]
+  friction: {from: 0.2, to: 0.8, count: 4}
+  slope_deg: [0, 5, 10, 15]
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "drive.yaml").write_text("drive: [{duration_s: 2, v_mps: 1.0}]\n")
+    (tmp_path / "own.yaml").write_text(SWEEP)
+    return tmp_path / "own.yaml"
+
+
+def test_a_sweep_leaves_table_report_and_plots(terrafusion: Any, file: Path) -> None:
+    done = terrafusion("sweep", file, "--out", "out", "--jobs", 1)
+    assert (done.status, done.err) == (0, "")
+    lines = done.out.splitlines()
+    assert lines[0].startswith("own: 32 runs of 2 s (terrain 2 x friction 4 x slope_deg 4; ")
+    assert lines[1].startswith("32 runs: ")
+    assert lines[-1] == "written to out"
+    names = sorted(path.name for path in Path("out").iterdir())
+    assert names == [
+        "energy_slip.png", "maps_0.png", "maps_1.png", "mobility.png", "report.html", "runs.parquet",
+        "sweep.json",
+    ]  # fmt: skip
+    for name in names[:4]:
+        assert Path("out", name).read_bytes().startswith(b"\x89PNG")
+    page = Path("out/report.html").read_text()
+    assert "Climbing &lt;sand&gt; &amp; co. elevate drives drive: 32 runs" in page
+    assert page.count("<figure>") == 4
+    assert json.loads(Path("out/sweep.json").read_text())["sha256"] in page
+    assert "http" not in page.split("</style>")[1]
+
+
+def test_no_plots_and_recordings_of_chosen_runs(terrafusion: Any, file: Path) -> None:
+    done = terrafusion(
+        "sweep", file, "--out", "out", "--jobs", 1, "--no-plots", "--recordings", 7, "--recordings", 3
+    )
+    assert done.status == 0
+    assert sorted(path.name for path in Path("out").iterdir()) == ["recordings", "runs.parquet", "sweep.json"]
+    logs = sorted(path.name for path in Path("out/recordings").iterdir())
+    assert logs == ["run-000003", "run-000007"]
+    looked = terrafusion("inspect", "out/recordings/run-000003")
+    assert looked.status == 0
+    assert "elevate" in looked.out
+
+
+def test_the_same_command_again_computes_nothing_and_redraws(terrafusion: Any, file: Path) -> None:
+    first = terrafusion("sweep", file, "--out", "out", "--jobs", 1, "--no-plots")
+    written = Path("out/runs.parquet").stat().st_mtime_ns
+    again = terrafusion("sweep", file, "--out", "out", "--jobs", 1)
+    assert again.out == first.out
+    assert Path("out/runs.parquet").stat().st_mtime_ns == written
+    assert Path("out/report.html").is_file()
+
+
+@pytest.mark.parametrize(
+    ("axes", "plots"),
+    [
+        ("{seed: [1, 2]}", ["energy_slip"]),
+        ("{slope_deg: [0, 4, 8]}", ["energy_slip", "profile"]),
+        ("{payload_kg: [0, 20], speed_mps: [0.5, 1.0, 1.5]}", ["energy_slip", "maps", "mobility"]),
+        ("{terrain: [loose_sand], slope_deg: [24, 25], friction: [0.1, 0.2]}", ["maps", "mobility"]),
+    ],
+)
+def test_the_plots_fit_the_axes(terrafusion: Any, file: Path, axes: str, plots: list[str]) -> None:
+    file.write_text(f"scenario: drive.yaml\naxes: {axes}\n")
+    done = terrafusion("sweep", file, "--out", "out", "--jobs", 1)
+    assert (done.status, done.err) == (0, "")
+    assert sorted(path.stem for path in Path("out").glob("*.png")) == plots
+
+
+def test_known_errors_are_one_line(terrafusion: Any, file: Path) -> None:
+    terrafusion("sweep", "climb", "--out", "out").refused("unknown sweep 'climb'", "friction_slope")
+    terrafusion("sweep", file, "--out", "out", "--max-runs", 31).refused("32 runs", "31", "--max-runs")
+    terrafusion("sweep", file, "--out", "out", "--recordings", 32).refused("no run 32", "0 to 31")
+    Path("taken").write_text("")
+    terrafusion("sweep", file, "--out", "taken").refused("taken", "cannot be written")
+    file.write_text("scenario: drive.yaml\naxes: {slope_deg: [30]}\n")
+    terrafusion("sweep", file, "--out", "out").refused("axes.slope_deg[0]", "30", "[0, 25] deg")
+    address = ("--backend", "dask", "--address", "127.0.0.1")
+    file.write_text(SWEEP)
+    terrafusion("sweep", file, "--out", "out", *address).refused("no address of a scheduler", "tcp://")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--backend", "slurm"),
+        ("--backend", "dask"),
+        ("--address", "tcp://127.0.0.1:8786"),
+        ("--jobs", "0"),
+        ("--recordings", "some"),
+        ("--recordings-format", "zip"),
+    ],
+)
+def test_wrong_usage_has_status_2(terrafusion: Any, file: Path, words: tuple[str, str]) -> None:
+    assert terrafusion("sweep", file, "--out", "out", *words).status == 2
+    assert not Path("out").exists()

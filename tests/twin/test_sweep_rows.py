@@ -1,0 +1,130 @@
+"""The rows of a sweep: physics of the conditions, and what becomes of a run that fails."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.twin.simulate import simulate_run
+from terrafusion.twin.sweep import Sweep, load_sweep
+from terrafusion.twin.sweeping import rows as module
+from terrafusion.twin.sweeping.rows import DONE, FAILED, IMMOBILISED, Row, arguments, columns, run_chunk
+
+DRIVE = """\
+drive:
+  - {duration_s: 1}
+  - {duration_s: 9, v_mps: 1.0, yaw_rate_radps: YAW}
+"""
+
+
+def sweep_of(folder: Path, axes: str, more: str = "", yaw: float = 0.0) -> Sweep:
+    (folder / "drive.yaml").write_text(DRIVE.replace("YAW", str(yaw)))
+    (folder / "own.yaml").write_text(f"scenario: drive.yaml\naxes: {axes}\n{more}")
+    return load_sweep(folder / "own.yaml")
+
+
+def all_rows(sweep: Sweep) -> list[Row]:
+    return run_chunk(sweep, list(sweep.cases()))
+
+
+def column(found: list[Row], name: str) -> np.ndarray:
+    return np.array([np.nan if row[name] is None else row[name] for row in found], dtype=float)
+
+
+def test_a_row_is_what_simulate_run_says_of_the_same_conditions(tmp_path: Path) -> None:
+    sweep = sweep_of(
+        tmp_path,
+        "{terrain: [loose_sand], friction: [0.5], slope_deg: [4], payload_kg: [5], speed_scale: [0.8]}",
+    )
+    (case,) = sweep.cases()
+    (row,) = all_rows(sweep)
+    summary = dataclasses.asdict(simulate_run(**arguments(sweep, case)).summary)
+    shared = summary.keys() & row.keys()
+    assert len(shared) >= 14
+    assert {name: row[name] for name in shared} == {name: summary[name] for name in shared}
+    assert (row["terrain"], row["friction"], row["slope_deg"]) == ("loose_sand", 0.5, 4.0)
+    assert (row["payload_kg"], row["speed_scale"], row["speed_mps"]) == (5.0, 0.8, 0.8)
+    assert row["mean_power_w"] == summary["energy_j"] / summary["duration_s"]
+    assert tuple(row) == tuple(c.name for c in columns(sensors=False))
+
+
+def test_more_friction_never_slips_more_and_never_gets_less_far(tmp_path: Path) -> None:
+    found = all_rows(
+        sweep_of(tmp_path, "{terrain: [medium_sand], friction: [0.3, 0.4, 0.6, 1.0], slope_deg: [8]}")
+    )
+    assert (np.diff(column(found, "mean_slip_ratio")) < 0.0).all()
+    assert (np.diff(column(found, "travel_m")) > 0.0).all()
+
+
+def test_slope_and_payload_cost_energy_a_metre(tmp_path: Path) -> None:
+    found = all_rows(
+        sweep_of(tmp_path, "{terrain: [medium_sand], slope_deg: [0, 4, 8], payload_kg: [0, 20]}")
+    )
+    energy = column(found, "energy_per_m_j").reshape(3, 2)
+    assert (np.diff(energy, axis=0) > 0.0).all()
+    assert (np.diff(energy, axis=1) > 0.0).all()
+    weight_n = 9.80665 * (32.0 + np.array([0.0, 20.0]))
+    climbed = weight_n * np.sin(np.radians([[0.0], [4.0], [8.0]]))
+    assert (energy > climbed).all()  # at least the work against gravity
+
+
+def test_too_little_friction_for_the_slope_is_told_as_no_way_made(tmp_path: Path) -> None:
+    found = all_rows(sweep_of(tmp_path, "{terrain: [loose_sand], friction: [0.1, 1.0], slope_deg: [0, 20]}"))
+    ways = [(row["status"], row["travel_ratio"]) for row in found]
+    assert [status == DONE for status, _ in ways] == [False, False, True, False]
+    assert all(ratio < 0.1 for status, ratio in ways if status != DONE)  # type: ignore[operator]
+
+
+def test_a_robot_without_drive_on_the_flat_is_immobilised_from_the_start(tmp_path: Path) -> None:
+    (tmp_path / "drive.yaml").write_text("drive: [{duration_s: 10, v_mps: 1.0}]\n")
+    (tmp_path / "own.yaml").write_text(
+        "scenario: drive.yaml\naxes: {terrain: [loose_sand], friction: [0.01]}\n"
+    )
+    (row,) = all_rows(load_sweep(tmp_path / "own.yaml"))
+    assert row["status"] == IMMOBILISED
+    assert row["mean_abs_slip"] is None
+    assert row["immobilised_at_s"] == pytest.approx(0.0, abs=0.5)
+
+
+def test_odometry_turns_more_than_a_skidding_robot_and_equally_both_ways(tmp_path: Path) -> None:
+    left = all_rows(sweep_of(tmp_path, "{terrain: [asphalt, loose_sand]}", yaw=0.3))
+    right = all_rows(sweep_of(tmp_path, "{terrain: [asphalt, loose_sand]}", yaw=-0.3))
+    straight = all_rows(sweep_of(tmp_path, "{terrain: [asphalt]}"))
+    errors = column(left, "yaw_error_rad")
+    assert (errors > 0.01).all()
+    np.testing.assert_allclose(column(right, "yaw_error_rad"), -errors, rtol=1e-6)
+    assert abs(column(straight, "yaw_error_rad")[0]) < 1e-9
+
+
+def test_seeds_change_sensors_only(tmp_path: Path) -> None:
+    found = all_rows(sweep_of(tmp_path, "{terrain: [medium_sand], seed: [1, 2]}", "sensors: true\n"))
+    assert found[0]["travel_m"] == found[1]["travel_m"]
+    for name in ("odometry_error_pct", "imu_error_pct", "gnss_error_pct"):
+        first, second = (float(row[name]) for row in found)  # type: ignore[arg-type]
+        assert first != second
+        assert min(first, second) > 0.0
+    without = all_rows(sweep_of(tmp_path, "{terrain: [medium_sand], seed: [1]}"))
+    assert without[0]["energy_j"] == found[0]["energy_j"]
+
+
+def test_a_run_that_fails_is_a_row_that_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails_on_slopes(setup):  # type: ignore[no-untyped-def]
+        if setup.scenario.slope_deg == 5.0:
+            raise TerrafusionError("the simulation diverged", time_s=1.0)
+        if setup.scenario.slope_deg == 6.0:
+            raise ZeroDivisionError("float division by zero")
+        return honest(setup)
+
+    honest = module.drive_through
+    monkeypatch.setattr(module, "drive_through", fails_on_slopes)
+    found = all_rows(sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 5, 6]}"))
+    assert [row["status"] for row in found] == [DONE, FAILED, FAILED]
+    assert found[1]["error"] == "t = 1.000 s: the simulation diverged"
+    assert found[2]["error"] == "ZeroDivisionError: float division by zero"
+    assert found[1]["distance_m"] is None
+    assert found[1]["slope_deg"] == 5.0
+    assert found[0]["error"] is None
