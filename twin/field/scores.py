@@ -1,0 +1,89 @@
+"""Scores of predictions, and their medians with intervals over independent stretches of driving."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
+from terrafusion.twin.field.runs import DT_S
+from terrafusion.twin.field.truth import heading
+
+Array = NDArray[np.float64]
+
+SPANS_S = (1.0, 2.0, HORIZON_S)
+METRICS = (
+    *(f"speed_rms_{span:g}s_mps" for span in SPANS_S),
+    *(f"turn_rms_{span:g}s_radps" for span in SPANS_S),
+    "position_m",
+    "heading_rad",
+)
+"""RMS error of forward speed and yaw rate (half-second means) over spans from the fork, and where the robot
+ends after five seconds, in the body frame of the fork."""
+DRAWS, SEED = 1000, 20240101
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A median and its 95 % interval."""
+
+    median: float
+    low: float
+    high: float
+
+
+def scores(prediction: Array, forks: Forks) -> Array:
+    """(F, len(METRICS)) errors of predictions (F, N_FUTURE + 1, 3); NaN where there is no truth."""
+    off = half_second_means(prediction) - forks.truth()
+    if forks.given_turn:
+        off[..., 2] = np.nan
+    bins = [round(span / BIN_S) for span in SPANS_S]
+    rms = [np.sqrt((off[:, :n, channel] ** 2).mean(axis=1)) for channel in (0, 2) for n in bins]
+    told, true = _end(prediction), _end(forks.motion[:, N_PAST:])
+    turned = np.abs(told[:, 2] - true[:, 2]) if not forks.given_turn else np.full(len(forks), np.nan)
+    return np.column_stack([*rms, np.hypot(told[:, 0] - true[:, 0], told[:, 1] - true[:, 1]), turned])
+
+
+def _end(motion: Array) -> Array:
+    """(F, 3) place and heading after the horizon, from the motion (F, T, 3) by the trapezoid rule."""
+    out = np.empty((len(motion), 3))
+    t = DT_S * np.arange(motion.shape[1])
+    for k, (forward, aside, turn) in enumerate(np.moveaxis(motion, 2, 1)):
+        psi = heading(t, turn)
+        velocity = (forward + 1j * aside) * np.exp(1j * psi)
+        place = DT_S * complex(velocity.sum() - 0.5 * (velocity[0] + velocity[-1]))
+        out[k] = place.real, place.imag, psi[-1]
+    return out
+
+
+def median(values: Array, group: NDArray[np.str_]) -> Interval:
+    """Median of values (F,), NaN left out, with an interval by a bootstrap that draws whole groups (F,)."""
+    known = np.isfinite(values)
+    if not known.any():
+        return Interval(np.nan, np.nan, np.nan)
+    draws = [np.median(values[known][rows]) for rows in drawn(group[known])]
+    low, high = np.percentile(draws, [2.5, 97.5])
+    return Interval(float(np.median(values[known])), float(low), float(high))
+
+
+def ratio(values: Array, others: Array, group: NDArray[np.str_]) -> Interval:
+    """Median of values (F,) over median of others (F,) on the same forks, with the same bootstrap."""
+    known = np.isfinite(values) & np.isfinite(others)
+    if not known.any():
+        return Interval(np.nan, np.nan, np.nan)
+    a, b = values[known], others[known]
+    draws = [np.median(a[rows]) / np.median(b[rows]) for rows in drawn(group[known])]
+    low, high = np.percentile(draws, [2.5, 97.5])
+    return Interval(float(np.median(a) / np.median(b)), float(low), float(high))
+
+
+def drawn(group: NDArray[np.str_]) -> list[NDArray[np.int64]]:
+    """Rows of `DRAWS` resamples of the groups, with replacement."""
+    rng = np.random.default_rng(SEED)
+    names, index = np.unique(group, return_inverse=True)
+    members = [np.flatnonzero(index == k) for k in range(len(names))]
+    return [
+        np.concatenate([members[k] for k in rng.integers(len(names), size=len(names))]) for _ in range(DRAWS)
+    ]
