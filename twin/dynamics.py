@@ -145,7 +145,8 @@ def _supply(q: dict[str, Any]) -> dict[str, Any]:
 
 def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, Any]:
     """Everything known of one wheel: its corner of the body, its ground, its motor, its forces."""
-    from terrafusion.twin.wheel import Ground, contact, slipping
+    from terrafusion.twin.terramechanics import following
+    from terrafusion.twin.wheel import Ground, WheelShape, contact, slipping
 
     name, side, end = WHEELS[i], SIDES[i], ENDS[i]
     forward, left = wheel_positions(q)[i]
@@ -161,10 +162,12 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
     w["slip_x_mps"], w["slip_y_mps"], w["transport_mps"], w["slip"] = slipping(w["rim_mps"], hub)
     w |= zip(SOIL_PARAMETERS, soil, strict=True)
     w["shear_x_m"], w["shear_y_m"] = w["shear_x"], w["shear_y"]
+    w["following"] = following(*origin_velocity(q), q["wheelbase_m"], w["width_m"], end)
     w = terms.apply("ground", w)
     c = contact(
         Ground(*(w[name] for name in SOIL_PARAMETERS)), w["load_n"], w["rim_mps"], hub,
-        (w["shear_x_m"], w["shear_y_m"]), w["brake"], w["clog"], w["radius_m"], w["width_m"],
+        (w["shear_x_m"], w["shear_y_m"]), w["brake"], w["clog"],
+        WheelShape(w["radius_m"], w["width_m"], w["grouser_height_m"], w["grouser_count"]), w["following"],
     )  # fmt: skip
     w |= c._asdict() | {"ground_slip": c.slip}
 

@@ -58,6 +58,7 @@ VEHICLE_PARAMETERS = (
     "dead_time_s", "dead_time_applied_s",
     "gravity_x_mps2", "gravity_y_mps2", "gravity_normal_mps2",
     "battery_full_v", "battery_empty_v", "battery_ohm", "battery_j", "battery_charge",
+    "grouser_height_m", "grouser_count",
 )  # fmt: skip
 """Parameters that hold for a whole run; gravity is given along the plane's x and y and into it.
 
@@ -69,7 +70,7 @@ SOIL_PARAMETERS = (
     "k_c", "k_phi", "exponent", "slip_sinkage", "contact_floor_m", "cohesion_pa", "tan_friction",
     "shear_modulus_m", "friction_cap", "rolling", "viscous_ns_per_m", "pickup_per_m", "churn_gain",
     "shed_per_m", "clog_torque_nm", "clog_sinkage_m",
-    "unit_weight_n_per_m3", "bulldozing", "suction_pa", "multipass",
+    "unit_weight_n_per_m3", "bulldozing", "suction_pa", "multipass", "skid_sinkage",
 )  # fmt: skip
 """Parameters of the ground under one wheel; the graph takes them once a wheel, in the order of `WHEELS`."""
 
@@ -116,7 +117,7 @@ def vehicle_vector(
             downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad),
             GRAVITY_MPS2 * math.cos(slope_rad),
             battery.full_v, battery.empty_v, battery.resistance_ohm, 3600.0 * battery.capacity_wh,
-            battery.charge,
+            battery.charge, wheel.grouser_height_m, wheel.grouser_count,
         ]
     )  # fmt: skip
 
@@ -131,7 +132,7 @@ def soil_vector(soil: SoilParams) -> Array:
             soil.resistance.rolling, soil.resistance.viscous_ns_per_m, soil.mud.pickup_per_m,
             soil.mud.churn_gain, soil.mud.shed_per_m, soil.mud.torque_nm, soil.mud.sinkage_m,
             soil.passive.unit_weight_n_per_m3, soil.passive.bulldozing, soil.mud.suction_pa,
-            soil.pressure.multipass,
+            soil.pressure.multipass, soil.pressure.skid_sinkage,
         ]
     )  # fmt: skip
 

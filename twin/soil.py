@@ -20,6 +20,7 @@ from terrafusion.twin.library import known_names, read_named
 class PressureSinkage:
     """Bekker: pressure p = (k_c / b + k_phi) z^n; rigid-wheel sinkage grows with slip by 1 + k_ss |s|.
 
+    `skid_sinkage` is the same for the share of its way that a braked or side-slipping wheel slides;
     `multipass` is the part of the sinkage that a wheel in the rut of the one before it does not make again.
     """
 
@@ -29,6 +30,7 @@ class PressureSinkage:
     slip_sinkage: Annotated[float, Quantity("", 0.0, 10.0)]
     contact_length_floor_m: Annotated[float, Quantity("m", 0.005, 0.5)]
     multipass: Annotated[float, Quantity("", 0.0, 1.0)] = 0.0
+    skid_sinkage: Annotated[float, Quantity("", 0.0, 20.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +45,7 @@ class Shear:
 
 @dataclass(frozen=True)
 class Passive:
-    """Soil pushed by the front and the side of a sunken wheel; `bulldozing` scales Rankine's passive pressure."""
+    """Soil pushed by front and side of a sunken wheel: `bulldozing` times Rankine's passive pressure."""
 
     unit_weight_n_per_m3: Annotated[float, Quantity("N/m3", 0.0, 3e4)] = 0.0
     bulldozing: Annotated[float, Quantity("", 0.0, 20.0)] = 0.0

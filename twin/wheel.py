@@ -1,4 +1,4 @@
-"""One wheel on soft ground, as CasADi expressions.
+"""One wheel on soft ground, as CasADi expressions: the laws of `terramechanics` put together.
 
 Every function takes and returns CasADi scalars (or floats) in SI units, is
 smooth everywhere, and is zero where the physics says zero: no force without
@@ -7,12 +7,29 @@ shear displacement, no resistance without motion.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import casadi as ca
 
-Scalar = Any
-"""A CasADi SX scalar or a float."""
+from terrafusion.twin import terramechanics as tm
+from terrafusion.twin.smooth import Scalar, saturate, smooth_abs, smooth_max, smooth_min
+from terrafusion.twin.terramechanics import SLIP_SPEED_MPS, WheelShape
+
+__all__ = [
+    "Contact",
+    "Footprint",
+    "Ground",
+    "WheelShape",
+    "clog_rate",
+    "contact",
+    "footprint",
+    "saturate",
+    "slipping",
+    "smooth_abs",
+    "smooth_max",
+    "smooth_min",
+    "steady_contact",
+]  # fmt: skip
 
 REST_SPEED_MPS = 1e-4
 """Below this speed a wheel counts as resting: the leak of the held shear displacement is of this order."""
@@ -20,14 +37,10 @@ RESISTANCE_SPEED_MPS = 0.02
 """Speed over which motion resistance builds up from zero."""
 BRAKE_BRISTLE_M = 0.01
 """Rim travel over which rolling resistance builds up."""
-SLIP_SPEED_MPS = 0.02
-"""Speed below which the slip ratio fades to zero."""
 SHEAR_DAMPING_S = 0.03
 """Visco-elastic time constant of the soil in shear at rest."""
 SHEAR_DAMPING_FADE_MPS = 0.05
 """Speed at which that damping has fallen to half: a rolling wheel meets fresh soil."""
-SINKAGE_LIMIT_RADII = 0.8
-"""Sinkage saturates at this fraction of the wheel radius."""
 
 
 class Ground(NamedTuple):
@@ -53,6 +66,7 @@ class Ground(NamedTuple):
     bulldozing: Scalar
     suction_pa: Scalar
     multipass: Scalar
+    skid_sinkage: Scalar
 
 
 class Contact(NamedTuple):
@@ -77,55 +91,12 @@ class Contact(NamedTuple):
     traction_y_n: Scalar
 
 
-def smooth_abs(value: Scalar, width: float) -> Scalar:
-    """|value|, rounded within `width` of zero, never below `width`."""
-    return ca.sqrt(value * value + width * width)
+class Footprint(NamedTuple):
+    """Sinkage and length of the contact, m, and how much the wheel skids over it, 0 to 2."""
 
-
-def smooth_max(a: Scalar, b: Scalar, width: float) -> Scalar:
-    """The larger of a and b, rounded where they differ by less than `width`."""
-    return 0.5 * (a + b + smooth_abs(a - b, width))
-
-
-def smooth_min(a: Scalar, b: Scalar, width: float) -> Scalar:
-    """The smaller of a and b, rounded where they differ by less than `width`."""
-    return 0.5 * (a + b - smooth_abs(a - b, width))
-
-
-def saturate(value: Scalar, limit: Scalar) -> Scalar:
-    """value / (1 + (value/limit)^4)^(1/4) for value >= 0: identity when small, `limit` when large."""
-    ratio = value / limit
-    square = ratio * ratio
-    return value / ca.sqrt(ca.sqrt(1.0 + square * square))
-
-
-def sinkage(
-    ground: Ground, load_n: Scalar, slip: Scalar, clog: Scalar, radius_m: Scalar, width_m: Scalar
-) -> Scalar:
-    """Sinkage, m: rigid wheel (Bekker 1969), grown by slip (Lyasko 2010) and by clogging.
-
-    z0 = [3 W / ((3 - n)(k_c + b k_phi) sqrt(D))]^(2/(2n+1)), z = z0 (1 + k_ss |s|) + z_clog q^4.
-    """
-    n = ground.exponent
-    stiffness = ground.k_c + width_m * ground.k_phi
-    static = (3.0 * load_n / ((3.0 - n) * stiffness * ca.sqrt(2.0 * radius_m))) ** (2.0 / (2.0 * n + 1.0))
-    grown = static * (1.0 + ground.slip_sinkage * smooth_abs(slip, 0.01)) + ground.clog_sinkage_m * clog**4
-    return saturate(grown, SINKAGE_LIMIT_RADII * radius_m)
-
-
-def compaction_resistance(ground: Ground, sinkage_m: Scalar, width_m: Scalar) -> Scalar:
-    """Motion resistance by compaction, N (Bekker 1969): (k_c + b k_phi) z^(n+1) / (n+1)."""
-    n1 = ground.exponent + 1.0
-    return (ground.k_c + width_m * ground.k_phi) * sinkage_m**n1 / n1
-
-
-def shear_fraction_over_displacement(ratio: Scalar) -> Scalar:
-    """g(x)/x of the mean shear under a wheel, x = j/K: g = 1 - (1 - exp(-x)) / x (Wong 2008, eq. 2.65).
-
-    The shear displacement grows linearly along the contact to j at its end.
-    `ratio` must be positive; the limit at zero is 1/2.
-    """
-    return (ratio - 1.0 + ca.exp(-ratio)) / (ratio * ratio)
+    sinkage_m: Scalar
+    length_m: Scalar
+    skid: Scalar
 
 
 def slipping(rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -137,6 +108,32 @@ def slipping(rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar]) -> tuple[Scalar, S
     return slip_x, -v, transport, slip_x / smooth_abs(transport, SLIP_SPEED_MPS)
 
 
+def footprint(
+    ground: Ground,
+    load_n: Scalar,
+    rim_mps: Scalar,
+    hub_mps: tuple[Scalar, Scalar],
+    clog: Scalar,
+    shape: WheelShape,
+    following: Scalar = 0.0,
+) -> Footprint:
+    """How deep and how long the wheel stands in the ground.
+
+    z = z0 (1 - m f)(1 + k_ss d + k_sk s) + z_clog q^4: the static sinkage z0 (Bekker 1969), less what the
+    wheel ahead has left to do in its rut (f = `following`, m = `multipass`), grown in proportion to the
+    driven slip d (Lyasko 2010 has 1.5 to 3 for k_ss) and to the skid s, and by clogging q.
+    """
+    transport = slipping(rim_mps, hub_mps)[2]
+    static = tm.static_sinkage(ground.k_c, ground.k_phi, ground.exponent, load_n, shape)
+    fresh = static * (1.0 - ground.multipass * following)
+    skid = tm.skid(rim_mps, hub_mps)
+    dug = ground.slip_sinkage * tm.driven_slip(rim_mps, hub_mps[0], transport) + ground.skid_sinkage * skid
+    clog_square = clog * clog
+    grown = fresh * (1.0 + dug) + ground.clog_sinkage_m * clog_square * clog_square
+    z = saturate(grown, tm.SINKAGE_LIMIT_RADII * shape.radius_m)
+    return Footprint(z, ca.sqrt(2.0 * shape.radius_m * z - z * z + ground.contact_floor_m**2), skid)
+
+
 def contact(
     ground: Ground,
     load_n: Scalar,
@@ -145,8 +142,8 @@ def contact(
     shear_m: tuple[Scalar, Scalar],
     brake_m: Scalar,
     clog: Scalar,
-    radius_m: Scalar,
-    width_m: Scalar,
+    shape: WheelShape,
+    following: Scalar = 0.0,
 ) -> Contact:
     """Forces and shear rates of one wheel.
 
@@ -158,50 +155,78 @@ def contact(
         shear_m: shear displacement at the end of the contact along body x and y, m (states).
         brake_m: bristle deflection of the braking torque, m (state).
         clog: clogging state, 0 clean to about 1.
-        radius_m: wheel radius, m.
-        width_m: wheel width, m.
+        shape: of the wheel.
+        following: share in which it rolls in the rut of a wheel ahead, 0 to 1.
 
     The soil under the wheel shears with the slip velocity v_s = (w R - u, -v)
     and is renewed at the transport speed V over the contact length l:
     dj/dt = v_s - j V / l, in steady rolling Janosi and Hanamoto's j = v_s l / |w R|.
-    Rolling resistance and clogging brake the wheel like dry friction, by a bristle
+    Rolling resistance, suction and clogging brake the wheel like dry friction, by a bristle
     (Dahl 1968) that deflects within `BRAKE_BRISTLE_M` of rim travel.
     """
     u, v = hub_mps
-    rim = smooth_abs(rim_mps, REST_SPEED_MPS)
     slip_x, slip_y, transport, slip = slipping(rim_mps, hub_mps)
-    z = sinkage(ground, load_n, slip, clog, radius_m, width_m)
-    length = ca.sqrt(2.0 * radius_m * z - z * z + ground.contact_floor_m**2)
-
+    z, length, skid = footprint(ground, load_n, rim_mps, hub_mps, clog, shape, following)
     damping = SHEAR_DAMPING_S / (1.0 + transport / SHEAR_DAMPING_FADE_MPS)
     jx = shear_m[0] + damping * slip_x
     jy = shear_m[1] + damping * slip_y
-    ratio = ca.sqrt((jx * jx + jy * jy) / ground.shear_modulus_m**2 + 1e-4)
-    fraction = shear_fraction_over_displacement(ratio)
-    strength = ground.cohesion_pa * width_m * length + load_n * ground.tan_friction
-    scale = saturate(strength * fraction * ratio, ground.friction_cap * load_n) / (
-        ratio * ground.shear_modulus_m
-    )
-    traction_x, traction_y = scale * jx, scale * jy
+    stiffness = _shear_stiffness(ground, load_n, (jx, jy), length, shape)
+    front, side = _bulldozing(ground, z, length, shape)
+    traction_x = stiffness * jx
+    traction_y = stiffness * jy + side * tm.mobilised(jy, ground.shear_modulus_m)
 
-    compaction = saturate(compaction_resistance(ground, z, width_m), load_n)
+    pushed = tm.compaction_resistance(ground.exponent, load_n, z, shape.radius_m)
     # The soil is pushed along the hub's way: the resistance opposes its velocity.
-    drag = compaction / ca.sqrt(u * u + v * v + RESISTANCE_SPEED_MPS**2) + ground.viscous_ns_per_m
+    speed = ca.sqrt(u * u + v * v + RESISTANCE_SPEED_MPS**2)
+    drag = pushed / speed + ground.viscous_ns_per_m
     clog_square = clog * clog
-    brake = ground.rolling * load_n * radius_m + ground.clog_torque_nm * clog_square * clog_square
+    brake = ground.rolling * load_n * shape.radius_m + ground.clog_torque_nm * clog_square * clog_square
+    brake = brake + tm.suction_torque(ground.suction_pa, length, shape.width_m)
     rolled = brake_m / BRAKE_BRISTLE_M
     return Contact(
-        force_x_n=traction_x - drag * u,
+        force_x_n=traction_x - (drag + front * skid / speed) * u,
         force_y_n=traction_y - drag * v,
         traction_x_n=traction_x,
         drag_torque_nm=brake * rolled,
-        brake_rate=rim_mps - rim * rolled,
+        brake_rate=rim_mps - smooth_abs(rim_mps, REST_SPEED_MPS) * rolled,
         shear_rate_x=slip_x - shear_m[0] * transport / length,
         shear_rate_y=slip_y - shear_m[1] * transport / length,
         slip=slip,
         sinkage_m=z,
         traction_y_n=traction_y,
     )
+
+
+def steady_contact(
+    ground: Ground, load_n: Scalar, rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar], shape: WheelShape
+) -> Contact:
+    """The contact in steady motion on fresh ground: shear and bristle at rest in closed form."""
+    slip_x, slip_y, transport, _ = slipping(rim_mps, hub_mps)
+    stay_s = footprint(ground, load_n, rim_mps, hub_mps, 0.0, shape).length_m / transport
+    brake = BRAKE_BRISTLE_M * rim_mps / smooth_abs(rim_mps, REST_SPEED_MPS)
+    shear = (slip_x * stay_s, slip_y * stay_s)
+    return contact(ground, load_n, rim_mps, hub_mps, shear, brake, 0.0, shape)
+
+
+def _shear_stiffness(
+    ground: Ground, load_n: Scalar, shear_m: tuple[Scalar, Scalar], length_m: Scalar, shape: WheelShape
+) -> Scalar:
+    """Thrust over shear displacement, N/m: Mohr-Coulomb strength, mobilised by shear, below the cap."""
+    ratio = ca.sqrt((shear_m[0] ** 2 + shear_m[1] ** 2) / ground.shear_modulus_m**2 + 1e-4)
+    cohesive, frictional = tm.grouser_gains(shape, length_m)
+    strength = ground.cohesion_pa * shape.width_m * length_m * (1.0 + cohesive)
+    strength = strength + load_n * ground.tan_friction * (1.0 + frictional)
+    thrust = strength * tm.shear_fraction_over_displacement(ratio) * ratio
+    return saturate(thrust, ground.friction_cap * load_n) / (ratio * ground.shear_modulus_m)
+
+
+def _bulldozing(
+    ground: Ground, sinkage_m: Scalar, length_m: Scalar, shape: WheelShape
+) -> tuple[Scalar, Scalar]:
+    """Passive force of the soil on the wheel's front and on its side, N, where fully mobilised."""
+    pressures = tm.passive_pressures(ground.cohesion_pa, ground.tan_friction, ground.unit_weight_n_per_m3)
+    front, side = tm.bulldozed(pressures, sinkage_m, length_m, shape.width_m)
+    return ground.bulldozing * front, ground.bulldozing * side
 
 
 def clog_rate(ground: Ground, clog: Scalar, rim_mps: Scalar, slip: Scalar) -> Scalar:

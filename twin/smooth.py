@@ -1,0 +1,32 @@
+"""Smooth stand-ins for |x|, max and min: CasADi expressions with derivatives of every order everywhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+
+Scalar = Any
+"""A CasADi SX scalar or a float."""
+
+
+def smooth_abs(value: Scalar, width: float) -> Scalar:
+    """|value|, rounded within `width` of zero, never below `width`."""
+    return ca.sqrt(value * value + width * width)
+
+
+def smooth_max(a: Scalar, b: Scalar, width: float) -> Scalar:
+    """The larger of a and b, rounded where they differ by less than `width`."""
+    return 0.5 * (a + b + smooth_abs(a - b, width))
+
+
+def smooth_min(a: Scalar, b: Scalar, width: float) -> Scalar:
+    """The smaller of a and b, rounded where they differ by less than `width`."""
+    return 0.5 * (a + b - smooth_abs(a - b, width))
+
+
+def saturate(value: Scalar, limit: Scalar) -> Scalar:
+    """value / (1 + (value/limit)^4)^(1/4) for value >= 0: identity when small, `limit` when large."""
+    ratio = value / limit
+    square = ratio * ratio
+    return value / ca.sqrt(ca.sqrt(1.0 + square * square))
