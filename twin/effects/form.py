@@ -21,11 +21,13 @@ Term = Callable[..., Mapping[str, Any]]
 STAGES: dict[str, tuple[str, ...]] = {
     "vehicle": VEHICLE_PARAMETERS,
     "command": (
-        "command_left_radps", "command_right_radps",
+        *(f"command_{side}_{unit}" for side in ("left", "right") for unit in ("radps", "radps2")),
         *(f"d_command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
     ),
-    "corner": ("radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m"),
-    "ground": (*SOIL_PARAMETERS, "shear_x_m", "shear_y_m"),
+    "corner": (
+        "radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m", "grouser_height_m", "grouser_count",
+    ),
+    "ground": (*SOIL_PARAMETERS, "shear_x_m", "shear_y_m", "following"),
     "motor": (
         "command_radps", "loop_speed_radps", "voltage_share", "d_play",
         "gear_efficiency", "no_load_radps", "stall_torque_nm", "torque_limit_nm", "loop_p_nms", "loop_i_nm",
