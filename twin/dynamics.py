@@ -128,12 +128,13 @@ def _gravity_along_body(q: dict[str, Any]) -> dict[str, Any]:
 
 
 def _commands(q: dict[str, Any]) -> dict[str, Any]:
-    """What the sides are told, rad/s, and the states of a command on its way, at rest."""
+    """What the sides are told, rad/s, its rate, and the states of a command on its way, at rest."""
     late = q["dead_time_s"] - q["dead_time_applied_s"]
-    commands = {f"command_{side}_radps": q[f"{side}_radps"] - late * q[f"{side}_rate_radps2"]
-                for side in ("left", "right")}  # fmt: skip
-    idle = {f"d_command_{kind}_{side}": 0.0 for kind in ("lag", "delay") for side in ("left", "right")}
-    return commands | idle
+    out = {f"d_command_{kind}_{side}": 0.0 for kind in ("lag", "delay") for side in ("left", "right")}
+    for side in ("left", "right"):
+        rate = q[f"{side}_rate_radps2"]
+        out |= {f"command_{side}_radps": q[f"{side}_radps"] - late * rate, f"command_{side}_radps2": rate}
+    return out
 
 
 def _supply(q: dict[str, Any]) -> dict[str, Any]:
@@ -158,6 +159,9 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
 
     w["hub_x_mps"], w["hub_y_mps"] = q["u"] - q["r"] * w["hub_left_m"], q["v"] + q["r"] * w["hub_forward_m"]
     w["rim_mps"] = w["wheel_speed"] * w["radius_m"]
+    ahead, aside = w["hub_forward_m"] + q["cg_forward_m"], w["hub_left_m"] + q["cg_left_m"]
+    w["wheel_x_m"] = q["x"] + q["cos_yaw"] * ahead - q["sin_yaw"] * aside
+    w["wheel_y_m"] = q["y"] + q["sin_yaw"] * ahead + q["cos_yaw"] * aside
     hub = (w["hub_x_mps"], w["hub_y_mps"])
     w["slip_x_mps"], w["slip_y_mps"], w["transport_mps"], w["slip"] = slipping(w["rim_mps"], hub)
     w |= zip(SOIL_PARAMETERS, soil, strict=True)
