@@ -115,7 +115,7 @@ def assert_same(a: Recording, b: Recording, tolerance: float) -> None:
 
 def test_without_a_compiler(tmp_path: Path) -> None:
     """CasADi's virtual machine makes the recording that compiled code makes, and says once why it is slow."""
-    from terrafusion.twin.engine.codegen import find_compiler
+    from terrafusion.twin.engine.compiler import find_compiler
 
     if find_compiler() is None:
         pytest.skip("no C compiler here to compare with")

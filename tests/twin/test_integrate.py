@@ -10,14 +10,15 @@ import pytest
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin import simulate
 from terrafusion.twin.dynamics import rhs
-from terrafusion.twin.engine import codegen, integrate
+from terrafusion.twin.engine import compiler, integrate, native
+from terrafusion.twin.engine.codegen import SINGLE
 from terrafusion.twin.layout import INDEX, INPUTS, soil_vector, vehicle_vector
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import load_soil, soil_names
 from terrafusion.twin.vehicle import load_vehicle, vehicle_names
 
-needs_compiler = pytest.mark.skipif(codegen.find_compiler() is None, reason="no C compiler")
+needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
 A_MINUTE = dataclasses.replace(load_scenario("mixed_terrain"), duration_s=60.0)
 
 
@@ -76,13 +77,13 @@ def test_unknown_backend_is_an_error(run) -> None:
 
 
 def test_without_a_compiler_the_virtual_machine_runs_and_is_named(monkeypatch, caplog) -> None:
-    codegen.driver.cache_clear()
-    monkeypatch.setattr(codegen, "find_compiler", lambda: None)
+    native.forget()
+    monkeypatch.setattr(compiler, "find_compiler", lambda: None)
     try:
         short = dataclasses.replace(load_scenario("straight"), duration_s=5.0)
         first, second = simulate_run(short), simulate_run(short)
     finally:
-        codegen.driver.cache_clear()
+        native.forget()
     assert any("virtual machine" in note for note in first.recording.notes)
     assert sum("no C compiler" in record.message for record in caplog.records) == 1
     assert np.array_equal(first.states, second.states)
@@ -92,9 +93,9 @@ def test_without_a_compiler_the_virtual_machine_runs_and_is_named(monkeypatch, c
 def test_the_library_is_compiled_once_and_found_again(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
     for _ in range(2):
-        codegen.driver.cache_clear()
-        assert codegen.driver(()) is not None
-    codegen.driver.cache_clear()
+        native.forget()
+        assert native.driver(SINGLE, (), True) is not None
+    native.forget()
     files = list((tmp_path / "cache").iterdir())
     assert len(files) == 1
 
@@ -102,10 +103,10 @@ def test_the_library_is_compiled_once_and_found_again(monkeypatch, tmp_path) -> 
 @needs_compiler
 def test_a_compiler_that_fails_is_told_and_replaced(monkeypatch, tmp_path, caplog) -> None:
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(codegen, "FLAGS", ("-no-such-flag",))
-    codegen.driver.cache_clear()
-    assert codegen.driver(()) is None
-    codegen.driver.cache_clear()
+    monkeypatch.setattr(compiler, "FLAGS", ("-no-such-flag",))
+    native.forget()
+    assert native.driver(SINGLE, (), True) is None
+    native.forget()
     assert "could not be compiled" in caplog.text
 
 
@@ -120,9 +121,9 @@ def test_a_home_that_cannot_be_written_still_gets_compiled_code(monkeypatch, tmp
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     monkeypatch.setenv("TERRAFUSION_CACHE", str(blocked / "cache"))
-    codegen.driver.cache_clear()
-    assert codegen.driver(()) is not None
-    codegen.driver.cache_clear()
+    native.forget()
+    assert native.driver(SINGLE, (), True) is not None
+    native.forget()
 
 
 @pytest.mark.parametrize("terrain", soil_names())

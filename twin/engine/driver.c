@@ -1,18 +1,13 @@
-/* Fixed-step RK4 around the generated right-hand side tf_rhs(x, u, vehicle, soil, effects).
+/* Fixed-step RK4 around the generated right-hand side, for TF_RUNS runs at a time.
  *
  * Inputs are linear between samples. Each wheel has its own soil: at the coordinate
  * c = time_weight * t + travel_weight * (travel + its distance ahead of the body origin) the
  * parameters are joined smoothly (3 w^2 - 2 w^3) between the knots of the route table, then
  * varied by the field of the plane, whose value is taken at the start of a step.
+ *
+ * Ahead of this file stand the sizes and indices from layout.py (TF_NX states, TF_NU inputs, TF_NV vehicle
+ * and TF_NP soil parameters, TF_NE effects), the types and the generated functions tf_once and tf_each.
  */
-#include <math.h>
-#include <stdlib.h>
-#include <string.h>
-
-/* The sizes TF_NX, TF_NU, TF_NP (soil parameters) and the indices TF_X, TF_Y, TF_YAW, TF_TRAVEL,
- * TF_WHEELBASE and TF_TRACK are defined ahead of this file from the names in layout.py. */
-#define TF_WHEELS 4
-
 typedef struct {
   const double *vehicle, *effects;
   double time_weight, travel_weight;
@@ -25,22 +20,21 @@ typedef struct {
   const double *response, *patch_soil;  /* (TF_NP,) */
 } tf_plant;
 
+/* The ground under the wheels of one run. */
 typedef struct {
   const tf_plant *plant;
   double ahead[TF_WHEELS], left[TF_WHEELS]; /* hubs from the body origin */
+  long row[TF_WHEELS];                      /* row of the table that `soil` holds as it is, -1 where it is mixed */
   double gain[TF_WHEELS][TF_NP], share[TF_WHEELS];
-  double soil[TF_WHEELS * TF_NP];
-  int *iw;
-  double *w;
-} tf_run;
+} tf_ground;
 
-static void tf_start(tf_run *run, const tf_plant *plant) {
+static void tf_ground_start(tf_ground *ground, const tf_plant *plant) {
   static const double sx[TF_WHEELS] = {0.5, 0.5, -0.5, -0.5}, sy[TF_WHEELS] = {0.5, -0.5, 0.5, -0.5};
-  run->plant = plant;
+  ground->plant = plant;
   for (int k = 0; k < TF_WHEELS; ++k) {
-    run->ahead[k] = sx[k] * plant->vehicle[TF_WHEELBASE];
-    run->left[k] = sy[k] * plant->vehicle[TF_TRACK];
-    memcpy(run->soil + k * TF_NP, plant->table, sizeof(double) * TF_NP);
+    ground->ahead[k] = sx[k] * plant->vehicle[TF_WHEELBASE];
+    ground->left[k] = sy[k] * plant->vehicle[TF_TRACK];
+    ground->row[k] = -1;
   }
 }
 
@@ -54,98 +48,138 @@ static double tf_grid(const tf_plant *plant, const double *grid, double column, 
          fr * ((1.0 - fc) * grid[j1 * w + i] + fc * grid[j1 * w + i1]);
 }
 
-static void tf_field(tf_run *run, const double *x) {
-  const tf_plant *plant = run->plant;
-  const double cosine = cos(x[TF_YAW]), sine = sin(x[TF_YAW]);
+static void tf_field(tf_ground *ground, double x, double y, double yaw) {
+  const tf_plant *plant = ground->plant;
+  if (!isfinite(x + y + yaw)) return; /* a run that has diverged */
+  const double cosine = cos(yaw), sine = sin(yaw);
   for (int k = 0; k < TF_WHEELS; ++k) {
-    const double px = (x[TF_X] + cosine * run->ahead[k] - sine * run->left[k]) / plant->cell;
-    const double py = (x[TF_Y] + sine * run->ahead[k] + cosine * run->left[k]) / plant->cell;
+    const double px = (x + cosine * ground->ahead[k] - sine * ground->left[k]) / plant->cell;
+    const double py = (y + sine * ground->ahead[k] + cosine * ground->left[k]) / plant->cell;
     const double g = tf_grid(plant, plant->log_gain, px, py);
-    run->share[k] = tf_grid(plant, plant->patch_share, px, py);
-    for (int i = 0; i < TF_NP; ++i) run->gain[k][i] = plant->response[i] == 0.0 ? 1.0 : exp(plant->response[i] * g);
+    ground->share[k] = tf_grid(plant, plant->patch_share, px, py);
+    for (int i = 0; i < TF_NP; ++i) ground->gain[k][i] = plant->response[i] == 0.0 ? 1.0 : exp(plant->response[i] * g);
   }
 }
 
-static void tf_soil(tf_run *run, double t, const double *x) {
-  const tf_plant *plant = run->plant;
-  if (plant->knots == 1 && plant->rows == 0) return; /* set once in tf_start */
-  for (int wheel = 0; wheel < TF_WHEELS; ++wheel) {
-    double *soil = run->soil + wheel * TF_NP;
-    const double c = plant->time_weight * t + plant->travel_weight * (x[TF_TRAVEL] + run->ahead[wheel]);
-    long k = 0;
-    while (k < plant->knots - 1 && c >= plant->at[k + 1]) ++k;
-    const double *row = plant->table + k * TF_NP;
-    if (k == plant->knots - 1 || c <= plant->at[0]) {
-      memcpy(soil, row, sizeof(double) * TF_NP);
-    } else {
-      double s = (c - plant->at[k]) / (plant->at[k + 1] - plant->at[k]);
-      s = s * s * (3.0 - 2.0 * s);
-      for (int i = 0; i < TF_NP; ++i) soil[i] = row[i] + s * (row[i + TF_NP] - row[i]);
+/* Row of the route table at a coordinate and the weight of the row after it. */
+static long tf_where(const tf_plant *plant, double c, double *weight) {
+  long k = 0;
+  *weight = 0.0;
+  while (k < plant->knots - 1 && c >= plant->at[k + 1]) ++k;
+  if (k == plant->knots - 1 || !(c > plant->at[0])) return k;
+  const double s = (c - plant->at[k]) / (plant->at[k + 1] - plant->at[k]);
+  *weight = s * s * (3.0 - 2.0 * s);
+  return k;
+}
+
+/* The soil under each wheel into soil[(parameter * TF_WHEELS + wheel) * stride]. */
+static void tf_soil(tf_ground *ground, double t, double travel, double *soil, int stride) {
+  const tf_plant *plant = ground->plant;
+  for (int k = 0; k < TF_WHEELS; ++k) {
+    double w;
+    const long row = tf_where(plant, plant->time_weight * t + plant->travel_weight * (travel + ground->ahead[k]), &w);
+    const double *a = plant->table + row * TF_NP, *b = w == 0.0 ? a : a + TF_NP;
+    if (plant->rows == 0 && w == 0.0 && ground->row[k] == row) continue;
+    ground->row[k] = plant->rows == 0 && w == 0.0 ? row : -1;
+    for (int i = 0; i < TF_NP; ++i) {
+      double value = a[i] + w * (b[i] - a[i]);
+      if (plant->rows > 0) {
+        value *= ground->gain[k][i];
+        value += ground->share[k] * (plant->patch_soil[i] - value);
+      }
+      soil[(i * TF_WHEELS + k) * stride] = value;
     }
-    if (plant->rows > 0)
-      for (int i = 0; i < TF_NP; ++i)
-        soil[i] = run->gain[wheel][i] * soil[i] + run->share[wheel] * (plant->patch_soil[i] - run->gain[wheel][i] * soil[i]);
   }
 }
 
-static void tf_slope(tf_run *run, double t, const double *x, const double *u, double *dx) {
-  const double *arg[32] = {x, u, run->plant->vehicle, run->soil, run->plant->effects};
-  double *res[8] = {dx};
-  tf_soil(run, t, x);
-  tf_rhs(arg, res, run->iw, run->w, 0);
+/* TF_RUNS runs side by side: lane i of every tf_real belongs to run i. */
+typedef struct {
+  tf_ground ground[TF_RUNS];
+  int changing; /* whether the soil changes on the way */
+  tf_real vehicle[TF_NV], effects[TF_NE + 1], soil[TF_NP * TF_WHEELS], held[TF_KEPT_HELD], local[TF_KEPT_LOCAL];
+} tf_runs;
+
+#define TF_LANE(values, lane) ((double *)(values) + (lane))
+
+static void tf_soils(tf_runs *runs, double t, const tf_real *x) {
+  for (int i = 0; i < TF_RUNS; ++i)
+    tf_soil(&runs->ground[i], t, *TF_LANE(x + TF_TRAVEL, i), TF_LANE(runs->soil, i), TF_RUNS);
 }
 
-static void tf_rk4(tf_run *run, double t, double h, double *x, double u[3][TF_NU]) {
-  double k1[TF_NX], k2[TF_NX], k3[TF_NX], k4[TF_NX], y[TF_NX];
+static void tf_fields(tf_runs *runs, const tf_real *x) {
+  for (int i = 0; i < TF_RUNS; ++i)
+    if (runs->ground[i].plant->rows > 0)
+      tf_field(&runs->ground[i], *TF_LANE(x + TF_X, i), *TF_LANE(x + TF_Y, i), *TF_LANE(x + TF_YAW, i));
+}
+
+static void tf_runs_start(tf_runs *runs, const tf_plant *const *plants, double t, const tf_real *x) {
+  runs->changing = 0;
+  for (int i = 0; i < TF_RUNS; ++i) {
+    tf_ground_start(&runs->ground[i], plants[i]);
+    runs->changing |= plants[i]->knots > 1 || plants[i]->rows > 0;
+    for (int k = 0; k < TF_NV; ++k) *TF_LANE(runs->vehicle + k, i) = plants[i]->vehicle[k];
+    for (int k = 0; k < TF_NE; ++k) *TF_LANE(runs->effects + k, i) = plants[i]->effects[k];
+  }
+  tf_fields(runs, x);
+  tf_soils(runs, t, x);
+  tf_once(runs->vehicle, runs->effects, runs->soil, runs->held);
+}
+
+static void tf_slope(tf_runs *runs, double t, const tf_real *x, const tf_real *u, tf_real *dx) {
+  if (runs->changing) tf_soils(runs, t, x);
+  tf_each(x, u, runs->vehicle, runs->effects, runs->soil, runs->held, runs->local, dx);
+}
+
+static void tf_rk4(tf_runs *runs, double t, double h, tf_real *x, tf_real u[3][TF_NU]) {
+  tf_real k1[TF_NX], k2[TF_NX], k3[TF_NX], k4[TF_NX], y[TF_NX];
   int i;
-  if (run->plant->rows > 0) tf_field(run, x);
-  tf_slope(run, t, x, u[0], k1);
+  if (runs->changing) tf_fields(runs, x);
+  tf_slope(runs, t, x, u[0], k1);
   for (i = 0; i < TF_NX; ++i) y[i] = x[i] + 0.5 * h * k1[i];
-  tf_slope(run, t + 0.5 * h, y, u[1], k2);
+  tf_slope(runs, t + 0.5 * h, y, u[1], k2);
   for (i = 0; i < TF_NX; ++i) y[i] = x[i] + 0.5 * h * k2[i];
-  tf_slope(run, t + 0.5 * h, y, u[1], k3);
+  tf_slope(runs, t + 0.5 * h, y, u[1], k3);
   for (i = 0; i < TF_NX; ++i) y[i] = x[i] + h * k3[i];
-  tf_slope(run, t + h, y, u[2], k4);
+  tf_slope(runs, t + h, y, u[2], k4);
   for (i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
 }
 
-/* Samples x(t0 + i dt), i = 0..n, into out (n + 1, TF_NX); out[0] holds x(t0) on entry.
- * Returns n, or the number of the last finite sample, or -1 when memory ran out. */
-#if defined(_WIN32)
-__declspec(dllexport)
-#endif
-long tf_simulate(const tf_plant *plant, long n, long substeps, double t0, double dt, const double *inputs,
-                 double *out) {
-  tf_run run;
-  casadi_int sz_arg, sz_res, sz_iw, sz_w;
-  tf_rhs_work(&sz_arg, &sz_res, &sz_iw, &sz_w);
-  run.iw = malloc(sizeof(int) * (size_t)(sz_iw + 1));
-  run.w = malloc(sizeof(double) * (size_t)(sz_w + 1));
-  if (!run.iw || !run.w) {
-    free(run.iw);
-    free(run.w);
-    return -1;
-  }
-  tf_start(&run, plant);
-  const double h = dt / (double)substeps;
-  long i = 0;
-  for (; i < n; ++i) {
-    double x[TF_NX], u[3][TF_NU];
-    const double *a = inputs + i * TF_NU, *b = a + TF_NU;
-    memcpy(x, out + i * TF_NX, sizeof x);
-    for (long j = 0; j < substeps; ++j) {
-      for (int m = 0; m < 3; ++m) {
-        const double f = ((double)j + 0.5 * m) / (double)substeps;
-        for (int c = 0; c < TF_NU; ++c) u[m][c] = a[c] + f * (b[c] - a[c]);
-      }
-      tf_rk4(&run, t0 + (double)i * dt + (double)j * h, h, x, u);
+/* Inputs at the start, middle and end of step j of `substeps` after a sample. */
+static void tf_inputs(const double *const *inputs, long sample, long j, long substeps, tf_real u[3][TF_NU]) {
+  for (int i = 0; i < TF_RUNS; ++i) {
+    const double *a = inputs[i] + sample * TF_NU, *b = a + TF_NU;
+    for (int m = 0; m < 3; ++m) {
+      const double f = ((double)j + 0.5 * m) / (double)substeps;
+      for (int c = 0; c < TF_NU; ++c) *TF_LANE(u[m] + c, i) = a[c] + f * (b[c] - a[c]);
     }
-    double sum = 0.0;
-    for (int c = 0; c < TF_NX; ++c) sum += x[c];
-    if (!isfinite(sum)) break;
-    memcpy(out + (i + 1) * TF_NX, x, sizeof x);
   }
-  free(run.iw);
-  free(run.w);
-  return i;
+}
+
+#if defined(_WIN32)
+#define TF_EXPORT __declspec(dllexport)
+#else
+#define TF_EXPORT __attribute__((visibility("default")))
+#endif
+
+TF_EXPORT const int tf_lanes = TF_RUNS;
+
+/* Samples x(t0 + i dt), i = 0..n, of TF_RUNS runs; every `every`-th into outs[run] ((n / every + 1, TF_NX)),
+ * whose first row holds x(t0) on entry. Two lanes may name the same run. */
+TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long substeps, long every, double t0, double dt,
+                           const double *const *inputs, double *const *outs) {
+  tf_runs runs;
+  tf_real x[TF_NX], u[3][TF_NU];
+  const double h = dt / (double)substeps;
+  for (int i = 0; i < TF_RUNS; ++i)
+    for (int c = 0; c < TF_NX; ++c) *TF_LANE(x + c, i) = outs[i][c];
+  tf_runs_start(&runs, plants, t0, x);
+  for (long i = 0; i < n; ++i) {
+    for (long j = 0; j < substeps; ++j) {
+      tf_inputs(inputs, i, j, substeps, u);
+      tf_rk4(&runs, t0 + (double)i * dt + (double)j * h, h, x, u);
+    }
+    if ((i + 1) % every == 0)
+      for (int k = 0; k < TF_RUNS; ++k)
+        for (int c = 0; c < TF_NX; ++c) outs[k][(i + 1) / every * TF_NX + c] = *TF_LANE(x + c, k);
+  }
 }

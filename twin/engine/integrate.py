@@ -6,16 +6,15 @@ samples and the soil following the route; they agree to rounding.
 
 from __future__ import annotations
 
-import ctypes
 import math
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.engine import vm
-from terrafusion.twin.engine.codegen import CPlant, driver
+from terrafusion.twin.engine.codegen import SINGLE
+from terrafusion.twin.engine.native import Driver, driver
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.layout import INPUTS, STATES, VEHICLE_PARAMETERS
 
@@ -54,11 +53,13 @@ def integrate(
     """
     steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
     x0, inputs = checked(x0, inputs)
-    library = chosen(backend, plant.effect_names())
-    if library is None:
+    native = chosen(backend, SINGLE, plant, plant.effect_names())
+    if native is None:
         states = vm.run(x0, inputs, dt_s, plant, t0_s, steps)
     else:
-        states = _run_c(library, x0, inputs, dt_s, plant, t0_s, steps)
+        states = np.empty((len(inputs), len(STATES)))
+        states[0] = x0
+        native.run([plant], [inputs], [states], dt_s, t0_s, steps)
     raise_if_diverged(states, t0_s, dt_s)
     return states
 
@@ -75,7 +76,7 @@ def checked(x0: Array, inputs: Array) -> tuple[Array, Array]:
     return x0, inputs
 
 
-def chosen(backend: str, effects: tuple[str, ...]) -> ctypes.CDLL | None:
+def chosen(backend: str, kind: str, plant: Plant, effects: tuple[str, ...]) -> Driver | None:
     """The compiled driver for a backend, None for the virtual machine.
 
     Raises:
@@ -83,12 +84,12 @@ def chosen(backend: str, effects: tuple[str, ...]) -> ctypes.CDLL | None:
     """
     if backend not in BACKENDS:
         raise TerrafusionError(f"unknown backend '{backend}'", remedy=f"known are {', '.join(BACKENDS)}")
-    library = None if backend == "vm" else driver(effects)
-    if library is None and backend == "c":
+    native = None if backend == "vm" else driver(kind, effects, plant.route.is_fixed())
+    if native is None and backend == "c":
         raise TerrafusionError(
             "no C compiler was found", remedy="install one, or use the backend 'auto' or 'vm'"
         )
-    return library
+    return native
 
 
 def raise_if_diverged(states: Array, t0_s: float, dt_s: float) -> None:
@@ -110,20 +111,4 @@ def steps_a_sample(dt_s: float, vehicle: Array) -> int:
 
 def compiled() -> bool:
     """Whether `backend="auto"` runs compiled code."""
-    return driver(()) is not None
-
-
-def _pointer(array: Array) -> Any:
-    return array.ctypes.data_as(ctypes.POINTER(ctypes.c_double))
-
-
-def _run_c(library: Any, x0: Array, inputs: Array, dt: float, plant: Plant, t0: float, steps: int) -> Array:
-    out = np.full((len(inputs), len(STATES)), np.nan)
-    out[0] = x0
-    held = CPlant(plant)
-    last = library.tf_simulate(
-        ctypes.byref(held.struct), len(inputs) - 1, steps, t0, dt, _pointer(inputs), _pointer(out)
-    )
-    if last < 0:
-        raise MemoryError("the twin's work arrays")
-    return out
+    return driver(SINGLE, (), True) is not None

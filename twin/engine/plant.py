@@ -54,6 +54,10 @@ class RouteTable:
         """Factors of time and travel that make the coordinate."""
         return (1.0, 0.0) if self.coordinate == "time" else (0.0, 1.0)
 
+    def is_fixed(self) -> bool:
+        """Whether every wheel stays on the same ground all the way."""
+        return len(self.at) == 1 and self.field is None
+
 
 @dataclass(frozen=True, eq=False)
 class Plant:

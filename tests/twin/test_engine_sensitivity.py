@@ -1,0 +1,116 @@
+"""Derivatives of runs against central differences, and what must hold of them exactly."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.drive import told
+from terrafusion.twin.engine.integrate import compiled, integrate
+from terrafusion.twin.engine.plant import Plant, RouteTable, SoilField
+from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
+from terrafusion.twin.layout import (
+    INDEX,
+    SOIL_PARAMETERS,
+    STATES,
+    VEHICLE_PARAMETERS,
+    soil_vector,
+    vehicle_vector,
+)
+from terrafusion.twin.soil import load_soil, soil_names
+from terrafusion.twin.vehicle import load_vehicle
+
+DT_S = 0.01
+BACKENDS = ["vm", pytest.param("c", marks=pytest.mark.skipif(not compiled(), reason="no C compiler"))]
+
+
+def inputs(seconds: float = 6.0) -> np.ndarray:
+    """Off from rest, a turn left and one right, a stop, and off again, backwards."""
+    t = np.arange(round(seconds / DT_S) + 1) * DT_S
+    speed = np.interp(t, [0.0, 1.0, 3.5, 4.0, 4.6, seconds], [0.0, 6.0, 6.0, 0.0, 0.0, -3.0])
+    turn = 0.3 * np.sin(2.0 * np.pi * t / 3.0)
+    return told(np.stack([speed * (1.0 - turn), speed * (1.0 + turn)], axis=1), DT_S, 0.013)
+
+
+def plant(*soils: str, varied: bool = False) -> Plant:
+    """Elevate on a slope, over grounds that change after 1 m."""
+    table = np.array([soil_vector(load_soil(name)) for name in soils])
+    at = np.array([0.8, 1.4])[: len(soils)]
+    rng, response = np.random.default_rng(5), np.zeros(len(SOIL_PARAMETERS))
+    for name, value in (("k_phi", 0.7), ("friction_cap", 0.4), ("shear_modulus_m", -0.5)):
+        response[SOIL_PARAMETERS.index(name)] = value
+    grids = rng.normal(0.0, 0.2, (6, 5)), rng.uniform(0.0, 0.5, (6, 5))
+    field = SoilField(0.4, grids[0], response, grids[1], soil_vector(load_soil("loose_sand")))
+    vehicle = vehicle_vector(load_vehicle("elevate"), slope_rad=0.05, aspect_rad=0.7)
+    return Plant(vehicle, RouteTable("travel", at, table, field if varied else None))
+
+
+def start() -> np.ndarray:
+    x0 = np.zeros(len(STATES))
+    x0[INDEX["yaw"]] = 0.2
+    return x0
+
+
+def along(p: Plant) -> tuple[tuple[str, ...], Directions]:
+    """One direction for a start, for six of the vehicle's numbers and for four of each soil."""
+    starts, vehicles = (
+        ("yaw", "u"),
+        ("mass_kg", "wheelbase_m", "radius_m", "lag_s", "cg_height_m", "dead_time_s"),
+    )
+    soils = ("k_phi", "exponent", "shear_modulus_m", "friction_cap")
+    names = (*starts, *vehicles, *(f"{n} {k}" for k in range(len(p.route.at)) for n in soils))
+    d = Directions.zeros(p, len(names))
+    for m, name in enumerate(names):
+        if name in starts:
+            d.start[INDEX[name], m] = 1.0
+        elif name in vehicles:
+            i = VEHICLE_PARAMETERS.index(name)
+            d.vehicle[i, m] = p.vehicle[i] if p.vehicle[i] != 0.0 else 1.0
+        else:
+            i, k = SOIL_PARAMETERS.index(name.split()[0]), int(name.split()[1])
+            d.soil[k, i, m] = p.route.soil[k, i]
+    return names, d
+
+
+def shifted(p: Plant, d: Directions, m: int, step: float) -> tuple[np.ndarray, Plant]:
+    """Start and plant, moved by `step` along direction m."""
+    effects = {name: p.effects.get(name, 0.0) + step * values[m] for name, values in d.effects.items()}
+    route = dataclasses.replace(p.route, soil=p.route.soil + step * d.soil[..., m])
+    moved = Plant(p.vehicle + step * d.vehicle[:, m], route, {**p.effects, **effects})
+    return start() + step * d.start[:, m], moved
+
+
+def difference(p: Plant, d: Directions, m: int, step: float) -> np.ndarray:
+    """Derivative by central differences, extrapolated from two steps (fourth order)."""
+
+    def central(h: float) -> np.ndarray:
+        ends = [integrate(x0, inputs(), DT_S, moved, substeps=3) for x0, moved in
+                (shifted(p, d, m, h), shifted(p, d, m, -h))]  # fmt: skip
+        return (ends[0] - ends[1]) / (2.0 * h)
+
+    return (4.0 * central(0.5 * step) - central(step)) / 3.0
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+@pytest.mark.parametrize(
+    ("soils", "varied"),
+    [
+        *(((name,), False) for name in soil_names()),
+        (("asphalt", "loose_sand"), False),
+        (("loose_sand", "mud"), True),
+    ],
+)
+def test_derivatives_meet_central_differences(backend, soils, varied) -> None:
+    """With a turn, a stop and a way back; each state by its own largest derivative."""
+    p = plant(*soils, varied=varied)
+    names, d = along(p)
+    states, tangents = integrate_with_sensitivity(start(), inputs(), DT_S, p, d, backend=backend, substeps=3)
+    np.testing.assert_array_equal(states, integrate(start(), inputs(), DT_S, p, backend=backend, substeps=3))
+    for m, name in enumerate(names):
+        expected = difference(p, d, m, 1e-6 if varied else 1e-5)
+        scale = np.abs(expected).max(axis=0) + 1e-6 * np.abs(expected).max()
+        worst = (np.abs(tangents[:, :, m] - expected) / scale).max()
+        # Small steps keep wheels within the cells of a field, where its gradient jumps, and cost digits.
+        assert worst < (2e-5 if varied else 1e-6), name

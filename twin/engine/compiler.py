@@ -1,0 +1,103 @@
+"""C source to shared library: compiled once, cached, found again.
+
+The cache lies in `$TERRAFUSION_CACHE`, else `$XDG_CACHE_HOME/terrafusion`, else
+`~/.cache/terrafusion`; entries are named by a hash of source, flags, compiler and processor.
+"""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import hashlib
+import importlib.util
+import logging
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+LOG = logging.getLogger("terrafusion.twin")
+
+# No fast-math and no contraction: a run gives the same bits with every compiler and every vector width.
+FLAGS = ("-O3", "-std=gnu99", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi",
+         "-fPIC", "-shared")  # fmt: skip
+NATIVE = "-march=native"
+
+
+def cache_folder() -> Path:
+    """Where compiled libraries are kept (not created here)."""
+    own = os.environ.get("TERRAFUSION_CACHE")
+    if own:
+        return Path(own)
+    base = os.environ.get("XDG_CACHE_HOME")
+    return (Path(base) if base else Path.home() / ".cache") / "terrafusion"
+
+
+def find_compiler() -> tuple[str, ...] | None:
+    """Command of a C compiler: `$CC`, cc, gcc, clang, or the `ziglang` package; None when there is none."""
+    own = os.environ.get("CC", "").split()
+    if own and shutil.which(own[0]):
+        return tuple(own)
+    for name in ("cc", "gcc", "clang"):
+        path = shutil.which(name)
+        if path:
+            return (path,)
+    if importlib.util.find_spec("ziglang") is not None:
+        return (sys.executable, "-m", "ziglang", "cc")
+    return None
+
+
+def compiled(source: str, compiler: tuple[str, ...]) -> Path:
+    """Path of the shared library, from the cache or freshly compiled (written atomically).
+
+    Raises:
+        OSError, subprocess.SubprocessError: the compiler cannot be run or fails (the text is its last line).
+    """
+    key = "\0".join([source, *FLAGS, *compiler, _version(compiler), sys.platform, processor()])
+    name = f"twin-{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
+    target = cache_folder() / name
+    if target.is_file():
+        return target
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        return _compile_into(target, source, compiler)
+    except OSError as error:  # a read-only or full home: compile for this process only
+        LOG.info("no cache in %s (%s)", target.parent, error)
+        folder = Path(tempfile.mkdtemp(prefix="terrafusion-"))
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)
+        return _compile_into(folder / name, source, compiler)
+
+
+@functools.cache
+def _version(compiler: tuple[str, ...]) -> str:
+    done = subprocess.run([*compiler, "--version"], capture_output=True, text=True, timeout=60, check=True)
+    return done.stdout
+
+
+@functools.cache
+def processor() -> str:
+    """Architecture and instruction sets: a home shared by machines keeps one library for each kind."""
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as file:
+            flags = next((line for line in file if line.startswith(("flags", "Features"))), "")
+    except OSError:
+        flags = platform.processor()
+    return f"{platform.machine()} {flags.strip()}"
+
+
+def _compile_into(target: Path, source: str, compiler: tuple[str, ...]) -> Path:
+    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
+        code, library = Path(scratch) / "twin.c", Path(scratch) / "twin.so"
+        code.write_text(source, encoding="utf-8")
+        said = ""
+        for native in ((NATIVE,), ()):  # a compiler that does not know the processor takes its baseline
+            command = [*compiler, *FLAGS, *native, "-o", str(library), str(code), "-lm"]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+            if done.returncode == 0:
+                os.replace(library, target)
+                return target
+            said = said or (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise subprocess.SubprocessError(f"{' '.join(compiler)}: {said}")

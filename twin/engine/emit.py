@@ -1,0 +1,198 @@
+"""C functions from a graph: what is fixed in a run computed once, equal work of the wheels four at a time.
+
+Every node belongs to a stage, by what it depends on: "late" arguments change at every evaluation, "wide" ones
+hold several directions of differentiation in a vector. Each stage becomes one C function; what a later stage
+needs of an earlier one is kept in that stage's array.
+
+Types in the C code: `tf_real` a number (or a vector of runs), `tf_four` one number for each wheel, `tf_wide`
+a vector of directions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+
+from terrafusion.twin.engine.graph import BINARY, CONST, INPUT, Graph, Outputs
+from terrafusion.twin.engine.packing import WHEELS, Atom, LaneOf, packs
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One C function: its name, the array it keeps, and which nodes belong to it."""
+
+    name: str
+    kept: str
+    late: bool
+    wide: bool
+
+
+ONCE = Stage("once", "held", late=False, wide=False)
+EACH = Stage("each", "local", late=True, wide=False)
+ONCE_WIDE = Stage("once_wide", "held_wide", late=False, wide=True)
+EACH_WIDE = Stage("each_wide", "", late=True, wide=True)
+STAGES = (ONCE, EACH, ONCE_WIDE, EACH_WIDE)
+
+
+@dataclass(eq=False)
+class Emitter:
+    """Writes the stages of a graph.
+
+    Attributes:
+        graph, outputs: what is to be computed.
+        late, wide: names of the arguments that change at every evaluation, that are vectors of directions.
+        lane_of: how arguments belong to wheels; None keeps every node by itself.
+    """
+
+    graph: Graph
+    outputs: Outputs
+    late: Collection[str]
+    wide: Collection[str]
+    lane_of: LaneOf | None = None
+    sizes: dict[str, int] = field(default_factory=dict)
+
+    def source(self) -> str:
+        """The C functions of the stages that hold anything, and the sizes of what they keep."""
+        self._assign_stages()
+        atoms = packs(self.graph, self._needed, self._pack_key, self.lane_of) if self.lane_of else []
+        self._packed = set(atoms)
+        self._home = {n: (atom, k) for atom in atoms for k, n in enumerate(atom)}
+        self._place()
+        functions = [self._function(stage) for stage in STAGES if self.wide or not stage.wide]
+        defines = [f"#define TF_KEPT_{k.upper()} {max(n, 1)}" for k, n in self.sizes.items()]
+        return "\n".join([*defines, *functions])
+
+    def _assign_stages(self) -> None:
+        graph = self.graph
+        late, wide = graph.depends(self.late), graph.depends(self.wide)
+        stages = {(s.late, s.wide): s for s in STAGES}
+        self._needed = graph.reached(n for nodes in self.outputs.values() for n in nodes)
+        self._stage = {n: stages[late[n], wide[n]] for n in self._needed}
+
+    def _pack_key(self, n: int) -> object:
+        """Only what is of one stage meets in a pack; vectors of directions do not."""
+        return n if self._stage[n].wide else self._stage[n].name
+
+    # Placing: what each stage computes, in which order, and what it keeps for later ones
+
+    def _atom(self, n: int) -> Atom:
+        return self._home[n][0] if n in self._home else (n,)
+
+    def _is_leaf(self, n: int) -> bool:
+        return self.graph.ops[n] in (INPUT, CONST)
+
+    def _place(self) -> None:
+        self._slot: dict[Atom, int] = {}
+        self.sizes = {s.kept: 0 for s in STAGES if s.kept}
+        wanted: dict[Stage, list[Atom]] = {s: [] for s in STAGES}
+        for name, nodes in self.outputs.items():
+            wanted[_writer(name)] += [self._atom(n) for n in nodes if not self._is_leaf(n)]
+        self._order: dict[Stage, list[Atom]] = {}
+        for stage in reversed(STAGES):
+            self._order[stage], borrowed = self._ordered(stage, wanted[stage])
+            for atom in borrowed:
+                if atom not in self._slot:
+                    kept = self._stage[atom[0]].kept
+                    self._slot[atom] = self.sizes[kept]
+                    self.sizes[kept] += len(atom)
+                    wanted[self._stage[atom[0]]].append(atom)
+
+    def _ordered(self, stage: Stage, roots: Iterable[Atom]) -> tuple[list[Atom], list[Atom]]:
+        """Atoms of a stage, operands first, and those of earlier stages that it takes."""
+        order: dict[Atom, None] = {}
+        borrowed: dict[Atom, None] = {}
+        stack: list[tuple[Atom, bool]] = [(a, False) for a in reversed(list(roots))]
+        while stack:
+            atom, ready = stack.pop()
+            if ready:
+                order[atom] = None
+            elif atom in order or atom in borrowed:
+                continue
+            elif self._stage[atom[0]] != stage:
+                borrowed[atom] = None
+            else:
+                stack.append((atom, True))
+                args = [a for n in atom for a in self.graph.args[n] if not self._is_leaf(a)]
+                stack.extend((self._atom(a), False) for a in reversed(args))
+        return list(order), list(borrowed)
+
+    # Writing
+
+    def _function(self, stage: Stage) -> str:
+        lines = [self._statement(stage, atom) for atom in self._order[stage]]
+        for atom in self._order[stage]:
+            if atom in self._slot:
+                place = f"{stage.kept} + {self._slot[atom]}"
+                lines.append(
+                    f"tf_put({place}, {_name(atom)});" if len(atom) > 1 else f"*({place}) = {_name(atom)};"
+                )
+        for name, nodes in self.outputs.items():
+            if stage == _writer(name):
+                lines += [f"{name}[{i}] = {self._output(stage, n)};" for i, n in enumerate(nodes)]
+        return (
+            f"static void tf_{stage.name}(TF_{stage.name.upper()}_ARGUMENTS) {{\n  "
+            + "\n  ".join(lines)
+            + "\n}\n"
+        )
+
+    def _statement(self, stage: Stage, atom: Atom) -> str:
+        graph, first = self.graph, atom[0]
+        op = graph.ops[first]
+        suffix, kind = (
+            ("four", "tf_four")
+            if len(atom) > 1
+            else ("wide", "tf_wide")
+            if stage.wide
+            else ("real", "tf_real")
+        )
+        args = [self._operand(stage, t) for t in zip(*(graph.args[n] for n in atom), strict=True)]
+        if op in BINARY:
+            value = f"{args[0]} {BINARY[op]} {args[1]}"
+        elif op == "neg":
+            value = f"-{args[0]}"
+        else:
+            value = f"tf_{op}_{suffix}({', '.join(args)})"
+        return f"const {kind} {_name(atom)} = {value};"
+
+    def _operand(self, stage: Stage, t: Atom) -> str:
+        """An operand: of one node, or of the four nodes of a pack."""
+        if len(t) == 1 or len(set(t)) == 1:
+            return self._scalar(stage, t[0])
+        if t in self._packed:
+            return (
+                _name(t)
+                if self._stage[t[0]] == stage
+                else f"tf_get({self._stage[t[0]].kept} + {self._slot[t]})"
+            )
+        values = [self.graph.values[n] for n in t]
+        if all(self.graph.ops[n] == INPUT for n in t) and values == [
+            (values[0][0], values[0][1] + k) for k in range(WHEELS)
+        ]:
+            return f"tf_get({values[0][0]} + {values[0][1]})"
+        return f"(tf_four){{{', '.join(self._scalar(stage, n) for n in t)}}}"
+
+    def _scalar(self, stage: Stage, n: int) -> str:
+        """One node's value: the name of what was computed, a literal, an argument, or what was kept."""
+        if self.graph.ops[n] == CONST:
+            value = repr(self.graph.values[n])
+            return f"({value})" if value.startswith("-") else value
+        if self.graph.ops[n] == INPUT:
+            name, i = self.graph.values[n]
+            return f"{name}[{i}]"
+        atom, k = self._home.get(n, ((n,), 0))
+        if self._stage[n] != stage:
+            return f"{self._stage[n].kept}[{self._slot[atom] + k}]"
+        return f"{_name(atom)}[{k}]" if len(atom) > 1 else _name(atom)
+
+    def _output(self, stage: Stage, n: int) -> str:
+        text = self._scalar(stage, n)
+        return f"tf_splat_{'wide' if stage.wide else 'real'}({text})" if self.graph.ops[n] == CONST else text
+
+
+def _name(atom: Atom) -> str:
+    return f"w{atom[0]}" if len(atom) > 1 else f"s{atom[0]}"
+
+
+def _writer(output: str) -> Stage:
+    """The stage that writes an output."""
+    return EACH_WIDE if output.endswith("_wide") else EACH

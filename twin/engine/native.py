@@ -1,0 +1,128 @@
+"""The compiled drivers as Python calls them."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import logging
+import subprocess
+import threading
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.engine import codegen, compiler
+from terrafusion.twin.engine.plant import Plant
+
+Array = NDArray[np.float64]
+LOG = logging.getLogger("terrafusion.twin")
+
+_DOUBLE_P = ctypes.POINTER(ctypes.c_double)
+_BUILDING = threading.RLock()  # CasADi's graphs are not safe in threads
+
+
+class _PlantStruct(ctypes.Structure):
+    """`tf_plant` of driver.c."""
+
+    _fields_ = (
+        ("vehicle", _DOUBLE_P), ("effects", _DOUBLE_P),
+        ("time_weight", ctypes.c_double), ("travel_weight", ctypes.c_double),
+        ("knots", ctypes.c_long), ("at", _DOUBLE_P), ("table", _DOUBLE_P),
+        ("rows", ctypes.c_long), ("columns", ctypes.c_long), ("cell", ctypes.c_double),
+        ("log_gain", _DOUBLE_P), ("patch_share", _DOUBLE_P),
+        ("response", _DOUBLE_P), ("patch_soil", _DOUBLE_P),
+    )  # fmt: skip
+
+
+class CPlant:
+    """A `Plant` as the C driver reads it, with the optional parameters of the graph it is driven by."""
+
+    def __init__(self, plant: Plant, effects: tuple[str, ...]) -> None:
+        route, field = plant.route, plant.route.field
+        arrays = [plant.vehicle, plant.effect_values(effects), route.at, route.soil]
+        if field is not None:
+            arrays += [field.log_gain, field.patch_share, field.response, field.patch_soil]
+        self._arrays = [
+            np.ascontiguousarray(a, dtype=float) for a in arrays
+        ]  # kept alive: C points into them
+        pointers = [pointer(a) for a in self._arrays] + [None] * (8 - len(arrays))
+        rows, columns = (0, 0) if field is None else field.log_gain.shape
+        self.struct = _PlantStruct(
+            *pointers[:2], *route.weights(), len(route.at), *pointers[2:4], rows, columns,
+            1.0 if field is None else field.cell_m, *pointers[4:],
+        )  # fmt: skip
+
+
+class Driver:
+    """A compiled driver of `lanes` runs at a time. Calls release the GIL and share nothing."""
+
+    def __init__(self, library: ctypes.CDLL, effects: tuple[str, ...]) -> None:
+        self.effects = effects
+        self.lanes = ctypes.c_int.in_dll(library, "tf_lanes").value
+        self._simulate = library.tf_simulate
+        self._simulate.restype = None
+        self._simulate.argtypes = [
+            ctypes.c_void_p, ctypes.c_long, ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_double,
+            ctypes.c_void_p, ctypes.c_void_p,
+        ]  # fmt: skip
+
+    def run(
+        self,
+        plants: Sequence[Plant],
+        inputs: Sequence[Array],
+        outs: Sequence[Array],
+        dt_s: float,
+        t0_s: float,
+        steps: int,
+        every: int = 1,
+    ) -> None:
+        """Fill each of `outs` (N // every + 1, X), whose first row holds the start, by its inputs (N + 1, U).
+
+        All arrays are contiguous; there are as many of each as the driver has lanes.
+        """
+        held = [CPlant(plant, self.effects) for plant in plants]
+        addresses = (ctypes.c_void_p * self.lanes)(*(ctypes.addressof(h.struct) for h in held))
+        self._simulate(
+            addresses, len(inputs[0]) - 1, steps, every, t0_s, dt_s,
+            (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in inputs)),
+            (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in outs)),
+        )  # fmt: skip
+
+
+def pointer(array: Array) -> Any:
+    """The array's first element as C takes it."""
+    return array.ctypes.data_as(_DOUBLE_P)
+
+
+def driver(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> Driver | None:
+    """The driver of a kind (see `codegen`), None where it cannot be compiled (said once)."""
+    with _BUILDING:
+        return _driver(kind, effects, fixed_ground)
+
+
+@functools.cache
+def _driver(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> Driver | None:
+    command = compiler.find_compiler()
+    if command is None:
+        _say("no C compiler: the twin runs in CasADi's virtual machine, many times slower; "
+             "install a compiler or the ziglang package")  # fmt: skip
+        return None
+    try:
+        path = compiler.compiled(codegen.source(kind, effects, fixed_ground), command)
+        return Driver(ctypes.CDLL(str(path)), effects)
+    except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
+        _say(f"the twin's C code could not be compiled ({error}): it runs in CasADi's virtual machine")
+        return None
+
+
+@functools.cache
+def _say(message: str) -> None:
+    LOG.warning(message)
+
+
+def forget() -> None:
+    """Look for the compiler and load the drivers anew (for tests)."""
+    _driver.cache_clear()
+    _say.cache_clear()
