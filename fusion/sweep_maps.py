@@ -13,10 +13,11 @@ Array = NDArray[np.float64]
 Columns = Mapping[str, NDArray[Any]]
 """The table of a sweep by column, (N,) each; NaN where a number is null."""
 
-NUMERIC_AXES = ("friction", "slope_deg", "payload_kg", "speed_mps", "seed")
+NUMERIC_AXES = ("friction", "slope_deg", "payload_kg", "speed_mps")
 MAX_LEVELS = 40
-"""An axis with more distinct values, as in a random sweep, is cut into `BINS` bins."""
-BINS = 12
+"""An axis with more distinct values, as in a random sweep, is cut into bins."""
+RUNS_A_CELL = 10
+"""Bins are as fine as leaves a cell of two such axes about so many runs."""
 
 
 def columns_of(table: Any) -> dict[str, NDArray[Any]]:
@@ -35,9 +36,9 @@ def select(columns: Columns, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]
 
 
 def varied(columns: Columns) -> list[str]:
-    """Numeric axes with more than one value, but for seeds."""
-    names = [name for name in NUMERIC_AXES if name != "seed"]
-    return [name for name in names if len(levels(columns[name])) > 1]
+    """Numeric axes with more than one value on some ground: grounds differ in friction by themselves."""
+    grounds = [columns["terrain"] == terrain for terrain in dict.fromkeys(columns["terrain"])]
+    return [name for name in NUMERIC_AXES if any(len(levels(columns[name][rows])) > 1 for rows in grounds)]
 
 
 def plane_of(columns: Columns) -> tuple[str, str] | None:
@@ -66,7 +67,8 @@ class CellAxis:
         """One cell a level where there are few; equal bins otherwise."""
         found = levels(values)
         if len(found) > MAX_LEVELS:
-            edges = np.linspace(found[0], found[-1], BINS + 1)
+            bins = int(np.clip(np.sqrt(len(values) / RUNS_A_CELL), 3, MAX_LEVELS))
+            edges = np.linspace(found[0], found[-1], bins + 1)
             return cls(0.5 * (edges[1:] + edges[:-1]), edges)
         middle = 0.5 * (found[1:] + found[:-1])
         first = found[0] - (middle[0] - found[0] if len(middle) else 0.5)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -34,6 +35,7 @@ LABELS = {
 }
 STUCK = "#d9d9d9"
 MAX_GROUPS = 6
+FEW_LEVELS = 6
 Dash = Literal["-", "--", ":", "-."]
 DASHES: tuple[Dash, ...] = ("-", "--", ":", "-.")
 
@@ -41,7 +43,8 @@ DASHES: tuple[Dash, ...] = ("-", "--", ":", "-.")
 def plot_maps(columns: Columns, plane: tuple[str, str], title: str = "") -> Figure:
     """Slip, energy a metre and the share of runs that got on over two axes, with the limit of mobility.
 
-    Slip and energy are medians of the runs that got on; cells without any are grey.
+    Slip and energy are medians over cells in which every run got on: medians of survivors would
+    look better the worse the conditions are. The other cells are grey.
     """
     from matplotlib.colors import LogNorm
     from matplotlib.figure import Figure
@@ -49,12 +52,13 @@ def plot_maps(columns: Columns, plane: tuple[str, str], title: str = "") -> Figu
     fig = Figure(figsize=(11.0, 3.6), layout="constrained")
     x, y = CellAxis.of(columns[plane[0]]), CellAxis.of(columns[plane[1]])
     share = share_mobile(columns, x, y, plane)
-    good = select(columns, columns["status"] == "done")
-    slip = 100.0 * in_cells(good, "mean_slip_ratio", x, y, plane)
-    energy = in_cells(good, "energy_per_m_j", x, y, plane)
+    slip, energy = (
+        np.where(share == 1.0, in_cells(columns, name, x, y, plane), np.nan)
+        for name in ("mean_slip_ratio", "energy_per_m_j")
+    )
     log = LogNorm() if np.nanmax(energy, initial=1.0) > 5.0 * np.nanmin(energy, initial=np.inf) else None
     kinds: list[tuple[str, Array, dict[str, Any]]] = [
-        ("mean slip ratio, %", slip, {"cmap": "viridis"}),
+        ("mean slip ratio, %", 100.0 * slip, {"cmap": "viridis"}),
         ("energy, J/m", energy, {"cmap": "magma_r", "norm": log}),
         ("share of runs that got on", share, {"cmap": "RdYlBu", "vmin": 0.0, "vmax": 1.0}),
     ]
@@ -66,6 +70,7 @@ def plot_maps(columns: Columns, plane: tuple[str, str], title: str = "") -> Figu
             _plain_numbers(bar.ax.yaxis)
         _limit_line(ax, x, y, share, style.TRUTH)
         style.dress(ax, x=LABELS[plane[0]], y=LABELS[plane[1]] if number == 0 else "", title=name)
+        _ticks(ax, x, y)
         ax.grid(False)
     if title:
         fig.suptitle(style.plain(title), fontsize=11)
@@ -73,7 +78,7 @@ def plot_maps(columns: Columns, plane: tuple[str, str], title: str = "") -> Figu
 
 
 def plot_mobility(columns: Columns, plane: tuple[str, str]) -> Figure:
-    """The limit of mobility of each ground and payload: below the line more than half of the runs got on."""
+    """The limit of mobility of each ground and payload: the line on which half of the runs got on."""
     from matplotlib.lines import Line2D
 
     fig, ax = style.canvas(None, (7.5, 4.5))
@@ -82,12 +87,14 @@ def plot_mobility(columns: Columns, plane: tuple[str, str]) -> Figure:
     for (terrain, payload), rows in _groups(columns, plane):
         dash = DASHES[_rank(columns["payload_kg"], payload) % len(DASHES)]
         colour = style.colour_of(terrain, style.TERRAIN_COLOURS)
+        share = share_mobile(select(columns, rows), x, y, plane)
         label = terrain if payload is None else f"{terrain}, {payload:g} kg"
-        part = select(columns, rows)
-        _limit_line(ax, x, y, share_mobile(part, x, y, plane), colour, dash)
+        if not _limit_line(ax, x, y, share, colour, dash):
+            label += ": all got on" if np.nanmin(share, initial=1.0) > 0.5 else ": no limit found"
         handles.append(Line2D([], [], color=colour, linestyle=dash, label=style.plain(label)))
     ax.set_xlim(x.edges[0], x.edges[-1])
     ax.set_ylim(y.edges[0], y.edges[-1])
+    _ticks(ax, x, y)
     if plane == ("friction", "slope_deg"):
         friction = np.linspace(x.edges[0], x.edges[-1], 200)
         label = "friction = tan(slope)"
@@ -99,24 +106,31 @@ def plot_mobility(columns: Columns, plane: tuple[str, str]) -> Figure:
 
 
 def plot_energy_slip(columns: Columns) -> Figure:
-    """Energy a metre against mean slip of the runs that got on, coloured by slope or by ground."""
+    """Energy a metre against mean slip of the runs that got on, coloured by slope, else by ground."""
     fig, ax = style.canvas(None, (7.5, 4.5))
     good = select(columns, (columns["status"] == "done") & np.isfinite(columns["energy_per_m_j"]))
     slip = 100.0 * good["mean_slip_ratio"]
+    sloped = len(levels(good["slope_deg"])) > 1
+    scale = (float(good["slope_deg"].min()), float(good["slope_deg"].max()))
     rows = style.thin(len(slip), 5000)
-    if len(levels(good["slope_deg"])) > 1:
+    terrains = list(dict.fromkeys(good["terrain"]))
+    for terrain, marker in zip(terrains, itertools.cycle("osD^v<>")):
+        here = rows[good["terrain"][rows] == terrain]
         dots = ax.scatter(
-            slip[rows], good["energy_per_m_j"][rows], c=good["slope_deg"][rows], s=9.0, cmap="viridis",
+            slip[here],
+            good["energy_per_m_j"][here],
+            c=good["slope_deg"][here] if sloped else style.colour_of(terrain, style.TERRAIN_COLOURS),
+            cmap="viridis" if sloped else None,
+            vmin=scale[0] if sloped else None,
+            vmax=scale[1] if sloped else None,
+            s=12.0,
+            marker=marker,
+            label=style.plain(terrain),
             rasterized=True,
-        )  # fmt: skip
+        )
+    if sloped:
         fig.colorbar(dots, ax=ax, label="slope, deg")
-    else:
-        for terrain in dict.fromkeys(good["terrain"]):
-            here = good["terrain"] == terrain
-            colour = style.colour_of(terrain, style.TERRAIN_COLOURS)
-            ax.scatter(
-                slip[here], good["energy_per_m_j"][here], s=9.0, color=colour, label=style.plain(terrain)
-            )
+    if len(terrains) > 1:
         style.legend_above(ax)
     ax.set_yscale("log")
     _plain_numbers(ax.yaxis)
@@ -157,7 +171,7 @@ def figures(columns: Columns) -> dict[str, tuple[Figure, str]]:
             out[name] = (plot_maps(part, plane, terrain), _maps_caption(columns, plane))
         out["mobility"] = (
             plot_mobility(columns, plane),
-            "Limit of mobility: below a line more than half of the runs got on.",
+            "Limit of mobility: the line on which half of the runs got on.",
         )
     for axis in varied(columns)[:1] if plane is None else []:
         out["profile"] = (
@@ -178,20 +192,21 @@ def _maps_caption(columns: Columns, plane: tuple[str, str]) -> str:
     others = [LABELS[name].split(",")[0] for name in varied(columns) if name not in plane]
     over = f"; medians over {' and '.join(others)}" if others else ""
     return (
-        "Slip and energy of the runs that got on, and their share"
-        f"{over}. The line is the limit of mobility; grey is where no run got on."
+        f"Slip and energy where every run got on, and the share that did{over}. "
+        "The line is the limit of mobility: half of the runs got on."
     )
 
 
-def _limit_line(ax: Axes, x: CellAxis, y: CellAxis, share: Array, colour: str, dash: Dash = "-") -> None:
-    """The line on which half of the runs got on, where there is one."""
+def _limit_line(ax: Axes, x: CellAxis, y: CellAxis, share: Array, colour: str, dash: Dash = "-") -> bool:
+    """Draw the line on which half of the runs got on; False where there is none."""
     known = np.isfinite(share)
     if min(share.shape) < 2 or not known.any() or share[known].min() >= 0.5 or share[known].max() <= 0.5:
-        return
+        return False
     ax.contour(
         x.centres, y.centres, np.ma.masked_invalid(share), levels=[0.5], colors=[colour], linewidths=[1.6],
         linestyles=[dash],
     )  # fmt: skip
+    return True
 
 
 def _groups(
@@ -212,6 +227,14 @@ def _groups(
 
 def _rank(values: Array, value: float | None) -> int:
     return 0 if value is None else int(np.searchsorted(levels(values), value))
+
+
+def _ticks(ax: Axes, x: CellAxis, y: CellAxis) -> None:
+    """Ticks at the levels, where they are few."""
+    if len(x.centres) <= FEW_LEVELS:
+        ax.set_xticks(x.centres)
+    if len(y.centres) <= FEW_LEVELS:
+        ax.set_yticks(y.centres)
 
 
 def _plain_numbers(axis: Any) -> None:
