@@ -109,7 +109,7 @@ FORMS = (
         "z = z0 (1 + (k_ss + e) d + ...), d driven slip", "linear, as the model's own k_ss",
     ),
     Form(
-        "slip_sinkage", "exponent", one("", 0.2, 0.0, 0.8),
+        "slip_sinkage", "exponent", one("", 0.1, 0.0, 0.8),
         {"ground": lambda q, e: {"exponent": q["exponent"] + e * (smooth_abs(q["slip"], 0.01) - 0.01)}},
         "n = n0 + e abs(s)", "Ding et al. 2010",
     ),
@@ -133,7 +133,7 @@ FORMS = (
         "force e W z / R against the hub's velocity", "ours",
     ),
     Form(
-        "motion_resistance", "viscous", one("N s/m", 10.0, 0.0, 500.0),
+        "motion_resistance", "viscous", one("N s/m", 3.0, 0.0, 500.0),
         {"ground": lambda q, e: {"viscous_ns_per_m": q["viscous_ns_per_m"] + e}},
         "force e times the hub's velocity, each wheel", "as the model's own c_v",
     ),
@@ -173,7 +173,7 @@ FORMS = (
         "ours",
     ),
     Form(
-        "mud_adhesion", "suction", one("Pa", 1000.0, 0.0, 20_000.0),
+        "mud_adhesion", "suction", one("Pa", 1000.0, 0.0, 10_000.0),
         {"ground": lambda q, e: {"suction_pa": q["suction_pa"] + e}},
         "torque (p + e) b l^2 / 2 against rolling", "as the model's own suction p",
     ),

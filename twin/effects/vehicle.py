@@ -18,6 +18,7 @@ SHORTEST_LAG_S = 0.002
 """A filter of the command path is this fast where its parameter is zero: no stiffer than the motor lag."""
 FRICTION_SPEED_RADPS = 0.1
 TURNING_RADPS = 0.2
+PULL_MPS2 = 2.0
 WARMING_J, DISCHARGE_J = 1e3, 1e4
 CROSSING_S = 0.03
 """Time in which a gear crosses its backlash."""
@@ -38,8 +39,9 @@ def _on_rear_axle(q: Quantities, share: Any) -> dict[str, Any]:
 
 
 def _command_g(q: Quantities) -> Any:
-    """Commanded acceleration over that of gravity."""
-    return 0.5 * q["radius_m"] * (q["left_rate_radps2"] + q["right_rate_radps2"]) / GRAVITY_MPS2
+    """Commanded acceleration over that of gravity, held within what a robot gives (a step commands any)."""
+    wanted = 0.5 * q["radius_m"] * (q["left_rate_radps2"] + q["right_rate_radps2"]) / PULL_MPS2
+    return PULL_MPS2 / GRAVITY_MPS2 * wanted / ca.sqrt(1.0 + wanted * wanted)
 
 
 def _filtered(kind: str, q: Quantities, out: Any, lag: Any) -> dict[str, Any]:
@@ -114,7 +116,7 @@ FORMS = (
     Form(
         "cg_longitudinal", "transfer", one("m", 0.1, -0.5, 0.5),
         {"vehicle": lambda q, e: {"cg_forward_m": q["cg_forward_m"] - e * _command_g(q)}},
-        "centre of gravity moves back by e a / g, a commanded", "ours: a load that slides",
+        "centre of gravity moves back by e a / g, a commanded, at most 2 m/s2", "ours: a load that slides",
     ),
     Form(
         "wheel_radius", "scale", one("", 0.03, -0.3, 0.3),
@@ -155,7 +157,7 @@ FORMS = (
         "torque limit times exp(-e E / 1 kJ), E drawn so far", "ours: derating",
     ),
     Form(
-        "battery_sag", "resistance", one("ohm", 0.1, 0.0, 2.0), {"motor": _sagging},
+        "battery_sag", "resistance", one("ohm", 0.1, 0.0, 1.0), {"motor": _sagging},
         "supply U / (1 + e I / U), I of all motors", "a resistance in series, bounded",
     ),
     Form(
