@@ -39,15 +39,27 @@ def limit_slew(wanted: Array, dt_s: float, vehicle: VehicleParams, scenario: Sce
     drive = vehicle.drive
     accel = min(drive.max_accel_mps2, scenario.max_accel_mps2)
     steps = (accel * dt_s, drive.max_yaw_accel_radps2 * dt_s)
-    out = np.empty_like(wanted)
     goal_v = np.clip(wanted[:, 0], -drive.max_speed_mps, drive.max_speed_mps)
-    for column, (goal, step) in enumerate(zip((goal_v, wanted[:, 1]), steps, strict=True)):
-        now, row = float(start[column]), []
-        for target in goal.tolist():
-            missing = target - now
-            now = target if -step <= missing <= step else now + (step if missing > 0.0 else -step)
-            row.append(now)
-        out[:, column] = row
+    goals = zip((goal_v, wanted[:, 1]), steps, start.tolist(), strict=True)
+    return np.stack([follow(goal, step, first) for goal, step, first in goals], axis=1)
+
+
+def follow(goal: Array, step: float, start: float) -> Array:
+    """The goal (N,), approached from `start` by at most `step` a sample."""
+    out = np.array(goal, dtype=float)
+    behind = np.flatnonzero(np.abs(np.diff(goal, prepend=start)) > step).tolist()
+    targets, done = out.tolist(), 0
+    for first in behind:  # elsewhere the goal is met as it stands
+        if first < done:
+            continue
+        now = start if first == 0 else targets[first - 1]
+        for i in range(first, len(targets)):
+            missing = targets[i] - now
+            done = i + 1
+            if -step <= missing <= step:
+                break
+            now += step if missing > 0.0 else -step
+            out[i] = now
     return out
 
 
@@ -73,28 +85,42 @@ def told(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
 
 
 def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
-    """Initial state (38,): standing at the origin with the scenario's heading, settled on the slope."""
+    """Initial state (X,): standing at the origin with the scenario's heading, settled on the slope."""
+    start, inputs = settling(scenario, dt_s)
+    return settled(scenario, integrate(start, inputs, -SETTLE_S)[-1])
+
+
+def settling(scenario: Scenario, dt_s: float) -> tuple[Array, Array]:
+    """State (X,) and inputs (N + 1, U) from which the robot settles for `SETTLE_S`."""
     x0 = np.zeros(len(STATES))
-    heading = math.radians(scenario.heading_deg)
-    x0[INDEX["yaw"]] = heading
-    count = max(1, round(SETTLE_S / dt_s))
-    x = integrate(x0, np.zeros((count + 1, len(INPUTS))), -SETTLE_S)[-1].copy()
+    x0[INDEX["yaw"]] = math.radians(scenario.heading_deg)
+    return x0, np.zeros((max(1, round(SETTLE_S / dt_s)) + 1, len(INPUTS)))
+
+
+def settled(scenario: Scenario, state: Array) -> Array:
+    """The state (X,) after settling, moved back to the origin with nothing driven yet."""
+    x = state.copy()
     for name in ("x", "y", "travel", "clog", "elapsed", *ENERGIES):
         x[INDEX[name]] = 0.0
     x[state_slice("wheel_angle")] = 0.0
-    x[INDEX["yaw"]] = heading
+    x[INDEX["yaw"]] = math.radians(scenario.heading_deg)
     return x
+
+
+def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[Array, Array]:
+    """Wanted twist (N, 2) and inputs (N, U) of a scenario that steers by no waypoints."""
+    dt = float(t_s[-1]) / (len(t_s) - 1)
+    wanted = scenario.commanded(t_s)
+    twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
+    return wanted, told(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
 
 
 def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator) -> Driven:
     """Drive the scenario at the samples t_s (N,), uniformly spaced from 0."""
-    dt = float(t_s[-1]) / (len(t_s) - 1)
-    start = at_rest(scenario, dt, integrate)
+    start = at_rest(scenario, float(t_s[-1]) / (len(t_s) - 1), integrate)
     if scenario.waypoints:
         return _steer(scenario, t_s, vehicle, integrate, start)
-    wanted = scenario.commanded(t_s)
-    twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
-    inputs = told(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
+    wanted, inputs = open_loop(scenario, t_s, vehicle)
     return Driven(wanted, integrate(start, inputs, 0.0))
 
 

@@ -1,0 +1,33 @@
+"""Commands within the limit of acceleration: the fast way equals the plain rule to the bit."""
+
+from __future__ import annotations
+
+import hypothesis.strategies as st
+import numpy as np
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
+
+from terrafusion.twin.drive import follow
+
+SPEEDS = st.floats(-3.0, 3.0).map(lambda v: round(v, 2))
+
+
+def plainly(goal: np.ndarray, step: float, start: float) -> np.ndarray:
+    """One sample after the other."""
+    now, out = start, []
+    for target in goal.tolist():
+        missing = target - now
+        now = target if abs(missing) <= step else now + (step if missing > 0.0 else -step)
+        out.append(now)
+    return np.array(out)
+
+
+@given(arrays(float, st.integers(0, 40), elements=SPEEDS), st.floats(0.001, 4.0), SPEEDS)
+def test_following_a_goal(goal: np.ndarray, step: float, start: float) -> None:
+    found = follow(goal, step, start)
+    np.testing.assert_array_equal(found, plainly(goal, step, start))
+    assert (np.abs(np.diff(found, prepend=start)) <= step * (1.0 + 1e-12) + 1e-15).all()
+
+
+def test_a_step_is_a_ramp_that_ends_on_the_goal() -> None:
+    np.testing.assert_allclose(follow(np.full(6, 1.0), 0.3, 0.0), [0.3, 0.6, 0.9, 1.0, 1.0, 1.0], atol=1e-15)
