@@ -6,6 +6,7 @@ range it must lie in. In the file it stands as a mapping with its source::
     mass_kg: {value: 32.0, source: "source study, Tab. 1"}
 
 The unit is the suffix of the key, so that a number cannot be read without it.
+`valid: [low, high]` may stand beside it: the range its source covers, held against the value.
 An unknown key, a missing source, a value out of range or of the wrong type is
 a `ConfigError` that names the key, the value and what is allowed.
 """
@@ -207,16 +208,32 @@ def _sourced(quantity: Quantity, raw: Any, file: Path | str, key: str) -> Any:
             remedy=f"write {{value: {quantity.allowed()}, source: where it comes from}}",
         )
     for name in raw:
-        if name not in ("value", "source"):
+        if name not in ("value", "source", "valid"):
             why = " (the unit is the suffix of the key)" if name == "unit" else ""
             raise ConfigError(
                 f"'{key}' has the unknown entry '{shown(name)}'{why}",
                 file=file,
-                remedy="keep 'value' and 'source' only",
+                remedy="keep 'value', 'source' and 'valid' only",
             )
     if not isinstance(raw.get("source"), str) or not raw["source"].strip():
         raise ConfigError(f"'{key}' has no source", file=file, remedy="tell where the number comes from")
-    return checked_number(raw.get("value"), quantity, file=file, key=key)
+    value = checked_number(raw.get("value"), quantity, file=file, key=key)
+    if "valid" in raw:
+        _check_valid(value, raw["valid"], quantity, file, key)
+    return value
+
+
+def _check_valid(value: Any, valid: Any, quantity: Quantity, file: Path | str, key: str) -> None:
+    """Refuses a number outside the range its source covers, `valid: [low, high]`."""
+    both = dataclasses.replace(quantity, size=2)
+    low, high = checked_number(valid, both, file=file, key=f"{key}.valid")  # type: ignore[misc]
+    numbers = value if isinstance(value, tuple) else (value,)
+    if not all(low <= number <= high for number in numbers):
+        raise ConfigError(
+            f"'{key}' is {shown(value)}, outside its validity range",
+            file=file,
+            remedy=f"its source covers [{low:g}, {high:g}] {quantity.unit}".rstrip(),
+        )
 
 
 def _unknown_key(name: str, known: list[str], file: Path | str, key: str) -> ConfigError:

@@ -63,10 +63,14 @@ class DriveSegment:
 
 @dataclass(frozen=True)
 class RouteLeg:
-    """Ground `terrain` for `length` metres (or seconds, see `Scenario.route_over`); the last has none."""
+    """Ground `terrain` for `length` metres (or seconds, see `Scenario.route_over`); the last has none.
+
+    `moisture_percent`, where known, is held against the range in which the soil was measured.
+    """
 
     terrain: str
     length: float | None = None
+    moisture_percent: float | None = None
 
 
 @dataclass(frozen=True)

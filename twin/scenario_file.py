@@ -48,6 +48,7 @@ _INTERVAL = {"start_s": _SECONDS, "duration_s": _DURATION}
 _STRETCH = {"start_m": Quantity("m", 0.0, 1e6), "length_m": Quantity("m", 0.1, 1e6)}
 _DENSITY = {"density": Quantity("", 0.0, 1.0)}
 _LENGTH = Quantity("m", 0.1, 1000.0)
+_PERCENT = Quantity("%", 0.0, 500.0)
 _VARIATION = {"strength_sigma": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
 _PATCHES = {"share": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
 
@@ -107,7 +108,7 @@ def _route(raw: dict[str, Any], over: str, file: str) -> tuple[RouteLeg, ...]:
     rows = _list(raw, "route", file)
     for i, row in enumerate(rows):
         here = f"route[{i}]"
-        _known(row, ("terrain", key), file, here)
+        _known(row, ("terrain", key, "moisture_percent"), file, here)
         if not isinstance(row.get("terrain"), str):
             raise ConfigError(f"'{here}.terrain' is missing", file=file, remedy="name a terrain")
         length = None
@@ -117,7 +118,10 @@ def _route(raw: dict[str, Any], over: str, file: str) -> tuple[RouteLeg, ...]:
                     f"'{here}.{key}' is missing", file=file, remedy="only the last leg has no length"
                 )
             length = float(checked_number(row[key], Quantity("", 0.1, 1e6), file=file, key=f"{here}.{key}"))  # type: ignore[arg-type]
-        legs.append(RouteLeg(row["terrain"], length))
+        wet = row.get("moisture_percent")
+        if wet is not None:
+            wet = float(checked_number(wet, _PERCENT, file=file, key=f"{here}.moisture_percent"))  # type: ignore[arg-type]
+        legs.append(RouteLeg(row["terrain"], length, wet))
     if not legs:
         raise ConfigError("'route' is empty", file=file, remedy="name at least one terrain")
     return tuple(legs)

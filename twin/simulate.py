@@ -27,6 +27,7 @@ from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import Scenario, load_scenario
 from terrafusion.twin.soil import SoilParams
 from terrafusion.twin.summary import RunSummary, slip_ratios, summarise
+from terrafusion.twin.validity import check_ground, check_slip
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_payload
 
 Array = NDArray[np.float64]
@@ -140,6 +141,7 @@ def simulate_run(
         recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
     recording = recording.with_notes(*_notes(setup, motion, vehicle))
     slip = slip_ratios(driven.states, motion, setup.vehicle)
+    check_slip(setup.route, setup.plant.route.field, setup.t_s, driven.states, slip)
     summary = summarise(driven, motion, setup.vehicle, slip)
     return SimulatedRun(recording, setup.t_s, driven.states, slip, summary, driven.wanted)
 
@@ -165,6 +167,7 @@ def set_up(
     _check(scenario, vehicle, seed)
     vehicle = with_payload(vehicle, scenario.payload_kg, scenario.payload_at_m)
     route = Route.of(scenario, soils)
+    check_ground(route, scenario, vehicle)
     slope, aspect = scenario.plane()
     _check_stands(scenario, vehicle)
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect)

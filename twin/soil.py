@@ -8,6 +8,7 @@ wheels, `vibration` for what an IMU on the chassis feels.
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -87,6 +88,22 @@ class Vibration:
 
 
 @dataclass(frozen=True)
+class Validity:
+    """Ranges (low, high) in which a soil's numbers hold; the module `validity` refuses what lies outside."""
+
+    ground_pressure_pa: Annotated[tuple[float, ...], Quantity("Pa", 0.0, 1e8, size=2)] = (0.0, 1e8)
+    wheel_diameter_m: Annotated[tuple[float, ...], Quantity("m", 0.0, 10.0, size=2)] = (0.0, 10.0)
+    slip: Annotated[tuple[float, ...], Quantity("", -2.0, 2.0, size=2)] = (-2.0, 2.0)
+    moisture_percent: Annotated[tuple[float, ...], Quantity("%", 0.0, 500.0, size=2)] | None = None
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            span = getattr(self, field.name)
+            if span is not None and span[0] > span[1]:
+                raise ValueError(f"validity.{field.name} must be [low, high]")
+
+
+@dataclass(frozen=True)
 class SoilParams:
     """A terrain under a small wheeled robot."""
 
@@ -98,6 +115,7 @@ class SoilParams:
     mud: Mud
     vibration: Vibration
     passive: Passive = Passive()
+    validity: Validity = Validity()
 
     def __post_init__(self) -> None:
         if self.vibration.high_hz <= self.vibration.low_hz:
