@@ -12,7 +12,18 @@ import sys
 import typer
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.fusion.cli import convert, demo, fetch, inspect, policy, replay, simulate, sweep, terrain
+from terrafusion.fusion.cli import (
+    convert,
+    demo,
+    fetch,
+    inspect,
+    policy,
+    replay,
+    simulate,
+    study,
+    sweep,
+    terrain,
+)
 
 app = typer.Typer(
     name="terrafusion",
@@ -27,6 +38,7 @@ app.command("fetch")(fetch.fetch)
 app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("sweep")(sweep.sweep)
+app.command("study")(study.study)
 app.command("replay")(replay.replay)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")

@@ -9,6 +9,7 @@ from terrafusion.twin.study.criteria import AGREE, VERDICTS, Criterion
 from terrafusion.twin.study.spread import Spread
 
 PREDICTED, CALIBRATED, GIVEN = "predicted", "calibrated", "given"
+NOT_EXAMINED = "not looked into: it agreed when this was written"
 BASES = (PREDICTED, CALIBRATED, GIVEN)
 
 
@@ -25,7 +26,7 @@ class Claim:
         unit, digits: how its value is told.
         basis: `PREDICTED`, or why agreement proves little: `CALIBRATED` to this, or `GIVEN` to the twin.
         why: what in the twin makes it agree.
-        why_not: what stands in the way where it does not.
+        why_not: what stands in the way where it does not; empty where it never was looked into.
     """
 
     source: str
@@ -81,5 +82,5 @@ def _row(claim: Claim, found: Spread) -> Row:
         verdict=verdict,
         criterion=claim.criterion.words(claim.unit),
         basis=claim.basis,
-        why=claim.why if verdict == AGREE else claim.why_not,
+        why=claim.why if verdict == AGREE else claim.why_not or NOT_EXAMINED,
     )

@@ -98,10 +98,7 @@ class Published:
         return _rank(near or among, 1.0 / FACTOR <= ratio <= FACTOR)
 
     def words(self, unit: str) -> str:
-        return (
-            f"within {POINTS:g} point or {100 * SHARE:g} %, or among the single runs "
-            f"(partly: within a factor of {FACTOR:g})"
-        )
+        return f"±{POINTS:g} point or ±{100 * SHARE:g} %, or among single runs (partly: factor {FACTOR:g})"
 
     def wanted(self, unit: str) -> str:
         return _told(self.target, unit)

@@ -81,6 +81,12 @@ def _ratios(runs: Runs, added: Sequence[Mapping[str, float]]) -> Evidence:
         "sand.slip.loose_over_medium": _quotients(
             (run.errors.slip for run in loose), (run.errors.slip for run in medium)
         ),
+        "sand.odometry.loose_over_medium": _quotients(
+            (run.errors.odometry for run in loose), (run.errors.odometry for run in medium)
+        ),
+        "medium_sand.imu_over_odometry": _quotients(
+            (run.errors.imu for run in medium), (run.errors.odometry for run in medium)
+        ),
         "loose_sand.odometry_over_others": _quotients(
             (run.errors.odometry for run in loose), (max(run.errors.imu, run.errors.gnss) for run in loose)
         ),

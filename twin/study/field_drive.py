@@ -19,7 +19,7 @@ from terrafusion.datasets.frames import enu_to_geodetic
 from terrafusion.datasets.recording import Fix, Recording
 from terrafusion.twin.scenario import DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study.cases import VEHICLE
+from terrafusion.twin.study.cases import UNEVEN, VEHICLE
 from terrafusion.twin.study.processing import CUTOFF_HZ, imu_speed, low_pass
 
 Array = NDArray[np.float64]
@@ -46,6 +46,7 @@ FIELD_DRIVE = Scenario(
         RouteLeg("medium_sand", 40.0), RouteLeg("loose_sand", 50.0), RouteLeg("medium_sand", 30.0),
         RouteLeg("loose_sand", 40.0), RouteLeg("medium_sand"),
     ),
+    variation=UNEVEN,
     gnss_fix=Fix.SINGLE,
     gnss_outages=tuple(Interval(start, length) for start, length in ((52.0, 3.0), (97.0, 2.0), (176.0, 4.0))),
 )  # fmt: skip

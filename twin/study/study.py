@@ -30,7 +30,7 @@ from terrafusion.twin.study.gnss_noise import RATES_HZ, NoiseFit, NoisyRun, fit_
 from terrafusion.twin.study.published import CASES, Case
 from terrafusion.twin.sweeping.pools import open_pool
 
-SEEDS, QUICK_SEEDS, MOST_SEEDS = 10, 3, 1000
+SEEDS, QUICK_SEEDS, MOST_SEEDS = 10, 2, 1000
 STUDY_LIKE_HZ = 5.0
 """Rate at which the study-like Gaussian noise is shown: that of the twin's receiver."""
 FLAT_TERRAIN = "loose_sand"
@@ -101,7 +101,7 @@ def run_study(plan: StudyPlan, progress: Progress | None = None) -> Study:
         TerrafusionError: a worker process died.
     """
     seeds, level = range(plan.seed_count()), Case(FLAT_TERRAIN, 0.0, *[float("nan")] * 4)
-    cells, steps = grid(plan.quick), slip_cells()
+    cells, steps = grid(plan.quick), slip_cells(plan.quick)
     work: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
         *((run_case, (case, seed)) for case in (*CASES, level) for seed in seeds),
         *((run_case, (case, seed, UNEVEN)) for case in CASES for seed in seeds),

@@ -10,6 +10,7 @@ from terrafusion.twin.study.published import CASES, Case
 from terrafusion.twin.study.spread import spread
 from terrafusion.twin.study.study import Study
 
+TAB4_HEAD = ("", "|s|", "odometry", "IMU", "GNSS, RTK", "GNSS, Gaussian", "stopped for good at")
 COLUMNS = ("source", "statement", "quantity", "study", "twin", "verdict", "criterion", "basis", "why")
 """Columns of the table of agreement, fields of `Row`."""
 
@@ -18,9 +19,8 @@ def study_lines(study: Study) -> list[str]:
     """Tab. 4 side by side, the GNSS noise, and how much agrees."""
     seeds = study.plan.seed_count()
     lines = [f"mean %, twin / study; {seeds} seeds, 95 % interval of the mean"]
-    head = ["", "|s|", "odometry", "IMU", "GNSS, RTK", "GNSS, Gaussian", "stopped for good after"]
-    rows = [head, *([case.label, *table_cells(study, case)] for case in CASES)]
-    widths = [max(len(row[k]) for row in rows) for k in range(len(head))]
+    rows = [list(TAB4_HEAD), *([case.label, *table_cells(study, case)] for case in CASES)]
+    widths = [max(len(row[k]) for row in rows) for k in range(len(TAB4_HEAD))]
     lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows]
     return [*lines, "", noise_sentence(study), *count_lines(study.rows)]
 
@@ -81,3 +81,22 @@ def markdown_rows(rows: Sequence[Row], columns: Sequence[str] = COLUMNS) -> list
         cells = [str(getattr(row, column)).replace("|", "\\|") for column in columns]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
+
+
+def document_section(study: Study) -> list[str]:
+    """What docs/study.md holds between its marks: Tab. 4, the GNSS noise, the counts, and the table."""
+    cells = [[case.label, *table_cells(study, case)] for case in CASES]
+    lines = [
+        "| mean %, twin / study | " + " | ".join(name.replace("|", "\\|") for name in TAB4_HEAD[1:]) + " |"
+    ]
+    lines.append(f"|{' --- |' * len(TAB4_HEAD)}")
+    lines += [f"| {' | '.join(row)} |" for row in cells]
+    return [
+        *lines,
+        "",
+        noise_sentence(study),
+        "",
+        *(f"- {line}" for line in count_lines(study.rows)),
+        "",
+        *markdown_rows(study.rows),
+    ]

@@ -1,0 +1,45 @@
+"""`terrafusion study`: the source study, reproduced by the twin."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafusion.fusion.cli.common import progress_bar
+
+
+def study(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the tables, metrics.json and report.html.")],
+    quick: Annotated[bool, typer.Option("--quick", help="Two seeds and a small batch.")] = False,
+    seeds: Annotated[
+        int | None, typer.Option(help="Seeds a case (10; 2 when quick).", show_default=False)
+    ] = None,
+    jobs: Annotated[int, typer.Option(help="Processes to run the twin in.")] = 1,
+    bags: Annotated[
+        bool, typer.Option("--bags", help="Also write the three runs as ROS 2 bags (MCAP).")
+    ] = False,
+) -> None:
+    """Reproduce the study this project starts from, and judge the twin against it, statement by statement.
+
+    Runs mud, loose and medium sand, the batch over friction, slope and payload, and a drive like the field
+    test. Prints Tab. 4 side by side; writes agreement.csv, metrics.json, batch.csv and report.html.
+
+    Example: terrafusion study --out study-out --quick --jobs 2
+    """
+    from terrafusion.fusion.study_outputs import write_bags, write_plan, write_study
+    from terrafusion.twin.study.study import StudyPlan, run_study
+    from terrafusion.twin.study.text import study_lines
+
+    plan = StudyPlan(seeds=seeds, quick=quick, jobs=jobs)
+    write_plan(out, plan)
+    with progress_bar("study") as progress:
+        found = run_study(plan, progress)
+    command = f"terrafusion study{' --quick' if quick else ''} --seeds {plan.seed_count()}"
+    write_study(out, found, {"command": command})
+    if bags:
+        write_bags(out)
+    for line in study_lines(found):
+        print(line)
+    print(f"report: {out / 'report.html'}")
