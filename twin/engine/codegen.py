@@ -3,32 +3,56 @@
 from __future__ import annotations
 
 from importlib import resources
+from typing import Any
 
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import CALLS, UnsupportedOperationError, read, with_reciprocals
 from terrafusion.twin.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
 
-__all__ = ["LANES", "SINGLE", "UnsupportedOperationError", "source", "wheel_of"]
+__all__ = ["LANES", "SINGLE", "TANGENT", "UnsupportedOperationError", "source", "wheel_of"]
 
-SINGLE, LANES = "single", "lanes"
-"""One run, its wheels side by side in a vector; several runs side by side."""
+SINGLE, LANES, TANGENT = "single", "lanes", "tangent"
+"""One run, its wheels side by side in a vector; several runs side by side; one run with its derivatives."""
 
 _ARGUMENTS = {
     "once": "const tf_real *vehicle, const tf_real *effects, const tf_real *soil, tf_real *held",
     "each": "const tf_real *x, const tf_real *u, const tf_real *vehicle, const tf_real *effects, "
     "const tf_real *soil, const tf_real *held, tf_real *local, tf_real *dx",
+    "once_wide": "const tf_real *vehicle, const tf_real *effects, const tf_real *soil, const tf_real *held, "
+    "const tf_wide *vehicle_wide, const tf_wide *effects_wide, const tf_wide *soil_wide, tf_wide *held_wide",
+    "each_wide": "const tf_real *x, const tf_real *u, const tf_real *vehicle, const tf_real *effects, "
+    "const tf_real *soil, const tf_real *held, const tf_real *local, const tf_wide *x_wide, "
+    "const tf_wide *vehicle_wide, const tf_wide *effects_wide, const tf_wide *soil_wide, "
+    "const tf_wide *held_wide, tf_wide *dx_wide",
 }
+_WIDE = ("x_wide", "vehicle_wide", "soil_wide", "effects_wide")
 
 
 def source(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> str:
     """C source of a driver; with `fixed_ground` the soil is taken once a run."""
-    graph, outputs = read(rhs(effects), _element)
-    late = {"x", "u"} if fixed_ground else {"x", "u", "soil"}
-    graph, outputs = with_reciprocals(graph, outputs, {"x", "u"}, "dx")
-    emitter = Emitter(graph, outputs, late, (), wheel_of if kind == SINGLE else None)
-    functions = emitter.source()
-    return "\n".join([_sizes(effects), _prelude(kind), functions, _text("driver.c")])
+    function = rhs(effects) if kind != TANGENT else _with_tangent(rhs(effects))
+    graph, outputs = with_reciprocals(*read(function, _element), {"x", "u"}, "dx")
+    late = {"x", "u", "x_wide"} | (set() if fixed_ground else {"soil", "soil_wide"})
+    emitter = Emitter(
+        graph, outputs, late, _WIDE if kind == TANGENT else (), None if kind == LANES else wheel_of
+    )
+    loops = [_text("driver.c"), _text("tangent.c")] if kind == TANGENT else [_text("driver.c")]
+    return "\n".join([_sizes(effects), _prelude(kind), emitter.source(), *loops])
+
+
+def _with_tangent(f: Any) -> Any:
+    """The right-hand side with its derivative `dx_wide` along a direction, named by `_WIDE`."""
+    import casadi as ca
+
+    plain = {name: ca.SX.sym(name, f.size1_in(name)) for name in f.name_in()}
+    seeds = {name: ca.SX.sym(name, f.size1_in(name.removesuffix("_wide"))) for name in _WIDE}
+    dx = f(*plain.values())
+    by = ca.vertcat(*(plain[name.removesuffix("_wide")] for name in _WIDE))
+    tangent = ca.jtimes(dx, by, ca.vertcat(*seeds.values()))
+    arguments = {**plain, **seeds}
+    return ca.Function("tf_tangent", [*arguments.values()], [dx, tangent], [*arguments], ["dx", "dx_wide"],
+                       {"cse": True})  # fmt: skip
 
 
 def wheel_of(argument: str, element: int) -> tuple[int, int] | None:
@@ -63,7 +87,8 @@ def _sizes(effects: tuple[str, ...]) -> str:
 def _prelude(kind: str) -> str:
     if kind == LANES:
         return _LANES_HEAD + _kernels("tf_real", "TF_RUNS", "real")
-    return _SINGLE_HEAD + _kernels("tf_four", "TF_WHEELS", "four") + _FOURS + _scalar_calls()
+    head = _SINGLE_HEAD + _kernels("tf_four", "TF_WHEELS", "four") + _FOURS + _scalar_calls()
+    return head + _WIDE_TYPE if kind == TANGENT else head
 
 
 def _kernels(vector: str, width: str, suffix: str) -> str:
@@ -91,6 +116,15 @@ _LANES_HEAD = f"""{_HEAD}
 _SINGLE_HEAD = f"""{_HEAD}
 #define TF_RUNS 1
 typedef double tf_real;
+"""
+_WIDE_TYPE = """
+#define TF_DIRECTIONS 4
+typedef double tf_wide __attribute__((vector_size(8 * TF_DIRECTIONS), may_alias));
+static inline tf_wide tf_splat_wide(double a) {
+  tf_wide r;
+  for (int i = 0; i < TF_DIRECTIONS; ++i) r[i] = a;
+  return r;
+}
 """
 _FOURS = """
 static inline double tf_splat_real(double a) { return a; }

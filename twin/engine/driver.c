@@ -61,28 +61,36 @@ static void tf_field(tf_ground *ground, double x, double y, double yaw) {
   }
 }
 
-/* Row of the route table at a coordinate and the weight of the row after it. */
-static long tf_where(const tf_plant *plant, double c, double *weight) {
-  long k = 0;
-  *weight = 0.0;
-  while (k < plant->knots - 1 && c >= plant->at[k + 1]) ++k;
-  if (k == plant->knots - 1 || !(c > plant->at[0])) return k;
-  const double s = (c - plant->at[k]) / (plant->at[k + 1] - plant->at[k]);
-  *weight = s * s * (3.0 - 2.0 * s);
-  return k;
+/* Where a wheel is on the route: row of the table, weight of the row after it, and its derivative. */
+typedef struct {
+  long row;
+  double weight, slope;
+} tf_place;
+
+static tf_place tf_where(const tf_ground *ground, int wheel, double t, double travel) {
+  const tf_plant *plant = ground->plant;
+  const double c = plant->time_weight * t + plant->travel_weight * (travel + ground->ahead[wheel]);
+  tf_place place = {0, 0.0, 0.0};
+  while (place.row < plant->knots - 1 && c >= plant->at[place.row + 1]) ++place.row;
+  if (place.row < plant->knots - 1 && c > plant->at[0]) {
+    const double length = plant->at[place.row + 1] - plant->at[place.row], s = (c - plant->at[place.row]) / length;
+    place.weight = s * s * (3.0 - 2.0 * s);
+    place.slope = 6.0 * s * (1.0 - s) / length;
+  }
+  return place;
 }
 
 /* The soil under each wheel into soil[(parameter * TF_WHEELS + wheel) * stride]. */
 static void tf_soil(tf_ground *ground, double t, double travel, double *soil, int stride) {
   const tf_plant *plant = ground->plant;
   for (int k = 0; k < TF_WHEELS; ++k) {
-    double w;
-    const long row = tf_where(plant, plant->time_weight * t + plant->travel_weight * (travel + ground->ahead[k]), &w);
-    const double *a = plant->table + row * TF_NP, *b = w == 0.0 ? a : a + TF_NP;
-    if (plant->rows == 0 && w == 0.0 && ground->row[k] == row) continue;
-    ground->row[k] = plant->rows == 0 && w == 0.0 ? row : -1;
+    const tf_place place = tf_where(ground, k, t, travel);
+    const double *a = plant->table + place.row * TF_NP, *b = place.weight == 0.0 ? a : a + TF_NP;
+    const int whole = plant->rows == 0 && place.weight == 0.0;
+    if (whole && ground->row[k] == place.row) continue;
+    ground->row[k] = whole ? place.row : -1;
     for (int i = 0; i < TF_NP; ++i) {
-      double value = a[i] + w * (b[i] - a[i]);
+      double value = a[i] + place.weight * (b[i] - a[i]);
       if (plant->rows > 0) {
         value *= ground->gain[k][i];
         value += ground->share[k] * (plant->patch_soil[i] - value);
@@ -130,18 +138,20 @@ static void tf_slope(tf_runs *runs, double t, const tf_real *x, const tf_real *u
   tf_each(x, u, runs->vehicle, runs->effects, runs->soil, runs->held, runs->local, dx);
 }
 
+/* The four stages of RK4: how far ahead of the step's start they lie, which input they take, their weights. */
+static const double tf_stage_at[4] = {0.0, 0.5, 0.5, 1.0}, tf_stage_weight[4] = {1.0, 2.0, 2.0, 1.0};
+static const int tf_stage_input[4] = {0, 1, 1, 2};
+
 static void tf_rk4(tf_runs *runs, double t, double h, tf_real *x, tf_real u[3][TF_NU]) {
-  tf_real k1[TF_NX], k2[TF_NX], k3[TF_NX], k4[TF_NX], y[TF_NX];
-  int i;
+  tf_real k[TF_NX] = {0}, sum[TF_NX] = {0}, y[TF_NX];
   if (runs->changing) tf_fields(runs, x);
-  tf_slope(runs, t, x, u[0], k1);
-  for (i = 0; i < TF_NX; ++i) y[i] = x[i] + 0.5 * h * k1[i];
-  tf_slope(runs, t + 0.5 * h, y, u[1], k2);
-  for (i = 0; i < TF_NX; ++i) y[i] = x[i] + 0.5 * h * k2[i];
-  tf_slope(runs, t + 0.5 * h, y, u[1], k3);
-  for (i = 0; i < TF_NX; ++i) y[i] = x[i] + h * k3[i];
-  tf_slope(runs, t + h, y, u[2], k4);
-  for (i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i]);
+  for (int s = 0; s < 4; ++s) {
+    const double ahead = tf_stage_at[s] * h;
+    for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + ahead * k[i];
+    tf_slope(runs, t + ahead, y, u[tf_stage_input[s]], k);
+    for (int i = 0; i < TF_NX; ++i) sum[i] += tf_stage_weight[s] * k[i];
+  }
+  for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * sum[i];
 }
 
 /* Inputs at the start, middle and end of step j of `substeps` after a sample. */
@@ -161,7 +171,11 @@ static void tf_inputs(const double *const *inputs, long sample, long j, long sub
 #define TF_EXPORT __attribute__((visibility("default")))
 #endif
 
+#if defined(TF_DIRECTIONS)
+TF_EXPORT const int tf_lanes = TF_DIRECTIONS;
+#else
 TF_EXPORT const int tf_lanes = TF_RUNS;
+#endif
 
 /* Samples x(t0 + i dt), i = 0..n, of TF_RUNS runs; every `every`-th into outs[run] ((n / every + 1, TF_NX)),
  * whose first row holds x(t0) on entry. Two lanes may name the same run. */

@@ -19,6 +19,8 @@ from terrafusion.twin.engine.plant import Plant
 Array = NDArray[np.float64]
 LOG = logging.getLogger("terrafusion.twin")
 
+MAX_BLOCKS = 4
+"""Blocks of directions a run carries (TF_BLOCKS of tangent.c)."""
 _DOUBLE_P = ctypes.POINTER(ctypes.c_double)
 _BUILDING = threading.RLock()  # CasADi's graphs are not safe in threads
 
@@ -56,9 +58,12 @@ class CPlant:
 
 
 class Driver:
-    """A compiled driver of `lanes` runs at a time. Calls release the GIL and share nothing."""
+    """A compiled driver of `lanes` runs at a time (of the kind `TANGENT`: directions).
 
-    def __init__(self, library: ctypes.CDLL, effects: tuple[str, ...]) -> None:
+    Calls release the GIL and share nothing.
+    """
+
+    def __init__(self, library: ctypes.CDLL, kind: str, effects: tuple[str, ...]) -> None:
         self.effects = effects
         self.lanes = ctypes.c_int.in_dll(library, "tf_lanes").value
         self._simulate = library.tf_simulate
@@ -67,6 +72,10 @@ class Driver:
             ctypes.c_void_p, ctypes.c_long, ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_double,
             ctypes.c_void_p, ctypes.c_void_p,
         ]  # fmt: skip
+        if kind == codegen.TANGENT:
+            self._simulate_wide = library.tf_simulate_wide
+            self._simulate_wide.restype = None
+            self._simulate_wide.argtypes = [*self._simulate.argtypes, ctypes.c_long, *[ctypes.c_void_p] * 5]
 
     def run(
         self,
@@ -90,6 +99,33 @@ class Driver:
             (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in outs)),
         )  # fmt: skip
 
+    def run_with_tangents(
+        self,
+        plant: Plant,
+        inputs: Array,
+        out: Array,
+        dt_s: float,
+        t0_s: float,
+        steps: int,
+        every: int,
+        tangents: Sequence[Array],
+    ) -> Array:
+        """Fill `out` as `run` does; the tangents (N // every + 1, X, M).
+
+        `tangents` are those of start (X, M), vehicle (V, M), effects (E, M) and route table (K S, M), with
+        M a multiple of `lanes` and at most `MAX_BLOCKS` of them.
+        """
+        count = tangents[0].shape[1]
+        blocks = count // self.lanes
+        split = [np.ascontiguousarray(a.reshape(len(a), blocks, self.lanes).swapaxes(0, 1)) for a in tangents]
+        wide = np.empty((len(out), out.shape[1], count))
+        held = CPlant(plant, self.effects)
+        self._simulate_wide(
+            ctypes.addressof(held.struct), len(inputs) - 1, steps, every, t0_s, dt_s, inputs.ctypes.data,
+            out.ctypes.data, blocks, *(a.ctypes.data for a in split), wide.ctypes.data,
+        )  # fmt: skip
+        return wide
+
 
 def pointer(array: Array) -> Any:
     """The array's first element as C takes it."""
@@ -111,7 +147,7 @@ def _driver(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> Driver |
         return None
     try:
         path = compiler.compiled(codegen.source(kind, effects, fixed_ground), command)
-        return Driver(ctypes.CDLL(str(path)), effects)
+        return Driver(ctypes.CDLL(str(path)), kind, effects)
     except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
         _say(f"the twin's C code could not be compiled ({error}): it runs in CasADi's virtual machine")
         return None

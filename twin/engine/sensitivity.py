@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.engine import vm
-from terrafusion.twin.engine.integrate import checked, raise_if_diverged, steps_a_sample
+from terrafusion.twin.engine.codegen import TANGENT
+from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged, steps_a_sample
+from terrafusion.twin.engine.native import MAX_BLOCKS, Driver
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 
@@ -62,6 +64,7 @@ def integrate_with_sensitivity(
     t0_s: float = 0.0,
     backend: str = "auto",
     substeps: int | None = None,
+    every: int = 1,
 ) -> tuple[Array, Array]:
     """States (N + 1, X), as `integrate` gives them, and their derivatives (N + 1, X, M) along M directions.
 
@@ -72,6 +75,7 @@ def integrate_with_sensitivity(
     Args:
         x0, inputs, dt_s, plant, t0_s, backend, substeps: as for `integrate.integrate`.
         directions: what changes in each direction.
+        every: only every so many-th sample is returned, from the first on.
 
     Raises:
         TerrafusionError: the state or a derivative ceased to be finite (the message names the time).
@@ -81,14 +85,58 @@ def integrate_with_sensitivity(
     steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
     effects = plant.effect_names(directions.effects)
     tangents = _tangents(plant, directions, effects)
-    out = vm.run_with_tangents(x0, inputs, dt_s, plant, t0_s, steps, tangents, effects)
-    raise_if_diverged(out, t0_s, dt_s)
-    nx = len(STATES)
-    return out[:, :nx], out[:, nx:].reshape(len(out), directions.count, nx).transpose(0, 2, 1)
+    native = chosen(backend, TANGENT, plant, effects)
+    if native is None:
+        return _by_vm(x0, inputs, dt_s, plant, t0_s, steps, every, tangents, effects)
+    return _by_c(native, x0, inputs, dt_s, plant, t0_s, steps, every, tangents)
 
 
-def _tangents(plant: Plant, d: Directions, effects: tuple[str, ...]) -> tuple[Array, Array, Array, Array]:
-    """Tangents of start (X, M), vehicle (V, M), route table (K S, M) and effects (E, M)."""
+def _by_c(
+    native: Driver,
+    x0: Array,
+    inputs: Array,
+    dt_s: float,
+    plant: Plant,
+    t0_s: float,
+    steps: int,
+    every: int,
+    tangents: tuple[Array, ...],
+) -> tuple[Array, Array]:
+    """As many directions at a time as the driver carries."""
+    count, together = tangents[0].shape[1], native.lanes * MAX_BLOCKS
+    states = np.empty(((len(inputs) - 1) // every + 1, len(STATES)))
+    parts = []
+    for first in range(0, max(count, 1), together):
+        some = [a[:, first : first + together] for a in tangents]
+        missing = -some[0].shape[1] % native.lanes
+        padded = [np.pad(a, ((0, 0), (0, missing))) for a in some]
+        states[0] = x0
+        wide = native.run_with_tangents(plant, inputs, states, dt_s, t0_s, steps, every, padded)
+        parts.append(wide[:, :, : some[0].shape[1]])
+        raise_if_diverged(states, t0_s, every * dt_s)
+        raise_if_diverged(wide.reshape(len(wide), -1), t0_s, every * dt_s)
+    return states, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=2)
+
+
+def _by_vm(
+    x0: Array,
+    inputs: Array,
+    dt_s: float,
+    plant: Plant,
+    t0_s: float,
+    steps: int,
+    every: int,
+    tangents: tuple[Array, ...],
+    effects: tuple[str, ...],
+) -> tuple[Array, Array]:
+    out = vm.run_with_tangents(x0, inputs, dt_s, plant, t0_s, steps, tangents, effects)[::every]
+    raise_if_diverged(out, t0_s, every * dt_s)
+    nx, count = len(STATES), tangents[0].shape[1]
+    return out[:, :nx], out[:, nx:].reshape(len(out), count, nx).transpose(0, 2, 1)
+
+
+def _tangents(plant: Plant, d: Directions, effects: tuple[str, ...]) -> tuple[Array, ...]:
+    """Tangents of start (X, M), vehicle (V, M), effects (E, M) and route table (K S, M)."""
     count = d.count
     wanted = {
         "start": (d.start, (len(STATES), count)),
@@ -100,5 +148,5 @@ def _tangents(plant: Plant, d: Directions, effects: tuple[str, ...]) -> tuple[Ar
         if np.shape(values) != shape:
             raise ValueError(f"directions of '{name}' have shape {np.shape(values)}, not {shape}")
     effect = np.array([d.effects.get(name, np.zeros(count)) for name in effects]).reshape(-1, count)
-    arrays = (d.start, d.vehicle, np.reshape(d.soil, (-1, count)), effect)
-    return tuple(np.ascontiguousarray(a, dtype=float) for a in arrays)  # type: ignore[return-value]
+    arrays = (d.start, d.vehicle, effect, np.reshape(d.soil, (-1, count)))
+    return tuple(np.ascontiguousarray(a, dtype=float) for a in arrays)

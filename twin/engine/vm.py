@@ -33,15 +33,15 @@ def run_with_tangents(
     plant: Plant,
     t0_s: float,
     steps: int,
-    tangents: tuple[Array, Array, Array, Array],
+    tangents: tuple[Array, ...],
     effects: tuple[str, ...],
 ) -> Array:
     """(N + 1, X (1 + M)): the states, then their derivatives column by column.
 
-    `tangents` are those of the start (X, M), vehicle (V, M), route table (K S, M)
-    and of the named effects (E, M), which are in the graph even where they are zero.
+    `tangents` are those of the start (X, M), vehicle (V, M), named effects (E, M)
+    and route table (K S, M); the named effects are in the graph even where they are zero.
     """
-    start, vehicle, table, effect = tangents
+    start, vehicle, effect, table = tangents
     count, route = start.shape[1], plant.route
     one = _sample_with_tangents(len(route.at), steps, effects, _Held(route.field), count)
     constants = _constants(plant, dt_s, plant.effect_values(effects))
