@@ -96,9 +96,13 @@ def test_same_seed_same_bits_and_the_motion_knows_no_seed() -> None:
 
 
 def test_an_outage_changes_no_other_sensor_and_no_other_fix() -> None:
+    """Of a receiver that is back at once; see test_sensing for one that has to climb back."""
+    elevate = load_vehicle("elevate")
+    prompt = dataclasses.replace(elevate.realism.gnss, reacquire_s=0.0, refix_s=0.0)
+    elevate = dataclasses.replace(elevate, realism=dataclasses.replace(elevate.realism, gnss=prompt))
     scenario = load_scenario("straight")
     gap = dataclasses.replace(scenario, gnss_outages=(Interval(20.0, 10.0),))
-    a, b = simulate(scenario), simulate(gap)
+    a, b = simulate(scenario, vehicle=elevate), simulate(gap, vehicle=elevate)
     assert np.array_equal(a.imu.accel_mps2, b.imu.accel_mps2)
     assert len(a.gnss) - len(b.gnss) == 50
     kept = np.isin(a.gnss.t_ns, b.gnss.t_ns)

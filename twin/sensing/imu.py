@@ -94,3 +94,9 @@ def triad(rng: np.random.Generator, scale_sigma: float, misalignment_sigma_rad: 
 
 def _digitised(values: Array, limit: float, quantum: float) -> Array:
     return stepped(np.clip(values, -limit, limit) if math.isfinite(limit) else values, quantum)
+
+
+def at_rest(vehicle: VehicleParams, count: int, seed: int) -> tuple[Array, Array]:
+    """Gyro and accelerometer (count, 3) of an IMU that stands level, without vibration."""
+    rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (count, 1))
+    return _measured(np.zeros((count, 3)), rest, vehicle.sensors.imu.rate_hz, vehicle, Noise(seed))
