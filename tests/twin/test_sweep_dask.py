@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import json
 import os
 import signal
@@ -179,6 +180,19 @@ def test_dead_workers_are_told_and_nothing_finished_is_lost(
             wait_for_workers(address, 1)
             again = run_sweep(sweep, tmp_path / "out", backend="dask", address=address)
     assert again.equals(whole)
+
+
+def test_the_work_of_a_dead_worker_is_done_by_others(tmp_path: Path) -> None:
+    sweep = sweep_of(tmp_path, duration_s=20)
+    whole = run_sweep(sweep, tmp_path / "whole")
+    with scheduler(tmp_path) as address, worker(address), worker(address) as mortal:
+        wait_for_workers(address, 2)
+        kill = functools.partial(mortal.send_signal, signal.SIGKILL)
+        table = run_sweep(
+            sweep, tmp_path / "out", backend="dask", address=address, progress=lambda share: kill()
+        )
+        assert mortal.wait(PATIENCE_S) == -signal.SIGKILL
+    assert table.equals(whole)
 
 
 def test_a_lost_scheduler_is_told(tmp_path: Path) -> None:

@@ -201,5 +201,6 @@ def _near(name: str, folder: Path) -> str:
 
 def _soils(scenario: Scenario, axes: tuple[Axis, ...], folder: Path) -> tuple[tuple[str, SoilParams], ...]:
     terrains = next((axis.levels for axis in axes if axis.name == "terrain"), None)
-    names = terrains if terrains is not None else tuple(leg.terrain for leg in scenario.route)
+    names = list(terrains if terrains is not None else [leg.terrain for leg in scenario.route])
+    names += [scenario.patches.terrain] if scenario.patches else []
     return tuple((str(name), load_soil(_near(str(name), folder))) for name in dict.fromkeys(names))

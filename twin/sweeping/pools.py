@@ -1,8 +1,8 @@
 """Where chunks of runs are computed: in this process, in processes of this machine, or on a Dask cluster.
 
 joblib's loky and a Dask client both offer the executor of `concurrent.futures`,
-so that all backends run the same code. (joblib's own Dask backend has no word
-for a cluster that lost its workers; the client has.)
+so that all backends run the same code, and that a cluster that lost its workers is
+noticed while waiting (inside joblib's own Dask backend it could not be).
 """
 
 from __future__ import annotations

@@ -53,7 +53,7 @@ _AXES = (
     Column("payload_kg", "float", "payload at the centre of gravity, kg"),
     Column("speed_scale", "float", "commanded speeds over the scenario's"),
     Column("speed_mps", "float", "fastest forward speed commanded, m/s"),
-    Column("seed", "int", "seed of the sensors' noise"),
+    Column("seed", "int", "seed of the sensors' noise and of ground that varies"),
 )
 _RESULTS = (
     Column("status", "text", f"one of {', '.join(STATUSES)}"),
@@ -102,7 +102,7 @@ def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
     """The arguments of `simulate_run` for a run of the sweep."""
     soils = dict(sweep.soils)
     if case.friction is not None:
-        soils = {name: _capped(soil, case.friction) for name, soil in soils.items()}
+        soils |= {name: _capped(soils[name], case.friction) for name in _grounds(sweep, case)}
     return {
         "scenario": at_speed(sweep.scenario, sweep.speed_scale(case)),
         "vehicle": sweep.vehicle,
@@ -112,6 +112,11 @@ def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
         "seed": case.seed,
         "soils": soils,
     }
+
+
+def _grounds(sweep: Sweep, case: Case) -> list[str]:
+    """Names of the grounds along the route."""
+    return [case.terrain] if case.terrain is not None else [leg.terrain for leg in sweep.scenario.route]
 
 
 def _capped(soil: SoilParams, friction: float) -> SoilParams:
@@ -135,7 +140,7 @@ def _row(sweep: Sweep, case: Case) -> Row:
 
 def _axes(sweep: Sweep, case: Case) -> Row:
     """The conditions of a run, those that no axis names among them."""
-    legs = [case.terrain] if case.terrain is not None else [leg.terrain for leg in sweep.scenario.route]
+    legs = _grounds(sweep, case)
     soils = dict(sweep.soils)
     caps = {soils[name].shear.friction_cap for name in legs} if case.friction is None else {case.friction}
     scale = sweep.speed_scale(case)
