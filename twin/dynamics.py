@@ -82,12 +82,16 @@ def graph(effects: tuple[str, ...] = ()) -> Graph:
     q = terms.apply("vehicle", q)
     q |= _gravity_along_body(q)
     q = terms.apply("command", q | _commands(q))
-    q |= _supply(q)
+    q = terms.apply("supply", q | _supply(q))
     wheels = [
         _wheel(i, q, [ps[k, i] for k in range(len(SOIL_PARAMETERS))], terms) for i in range(len(WHEELS))
     ]
-    q = terms.apply("body", q | _forces(wheels))
-    derivative = ca.vertcat(*_derivatives(q, wheels))
+    forces = _forces(wheels)
+    q = terms.apply("body", q | forces)
+    d = _derivatives(q, wheels)
+    if terms.at("body"):  # what reaches the body from elsewhere than the wheels is spent, or given, there
+        d["resistance_work"] = d["resistance_work"] + _power(forces, q) - _power(q, q)
+    derivative = ca.vertcat(*(d[name] for name in STATES))
     return Graph((x, u, pv, ca.vec(ps), pe), terms, q, wheels, derivative)
 
 
@@ -141,7 +145,12 @@ def _supply(q: dict[str, Any]) -> dict[str, Any]:
     """Voltage of the battery over the motors' nominal one, and what its store gives."""
     power = sum(drawn_power(q, q[f"torque_{name}"], q[f"wheel_speed_{name}"]) for name in WHEELS)
     supply_v, taken_w = battery(q, power, q["electric_energy"])
-    return {"voltage_share": supply_v / q["supply_v"], "battery_power_w": power, "d_electric_energy": taken_w}
+    return {
+        "voltage_share": supply_v / q["supply_v"],
+        "battery_power_w": power,
+        "d_electric_energy": taken_w,
+        "d_sag_current": 0.0,
+    }
 
 
 def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, Any]:
@@ -198,8 +207,14 @@ def _forces(wheels: list[dict[str, Any]]) -> dict[str, Any]:
     return {"body_force_x_n": force_x, "body_force_y_n": force_y, "body_moment_nm": moment}
 
 
-def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> list[Any]:
-    """dx/dt in the order of `STATES`."""
+def _power(forces: dict[str, Any], q: dict[str, Any]) -> Any:
+    """Power of forces on the body, W."""
+    along = forces["body_force_x_n"] * q["u"] + forces["body_force_y_n"] * q["v"]
+    return along + forces["body_moment_nm"] * q["r"]
+
+
+def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> dict[str, Any]:
+    """dx/dt by the names of `STATES`."""
     from terrafusion.twin.wheel import Ground, clog_rate
 
     d: dict[str, Any] = dict.fromkeys(STATES, 0.0)
@@ -225,7 +240,7 @@ def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> list[Any]:
     d["x"] = q["cos_yaw"] * origin_u - q["sin_yaw"] * origin_v
     d["y"] = q["sin_yaw"] * origin_u + q["cos_yaw"] * origin_v
     d["yaw"], d["travel"], d["elapsed"] = q["r"], origin_u, 1.0
-    return [d[name] for name in STATES]
+    return d
 
 
 def _dissipated(w: dict[str, Any]) -> tuple[Any, Any]:

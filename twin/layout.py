@@ -35,6 +35,7 @@ STATES = (
     "elapsed",
     *(f"command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
     *(f"play_{w}" for w in WHEELS),
+    "sag_current",
 )  # fmt: skip
 """State names: m, rad, m/s, rad/s, N m (`torque`, at the wheel), rad (`speed_error`, integrated), J.
 
@@ -45,7 +46,7 @@ battery's store, `slip_work` spent in the slip of the wheels and `resistance_wor
 resists motion between motor and body.
 The last rows serve optional effects: `elapsed` is the time driven (s); at rest where the effect is absent are
 `command_lag` and `command_delay`, the filtered rate of a side's command (rad/s2), and `play`, where a gear
-stands in its backlash (-1 to 1).
+stands in its backlash (-1 to 1), and `sag_current`, the smoothed current of all motors (A).
 """
 
 INPUTS = ("left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2")

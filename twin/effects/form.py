@@ -24,12 +24,13 @@ STAGES: dict[str, tuple[str, ...]] = {
         *(f"command_{side}_{unit}" for side in ("left", "right") for unit in ("radps", "radps2")),
         *(f"d_command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
     ),
+    "supply": ("voltage_share", "d_sag_current"),
     "corner": (
         "radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m", "grouser_height_m", "grouser_count",
     ),
     "ground": (*SOIL_PARAMETERS, "shear_x_m", "shear_y_m", "following"),
     "motor": (
-        "command_radps", "loop_speed_radps", "voltage_share", "d_play",
+        "command_radps", "loop_speed_radps", "d_play",
         "gear_efficiency", "no_load_radps", "stall_torque_nm", "torque_limit_nm", "loop_p_nms", "loop_i_nm",
         "lag_s",
     ),

@@ -119,7 +119,7 @@ FORMS = (
         "strength times 1 + e ln(1 + v_s / 0.01 m/s)", "ours, after Graham et al. 1983 on clay",
     ),
     Form(
-        "rate_dependent_shear", "linear", one("s/m", 0.3, -0.2, 5.0),
+        "rate_dependent_shear", "linear", one("s/m", 0.3, -0.2, 1.0),
         {"ground": lambda q, e: scaled_shear(q, 1.0 + e * _slip_speed(q))},
         "strength times 1 + e v_s", "ours, after a Bingham body",
     ),

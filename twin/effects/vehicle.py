@@ -11,6 +11,7 @@ from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.effects.terrain import grown
 from terrafusion.twin.layout import WHEELS
+from terrafusion.twin.smooth import smooth_max
 
 Quantities = Mapping[str, Any]
 
@@ -20,6 +21,7 @@ FRICTION_SPEED_RADPS = 0.1
 TURNING_RADPS = 0.2
 PULL_MPS2 = 2.0
 WARMING_J, DISCHARGE_J = 1e3, 1e4
+SMOOTHING_S = 0.02
 CROSSING_S = 0.03
 """Time in which a gear crosses its backlash."""
 CROSSING_NM = 0.3
@@ -86,8 +88,13 @@ def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
 
 
 def _sagging(q: Quantities, ohm: Any) -> dict[str, Any]:
+    """The supply behind a resistance; its capacitors smooth the current, which keeps the loop from being stiff."""
     current = q["battery_power_w"] / q["supply_v"]
-    return {"voltage_share": q["voltage_share"] / (1.0 + ohm * current / q["supply_v"])}
+    return {
+        "d_sag_current": (current - q["sag_current"]) / SMOOTHING_S,
+        "voltage_share": q["voltage_share"]
+        / (1.0 + ohm * smooth_max(q["sag_current"], 0.0, 0.01) / q["supply_v"]),
+    }
 
 
 FORMS = (
@@ -157,12 +164,12 @@ FORMS = (
         "torque limit times exp(-e E / 1 kJ), E drawn so far", "ours: derating",
     ),
     Form(
-        "battery_sag", "resistance", one("ohm", 0.1, 0.0, 1.0), {"motor": _sagging},
-        "supply U / (1 + e I / U), I of all motors", "a resistance in series, bounded",
+        "battery_sag", "resistance", one("ohm", 0.1, 0.0, 1.0), {"supply": _sagging},
+        "supply U / (1 + e I / U), I of all motors, smoothed over 20 ms", "a resistance in series, bounded",
     ),
     Form(
         "battery_sag", "discharge", one("", 0.1, 0.0, 2.0),
-        {"motor": lambda q, e: {"voltage_share": q["voltage_share"] * _fallen(q, e, DISCHARGE_J)}},
+        {"supply": lambda q, e: {"voltage_share": q["voltage_share"] * _fallen(q, e, DISCHARGE_J)}},
         "supply times exp(-e E / 10 kJ), E drawn so far", "ours",
     ),
     Form(
