@@ -160,4 +160,4 @@ def main(vehicle: str = "elevate", hours: float = 2.0, seeds: int = 4) -> list[s
 if __name__ == "__main__":
     import sys
 
-    print("\n".join(main(*sys.argv[1:2])))
+    print("\n".join(main(sys.argv[1] if len(sys.argv) > 1 else "elevate")))

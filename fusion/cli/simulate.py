@@ -9,6 +9,7 @@ import typer
 
 if TYPE_CHECKING:
     from terrafusion.twin.simulate import SimulatedRun
+    from terrafusion.twin.summary import RunSummary
 
 
 def simulate(
@@ -18,17 +19,35 @@ def simulate(
     terrain: Annotated[
         str | None, typer.Option(help="One ground for the whole route, instead of the scenario's.")
     ] = None,
-    slope_deg: Annotated[float | None, typer.Option(help="Slope of the ground, 0 to 25 deg.")] = None,
-    payload_kg: Annotated[float, typer.Option(help="Payload at the centre of gravity, kg.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="Seed of all sensor noise.")] = 0,
+    slope_deg: Annotated[
+        float | None, typer.Option(help="Slope of the ground, 0 to 25 deg, instead of the scenario's.")
+    ] = None,
+    cross_slope_deg: Annotated[
+        float | None,
+        typer.Option(help="Its slope across the start heading, -25 to 25 deg, rising to the left."),
+    ] = None,
+    payload_kg: Annotated[float | None, typer.Option(help="Payload, kg, instead of the scenario's.")] = None,
+    payload_at: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z",
+            help="Its centre of gravity, m forward, left and up of the body origin, which lies on the ground "
+            "midway between the wheels; by default the robot's own centre of gravity.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Seed of all sensor noise and of ground that varies.")] = 0,
     noiseless: Annotated[bool, typer.Option("--noiseless", help="Exact sensors, for checks.")] = False,
 ) -> None:
     """Simulate one drive with its ground truth, and write it as a log folder or an MCAP bag.
 
     Built-in scenarios: paper_profile, straight, circle, figure_eight, spin, staircase, chirp, waypoints,
-    mixed_terrain, demo.
+    mixed_terrain, demo. A YAML file may also set zones of GNSS outage and of trees; see docs/sensors.md.
 
-    Example: terrafusion simulate paper_profile --terrain loose_sand --slope-deg 5 --out sand.mcap
+    Examples:
+
+    terrafusion simulate paper_profile --terrain loose_sand --slope-deg 5 --out sand.mcap
+
+    terrafusion simulate straight --cross-slope-deg 10 --payload-kg 30 --payload-at 0,0.1,0.4 --out tilted
     """
     from terrafusion.twin.simulate import simulate_run
 
@@ -37,7 +56,9 @@ def simulate(
         vehicle=vehicle,
         terrain=terrain,
         slope_deg=slope_deg,
+        cross_slope_deg=cross_slope_deg,
         payload_kg=payload_kg,
+        payload_at_m=None if payload_at is None else _place(payload_at),
         seed=seed,
         noiseless=noiseless,
     )
@@ -54,16 +75,46 @@ def simulate(
     print(f"written to {out}")
 
 
+def _place(text: str) -> tuple[float, float, float]:
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{text}' is not X,Y,Z in metres", param_hint="--payload-at") from None
+    return x, y, z
+
+
 def summary_lines(run: SimulatedRun) -> list[str]:
     """The run in a few lines of text."""
     summary = run.summary
-    lines = [
+    return [
         run.recording.description,
         f"distance {summary.distance_m:.1f} m in {summary.duration_s:.1f} s, "
         f"mean |slip| {100 * summary.mean_abs_slip:.1f} %, energy {summary.energy_per_m_j:.0f} J/m",
+        _energy_line(summary),
+        _immobilised_line(summary),
+        *run.recording.notes,
     ]
+
+
+def _energy_line(summary: RunSummary) -> str:
+    parts = {
+        "heat of battery, motors and gears": summary.heat_j,
+        "resistance": summary.resistance_work_j,
+        "slip": summary.slip_work_j,
+        "height and speed": summary.motor_work_j - summary.resistance_work_j - summary.slip_work_j,
+    }
+    whole = max(summary.energy_j, 1e-9)
+    shares = ", ".join(f"{100 * part / whole:.0f} % {name}" for name, part in parts.items())
+    return (
+        f"battery {summary.energy_j / 1000:.1f} kJ, power {summary.mean_power_w:.0f} W mean, "
+        f"{summary.peak_power_w:.0f} W peak: {shares}"
+    )
+
+
+def _immobilised_line(summary: RunSummary) -> str:
     if summary.immobilised_at_s is None:
-        lines.append("not immobilised")
-    else:
-        lines.append(f"immobilised at {summary.immobilised_at_s:.1f} s")
-    return [*lines, *run.recording.notes]
+        return "not immobilised"
+    return (
+        f"immobilised at {summary.immobilised_at_s:.1f} s, "
+        f"({summary.immobilised_x_m:.1f}, {summary.immobilised_y_m:.1f}) m: {summary.immobilised_cause}"
+    )
