@@ -88,7 +88,7 @@ def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
 
 
 def _sagging(q: Quantities, ohm: Any) -> dict[str, Any]:
-    """The supply behind a resistance; its capacitors smooth the current, which keeps the loop from being stiff."""
+    """The supply behind a resistance; capacitors smooth the current: the loop is not stiff."""
     current = q["battery_power_w"] / q["supply_v"]
     return {
         "d_sag_current": (current - q["sag_current"]) / SMOOTHING_S,
