@@ -1,0 +1,194 @@
+"""Results as rows of plain numbers, and as tables for people."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.field.compare import OTHER, Result
+from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN
+from terrafusion.twin.field.scores import METRICS, Interval, median, ratio
+from terrafusion.twin.field.slip import SlipRow
+from terrafusion.twin.field.twin_model import TwinModel
+from terrafusion.twin.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS
+
+Array = NDArray[np.float64]
+
+SHOWN = ("speed_rms_1s_mps", "speed_rms_5s_mps", "turn_rms_1s_radps", "turn_rms_5s_radps", "position_m")
+"""What the printed table shows of `METRICS`; the files hold all."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """One model on one ground.
+
+    Attributes:
+        vehicle, inputs, scheme, ground, trained_on, rule, model: see `compare.Result`.
+        forks, groups: how many forks, and independent stretches they lie in.
+        noise_mps: median noise of the true forward speed, NaN without.
+        errors: by metric, median over forks with a 95 % interval.
+        ratios: by metric, median over that of the best kinematic model on the same forks.
+    """
+
+    vehicle: str
+    inputs: str
+    scheme: str
+    ground: str
+    trained_on: str
+    rule: str
+    model: str
+    forks: int
+    groups: int
+    noise_mps: float
+    errors: dict[str, Interval]
+    ratios: dict[str, Interval]
+
+
+def lines(vehicle: str, results: Sequence[Result]) -> list[Line]:
+    """Folds put together: every fork counts once in each line; forks of several grounds are not mixed."""
+    cells: dict[tuple[str, str, str, str, str], list[Result]] = {}
+    for r in results:
+        source = r.trained_on if r.scheme == OTHER else ""
+        cells.setdefault((r.inputs, r.scheme, r.ground, source, r.name), []).append(r)
+    out = []
+    for (inputs, scheme, ground, source, name), parts in cells.items():
+        values = np.concatenate([r.scores for r in parts])
+        group = np.concatenate([r.forks.group for r in parts])
+        noise = np.concatenate([r.forks.noise_mps for r in parts])
+        best = np.concatenate([r.scores for r in cells[inputs, scheme, ground, source, BEST_KINEMATIC]])
+        columns = list(enumerate(METRICS))
+        out.append(
+            Line(
+                vehicle, inputs, scheme, ground, source or parts[0].trained_on, parts[0].rule, name,
+                len(values), len(np.unique(group)),
+                float(np.nanmedian(noise)) if np.isfinite(noise).any() else float("nan"),
+                {m: median(values[:, k], group) for k, m in columns},
+                {m: ratio(values[:, k], best[:, k], group) for k, m in columns},
+            )
+        )  # fmt: skip
+    return out
+
+
+def line_rows(all_lines: Sequence[Line]) -> Iterator[dict[str, Any]]:
+    """One flat row a line, for CSV and JSON; unknown numbers are None."""
+    for line in all_lines:
+        row = {f.name: getattr(line, f.name) for f in dataclasses.fields(line)}
+        for kind, name in (("errors", ""), ("ratios", "_over_best_kinematic")):
+            for metric, interval in row.pop(kind).items():
+                row |= {
+                    f"{metric}{name}": _known(interval.median),
+                    f"{metric}{name}_low": _known(interval.low),
+                    f"{metric}{name}_high": _known(interval.high),
+                }
+        yield row | {"noise_mps": _known(line.noise_mps)}
+
+
+def fork_rows(vehicle: str, results: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """One row a fork and model, with all errors."""
+    for r in results:
+        for k in range(len(r.forks)):
+            yield {
+                "vehicle": vehicle, "inputs": r.inputs, "scheme": r.scheme, "trained_on": r.trained_on,
+                "ground": r.ground, "recording": str(r.forks.recording[k]), "group": str(r.forks.group[k]),
+                "time_s": float(r.forks.time_s[k]), "model": r.name,
+                **{m: _known(float(v)) for m, v in zip(METRICS, r.scores[k], strict=True)},
+            }  # fmt: skip
+
+
+def slip_table_rows(vehicle: str, rows: Sequence[SlipRow]) -> Iterator[dict[str, Any]]:
+    """One flat row a ground, recording and source."""
+    for row in rows:
+        flat = {f.name: getattr(row, f.name) for f in dataclasses.fields(row)}
+        for name in ("slip", "track_m"):
+            interval = flat.pop(name)
+            flat |= {
+                name: _known(interval.median),
+                f"{name}_lowest": _known(interval.low),
+                f"{name}_highest": _known(interval.high),
+            }
+        yield {"vehicle": vehicle, **{k: _known(v) if isinstance(v, float) else v for k, v in flat.items()}}
+
+
+def parameters(vehicle: str, results: Sequence[Result]) -> Iterator[dict[str, Any]]:
+    """The numbers of every fitted model, each once."""
+    seen: set[int] = set()
+    for r in results:
+        if id(r.model) in seen:
+            continue
+        seen.add(id(r.model))
+        if isinstance(r.model, TwinModel):
+            numbers = dict(zip(VEHICLE_PARAMETERS, r.model.vehicle.tolist(), strict=True))
+            numbers |= dict(zip(SOIL_PARAMETERS, r.model.soil.tolist(), strict=True))
+        elif dataclasses.is_dataclass(r.model) and dataclasses.fields(r.model):
+            numbers = dataclasses.asdict(r.model)
+        else:
+            continue
+        yield {
+            "vehicle": vehicle, "inputs": r.inputs, "scheme": r.scheme, "trained_on": r.trained_on,
+            "model": r.name, "numbers": numbers,
+        }  # fmt: skip
+
+
+def markdown(all_lines: Sequence[Line], scheme: str) -> str:
+    """Table of one scheme: medians; the twin's with the ratio to the best kinematic model in brackets."""
+    chosen = [line for line in all_lines if line.scheme == scheme]
+    head = ["vehicle, inputs, ground", "model", "forks (stretches)", *map(_title, SHOWN)]
+    out = [head, ["---"] * len(head)]
+    for line in chosen:
+        where = f"{line.vehicle}, {line.inputs}, {line.ground or 'unknown'}"
+        if scheme == OTHER:
+            where += f", trained on {line.trained_on}"
+        cells = [_cell(line, metric) for metric in SHOWN]
+        out.append([where, line.model, f"{line.forks} ({line.groups})", *cells])
+    return "".join(f"| {' | '.join(row)} |\n" for row in out)
+
+
+def slip_markdown(rows: Sequence[tuple[str, SlipRow]]) -> str:
+    """Table of slip and effective track by ground, with vehicles' names."""
+    head = [
+        "vehicle, ground",
+        "source",
+        "forks",
+        "slip over 5 s",
+        "10 to 90 % of forks",
+        "effective track, m",
+    ]
+    out = [head, ["---"] * len(head)]
+    for vehicle, row in rows:
+        if row.recording:
+            continue
+        spread = f"{row.slip_low:+.3f} to {row.slip_high:+.3f}" if row.count else "-"
+        cells = [_interval(row.slip, "+.3f"), spread, _interval(row.track_m, ".2f")]
+        out.append([f"{vehicle}, {row.ground or 'unknown'}", row.source, str(row.count), *cells])
+    return "".join(f"| {' | '.join(row)} |\n" for row in out)
+
+
+def _cell(line: Line, metric: str) -> str:
+    value = line.errors[metric].median
+    if not np.isfinite(value):
+        return "-"
+    if line.model != TWIN:
+        return f"{value:.3f}"
+    r = line.ratios[metric]
+    return f"**{value:.3f}** ({r.median:.2f}, {r.low:.2f} to {r.high:.2f})"
+
+
+def _title(metric: str) -> str:
+    name, unit = metric.rsplit("_", 1)
+    unit = {"mps": "m/s", "radps": "rad/s"}.get(unit, unit)
+    return f"{name.replace('_rms', '').replace('_', ' ')}, {unit}"
+
+
+def _interval(value: Interval, form: str) -> str:
+    if not np.isfinite(value.median):
+        return "-"
+    return f"{value.median:{form}} ({value.low:{form}} to {value.high:{form}})"
+
+
+def _known(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,220 @@
+"""The twin as a model of forks: its wheels driven as measured, or its motors told what was commanded."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.twin.drive import told
+from terrafusion.twin.engine.integrate import integrate
+from terrafusion.twin.engine.plant import Plant, RouteTable
+from terrafusion.twin.field.fitting import Bounded, fit
+from terrafusion.twin.field.forks import N_PAST, Forks
+from terrafusion.twin.field.runs import DT_S
+from terrafusion.twin.layout import (
+    INDEX,
+    SOIL_PARAMETERS,
+    STATES,
+    VEHICLE_PARAMETERS,
+    soil_vector,
+    state_slice,
+    vehicle_vector,
+)
+from terrafusion.twin.soil import SoilParams
+from terrafusion.twin.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+
+HEAVY = 100.0
+"""Wheels that are to turn as measured get this many times their inertia: the ground hardly slows them."""
+FOLLOW_S = 0.01
+"""Time constant with which they follow, and the motors' lag in all runs here."""
+NO_LIMIT_NM = 1e5
+SUBSTEPS_DRIVEN, SUBSTEPS = 8, 15
+"""RK4 steps a sample; heavy wheels allow longer ones (tested against the default step)."""
+TORQUE_MEMORY = 5
+"""Samples over which the torque at the fork is averaged."""
+WORKERS = 2
+
+
+@dataclass(frozen=True)
+class Freedom:
+    """A number of the twin that a calibration may change, and its range.
+
+    `names` are entries of `VEHICLE_PARAMETERS` or `SOIL_PARAMETERS`; all are multiplied by the same factor
+    within (low, high), or, where `added`, get the same amount within (low, high) added.
+    """
+
+    names: tuple[str, ...]
+    low: float
+    high: float
+    added: bool = False
+
+
+GROUND = (
+    Freedom(("radius_m",), 0.8, 1.2),
+    Freedom(("tan_friction", "friction_cap"), 0.02, 2.0),
+    Freedom(("shear_modulus_m",), 0.05, 50.0),
+    Freedom(("k_phi",), 0.05, 20.0),
+    Freedom(("viscous_ns_per_m",), 0.0, 300.0, added=True),
+    Freedom(("cg_forward_m",), -0.3, 0.3, added=True),
+    Freedom(("cg_left_m",), -0.2, 0.2, added=True),
+)
+"""What wheel speeds and the body's motion tell of the ground and of where the weight lies."""
+
+ACTUATION = (
+    Freedom(("loop_p_nms",), 0.02, 20.0),
+    Freedom(("loop_i_nm",), 0.005, 20.0),
+    Freedom(("dead_time_s",), 0.0, 0.6, added=True),
+    Freedom(("torque_limit_nm", "stall_torque_nm"), 0.1, 5.0),
+    Freedom(("rolling",), 0.2, 10.0),
+)
+"""What commands tell besides, once the ground is known."""
+
+
+@dataclass(frozen=True, eq=False)
+class TwinModel:
+    """The twin of one vehicle on one ground.
+
+    Attributes:
+        vehicle: (V,) `VEHICLE_PARAMETERS`.
+        soil: (S,) `SOIL_PARAMETERS`.
+        commanded: whether the inputs are commands to the motors, not measured wheel speeds.
+    """
+
+    vehicle: Array
+    soil: Array
+    commanded: bool
+
+    @classmethod
+    def nominal(cls, vehicle: VehicleParams, soil: SoilParams, *, commanded: bool) -> TwinModel:
+        """By the library's numbers."""
+        return cls(vehicle_vector(vehicle), soil_vector(soil), commanded)
+
+    def predict(self, forks: Forks) -> Array:
+        """(F, N_FUTURE + 1, 3) forward speed, sideways speed, yaw rate of the body origin from each fork on.
+
+        Raises:
+            TerrafusionError: a run diverged.
+        """
+        with ThreadPoolExecutor(WORKERS) as pool:
+            return np.stack(list(pool.map(lambda k: self._one(forks, k), range(len(forks)))))
+
+    def _one(self, forks: Forks, k: int) -> Array:
+        motion = forks.motion[k]
+        inputs = self._sides(forks.inputs_radps[k], motion, forks.given_turn)
+        past = self._sides(forks.past_radps[k], motion, forks.given_turn)
+        driven = self._plant(driven=True)
+        before = _integrated(self._start(past[0], motion[0]), told(past, DT_S), driven, SUBSTEPS_DRIVEN)
+        start = self._corrected(before[-1], motion[N_PAST])
+        if self.commanded:
+            late = float(self.vehicle[_V["dead_time_s"]])
+            future = told(inputs, DT_S, late)[N_PAST:]
+            start = self._at_work(start, before, future[0, :2], driven.vehicle)
+            states = _integrated(start, future, self._plant(driven=False), SUBSTEPS)
+        else:
+            states = _integrated(start, told(inputs[N_PAST:], DT_S), driven, SUBSTEPS_DRIVEN)
+        turn = states[:, INDEX["r"]]
+        forward = states[:, INDEX["u"]] + turn * self.vehicle[_V["cg_left_m"]]
+        aside = states[:, INDEX["v"]] - turn * self.vehicle[_V["cg_forward_m"]]
+        return np.stack([forward, aside, motion[N_PAST:, 2] if forks.given_turn else turn], axis=1)
+
+    def _plant(self, *, driven: bool) -> Plant:
+        vehicle = self.vehicle.copy()
+        vehicle[_V["lag_s"]] = FOLLOW_S
+        vehicle[_V["dead_time_applied_s"]] = vehicle[_V["dead_time_s"]]
+        if driven:
+            inertia = HEAVY * vehicle[_V["wheel_inertia_kgm2"]]
+            vehicle[_V["wheel_inertia_kgm2"]] = inertia
+            vehicle[_V["loop_p_nms"]] = 0.25 * inertia / FOLLOW_S
+            vehicle[_V["loop_i_nm"]] = 0.5 * inertia / FOLLOW_S
+            vehicle[_V["stall_torque_nm"]] = vehicle[_V["torque_limit_nm"]] = NO_LIMIT_NM
+            vehicle[_V["no_load_radps"]] *= 100.0
+            vehicle[_V["battery_ohm"]] = 0.0
+        return Plant(vehicle, RouteTable("travel", np.zeros(1), self.soil[None]))
+
+    def _sides(self, sides: Array, motion: Array, given_turn: bool) -> Array:
+        """Side speeds; where the log knows their mean only, they turn the body about as the gyro says."""
+        if not given_turn:
+            return sides
+        track, base, radius = (self.vehicle[_V[n]] for n in ("track_m", "wheelbase_m", "radius_m"))
+        # Centres of rotation of four wheels on dry friction: track + base^2 / track apart.
+        half = 0.5 * (track + base * base / track) / radius * motion[: len(sides), 2]
+        return np.stack([sides[:, 0] - half, sides[:, 1] + half], axis=1)
+
+    def _start(self, sides: Array, motion: Array) -> Array:
+        x = np.zeros(len(STATES))
+        x[state_slice("wheel_speed")] = np.tile(sides, 2)
+        return self._corrected(x, motion)
+
+    def _corrected(self, x: Array, motion: Array) -> Array:
+        """The state with the true forward speed and yaw rate, where they are known."""
+        out = x.copy()
+        turn = motion[2]
+        out[INDEX["r"]] = turn
+        if np.isfinite(motion[0]):
+            out[INDEX["u"]] = motion[0] - turn * self.vehicle[_V["cg_left_m"]]
+        return out
+
+    def _at_work(self, x: Array, before: Array, command: Array, driven: Array) -> Array:
+        """The state with the motors at the torque that moved the wheels so far, their loops asking for it.
+
+        The torque is that of the past second with the wheels driven as measured, less what turned their
+        added inertia.
+        """
+        out, count = x.copy(), TORQUE_MEMORY
+        speed, torque = state_slice("wheel_speed"), state_slice("torque")
+        spun = (
+            driven[_V["wheel_inertia_kgm2"]]
+            * (before[-1, speed] - before[-1 - count, speed])
+            / (count * DT_S)
+        )
+        steady = 0.5 * (before[-1 - count : -1, torque] + before[-count:, torque]).mean(axis=0) - spun
+        gears = self.vehicle[_V["gear_ratio"]] * self.vehicle[_V["gear_efficiency"]]
+        limit = gears * self.vehicle[_V["torque_limit_nm"]]
+        steady = np.clip(steady, -limit, limit)
+        error = np.tile(command, 2) - out[speed]
+        out[torque] = steady
+        out[state_slice("speed_error")] = (steady - self.vehicle[_V["loop_p_nms"]] * error) / self.vehicle[
+            _V["loop_i_nm"]
+        ]
+        return out
+
+
+_V = {name: i for i, name in enumerate(VEHICLE_PARAMETERS)}
+_S = {name: i for i, name in enumerate(SOIL_PARAMETERS)}
+
+
+def _integrated(start: Array, inputs: Array, plant: Plant, substeps: int) -> Array:
+    """States (N + 1, X); where an odd set of numbers is too stiff for the step, with a quarter of it."""
+    try:
+        return integrate(start, inputs, DT_S, plant, substeps=substeps)
+    except TerrafusionError:
+        return integrate(start, inputs, DT_S, plant, substeps=4 * substeps)
+
+
+def changed(model: TwinModel, freedoms: Sequence[Freedom], values: Array) -> TwinModel:
+    """The model with its numbers changed: `values` (P,) are logarithms of factors, or amounts added."""
+    vehicle, soil = model.vehicle.copy(), model.soil.copy()
+    for freedom, value in zip(freedoms, values.tolist(), strict=True):
+        for name in freedom.names:
+            vector, index = (vehicle, _V) if name in _V else (soil, _S)
+            old = vector[index[name]]
+            vector[index[name]] = old + value if freedom.added else old * np.exp(value)
+    return dataclasses.replace(model, vehicle=vehicle, soil=soil)
+
+
+def calibrated(model: TwinModel, freedoms: Sequence[Freedom], forks: Forks, *, rounds: int = 12) -> TwinModel:
+    """The model with the freedoms fitted on the forks by the common criterion."""
+    numbers = [
+        Bounded(0.0, f.low, f.high) if f.added else Bounded(0.0, float(np.log(f.low)), float(np.log(f.high)))
+        for f in freedoms
+    ]
+    found = fit(numbers, lambda p: changed(model, freedoms, p).predict(forks), forks, rounds=rounds)
+    return changed(model, freedoms, found)
