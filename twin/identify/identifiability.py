@@ -1,0 +1,89 @@
+"""What the data can tell: the information matrix in units of the prior, its weak directions, in words.
+
+All numbers are counted in their prior sigmas, so that a direction's posterior sigma is 1 where the log says
+nothing about it and towards 0 where it says all. Offsets and poses are marginalised beforehand.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+TOLD_RATIO = 0.5
+"""A number counts as told when the log at least halves its prior sigma."""
+MEMBER = 0.3
+"""A number belongs to a direction when its weight in the unit vector is at least this."""
+
+TOLD, COMBINED, UNTOLD = "told", "only in combination", "not told"
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of numbers that the data do not tell.
+
+    Attributes:
+        weights: by name, in prior sigmas, of the members.
+        ratio: posterior over prior sigma along it.
+        sentence: what that means.
+    """
+
+    weights: dict[str, float]
+    ratio: float
+    sentence: str
+
+
+@dataclass(frozen=True, eq=False)
+class Identifiability:
+    """Attributes:
+    ratio: (P,) posterior over prior sigma.
+    alone: (P,) the same if all other numbers were known.
+    status: (P,) `TOLD`, `COMBINED` or `UNTOLD`.
+    eigenvalues: (P,) of the data's information in units of the prior's, falling.
+    eigenvectors: (P, P) in columns.
+    weak: the directions the data do not tell.
+    """
+
+    ratio: Array
+    alone: Array
+    status: tuple[str, ...]
+    eigenvalues: Array
+    eigenvectors: Array
+    weak: tuple[Direction, ...]
+
+
+def examine(names: Sequence[str], covariance: Array) -> Identifiability:
+    """Identifiability from the posterior covariance (P, P) in prior sigmas."""
+    precision = np.linalg.inv(covariance)
+    ratio, alone = np.sqrt(np.diag(covariance)), 1.0 / np.sqrt(np.diag(precision))
+    status = tuple(
+        TOLD if whole <= TOLD_RATIO else COMBINED if single <= TOLD_RATIO else UNTOLD
+        for whole, single in zip(ratio, alone, strict=True)
+    )
+    values, vectors = np.linalg.eigh(precision - np.eye(len(names)))
+    values, vectors = values[::-1], vectors[:, ::-1]
+    weak = [
+        _direction(names, vectors[:, i], 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)))
+        for i in range(len(names))
+        if 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)) > TOLD_RATIO
+    ]
+    return Identifiability(ratio, alone, status, np.maximum(values, 0.0), vectors, tuple(weak))
+
+
+def _direction(names: Sequence[str], vector: Array, ratio: float) -> Direction:
+    order = np.argsort(-np.abs(vector))
+    members = [int(i) for i in order if abs(vector[i]) >= MEMBER] or [int(order[0])]
+    sign = 1.0 if vector[members[0]] >= 0.0 else -1.0
+    weights = {names[i]: round(sign * float(vector[i]), 3) for i in members}
+    left = f"the log leaves {100.0 * ratio:.0f} % of what was unknown"
+    if len(members) == 1:
+        return Direction(weights, ratio, f"{names[members[0]]} is not told by this data ({left})")
+    moves = " and ".join(f"{name} {'up' if weight > 0.0 else 'down'}" for name, weight in weights.items())
+    listed = ", ".join(list(weights)[:-1]) + f" and {list(weights)[-1]}"
+    return Direction(
+        weights, ratio, f"{listed} are told only in combination: {moves} looks the same ({left})"
+    )
