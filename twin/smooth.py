@@ -26,7 +26,11 @@ def smooth_min(a: Scalar, b: Scalar, width: float) -> Scalar:
 
 
 def saturate(value: Scalar, limit: Scalar) -> Scalar:
-    """value / (1 + (value/limit)^4)^(1/4) for value >= 0: identity when small, `limit` when large."""
+    """value / (1 + (value/limit)^8)^(1/8) for value >= 0: identity when small, `limit` when large.
+
+    At 0.8 of the limit it lies 2 % below the identity.
+    """
     ratio = value / limit
     square = ratio * ratio
-    return value / ca.sqrt(ca.sqrt(1.0 + square * square))
+    fourth = square * square
+    return value / ca.sqrt(ca.sqrt(ca.sqrt(1.0 + fourth * fourth)))

@@ -15,6 +15,7 @@ from typing import Annotated
 
 from terrafusion.datasets.config import Quantity, structure
 from terrafusion.twin.library import known_names, read_named
+from terrafusion.twin.soil_table import is_published, published_soil
 
 
 @dataclass(frozen=True)
@@ -128,11 +129,16 @@ def soil_names() -> tuple[str, ...]:
 
 
 def load_soil(name_or_path: str | Path) -> SoilParams:
-    """A soil by its terrain name in the library, or from a YAML file.
+    """A soil by its terrain name in the library, from the table of published soils, or from a YAML file.
+
+    `load_soil("mud")`, `load_soil("wong:lete_sand")` (see `soil_table`), `load_soil("my_field.yaml")`.
 
     Raises:
         ConfigError: unknown name (the known ones are listed), or a file that
             does not keep to the parameters' names, units and ranges.
     """
+    name = str(name_or_path)
+    if is_published(name):
+        return structure(SoilParams, published_soil(name), file=f"soil_table.csv, {name}")
     raw, file = read_named("soils", name_or_path, kind="terrain")
     return structure(SoilParams, raw, file=file)

@@ -52,9 +52,7 @@ def check_wheel(soil: SoilParams, radius_m: float, width_m: float, load_n: float
     """
     _check(soil, "wheel_diameter_m", 2.0 * radius_m, "wheel diameter", "m")
     pressure = ground_pressure_pa(soil, radius_m, width_m, load_n)
-    _check(
-        soil, "ground_pressure_pa", pressure, f"ground pressure of a wheel that carries {load_n:.0f} N,", "Pa"
-    )
+    _check(soil, "ground_pressure_pa", pressure, f"pressure under a wheel with {load_n:.0f} N", "Pa")
 
 
 def check_ground(route: Route, scenario: Scenario, vehicle: VehicleParams) -> None:
