@@ -11,7 +11,7 @@ from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin import simulate
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine import compiler, integrate, native
-from terrafusion.twin.engine.codegen import SINGLE
+from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.layout import INDEX, INPUTS, soil_vector, vehicle_vector
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
@@ -94,7 +94,7 @@ def test_the_library_is_compiled_once_and_found_again(monkeypatch, tmp_path) -> 
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
     for _ in range(2):
         native.forget()
-        assert native.driver(SINGLE, (), True) is not None
+        assert native.driver(Variant(SINGLE, (), True)) is not None
     native.forget()
     files = list((tmp_path / "cache").iterdir())
     assert len(files) == 1
@@ -105,7 +105,7 @@ def test_a_compiler_that_fails_is_told_and_replaced(monkeypatch, tmp_path, caplo
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(compiler, "FLAGS", ("-no-such-flag",))
     native.forget()
-    assert native.driver(SINGLE, (), True) is None
+    assert native.driver(Variant(SINGLE, (), True)) is None
     native.forget()
     assert "could not be compiled" in caplog.text
 
@@ -122,7 +122,7 @@ def test_a_home_that_cannot_be_written_still_gets_compiled_code(monkeypatch, tmp
     blocked.write_text("not a folder")
     monkeypatch.setenv("TERRAFUSION_CACHE", str(blocked / "cache"))
     native.forget()
-    assert native.driver(SINGLE, (), True) is not None
+    assert native.driver(Variant(SINGLE, (), True)) is not None
     native.forget()
 
 

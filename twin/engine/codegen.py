@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from importlib import resources
-from typing import Any
+from typing import Any, NamedTuple
 
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import CALLS, UnsupportedOperationError, read, with_reciprocals
+from terrafusion.twin.engine.linear import eliminated
 from terrafusion.twin.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
 
-__all__ = ["LANES", "SINGLE", "TANGENT", "UnsupportedOperationError", "source", "wheel_of"]
+__all__ = ["LANES", "SINGLE", "TANGENT", "UnsupportedOperationError", "Variant", "source", "wheel_of"]
 
 SINGLE, LANES, TANGENT = "single", "lanes", "tangent"
 """One run, its wheels side by side in a vector; several runs side by side; one run with its derivatives."""
@@ -29,11 +30,29 @@ _ARGUMENTS = {
 _WIDE = ("x_wide", "vehicle_wide", "soil_wide", "effects_wide")
 
 
-def source(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> str:
-    """C source of a driver; with `fixed_ground` the soil is taken once a run."""
+class Variant(NamedTuple):
+    """Which driver: its kind, the optional effects in the graph, whether the soil is taken once a run.
+
+    `active` names the parameters (argument, element) that change along some direction of a `TANGENT`: what
+    the others would do is left out.
+    """
+
+    kind: str
+    effects: tuple[str, ...]
+    fixed_ground: bool
+    active: frozenset[tuple[str, int]] = frozenset()
+
+
+def source(variant: Variant) -> str:
+    """C source of a driver."""
+    kind, effects, fixed_ground, active = variant
     function = rhs(effects) if kind != TANGENT else _with_tangent(rhs(effects))
     graph, outputs = with_reciprocals(*read(function, _element), {"x", "u"}, "dx")
     late = {"x", "u", "x_wide"} | (set() if fixed_ground else {"soil", "soil_wide"})
+    if kind == TANGENT:
+        graph, outputs = eliminated(
+            graph, outputs, _WIDE, late, lambda name, i: not _changes(active, name, i)
+        )
     emitter = Emitter(
         graph, outputs, late, _WIDE if kind == TANGENT else (), None if kind == LANES else wheel_of
     )
@@ -53,6 +72,12 @@ def _with_tangent(f: Any) -> Any:
     arguments = {**plain, **seeds}
     return ca.Function("tf_tangent", [*arguments.values()], [dx, tangent], [*arguments], ["dx", "dx_wide"],
                        {"cse": True})  # fmt: skip
+
+
+def _changes(active: frozenset[tuple[str, int]], argument: str, element: int) -> bool:
+    """Whether an element of an argument of `_WIDE` may differ from zero."""
+    name = argument.removesuffix("_wide")
+    return name == "x" or (name, element // len(WHEELS) if name == "soil" else element) in active
 
 
 def wheel_of(argument: str, element: int) -> tuple[int, int] | None:

@@ -72,9 +72,13 @@ class Graph:
 
     def depends(self, names: Collection[str]) -> list[bool]:
         """Whether each node depends on one of the named arguments."""
+        return self.depends_on_inputs(lambda name, i: name in names)
+
+    def depends_on_inputs(self, which: Callable[[str, int], bool]) -> list[bool]:
+        """Whether each node depends on one of the elements (argument, i) for which `which` holds."""
         out: list[bool] = []
         for op, args, value in zip(self.ops, self.args, self.values, strict=True):
-            out.append(value[0] in names if op == INPUT else any(out[a] for a in args))
+            out.append(which(*value) if op == INPUT else any(out[a] for a in args))
         return out
 
 

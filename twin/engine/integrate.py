@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.engine import vm
-from terrafusion.twin.engine.codegen import SINGLE
+from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.engine.native import Driver, driver
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.layout import INPUTS, STATES, VEHICLE_PARAMETERS
@@ -53,7 +53,7 @@ def integrate(
     """
     steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
     x0, inputs = checked(x0, inputs)
-    native = chosen(backend, SINGLE, plant, plant.effect_names())
+    native = chosen(backend, Variant(SINGLE, plant.effect_names(), plant.route.is_fixed()))
     if native is None:
         states = vm.run(x0, inputs, dt_s, plant, t0_s, steps)
     else:
@@ -76,7 +76,7 @@ def checked(x0: Array, inputs: Array) -> tuple[Array, Array]:
     return x0, inputs
 
 
-def chosen(backend: str, kind: str, plant: Plant, effects: tuple[str, ...]) -> Driver | None:
+def chosen(backend: str, variant: Variant) -> Driver | None:
     """The compiled driver for a backend, None for the virtual machine.
 
     Raises:
@@ -84,7 +84,7 @@ def chosen(backend: str, kind: str, plant: Plant, effects: tuple[str, ...]) -> D
     """
     if backend not in BACKENDS:
         raise TerrafusionError(f"unknown backend '{backend}'", remedy=f"known are {', '.join(BACKENDS)}")
-    native = None if backend == "vm" else driver(kind, effects, plant.route.is_fixed())
+    native = None if backend == "vm" else driver(variant)
     if native is None and backend == "c":
         raise TerrafusionError(
             "no C compiler was found", remedy="install one, or use the backend 'auto' or 'vm'"
@@ -111,4 +111,4 @@ def steps_a_sample(dt_s: float, vehicle: Array) -> int:
 
 def compiled() -> bool:
     """Whether `backend="auto"` runs compiled code."""
-    return driver(SINGLE, (), True) is not None
+    return driver(Variant(SINGLE, (), True)) is not None

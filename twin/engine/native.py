@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.engine import codegen, compiler
+from terrafusion.twin.engine.codegen import Variant
 from terrafusion.twin.engine.plant import Plant
 
 Array = NDArray[np.float64]
@@ -63,8 +64,8 @@ class Driver:
     Calls release the GIL and share nothing.
     """
 
-    def __init__(self, library: ctypes.CDLL, kind: str, effects: tuple[str, ...]) -> None:
-        self.effects = effects
+    def __init__(self, library: ctypes.CDLL, variant: Variant) -> None:
+        self.effects = variant.effects
         self.lanes = ctypes.c_int.in_dll(library, "tf_lanes").value
         self._simulate = library.tf_simulate
         self._simulate.restype = None
@@ -72,7 +73,7 @@ class Driver:
             ctypes.c_void_p, ctypes.c_long, ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_double,
             ctypes.c_void_p, ctypes.c_void_p,
         ]  # fmt: skip
-        if kind == codegen.TANGENT:
+        if variant.kind == codegen.TANGENT:
             self._simulate_wide = library.tf_simulate_wide
             self._simulate_wide.restype = None
             self._simulate_wide.argtypes = [*self._simulate.argtypes, ctypes.c_long, *[ctypes.c_void_p] * 5]
@@ -132,22 +133,22 @@ def pointer(array: Array) -> Any:
     return array.ctypes.data_as(_DOUBLE_P)
 
 
-def driver(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> Driver | None:
-    """The driver of a kind (see `codegen`), None where it cannot be compiled (said once)."""
+def driver(variant: Variant) -> Driver | None:
+    """The driver, None where it cannot be compiled (said once)."""
     with _BUILDING:
-        return _driver(kind, effects, fixed_ground)
+        return _driver(variant)
 
 
 @functools.cache
-def _driver(kind: str, effects: tuple[str, ...], fixed_ground: bool) -> Driver | None:
+def _driver(variant: Variant) -> Driver | None:
     command = compiler.find_compiler()
     if command is None:
         _say("no C compiler: the twin runs in CasADi's virtual machine, many times slower; "
              "install a compiler or the ziglang package")  # fmt: skip
         return None
     try:
-        path = compiler.compiled(codegen.source(kind, effects, fixed_ground), command)
-        return Driver(ctypes.CDLL(str(path)), kind, effects)
+        path = compiler.compiled(codegen.source(variant), command)
+        return Driver(ctypes.CDLL(str(path)), variant)
     except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
         _say(f"the twin's C code could not be compiled ({error}): it runs in CasADi's virtual machine")
         return None

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.engine import vm
-from terrafusion.twin.engine.codegen import TANGENT
+from terrafusion.twin.engine.codegen import TANGENT, Variant
 from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged, steps_a_sample
 from terrafusion.twin.engine.native import MAX_BLOCKS, Driver
 from terrafusion.twin.engine.plant import Plant
@@ -85,10 +85,19 @@ def integrate_with_sensitivity(
     steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
     effects = plant.effect_names(directions.effects)
     tangents = _tangents(plant, directions, effects)
-    native = chosen(backend, TANGENT, plant, effects)
+    fixed = plant.route.is_fixed()
+    native = chosen(backend, Variant(TANGENT, effects, fixed, _active(tangents, fixed)))
     if native is None:
         return _by_vm(x0, inputs, dt_s, plant, t0_s, steps, every, tangents, effects)
     return _by_c(native, x0, inputs, dt_s, plant, t0_s, steps, every, tangents)
+
+
+def _active(tangents: tuple[Array, ...], fixed_ground: bool) -> frozenset[tuple[str, int]]:
+    """The parameters that change along some direction; all the soil's where the ground changes on the way."""
+    _, vehicle, effects, table = (a.any(axis=1) for a in tangents)
+    soil = table.reshape(-1, len(SOIL_PARAMETERS)).any(axis=0) | (not fixed_ground)
+    named = {"vehicle": vehicle, "effects": effects, "soil": soil}
+    return frozenset((name, int(i)) for name, some in named.items() for i in np.flatnonzero(some))
 
 
 def _by_c(
