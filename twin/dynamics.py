@@ -144,12 +144,12 @@ def _commands(q: dict[str, Any]) -> dict[str, Any]:
 def _supply(q: dict[str, Any]) -> dict[str, Any]:
     """Voltage of the battery over the motors' nominal one, and what its store gives."""
     power = sum(drawn_power(q, q[f"torque_{name}"], q[f"wheel_speed_{name}"]) for name in WHEELS)
-    supply_v, taken_w = battery(q, power, q["electric_energy"])
+    supply_v, taken_w, rate = battery(q, power, q["electric_energy"], q["sag_current"])
     return {
         "voltage_share": supply_v / q["supply_v"],
         "battery_power_w": power,
         "d_electric_energy": taken_w,
-        "d_sag_current": 0.0,
+        "d_sag_current": rate,
     }
 
 

@@ -44,9 +44,10 @@ friction bristle (m), `travel` the path driven forward (m), `clog` from 0 to 1.
 Energies are sums from the start: `motor_work` at the wheels, `electric_energy` taken from the
 battery's store, `slip_work` spent in the slip of the wheels and `resistance_work` in all that
 resists motion between motor and body.
-The last rows serve optional effects: `elapsed` is the time driven (s); at rest where the effect is absent are
-`command_lag` and `command_delay`, the filtered rate of a side's command (rad/s2), and `play`, where a gear
-stands in its backlash (-1 to 1), and `sag_current`, the smoothed current of all motors (A).
+`sag_current` is the battery's smoothed current (A). The others of the last rows serve optional effects:
+`elapsed` is the time driven (s); at rest where the effect is absent are `command_lag` and
+`command_delay`, the filtered rate of a side's command (rad/s2), and `play`, where a gear stands in its
+backlash (-1 to 1).
 """
 
 INPUTS = ("left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2")

@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from typing import Any
 
+SMOOTHING_S = 0.02
+"""Time constant of the current behind the battery's sag (assumed)."""
 DRAW_WIDTH_W = 1e-3
 """A motor's power is cut off at zero within this width: the bridge does not feed back."""
 
@@ -79,25 +81,24 @@ def drawn_power(p: Any, torque_nm: Any, speed_radps: Any) -> Any:
     return smooth_max(motor_voltage(p, current, speed_radps) * current, 0.0, DRAW_WIDTH_W)
 
 
-def battery(p: Any, power_w: Any, drawn_j: Any) -> tuple[Any, Any]:
-    """Battery voltage under load, V, and the power taken from its store, W, its own heat included.
+def battery(p: Any, power_w: Any, drawn_j: Any, current_a: Any) -> tuple[Any, Any, Any]:
+    """Battery voltage under load, V, the power taken from its store, W, and d(current)/dt, A/s.
 
-    The open-circuit voltage falls linearly with the energy taken, from
-    `battery_full_v` to `battery_empty_v` and not below; behind the internal
-    resistance R the terminal voltage at the power P is the larger root of
-    U^2 - U0 U + R P = 0. It stays above U0 / 2, where the battery gives all it can.
+    The open-circuit voltage falls linearly with the energy taken, from `battery_full_v` to
+    `battery_empty_v` and not below. The internal resistance carries the motors' current smoothed
+    over `SMOOTHING_S`, as polarisation and the controllers' capacitors do; so the loop from voltage to
+    torque to current is not stiff. The voltage stays above a third of the open one.
 
     Args:
         p: vehicle parameters.
         power_w: what all motors draw at the terminals.
         drawn_j: energy taken from the store since the start.
+        current_a: smoothed current (state).
     """
     from terrafusion.twin.wheel import smooth_max
 
     charge = smooth_max(p["battery_charge"] - drawn_j / p["battery_j"], 0.0, 1e-3)
     open_v = p["battery_empty_v"] + (p["battery_full_v"] - p["battery_empty_v"]) * charge
-    square = open_v * open_v
-    root = smooth_max(square - 4.0 * p["battery_ohm"] * power_w, 0.0, 1e-3 * square)
-    voltage = 0.5 * (open_v + root**0.5)
-    current = power_w / voltage
-    return voltage, power_w + p["battery_ohm"] * current * current
+    voltage = smooth_max(open_v - p["battery_ohm"] * current_a, open_v / 3.0, 1e-3 * open_v)
+    taken = power_w + p["battery_ohm"] * current_a * current_a
+    return voltage, taken, (power_w / voltage - current_a) / SMOOTHING_S

@@ -171,14 +171,13 @@ def energy_of(t_s: Array, states: Array, parameters: Array) -> Energy:
     current = motor_current(p, torque, wheel)
     power = motor_voltage(p, current, wheel) * current
     given_back = np.minimum(power, 0.0)
-    terminals = (power - given_back).sum(axis=1)
     total = {
         name: float(states[-1, INDEX[name]] - states[0, INDEX[name]])
         for name in ("electric_energy", "slip_work", "resistance_work")
     }
     return Energy(
         battery_j=total["electric_energy"],
-        battery_heat_j=_sum(t_s, _battery_current(p, terminals, states) ** 2 * p["battery_ohm"]),
+        battery_heat_j=_sum(t_s, p["battery_ohm"] * states[:, INDEX["sag_current"]] ** 2),
         motor_heat_j=_sum(t_s, winding_loss(p, current).sum(axis=1)),
         gear_heat_j=_sum(t_s, gear_loss(p, current, torque, wheel).sum(axis=1)),
         braking_heat_j=-_sum(t_s, given_back.sum(axis=1)),
@@ -187,15 +186,6 @@ def energy_of(t_s: Array, states: Array, parameters: Array) -> Energy:
         potential_j=_gained(_potential_j(p, states)),
         kinetic_j=_gained(_kinetic_j(p, states)),
     )
-
-
-def _battery_current(p: dict[str, float], terminals_w: Array, states: Array) -> Array:
-    """Current (N,) of the battery from its equation U^2 - U0 U + R P = 0, see `motors.battery`."""
-    drawn = states[:, INDEX["electric_energy"]]
-    charge = np.maximum(p["battery_charge"] - drawn / p["battery_j"], 0.0)
-    open_v = p["battery_empty_v"] + (p["battery_full_v"] - p["battery_empty_v"]) * charge
-    root = np.sqrt(np.maximum(open_v**2 - 4.0 * p["battery_ohm"] * terminals_w, 0.0))
-    return np.asarray(2.0 * terminals_w / (open_v + root))
 
 
 def _potential_j(p: dict[str, float], states: Array) -> Array:

@@ -11,7 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.twin.drive import Driven
+from terrafusion.twin.drive import Driven, told
+from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
 from terrafusion.twin.motors import battery, gear_loss, motor_current, motor_torque
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
@@ -84,22 +85,30 @@ def test_top_speed_follows_the_supply(share) -> None:
 
 
 @QUICK
-@given(power=st.floats(0.0, 2000.0), drawn=st.floats(0.0, 2e6), ohm=st.floats(0.0, 0.2))
-def test_battery_solves_its_circuit(power, drawn, ohm) -> None:
+@given(current=st.floats(0.0, 100.0), drawn=st.floats(0.0, 2e6), ohm=st.floats(0.0, 0.1))
+def test_battery_solves_its_circuit(current, drawn, ohm) -> None:
+    """At the steady current the store gives the open voltage times the current: terminals and own heat."""
     p = P | {"battery_ohm": ohm}
-    voltage, taken = (float(x) for x in battery(p, ca.DM(power), ca.DM(drawn)))
     charge = max(0.0, 1.0 - drawn / p["battery_j"])
     open_v = p["battery_empty_v"] + (p["battery_full_v"] - p["battery_empty_v"]) * charge
+    power = (open_v - ohm * current) * current
+    voltage, taken, rate = (float(x) for x in battery(p, ca.DM(power), ca.DM(drawn), ca.DM(current)))
+    assert voltage == pytest.approx(open_v - ohm * current, abs=5e-3)
+    assert taken == pytest.approx(open_v * current, rel=1e-3, abs=1e-9)
+    assert rate == pytest.approx(0.0, abs=2.0)
+
+
+@QUICK
+@given(power=st.floats(0.0, 1e4), current=st.floats(0.0, 1e3), ohm=st.floats(0.0, 10.0))
+def test_an_overloaded_battery_neither_reverses_nor_makes_energy(power, current, ohm) -> None:
+    voltage, taken, _ = (float(x) for x in battery(P | {"battery_ohm": ohm}, power, ca.DM(0.0), current))
+    assert voltage >= P["battery_full_v"] / 3.0
     assert taken >= power
-    assert 0.499 * open_v < voltage < open_v + 1e-2
-    if 4.0 * ohm * power < 0.8 * open_v**2:
-        assert voltage**2 - open_v * voltage + ohm * power == pytest.approx(0.0, abs=0.5)
-        assert taken == pytest.approx(open_v * power / voltage, rel=2e-3, abs=1e-9)
 
 
 def test_without_a_battery_the_supply_is_stiff() -> None:
     p = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(fed_by(None)).tolist(), strict=True))
-    voltage, taken = battery(p, ca.DM(800.0), ca.DM(1e6))
+    voltage, taken, _ = battery(p, ca.DM(800.0), ca.DM(1e6), ca.DM(30.0))
     assert float(voltage) == pytest.approx(ELEVATE.drive.supply_v, rel=1e-6)
     assert float(taken) == 800.0
 
@@ -164,7 +173,18 @@ def test_a_flat_battery_sags_and_slows_the_robot() -> None:
     full = top(Battery(25.4, 21.0, 0.05, 480.0, 1.0))
     empty = top(Battery(25.4, 21.0, 0.05, 480.0, 0.0))
     worn = top(Battery(25.4, 21.0, 0.30, 480.0, 0.0))
-    assert full > 1.1 * empty > 1.1 * 1.05 * worn > 0.0
+    assert full > 1.1 * empty
+    assert empty > 1.05 * worn > 0.0
+
+
+def test_a_battery_that_gives_out_does_not_make_the_step_unstable() -> None:
+    """Ten times the resistance: the step of the integrator still resolves the loop of voltage and torque."""
+    weak = dataclasses.replace(ELEVATE.battery, resistance_ohm=0.5)
+    setup = set_up("staircase", vehicle=fed_by(weak), terrain="loose_sand", slope_deg=5.0)
+    sides = told(np.repeat([[0.0, 0.0], [11.0, 11.0]], [100, 900], axis=0), 0.01)
+    x0 = np.zeros(len(STATES))
+    coarse, fine = (integrate(x0, sides, 0.01, setup.plant, substeps=n) for n in (3, 12))
+    assert np.abs(coarse[-1, :6] - fine[-1, :6]).max() < 1e-3
 
 
 def test_the_charge_falls_with_the_energy_drawn() -> None:
@@ -191,7 +211,7 @@ def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps,
     setup = set_up("straight")
     states = np.zeros((len(setup.t_s), len(STATES)))
     states[:, state_slice("wheel_speed")] = wheel_radps
-    driven = Driven(setup.scenario.commanded(setup.t_s), states)
+    driven = Driven(setup.scenario.commanded(setup.t_s), np.zeros((len(states), 4)), states)
     motion = setup.motion(states)
     summary = summarise(driven, motion, setup.vehicle, slip_ratios(states, motion, setup.vehicle))
     assert summary.immobilised_cause == cause

@@ -21,7 +21,6 @@ FRICTION_SPEED_RADPS = 0.1
 TURNING_RADPS = 0.2
 PULL_MPS2 = 2.0
 WARMING_J, DISCHARGE_J = 1e3, 1e4
-SMOOTHING_S = 0.02
 CROSSING_S = 0.03
 """Time in which a gear crosses its backlash."""
 CROSSING_NM = 0.3
@@ -88,13 +87,9 @@ def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
 
 
 def _sagging(q: Quantities, ohm: Any) -> dict[str, Any]:
-    """The supply behind a resistance; capacitors smooth the current: the loop is not stiff."""
-    current = q["battery_power_w"] / q["supply_v"]
-    return {
-        "d_sag_current": (current - q["sag_current"]) / SMOOTHING_S,
-        "voltage_share": q["voltage_share"]
-        / (1.0 + ohm * smooth_max(q["sag_current"], 0.0, 0.01) / q["supply_v"]),
-    }
+    """A further resistance behind the battery's own; the current is smoothed: the loop is not stiff."""
+    drop = ohm * smooth_max(q["sag_current"], 0.0, 0.01) / q["supply_v"]
+    return {"voltage_share": q["voltage_share"] / (1.0 + drop)}
 
 
 FORMS = (
