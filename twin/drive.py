@@ -28,9 +28,10 @@ MAX_STEERING_RADPS = 0.8
 
 @dataclass(frozen=True, eq=False)
 class Driven:
-    """What was wanted and what came of it: twist (N, 2) before limits, states (N, 38)."""
+    """What was wanted, told and driven: twist (N, 2) before limits, inputs (N, U), states (N, X)."""
 
     wanted: Array
+    inputs: Array
     states: Array
 
 
@@ -121,7 +122,7 @@ def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Int
     if scenario.waypoints:
         return _steer(scenario, t_s, vehicle, integrate, start)
     wanted, inputs = open_loop(scenario, t_s, vehicle)
-    return Driven(wanted, integrate(start, inputs, 0.0))
+    return Driven(wanted, inputs, integrate(start, inputs, 0.0))
 
 
 def _steer(
@@ -148,7 +149,7 @@ def _steer(
         states[first : last + 1] = integrate(states[first], inputs[first - known :], float(t_s[first]))
         wanted[first + 1 : last + 1] = wish
         first = last
-    return Driven(wanted, states)
+    return Driven(wanted, told(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s), states)
 
 
 def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:

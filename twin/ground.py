@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.engine.plant import SoilField
-from terrafusion.twin.layout import SOIL_PARAMETERS
+from terrafusion.twin.engine.plant import RouteTable, SoilField
+from terrafusion.twin.layout import INDEX, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 
@@ -146,3 +146,35 @@ def _patch_share(unit: Array, share: float) -> Array:
 
 def _stream(seed: int, name: str) -> np.random.Generator:
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, zlib.crc32(name.encode())])))
+
+
+def under_wheels(route: RouteTable, vehicle: Array, t_s: Array, states: Array) -> Array:
+    """`SOIL_PARAMETERS` (N, 4 S) under each wheel, wheel by wheel, at the samples (N,) of a drive.
+
+    As the integrator has it: the route's table joined smoothly between its knots, then varied by the field.
+    """
+    time_weight, travel_weight = route.weights()
+    half = {name: 0.5 * vehicle[VEHICLE_PARAMETERS.index(f"{name}_m")] for name in ("wheelbase", "track")}
+    x, y, yaw, travel = (states[:, INDEX[name]] for name in ("x", "y", "yaw", "travel"))
+    wheels = []
+    for end, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+        ahead, left = end * half["wheelbase"], side * half["track"]
+        soil = _on_route(route, time_weight * t_s + travel_weight * (travel + ahead))
+        if route.field is not None:
+            place = x + np.cos(yaw) * ahead - np.sin(yaw) * left, y + np.sin(yaw) * ahead + np.cos(yaw) * left
+            gain = value_at(route.field.log_gain, route.field.cell_m, *place)
+            soil = soil * np.exp(gain[:, None] * route.field.response)
+            share = patch_share(route.field, *place)[:, None]
+            soil = soil + share * (route.field.patch_soil - soil)
+        wheels.append(soil)
+    return np.hstack(wheels)
+
+
+def _on_route(route: RouteTable, coordinate: Array) -> Array:
+    """Soil (N, S) of the route's table at coordinates (N,)."""
+    if len(route.at) == 1:
+        return np.tile(route.soil[0], (len(coordinate), 1))
+    i = np.clip(np.searchsorted(route.at, coordinate, side="right") - 1, 0, len(route.at) - 2)
+    w = np.clip((coordinate - route.at[i]) / (route.at[i + 1] - route.at[i]), 0.0, 1.0)
+    w = (w * w * (3.0 - 2.0 * w))[:, None]
+    return np.asarray(route.soil[i] + w * (route.soil[i + 1] - route.soil[i]))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +17,8 @@ from terrafusion.datasets.recording import Command, Recording, Terrain
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.twin import sensors
 from terrafusion.twin.drive import Driven, drive
+from terrafusion.twin.effects.catalogue import checked
+from terrafusion.twin.effects.sensed import as_driven, sensed, true_motion, with_effects
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.ground import patch_share
@@ -49,7 +51,7 @@ class SimulatedRun:
     Attributes:
         recording: the drive as sensors report it, with truth.
         t_s: (N,) seconds, at the IMU's rate.
-        states: (N, 38) in the order of `layout.STATES`.
+        states: (N, X) in the order of `layout.STATES`.
         slip: (N, 4) slip ratio of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest.
         summary: the run in a few numbers.
         wanted: (N, 2) commanded twist before limits, m/s and rad/s.
@@ -72,10 +74,12 @@ class RunSetup:
     route: Route
     plant: Plant
     t_s: Array
+    effects: Mapping[str, float] = field(default_factory=dict)
 
-    def motion(self, states: Array) -> Motion:
-        """The body's motion in the world from the states (N, 38)."""
-        return motion_of(self.t_s, states, self.vehicle, *self.scenario.plane())
+    def motion(self, states: Array, inputs: Array | None = None) -> Motion:
+        """The body's motion in the world from the states (N, X); some effects need the inputs (N, U), too."""
+        motion = motion_of(self.t_s, states, self.vehicle, *self.scenario.plane())
+        return true_motion(motion, states, inputs, self.plant, self.vehicle) if self.plant.effects else motion
 
 
 def simulate(
@@ -90,11 +94,13 @@ def simulate(
     seed: int = 0,
     noiseless: bool = False,
     backend: str = "auto",
+    effects: Mapping[str, float] | None = None,
 ) -> Recording:
     """One drive with all channels and its truth; see `simulate_run`."""
     return simulate_run(
         scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, cross_slope_deg=cross_slope_deg,
         payload_kg=payload_kg, payload_at_m=payload_at_m, seed=seed, noiseless=noiseless, backend=backend,
+        effects=effects,
     ).recording  # fmt: skip
 
 
@@ -111,6 +117,7 @@ def simulate_run(
     noiseless: bool = False,
     backend: str = "auto",
     soils: Mapping[str, SoilParams] | None = None,
+    effects: Mapping[str, float] | None = None,
 ) -> SimulatedRun:
     """Drive a scenario and keep the states, too.
 
@@ -126,6 +133,7 @@ def simulate_run(
         noiseless: exact sensors (no noise, bias, quantisation, vibration, latency).
         backend: "c", "vm" or "auto", see `integrate.integrate`.
         soils: grounds by name, in place of the library's.
+        effects: optional effects by name, see docs/effects.md; what is not named is absent.
 
     Raises:
         ConfigError: unknown name, bad file, or a number out of range.
@@ -133,12 +141,17 @@ def simulate_run(
     """
     setup = set_up(
         scenario, vehicle=vehicle, terrain=terrain, slope_deg=slope_deg, cross_slope_deg=cross_slope_deg,
-        payload_kg=payload_kg, payload_at_m=payload_at_m, seed=seed, soils=soils,
+        payload_kg=payload_kg, payload_at_m=payload_at_m, seed=seed, soils=soils, effects=effects,
     )  # fmt: skip
     driven = drive_through(setup, backend)
-    motion = setup.motion(driven.states)
+    motion = setup.motion(driven.states, driven.inputs)
     recording = _record(setup, driven, motion, sensors.Noise(seed, noiseless))
-    recording = dataclasses.replace(recording, description=_description(setup.scenario, seed, noiseless))
+    if setup.effects:
+        late_s = 0.0 if noiseless else setup.vehicle.realism.gnss_latency_s
+        recording = sensed(
+            recording, motion, driven.states, driven.inputs, setup.plant, setup.vehicle, setup.effects, late_s
+        )
+    recording = dataclasses.replace(recording, description=_description(setup, seed, noiseless))
     if backend != "c" and (backend == "vm" or not compiled()):
         recording = recording.with_notes("integrated in CasADi's virtual machine (slower, same numbers)")
     recording = recording.with_notes(*_notes(setup, motion, vehicle))
@@ -159,6 +172,7 @@ def set_up(
     payload_at_m: tuple[float, float, float] | None = None,
     seed: int = 0,
     soils: Mapping[str, SoilParams] | None = None,
+    effects: Mapping[str, float] | None = None,
 ) -> RunSetup:
     """What `simulate_run` drives with the same arguments."""
     vehicle = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
@@ -175,7 +189,9 @@ def set_up(
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect)
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
-    return RunSetup(scenario, vehicle, route, Plant(parameters, route.table(seed)), np.arange(count) / rate)
+    known = checked(effects or {})
+    plant = with_effects(Plant(parameters, route.table(seed)), known)
+    return RunSetup(scenario, vehicle, route, plant, np.arange(count) / rate, known)
 
 
 def drive_through(setup: RunSetup, backend: str = "auto") -> Driven:
@@ -185,7 +201,7 @@ def drive_through(setup: RunSetup, backend: str = "auto") -> Driven:
     def run(x0: Array, inputs: Array, t0_s: float) -> Array:
         return integrate(x0, inputs, dt_s, setup.plant, t0_s=t0_s, backend=backend)
 
-    return drive(setup.scenario, setup.t_s, setup.vehicle, run)
+    return drive(setup.scenario, setup.t_s, as_driven(setup.vehicle, setup.effects), run)
 
 
 def _check(scenario: Scenario, vehicle: VehicleParams, seed: int) -> None:
@@ -251,10 +267,12 @@ def _truth(t_ns: NDArray[np.int64], motion: Motion) -> Trajectory:
     return Trajectory(t_ns, motion.position_m, matrix_to_quaternion(motion.rotation), twist)
 
 
-def _description(scenario: Scenario, seed: int, noiseless: bool) -> str:
+def _description(setup: RunSetup, seed: int, noiseless: bool) -> str:
+    scenario = setup.scenario
     patches = [scenario.patches.terrain] if scenario.patches else []
     grounds = ", ".join(dict.fromkeys([*(leg.terrain for leg in scenario.route), *patches]))
     extras = "exact sensors" if noiseless else f"seed {seed}"
+    extras += "".join(f"; {key} = {value:g}" for key, value in setup.effects.items())
     across = f", across {scenario.cross_slope_deg:g} deg" if scenario.cross_slope_deg else ""
     place = f" at {', '.join(f'{x:g}' for x in scenario.payload_at_m)} m" if scenario.payload_at_m else ""
     return (

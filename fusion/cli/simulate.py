@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli.effects import effect_values, listed
+
 if TYPE_CHECKING:
     from terrafusion.twin.simulate import SimulatedRun
     from terrafusion.twin.summary import RunSummary
@@ -37,6 +39,15 @@ def simulate(
     ] = None,
     seed: Annotated[int, typer.Option(help="Seed of all sensor noise and of ground that varies.")] = 0,
     noiseless: Annotated[bool, typer.Option("--noiseless", help="Exact sensors, for checks.")] = False,
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=VALUE",
+            help="An optional effect, e.g. wheel_radius/scale=0.03; may be repeated. 'help' lists all.",
+            callback=listed,
+            is_eager=True,
+        ),
+    ] = None,
 ) -> None:
     """Simulate one drive with its ground truth, and write it as a log folder or an MCAP bag.
 
@@ -48,6 +59,8 @@ def simulate(
     terrafusion simulate paper_profile --terrain loose_sand --slope-deg 5 --out sand.mcap
 
     terrafusion simulate straight --cross-slope-deg 10 --payload-kg 30 --payload-at 0,0.1,0.4 --out tilted
+
+    terrafusion simulate spin --effect wheel_radius/scale=0.03 --effect gyro_bias/constant=0.01 --out worn
     """
     from terrafusion.twin.simulate import simulate_run
 
@@ -61,6 +74,7 @@ def simulate(
         payload_at_m=None if payload_at is None else _place(payload_at),
         seed=seed,
         noiseless=noiseless,
+        effects=effect_values(effect or []),
     )
     if out.suffix == ".mcap":
         from terrafusion.datasets.writers.mcap import write_mcap

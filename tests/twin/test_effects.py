@@ -43,7 +43,7 @@ CONTRACT = EFFECTS.split()
 BODY = ("u", "v", "r")
 REACH = {
     "command": ("torque", "speed_error", "command"),
-    "supply": ("torque", "speed_error", "sag_current"),
+    "supply": ("torque", "speed_error"),
     "corner": (*BODY, "wheel_speed", "shear", "brake", "clog", "slip_work", "resistance_work"),
     "ground": (*BODY, "wheel_speed", "shear", "brake", "clog", "slip_work", "resistance_work"),
     "motor": ("torque", "speed_error", "play"),
@@ -89,7 +89,7 @@ def test_every_stage_is_used_and_tells_what_may_be_set() -> None:
 def test_effects_that_are_named_and_zero_change_nothing_but_rounding() -> None:
     states, inputs = samples()
     vehicle, ground = plant("mud", slope_rad=0.08).vehicle, soil("mud")
-    own = [i for name, i in INDEX.items() if not name.startswith(("command", "play", "sag"))]
+    own = [i for name, i in INDEX.items() if not name.startswith(("command", "play"))]
     plain = rhs()(states.T, inputs.T, vehicle, ground, []).full().T
     np.testing.assert_allclose(derivatives({}, states, inputs)[:, own], plain[:, own], rtol=1e-11, atol=1e-11)
     np.testing.assert_allclose(

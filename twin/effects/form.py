@@ -24,7 +24,7 @@ STAGES: dict[str, tuple[str, ...]] = {
         *(f"command_{side}_{unit}" for side in ("left", "right") for unit in ("radps", "radps2")),
         *(f"d_command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
     ),
-    "supply": ("voltage_share", "d_sag_current"),
+    "supply": ("voltage_share",),
     "corner": (
         "radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m", "grouser_height_m", "grouser_count",
     ),
