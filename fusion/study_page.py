@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -62,7 +62,7 @@ def _tab4(study: Study) -> str:
     return "\n".join(
         [
             "<h2>Tab. 4: twin / study</h2>",
-            _table(TAB4_HEAD, rows),
+            _table(TAB4_HEAD, rows, range(1, 7)),
             '<p class="dim">Mean percent over moving samples, with the 95 % interval of the mean over the '
             "seeds. On even ground the motion knows no seed: slip and odometry do not scatter.</p>",
             figure(fig, "Each point is one run of the twin; the diamonds are the study's single runs."),
@@ -77,7 +77,7 @@ def _open(rows: Sequence[Row]) -> str:
         (_told(row), escape(row.study), escape(row.twin), _verdict(row), escape(row.why)) for row in found
     ]
     heads = ("statement and what is measured", "study", "twin", "verdict", "why")
-    return "<h2>What does not agree</h2>\n" + _table(heads, lines)
+    return "<h2>What does not agree</h2>\n" + _table(heads, lines, (1, 2))
 
 
 def _agreement(rows: Sequence[Row]) -> str:
@@ -95,7 +95,7 @@ def _agreement(rows: Sequence[Row]) -> str:
     heads = ("statement and what is measured", "study", "twin", "verdict", "criterion", "why")
     return (
         "<h2>All statements and numbers</h2>\n"
-        + _table(heads, lines)
+        + _table(heads, lines, (1, 2))
         + '<p class="dim">The verdict is computed by the criterion. Calibrated: the twin was fitted to this '
         "number; given: it was taken over. Agreement proves little there.</p>"
     )
@@ -119,13 +119,13 @@ def _tables(study: Study) -> str:
         )
         for terrain, (low, high) in FRICTION.items()
     ]
-    robot = [(escape(f.name), f"{f.study:g} {f.unit}", f"{f.twin:.4g} {f.unit}") for f in platform_figures()]
+    robot = [(escape(f.name), f"{f.study:g} {f.unit}", f"{f.twin:.5g} {f.unit}") for f in platform_figures()]
     return "\n".join(
         [
             "<h2>Tab. 3: effective friction</h2>",
             _table(("terrain", "friction", "mean |s| over it, flat", "mean |s| over it, 5 deg"), tab3),
             "<h2>Tabs. 1 and 2: robot, sensors, profile</h2>",
-            _table(("figure", "study", "twin"), robot),
+            _table(("figure", "study", "twin"), robot, (1, 2)),
         ]
     )
 
@@ -240,8 +240,14 @@ def _figures(parts: Iterable[tuple[object, str]]) -> str:
     return "\n".join(figure(fig, caption) for fig, caption in parts)  # type: ignore[arg-type]
 
 
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table of cells that are HTML already."""
-    top = "".join(f"<th>{escape(head)}</th>" for head in heads)
-    lines = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f'<div class="scroll"><table><thead><tr>{top}</tr></thead><tbody>{lines}</tbody></table></div>'
+def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = ()) -> str:
+    """A table of cells that are HTML already; `numbers` are the columns to align as such."""
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        kinds = [' class="n"' if column in numbers else "" for column in range(len(cells))]
+        told = (f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
+        return f"<tr>{''.join(told)}</tr>"
+
+    top = line([escape(head) for head in heads], "th")
+    body = "".join(line(row, "td") for row in rows)
+    return f'<div class="scroll"><table><thead>{top}</thead><tbody>{body}</tbody></table></div>'

@@ -210,7 +210,8 @@ def plot_energy(
                 label=f"{terrain.replace('_', ' ')}, {held:g} {unit}",
             )
         style.dress(ax, x=label, y="energy, J/m")
-        ax.legend(fontsize=7, frameon=False)
+        ax.set_ylim(0.0, 1.35 * ax.get_ylim()[1])
+        ax.legend(fontsize=7, frameon=False, loc="upper left")
     known = [r for r in over_slip if r.mobile]
     for key, label, marker in (("slip_ratio", "usual slip ratio", "o"), ("slip", "the study's proxy", "s")):
         panels[2].plot(

@@ -16,7 +16,9 @@ def study(
     seeds: Annotated[
         int | None, typer.Option(help="Seeds a case (10; 2 when quick).", show_default=False)
     ] = None,
-    jobs: Annotated[int, typer.Option(help="Processes to run the twin in.")] = 1,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes on this machine; by default one a processor.")
+    ] = None,
     bags: Annotated[
         bool, typer.Option("--bags", help="Also write the three runs as ROS 2 bags (MCAP).")
     ] = False,
@@ -26,13 +28,15 @@ def study(
     Runs mud, loose and medium sand, the batch over friction, slope and payload, and a drive like the field
     test. Prints Tab. 4 side by side; writes agreement.csv, metrics.json, batch.csv and report.html.
 
-    Example: terrafusion study --out study-out --quick --jobs 2
+    Example: terrafusion study --out study-out --quick
     """
+    import joblib
+
     from terrafusion.fusion.study_outputs import write_bags, write_plan, write_study
     from terrafusion.twin.study.study import StudyPlan, run_study
     from terrafusion.twin.study.text import study_lines
 
-    plan = StudyPlan(seeds=seeds, quick=quick, jobs=jobs)
+    plan = StudyPlan(seeds=seeds, quick=quick, jobs=jobs or joblib.cpu_count())
     write_plan(out, plan)
     with progress_bar("study") as progress:
         found = run_study(plan, progress)

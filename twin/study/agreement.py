@@ -78,7 +78,7 @@ def _row(claim: Claim, found: Spread) -> Row:
         statement=claim.statement,
         quantity=claim.quantity,
         study=claim.criterion.wanted(claim.unit),
-        twin=f"{found.text(claim.digits)} {claim.unit}".rstrip(),
+        twin=f"{found.text(claim.digits)} {claim.unit}".rstrip() if found.runs else found.text(),
         verdict=verdict,
         criterion=claim.criterion.words(claim.unit),
         basis=claim.basis,

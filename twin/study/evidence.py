@@ -17,7 +17,7 @@ from terrafusion.twin.study.batch import (
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.field_drive import FieldDrive, field_measures
 from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun
-from terrafusion.twin.study.published import CASES
+from terrafusion.twin.study.published import CASES, FRICTION
 from terrafusion.twin.study.robot import platform_figures
 from terrafusion.twin.study.spread import Spread, spread
 
@@ -121,6 +121,7 @@ def batch_evidence(batch: Sequence[CellResult], over_slip: Sequence[CellResult])
         "mud.not_mobile": 100.0 * sum(not r.mobile for r in mud) / len(mud),
         "medium_sand.most_slip": max(medium),
         "batch.less_friction_more_slip": share_of_pairs(batch, "friction", _less_friction_slips_more),
+        "loose_sand.slip.friction_factor": _friction_factor(on, "loose_sand"),
         "energy.slope_growth": least_growth(batch, "slope_deg"),
         "energy.payload_growth": least_growth(batch, "payload_kg"),
         "energy.steepening.slip_ratio": steepening(over_slip, "slip_ratio"),
@@ -138,6 +139,12 @@ def field_evidence(drives: Sequence[FieldDrive]) -> Evidence:
 def platform_evidence() -> Evidence:
     """Tab. 1 and 2 and the profile: how many figures differ."""
     return {"platform.differences": spread([float(sum(not figure.same for figure in platform_figures()))])}
+
+
+def _friction_factor(on: Mapping[tuple[str, float], CellResult], terrain: str) -> float:
+    """Slip at the low end of a terrain's friction range over that at the high end."""
+    low, high = FRICTION[terrain]
+    return on[terrain, low].slip / on[terrain, high].slip
 
 
 def _nominal(result: CellResult) -> bool:
