@@ -16,7 +16,7 @@ from terrafusion.datasets.catalog import DATA_VARIABLE
 from terrafusion.datasets.errors import DataError, TerrafusionError
 from terrafusion.twin.field import plots, summary
 from terrafusion.twin.field.compare import OTHER, POOLED, SAME, compare
-from terrafusion.twin.field.slip import slip_rows
+from terrafusion.twin.field.slip import SlipRow, slip_rows
 from terrafusion.twin.field.sources import SETS, read
 
 
@@ -51,7 +51,10 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
             print(f"\r\x1b[K{time.monotonic() - started:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
 
     drives = read(data, progress)
-    lines, forks, slips, numbers = [], [], [], []
+    lines: list[summary.Line] = []
+    slips: list[tuple[str, SlipRow]] = []
+    forks: list[dict[str, Any]] = []
+    numbers: list[dict[str, Any]] = []
     for name, runs in drives.runs.items():
         results = compare(runs, lambda text, name=name: progress(f"{name}: {text}"))  # type: ignore[misc]
         vehicle, own = runs[0].vehicle, summary.lines(name, results)
@@ -71,7 +74,7 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
     print(_report(lines, slips, drives.left_out))
 
 
-def _report(lines: list[summary.Line], slips: list[Any], left_out: dict[str, str]) -> str:
+def _report(lines: list[summary.Line], slips: list[tuple[str, SlipRow]], left_out: dict[str, str]) -> str:
     parts = [
         f"## Trained on: {scheme}\n\n{summary.markdown(lines, scheme)}" for scheme in (SAME, POOLED, OTHER)
     ]
@@ -81,9 +84,13 @@ def _report(lines: list[summary.Line], slips: list[Any], left_out: dict[str, str
 
 
 def _write(
-    out: Path, lines: list[summary.Line], forks: list[Any], slips: list[Any], numbers: list[Any],
+    out: Path,
+    lines: list[summary.Line],
+    forks: list[dict[str, Any]],
+    slips: list[tuple[str, SlipRow]],
+    numbers: list[dict[str, Any]],
     left_out: dict[str, str],
-) -> None:  # fmt: skip
+) -> None:
     _folder(out)
     rows = list(summary.line_rows(lines))
     slip = [flat for name, row in slips for flat in summary.slip_table_rows(name, [row])]

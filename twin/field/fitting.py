@@ -13,9 +13,10 @@ from terrafusion.twin.field.forks import Forks, half_second_means
 
 Array = NDArray[np.float64]
 
-SPEED_MPS, SIDE_MPS, TURN_RADPS = 0.2, 0.4, 0.1
+SPEED_MPS, SIDE_MPS, TURN_RADPS = 0.1, 0.2, 0.05
 """What counts as one unit of misfit in forward speed, sideways speed, yaw rate."""
-LOSS = "soft_l1"
+LOSS: Any = "soft_l1"
+DIFFERENCE: Any = 1e-5
 EDGE = 0.02
 """No start is nearer to an end of its range than this share of it."""
 
@@ -42,6 +43,7 @@ def fit(
     predict: Callable[[Array], Array],
     forks: Forks,
     *,
+    doubts: Array | None = None,
     rounds: int = 60,
 ) -> Array:
     """The numbers (P,) that fit best, by trust-region least squares with the loss `LOSS` (scipy).
@@ -52,6 +54,7 @@ def fit(
         numbers: starts and ranges.
         predict: motion (F, N_FUTURE + 1, 3) from the numbers.
         forks: to fit on.
+        doubts: (P,) standard deviations of the numbers about their starts, None where nothing is known.
         rounds: steps at most.
     """
     from scipy.optimize import least_squares
@@ -64,8 +67,14 @@ def fit(
     def value(z: Array) -> Array:
         return low + (high - low) * expit(first + z)
 
+    middle = value(np.zeros(len(first)))
+
+    def misfit(z: Array) -> Array:
+        found = residuals(predict(value(z)), forks)
+        return found if doubts is None else np.concatenate([found, (value(z) - middle) / doubts])
+
     found: Any = least_squares(
-        lambda z: residuals(predict(value(z)), forks), np.zeros(len(first)), loss=LOSS, max_nfev=rounds,
-        diff_step=1e-5, xtol=1e-4, ftol=1e-4,
+        misfit, np.zeros(len(first)), loss=LOSS, max_nfev=rounds,
+        diff_step=DIFFERENCE, xtol=1e-4, ftol=1e-4,
     )  # fmt: skip
     return np.asarray(value(found.x))

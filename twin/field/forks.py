@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,7 +63,7 @@ class Forks:
 
     def select(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> Forks:
         """The forks of a mask or of indices."""
-        changed = {
+        changed: dict[str, Any] = {
             f.name: getattr(self, f.name)[rows]
             for f in dataclasses.fields(self)
             if isinstance(getattr(self, f.name), np.ndarray)
@@ -81,7 +82,7 @@ class Forks:
 def joined(parts: Sequence[Forks]) -> Forks:
     """Forks of several kinds of ground as one."""
     first = parts[0]
-    together = {
+    together: dict[str, Any] = {
         f.name: np.concatenate([getattr(p, f.name) for p in parts])
         for f in dataclasses.fields(first)
         if isinstance(getattr(first, f.name), np.ndarray)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from terrafusion.twin.field.compare import SAME, Result
 from terrafusion.twin.field.forks import N_PAST, Forks
 from terrafusion.twin.field.runs import DT_S
-from terrafusion.twin.field.scores import Interval, drawn
+from terrafusion.twin.field.scores import Interval, drawn, interval
 
 Array = NDArray[np.float64]
 
@@ -98,6 +98,5 @@ def _track(apart: Array, turned: Array) -> float:
 def _interval(statistic, group: NDArray[np.str_]) -> Interval:  # type: ignore[no-untyped-def]
     if not len(group):
         return Interval(np.nan, np.nan, np.nan)
-    values = [statistic(rows) for rows in drawn(group)]
-    low, high = np.percentile(values, [2.5, 97.5])
-    return Interval(float(statistic(np.arange(len(group)))), float(low), float(high))
+    draws = np.array([statistic(rows) for rows in drawn(group)])
+    return interval(float(statistic(np.arange(len(group)))), draws)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.field.compare import OTHER, Result
 from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN
-from terrafusion.twin.field.scores import METRICS, Interval, median, ratio
+from terrafusion.twin.field.scores import METRICS, Interval, interval, medians
 from terrafusion.twin.field.slip import SlipRow
 from terrafusion.twin.field.twin_model import TwinModel
 from terrafusion.twin.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS
@@ -51,27 +51,47 @@ class Line:
 
 def lines(vehicle: str, results: Sequence[Result]) -> list[Line]:
     """Folds put together: every fork counts once in each line; forks of several grounds are not mixed."""
-    cells: dict[tuple[str, str, str, str, str], list[Result]] = {}
+    wheres: dict[Where, dict[str, list[Result]]] = {}
     for r in results:
         source = r.trained_on if r.scheme == OTHER else ""
-        cells.setdefault((r.inputs, r.scheme, r.ground, source, r.name), []).append(r)
+        models = wheres.setdefault((r.inputs, r.scheme, r.ground, source), {})
+        models.setdefault(r.name, []).append(r)
+    return [line for name in wheres for line in _lines_of(vehicle, name, wheres[name])]
+
+
+Where = tuple[str, str, str, str]
+
+
+def _lines_of(vehicle: str, where: Where, models: dict[str, list[Result]]) -> list[Line]:
+    """The lines of all models in one place: they are scored on the same forks."""
+    inputs, scheme, ground, source = where
+    first = next(iter(models.values()))
+    group = np.concatenate([r.forks.group for r in first])
+    noise = np.concatenate([r.forks.noise_mps for r in first])
+    middle, draws = medians(
+        np.hstack([np.concatenate([r.scores for r in parts]) for parts in models.values()]), group
+    )
+    width = len(METRICS)
+    best = width * list(models).index(BEST_KINEMATIC)
     out = []
-    for (inputs, scheme, ground, source, name), parts in cells.items():
-        values = np.concatenate([r.scores for r in parts])
-        group = np.concatenate([r.forks.group for r in parts])
-        noise = np.concatenate([r.forks.noise_mps for r in parts])
-        best = np.concatenate([r.scores for r in cells[inputs, scheme, ground, source, BEST_KINEMATIC]])
-        columns = list(enumerate(METRICS))
+    for k, (name, parts) in enumerate(models.items()):
+        own = {m: k * width + i for i, m in enumerate(METRICS)}
+        rival = {m: best + i for i, m in enumerate(METRICS)}
         out.append(
             Line(
                 vehicle, inputs, scheme, ground, source or parts[0].trained_on, parts[0].rule, name,
-                len(values), len(np.unique(group)),
+                len(group), len(np.unique(group)),
                 float(np.nanmedian(noise)) if np.isfinite(noise).any() else float("nan"),
-                {m: median(values[:, k], group) for k, m in columns},
-                {m: ratio(values[:, k], best[:, k], group) for k, m in columns},
+                {m: interval(middle[i], draws[:, i]) for m, i in own.items()},
+                {m: _ratio(middle, draws, own[m], rival[m]) for m in METRICS},
             )
         )  # fmt: skip
     return out
+
+
+def _ratio(middle: Array, draws: Array, one: int, other: int) -> Interval:
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return interval(middle[one] / middle[other], draws[:, one] / draws[:, other])
 
 
 def line_rows(all_lines: Sequence[Line]) -> Iterator[dict[str, Any]]:
@@ -79,11 +99,11 @@ def line_rows(all_lines: Sequence[Line]) -> Iterator[dict[str, Any]]:
     for line in all_lines:
         row = {f.name: getattr(line, f.name) for f in dataclasses.fields(line)}
         for kind, name in (("errors", ""), ("ratios", "_over_best_kinematic")):
-            for metric, interval in row.pop(kind).items():
+            for metric, found in row.pop(kind).items():
                 row |= {
-                    f"{metric}{name}": _known(interval.median),
-                    f"{metric}{name}_low": _known(interval.low),
-                    f"{metric}{name}_high": _known(interval.high),
+                    f"{metric}{name}": _known(found.median),
+                    f"{metric}{name}_low": _known(found.low),
+                    f"{metric}{name}_high": _known(found.high),
                 }
         yield row | {"noise_mps": _known(line.noise_mps)}
 
@@ -105,11 +125,11 @@ def slip_table_rows(vehicle: str, rows: Sequence[SlipRow]) -> Iterator[dict[str,
     for row in rows:
         flat = {f.name: getattr(row, f.name) for f in dataclasses.fields(row)}
         for name in ("slip", "track_m"):
-            interval = flat.pop(name)
+            found = flat.pop(name)
             flat |= {
-                name: _known(interval.median),
-                f"{name}_lowest": _known(interval.low),
-                f"{name}_highest": _known(interval.high),
+                name: _known(found.median),
+                f"{name}_lowest": _known(found.low),
+                f"{name}_highest": _known(found.high),
             }
         yield {"vehicle": vehicle, **{k: _known(v) if isinstance(v, float) else v for k, v in flat.items()}}
 
@@ -123,7 +143,7 @@ def parameters(vehicle: str, results: Sequence[Result]) -> Iterator[dict[str, An
         seen.add(id(r.model))
         if isinstance(r.model, TwinModel):
             numbers = dict(zip(VEHICLE_PARAMETERS, r.model.vehicle.tolist(), strict=True))
-            numbers |= dict(zip(SOIL_PARAMETERS, r.model.soil.tolist(), strict=True))
+            numbers |= dict(zip(SOIL_PARAMETERS, r.model.soil.tolist(), strict=True)) | dict(r.model.effects)
         elif dataclasses.is_dataclass(r.model) and dataclasses.fields(r.model):
             numbers = dataclasses.asdict(r.model)
         else:
@@ -141,6 +161,8 @@ def markdown(all_lines: Sequence[Line], scheme: str) -> str:
     out = [head, ["---"] * len(head)]
     for line in chosen:
         where = f"{line.vehicle}, {line.inputs}, {line.ground or 'unknown'}"
+        if line.model == chosen[0].model and np.isfinite(line.noise_mps):
+            where += f" (noise {line.noise_mps:.3f} m/s)"
         if scheme == OTHER:
             where += f", trained on {line.trained_on}"
         cells = [_cell(line, metric) for metric in SHOWN]

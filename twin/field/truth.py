@@ -10,6 +10,7 @@ turned once a chunk to the poses' own yaw: over two seconds it is far better tha
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -115,7 +116,7 @@ def _track_direction(t_s: Array, psi: Array, poses: Poses, rolled_mps: Array) ->
     return out
 
 
-def _design(t_s: Array, psi: Array, poses: Poses, knots: Array) -> tuple[object, object]:
+def _design(t_s: Array, psi: Array, poses: Poses, knots: Array) -> tuple[Any, Any]:
     """Sparse (M, 2K + C) of x and of y: integrals of the speeds from a chunk's first pose, and its origin."""
     from scipy import sparse
 
@@ -140,7 +141,7 @@ def _design(t_s: Array, psi: Array, poses: Poses, knots: Array) -> tuple[object,
     width = 2 * size + len(chunks)
     origin = sparse.coo_matrix((np.ones(count), (np.arange(count), 2 * size + index)), shape=(count, width))
 
-    def matrix(u: Array, v: Array) -> object:
+    def matrix(u: Array, v: Array) -> Any:
         both = (np.concatenate([rows, rows]), np.concatenate([columns, columns + size]))
         body = sparse.coo_matrix((np.concatenate([u, v]), both), shape=(count, width))
         return (body + origin).tocsr()
@@ -148,18 +149,18 @@ def _design(t_s: Array, psi: Array, poses: Poses, knots: Array) -> tuple[object,
     return matrix(cosine, -sine), matrix(sine, cosine)
 
 
-def _solved(design: tuple[object, object], turned: Array, rolled: Array, size: int) -> Array:
+def _solved(design: tuple[Any, Any], turned: Array, rolled: Array, size: int) -> Array:
     """Speeds (2, K) at the knots, by reweighted least squares; the positions' sigma is found on the way."""
     from scipy import sparse
     from scipy.sparse.linalg import spsolve
 
     ax, ay = design
     # The chunks' origins differ between x and y: two sets of unknowns.
-    chunks = ax.shape[1] - 2 * size  # type: ignore[attr-defined]
+    chunks = ax.shape[1] - 2 * size
     empty = sparse.csr_matrix((len(turned), chunks))
     A = sparse.vstack(
         [sparse.hstack([ax, empty]), sparse.hstack([ay[:, : 2 * size], empty, ay[:, 2 * size :]])]
-    )  # type: ignore[index]
+    )
     A, b = A.tocsr(), np.concatenate([turned[:, 0], turned[:, 1]])
     bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(size - 2, size)) / (ACCEL_WALK * KNOT_S**1.5)
     smooth = sparse.block_diag([bend, bend])

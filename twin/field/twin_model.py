@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,35 +45,45 @@ WORKERS = 2
 
 @dataclass(frozen=True)
 class Freedom:
-    """A number of the twin that a calibration may change, and its range.
+    """A number of the twin that a calibration may change, its range, and how far it is thought to be off.
 
-    `names` are entries of `VEHICLE_PARAMETERS` or `SOIL_PARAMETERS`; all are multiplied by the same factor
-    within (low, high), or, where `added`, get the same amount within (low, high) added.
+    `names` are entries of `VEHICLE_PARAMETERS` or `SOIL_PARAMETERS`, or optional effects. All are multiplied
+    by the same factor within (low, high), or, where `added`, get the same amount within (low, high) added.
+    `doubt` is the standard deviation of the logarithm of the factor, or of the amount: it decides what the
+    drives leave open and hardly moves what they tell.
     """
 
     names: tuple[str, ...]
     low: float
     high: float
+    doubt: float
     added: bool = False
 
 
 GROUND = (
-    Freedom(("radius_m",), 0.8, 1.2),
-    Freedom(("tan_friction", "friction_cap"), 0.02, 2.0),
-    Freedom(("shear_modulus_m",), 0.05, 50.0),
-    Freedom(("k_phi",), 0.05, 20.0),
-    Freedom(("viscous_ns_per_m",), 0.0, 300.0, added=True),
-    Freedom(("cg_forward_m",), -0.3, 0.3, added=True),
-    Freedom(("cg_left_m",), -0.2, 0.2, added=True),
+    Freedom(("radius_m",), 0.8, 1.2, 0.05),
+    Freedom(("tan_friction", "friction_cap"), 0.02, 2.0, 1.0),
+    Freedom(("shear_modulus_m",), 0.05, 50.0, 1.5),
+    Freedom(("k_phi",), 0.05, 20.0, 1.5),
+    Freedom(("viscous_ns_per_m",), 0.0, 300.0, 20.0, added=True),
+    Freedom(("cg_forward_m",), -0.3, 0.3, 0.05, added=True),
+    Freedom(("cg_left_m",), -0.2, 0.2, 0.02, added=True),
+    Freedom(("wheelbase_m",), 0.7, 1.4, 0.1),
+    Freedom(("yaw_inertia_kgm2",), 0.3, 3.0, 0.3),
+    Freedom(("wheel_radius_asymmetry/sides",), -0.1, 0.1, 0.02, added=True),
 )
-"""What wheel speeds and the body's motion tell of the ground and of where the weight lies."""
+"""What wheel speeds and the body's motion tell of the ground, of the weight and of the tyres.
+
+The wheelbase is an effective one: tyres and rockers move the load about.
+"""
 
 ACTUATION = (
-    Freedom(("loop_p_nms",), 0.02, 20.0),
-    Freedom(("loop_i_nm",), 0.005, 20.0),
-    Freedom(("dead_time_s",), 0.0, 0.6, added=True),
-    Freedom(("torque_limit_nm", "stall_torque_nm"), 0.1, 5.0),
-    Freedom(("rolling",), 0.2, 10.0),
+    Freedom(("loop_p_nms",), 0.02, 20.0, 1.5),
+    Freedom(("loop_i_nm",), 0.005, 20.0, 1.5),
+    Freedom(("dead_time_s",), 0.0, 0.6, 0.2, added=True),
+    Freedom(("torque_limit_nm", "stall_torque_nm"), 0.1, 5.0, 0.7),
+    Freedom(("no_load_radps",), 0.5, 3.0, 0.3),
+    Freedom(("rolling",), 0.2, 10.0, 0.7),
 )
 """What commands tell besides, once the ground is known."""
 
@@ -86,11 +96,13 @@ class TwinModel:
         vehicle: (V,) `VEHICLE_PARAMETERS`.
         soil: (S,) `SOIL_PARAMETERS`.
         commanded: whether the inputs are commands to the motors, not measured wheel speeds.
+        effects: optional effects by name.
     """
 
     vehicle: Array
     soil: Array
     commanded: bool
+    effects: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def nominal(cls, vehicle: VehicleParams, soil: SoilParams, *, commanded: bool) -> TwinModel:
@@ -137,7 +149,7 @@ class TwinModel:
             vehicle[_V["stall_torque_nm"]] = vehicle[_V["torque_limit_nm"]] = NO_LIMIT_NM
             vehicle[_V["no_load_radps"]] *= 100.0
             vehicle[_V["battery_ohm"]] = 0.0
-        return Plant(vehicle, RouteTable("travel", np.zeros(1), self.soil[None]))
+        return Plant(vehicle, RouteTable("travel", np.zeros(1), self.soil[None]), self.effects)
 
     def _sides(self, sides: Array, motion: Array, given_turn: bool) -> Array:
         """Side speeds; where the log knows their mean only, they turn the body about as the gyro says."""
@@ -201,20 +213,26 @@ def _integrated(start: Array, inputs: Array, plant: Plant, substeps: int) -> Arr
 
 def changed(model: TwinModel, freedoms: Sequence[Freedom], values: Array) -> TwinModel:
     """The model with its numbers changed: `values` (P,) are logarithms of factors, or amounts added."""
-    vehicle, soil = model.vehicle.copy(), model.soil.copy()
+    vehicle, soil, effects = model.vehicle.copy(), model.soil.copy(), dict(model.effects)
     for freedom, value in zip(freedoms, values.tolist(), strict=True):
         for name in freedom.names:
+            if "/" in name:
+                effects[name] = effects.get(name, 0.0) + value
+                continue
             vector, index = (vehicle, _V) if name in _V else (soil, _S)
             old = vector[index[name]]
             vector[index[name]] = old + value if freedom.added else old * np.exp(value)
-    return dataclasses.replace(model, vehicle=vehicle, soil=soil)
+    return dataclasses.replace(model, vehicle=vehicle, soil=soil, effects=effects)
 
 
-def calibrated(model: TwinModel, freedoms: Sequence[Freedom], forks: Forks, *, rounds: int = 12) -> TwinModel:
+def calibrated(model: TwinModel, freedoms: Sequence[Freedom], forks: Forks, *, rounds: int = 20) -> TwinModel:
     """The model with the freedoms fitted on the forks by the common criterion."""
     numbers = [
         Bounded(0.0, f.low, f.high) if f.added else Bounded(0.0, float(np.log(f.low)), float(np.log(f.high)))
         for f in freedoms
     ]
-    found = fit(numbers, lambda p: changed(model, freedoms, p).predict(forks), forks, rounds=rounds)
+    doubts = np.array([f.doubt for f in freedoms])
+    found = fit(
+        numbers, lambda p: changed(model, freedoms, p).predict(forks), forks, doubts=doubts, rounds=rounds
+    )
     return changed(model, freedoms, found)
