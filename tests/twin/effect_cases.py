@@ -83,13 +83,14 @@ def exciting() -> np.ndarray:
 
 
 def drive(
-    values: dict[str, float], sides: np.ndarray, terrain: str = "loose_sand", **kw
+    values: dict[str, float], sides: np.ndarray, terrain: str = "loose_sand", start: np.ndarray | None = None
 ) -> tuple[np.ndarray, ...]:
-    """States, inputs and outputs of a drive from rest, in the graph of all effects."""
+    """States, inputs and outputs of a drive, from rest unless told, in the graph of all effects."""
     effects = dict.fromkeys(KEYS, NAMED) | values
-    own = plant(terrain, effects, **kw)
+    own = plant(terrain, effects)
     inputs = told(sides, DT_S, values.get("dead_time/transport", 0.0))
-    states = integrate(np.zeros(len(STATES)), inputs, DT_S, own)
+    x0 = np.zeros(len(STATES)) if start is None else start
+    states = integrate(x0, inputs, DT_S, own)
     return states, inputs, measured(states, inputs, own.vehicle, soil(terrain), MOUNTING, effects)
 
 
