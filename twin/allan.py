@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
+REWEIGHTINGS = 5
 SHORT_S, LONG_S = 1.0, 3.0
 """Clusters up to the first show white noise alone, those from the second on the others."""
 
@@ -106,10 +107,14 @@ def _fit(curve: Allan) -> Array:
     tau, square = curve.tau_s, curve.deviation**2
     short, long = tau <= SHORT_S, tau >= LONG_S
     white = float(np.average((square * tau)[short], weights=1.0 / tau[short]))
-    # The relative error of an Allan variance of clusters of m in N values is sqrt(2 m / N).
-    weight = 1.0 / (square * np.sqrt(tau))[long]
-    model = np.stack([tau / 3.0, np.ones_like(tau)], axis=1)[long] * weight[:, None]
-    squares, _ = nnls(model, np.maximum(square - white / tau, 0.0)[long] * weight)
+    model = np.stack([tau / 3.0, np.ones_like(tau)], axis=1)[long]
+    rest, expected = np.maximum(square - white / tau, 0.0)[long], square[long]
+    for _ in range(REWEIGHTINGS):
+        # The relative error of an Allan variance of clusters of m in N values grows with sqrt(m / N); of the
+        # fitted variance, because a weight of the measured one would favour what came out small.
+        weight = 1.0 / (expected * np.sqrt(tau[long]))
+        squares, _ = nnls(model * weight[:, None], rest * weight)
+        expected = model @ squares + white / tau[long]
     return np.sqrt([white, *squares])
 
 
