@@ -56,7 +56,7 @@ def allan_deviation(values: Array, rate_hz: float, per_octave: int = 2) -> Allan
     """Overlapping Allan deviation of rates (N,) sampled at `rate_hz`, to clusters of a fifth of the series.
 
     sigma^2(tau) = <(theta(t + 2 tau) - 2 theta(t + tau) + theta(t))^2> / (2 tau^2), theta the integral of the
-    rates (IEEE Std 952-1997, eq. C.9). The interval takes the smaller of the degrees of freedom that
+    rates (IEEE Std 952-1997, annex C). The interval takes the smaller of the degrees of freedom that
     white noise and a random walk leave (Riley, NIST SP 1065, 2008, table 5).
 
     Raises:

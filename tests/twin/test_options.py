@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -176,6 +177,14 @@ def test_a_scenario_file_takes_every_option(tmp_path) -> None:
     assert not ((seconds >= 4.0) & (seconds < 6.0)).any()
     description = simulate(scenario).description
     assert "slope 5 deg, across -3 deg; payload 20 kg at 0.1, 0, 0.3 m" in description
+
+
+def test_the_example_of_the_documents_drives(tmp_path) -> None:
+    text = (Path(__file__).parents[2] / "docs" / "sensors.md").read_text(encoding="utf-8")
+    own = tmp_path / "wood.yaml"
+    own.write_text(text.split("```yaml\n")[1].split("```")[0])
+    gnss = simulate(own).gnss
+    assert {int(Fix.FIXED), int(Fix.SINGLE)} <= set(gnss.fix)
 
 
 @pytest.mark.parametrize(
