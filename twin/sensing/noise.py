@@ -18,7 +18,7 @@ FLICKER_TIMES_S = tuple(FLICKER_RATIO**k for k in range(8))
 FLICKER_STEP_S = 0.25
 """Flicker is drawn at this interval, a quarter of its shortest correlation time, and is linear between."""
 FLOOR_PER_INSTABILITY = math.sqrt(2.0 * math.log(2.0) / math.pi)
-"""Floor of the Allan deviation over the coefficient of bias instability, 0.664 (IEEE Std 952-1997, annex C)."""
+"""Floor of the Allan deviation over the coefficient of bias instability, 0.664 (IEEE Std 952-1997)."""
 
 
 @dataclass(frozen=True)
