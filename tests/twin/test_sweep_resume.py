@@ -54,6 +54,14 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return runs
 
 
+def _wait_for_parts(out: Path, count: int, child: subprocess.Popen[Any]) -> None:
+    limit = time.monotonic() + 60.0
+    while len(list((out / "parts").glob("part-*.parquet"))) < count:
+        assert child.poll() is None, "the sweep ended before it could be stopped"
+        assert time.monotonic() < limit
+        time.sleep(0.002)
+
+
 def test_order_and_bits_do_not_hang_on_the_number_of_workers(file: Path, tmp_path: Path) -> None:
     sweep = load_sweep(file)
     run_sweep(sweep, tmp_path / "one", jobs=1)
@@ -69,15 +77,11 @@ def test_a_killed_sweep_continues_without_loss(file: Path, tmp_path: Path, compu
     computed.clear()
     killed = tmp_path / "killed"
     child = subprocess.Popen([sys.executable, "-c", PROGRAM, str(file), str(killed)])
-    parts = killed / "parts"
-    limit = time.monotonic() + 60.0
-    while not (parts.is_dir() and len(list(parts.glob("part-*.parquet"))) >= 2):
-        assert child.poll() is None, "the sweep ended before it could be killed"
-        assert time.monotonic() < limit
-        time.sleep(0.002)
+    _wait_for_parts(killed, 2, child)
     child.send_signal(signal.SIGKILL)
     child.wait()
-    before = {part.name: part.stat().st_mtime_ns for part in parts.glob("part-*.parquet")}
+    parts = killed / "parts"
+    before = [part.name for part in parts.glob("part-*.parquet")]
     chunks = sweep.chunks()
     assert 2 <= len(before) < len(chunks)
     assert not json.loads((killed / "sweep.json").read_text())["complete"]
@@ -91,6 +95,21 @@ def test_a_killed_sweep_continues_without_loss(file: Path, tmp_path: Path, compu
     for name in ("runs.parquet", "sweep.json"):
         assert (killed / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     assert not parts.exists()
+
+
+def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Path) -> None:
+    file.write_text(SWEEP.replace("[0, 3, 6, 9]", "{from: 0, to: 20, count: 100}"))
+    program = PROGRAM.replace("sys.argv[2]", "sys.argv[2], jobs=2")
+    words = [sys.executable, "-c", program, str(file), str(tmp_path / "out")]
+    with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as child:
+        _wait_for_parts(tmp_path / "out", 2, child)
+        child.send_signal(signal.SIGINT)
+        begun = time.monotonic()
+        _, said = child.communicate(timeout=60.0)
+    assert time.monotonic() - begun < 10.0
+    assert said.rstrip().endswith("KeyboardInterrupt")
+    assert said.count("Traceback") == 1
+    assert "loky" not in said
 
 
 def test_a_worker_that_dies_is_told() -> None:

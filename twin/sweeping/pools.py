@@ -8,6 +8,7 @@ noticed while waiting (inside joblib's own Dask backend it could not be).
 from __future__ import annotations
 
 import contextlib
+import itertools
 import logging
 import platform
 import socket
@@ -36,9 +37,15 @@ _CONTINUE = "finished runs are kept, and the same command continues"
 
 @dataclass(frozen=True)
 class Pool:
-    """An executor (None: this process) and a check that raises when its workers are gone for good."""
+    """An executor (None: this process) and how to use it.
+
+    Attributes:
+        at_once: jobs handed over ahead of their results; None for all.
+        check: raises when the workers are gone for good.
+    """
 
     executor: Executor | None
+    at_once: int | None = None
     check: Callable[[], None] = lambda: None
 
     def results(self, function: Callable[..., T], jobs: Iterable[tuple[Any, ...]]) -> Iterator[T]:
@@ -51,17 +58,15 @@ class Pool:
             for job in jobs:
                 yield function(*job)
             return
-        waiting: set[Future[T]] = {self.executor.submit(function, *job) for job in jobs}
-        try:
-            while waiting:
-                done, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
-                for future in done:
-                    yield _result(future)
-                if not done:
-                    self.check()
-        finally:
-            for future in waiting:
-                future.cancel()
+        queue = iter(jobs)
+        waiting = {self.executor.submit(function, *job) for job in itertools.islice(queue, self.at_once)}
+        while waiting:
+            done, waiting = wait(waiting, timeout=_POLL_S, return_when=FIRST_COMPLETED)
+            results = [_result(future) for future in done]
+            waiting |= {self.executor.submit(function, *job) for job in itertools.islice(queue, len(done))}
+            yield from results
+            if not done:
+                self.check()
 
 
 @contextlib.contextmanager
@@ -89,7 +94,8 @@ def open_pool(backend: str, jobs: int, address: str | None = None) -> Iterator[P
         yield Pool(None)
     else:
         with _loky(jobs) as executor:
-            yield Pool(executor)
+            # As many as loky hands on at once: it stops cleanly only when none waits inside it.
+            yield Pool(executor, at_once=2 * jobs)
 
 
 def _result(future: Future[T]) -> T:
@@ -143,7 +149,7 @@ def _dask(address: str) -> Iterator[Pool]:
         except Exception as error:  # of many kinds: what answers may be anything
             raise _no_scheduler(address, _first_line(error)) from None
         _check_workers(client, address)
-        yield Pool(client.get_executor(pure=False), _Watch(client, address))
+        yield Pool(client.get_executor(pure=False), check=_Watch(client, address))
 
 
 def _knock(address: str) -> None:
