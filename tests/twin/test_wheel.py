@@ -1,0 +1,218 @@
+"""One wheel on soil: signs, limits, symmetry, monotonicity, energy, smoothness; terms that are absent at zero."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import casadi as ca
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from terrafusion.twin.layout import SOIL_PARAMETERS, soil_vector
+from terrafusion.twin.soil import load_soil, soil_names
+from terrafusion.twin.wheel import Ground, WheelShape, contact, footprint, steady_contact
+
+LOAD_N = 80.0
+SMOOTH = WheelShape(0.175, 0.145)
+SPIKED = WheelShape(0.175, 0.145, 0.02, 18.0)
+SPEEDS = st.floats(-2.0, 2.0)
+LOADS = st.floats(5.0, 500.0)
+SOILS = st.sampled_from(soil_names())
+FEW = settings(max_examples=60, deadline=None)
+
+
+def ground(name: str, **changed: float) -> Ground:
+    return Ground(*soil_vector(load_soil(name)))._replace(**changed)
+
+
+def steady(
+    on: Ground, rim: float, hub: tuple[float, float], load: float = LOAD_N, shape: Any = SMOOTH
+) -> Any:
+    return type(
+        "Steady", (), {k: float(x) for k, x in steady_contact(on, load, rim, hub, shape)._asdict().items()}
+    )
+
+
+@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("speed", [-1.5, -0.1, 0.3, 2.0])
+def test_no_traction_without_slip(name, speed) -> None:
+    wheel = steady(ground(name), speed, (speed, 0.0))
+    assert abs(wheel.traction_x_n) < 1e-9
+    assert wheel.force_y_n == 0.0
+    assert wheel.force_x_n * speed <= 0.0
+
+
+@FEW
+@given(name=SOILS, rim=SPEEDS, u=SPEEDS, v=SPEEDS, load=LOADS)
+def test_traction_goes_with_the_slip_and_stays_below_its_limits(name, rim, u, v, load) -> None:
+    on = ground(name)
+    wheel = steady(on, rim, (u, v), load)
+    assert wheel.traction_x_n * (rim - u) >= -1e-12
+    assert wheel.traction_y_n * -v >= -1e-12
+    z, length, _ = (float(x) for x in footprint(on, load, rim, (u, v), 0.0, SMOOTH))
+    strength = on.cohesion_pa * SMOOTH.width_m * length + load * on.tan_friction
+    assert abs(wheel.traction_x_n) <= min(strength, on.friction_cap * load) * (1.0 + 1e-9)
+    assert 0.0 < z <= 1.5 * SMOOTH.radius_m
+
+
+@FEW
+@given(name=SOILS, rim=SPEEDS, u=SPEEDS, v=SPEEDS, load=LOADS)
+def test_left_and_right_forward_and_backward_are_alike(name, rim, u, v, load) -> None:
+    on = ground(name)
+    wheel, mirrored = steady(on, rim, (u, v), load), steady(on, rim, (u, -v), load)
+    backward = steady(on, -rim, (-u, v), load)
+    assert mirrored.force_x_n == pytest.approx(wheel.force_x_n, abs=1e-9)
+    assert mirrored.force_y_n == pytest.approx(-wheel.force_y_n, abs=1e-9)
+    assert backward.force_x_n == pytest.approx(-wheel.force_x_n, abs=1e-9)
+    assert backward.force_y_n == pytest.approx(wheel.force_y_n, abs=1e-9)
+    assert backward.drag_torque_nm == pytest.approx(-wheel.drag_torque_nm, abs=1e-9)
+
+
+@FEW
+@given(name=SOILS, rim=SPEEDS, u=SPEEDS, v=SPEEDS, load=LOADS, spiked=st.booleans())
+def test_a_wheel_never_gives_more_than_its_motor(name, rim, u, v, load, spiked) -> None:
+    """In steady motion the torque's power covers the power given to the body, whatever the slip."""
+    shape = SPIKED if spiked else SMOOTH
+    on = ground(name, bulldozing=8.0, suction_pa=3000.0, multipass=0.7)
+    wheel = steady(on, rim, (u, v), load, shape)
+    taken = wheel.traction_x_n * rim + wheel.drag_torque_nm * rim / shape.radius_m
+    given_to_body = wheel.force_x_n * u + wheel.force_y_n * v
+    assert taken - given_to_body >= -1e-9
+
+
+@FEW
+@given(name=SOILS, rim=SPEEDS, u=SPEEDS, v=SPEEDS)
+def test_the_closed_form_is_the_steady_state(name, rim, u, v) -> None:
+    wheel = steady(ground(name), rim, (u, v))
+    assert abs(wheel.shear_rate_x) < 1e-9
+    assert abs(wheel.shear_rate_y) < 1e-9
+    assert abs(wheel.brake_rate) < 1e-9
+
+
+@pytest.mark.parametrize("name", soil_names())
+def test_traction_grows_with_slip(name) -> None:
+    on = ground(name)
+    pulls = [steady(on, 1.0, (1.0 - s, 0.0)).traction_x_n for s in np.linspace(0.0, 0.95, 20)]
+    assert (np.diff(pulls) > 0.0).all()
+
+
+@pytest.mark.parametrize("name", [name for name in soil_names() if name != "asphalt"])
+def test_sinkage_grows_with_load_slip_and_skid_and_shrinks_with_width(name) -> None:
+    on = ground(name)
+    z = [steady(on, 1.0, (1.0, 0.0), load).sinkage_m for load in (20.0, 80.0, 200.0)]
+    assert z == sorted(z)
+    z = [steady(on, 1.0, (1.0 - s, 0.0)).sinkage_m for s in (0.1, 0.3, 0.6, 0.9)]
+    assert z == sorted(z)
+    z = [steady(on, 1.0 - s, (1.0, 0.0)).sinkage_m for s in (0.1, 0.3, 0.6, 1.0)]
+    assert z == sorted(z)
+    z = [steady(on, np.cos(a), (np.cos(a), np.sin(a))).sinkage_m for a in (0.2, 0.6, 1.0, 1.5)]
+    assert z == sorted(z)
+    narrow, wide = (steady(on, 1.0, (1.0, 0.0), LOAD_N, WheelShape(0.175, b)).sinkage_m for b in (0.08, 0.2))
+    assert wide < narrow
+
+
+@pytest.mark.parametrize("number", ["cohesion_pa", "tan_friction"])
+def test_strength_of_the_soil_pulls_more(number) -> None:
+    on = ground("loose_sand", friction_cap=5.0)
+    stronger = on._replace(**{number: 1.5 * getattr(on, number)})
+    assert steady(stronger, 1.0, (0.8, 0.0)).traction_x_n > steady(on, 1.0, (0.8, 0.0)).traction_x_n
+
+
+@pytest.mark.parametrize(
+    "number", ["bulldozing", "suction_pa", "skid_sinkage", "slip_sinkage", "viscous_ns_per_m"]
+)
+def test_a_term_takes_power_and_is_absent_at_zero(number) -> None:
+    """More of it costs more at the same motion; at zero, numbers that only it uses do not matter."""
+    base = ground("mud", **{number: 0.0})
+    values = {
+        "bulldozing": 8.0,
+        "suction_pa": 5e3,
+        "skid_sinkage": 5.0,
+        "slip_sinkage": 3.0,
+        "viscous_ns_per_m": 20.0,
+    }
+    with_it = base._replace(**{number: values[number]})
+
+    def power(on: Ground) -> float:
+        wheel = steady(on, 0.6, (1.0, 0.2)) if number == "skid_sinkage" else steady(on, 1.0, (0.7, 0.2))
+        rim, u = (0.6, 1.0) if number == "skid_sinkage" else (1.0, 0.7)
+        drag = wheel.drag_torque_nm / SMOOTH.radius_m
+        return (wheel.traction_x_n + drag) * rim - wheel.force_x_n * u - wheel.force_y_n * 0.2
+
+    assert power(with_it) > power(base) + 1e-3
+    if number == "bulldozing":
+        assert power(base._replace(unit_weight_n_per_m3=9e3)) == power(base)
+
+
+def test_bulldozing_pushes_back_on_skidding_and_side_slipping_wheels_only() -> None:
+    without, with_it = (ground("loose_sand", bulldozing=gain) for gain in (0.0, 6.0))
+    rolling, rolling_too = (steady(on, 1.0, (0.9, 0.0)).force_x_n for on in (without, with_it))
+    assert rolling_too == pytest.approx(rolling, abs=0.5)
+    assert steady(with_it, 0.0, (1.0, 0.0)).force_x_n < steady(without, 0.0, (1.0, 0.0)).force_x_n - 5.0
+    assert steady(with_it, 1.0, (1.0, 0.5)).force_y_n < steady(without, 1.0, (1.0, 0.5)).force_y_n - 5.0
+
+
+def test_a_following_wheel_sinks_and_resists_less() -> None:
+    on = ground("loose_sand")
+    fresh, rut = (
+        contact(on, LOAD_N, 1.0, (1.0, 0.0), (0.0, 0.0), 0.0, 0.0, SMOOTH, share) for share in (0.0, 1.0)
+    )
+    assert float(rut.sinkage_m) == pytest.approx((1.0 - on.multipass) * float(fresh.sinkage_m), rel=1e-6)
+    saved = np.sqrt(1.0 - on.multipass)
+    assert float(rut.force_x_n) + on.viscous_ns_per_m == pytest.approx(
+        saved * (float(fresh.force_x_n) + on.viscous_ns_per_m), rel=1e-3
+    )
+    bare = on._replace(multipass=0.0)
+    same = [
+        contact(bare, LOAD_N, 1.0, (1.0, 0.0), (0.0, 0.0), 0.0, 0.0, SMOOTH, f).sinkage_m for f in (0.0, 1.0)
+    ]
+    assert float(same[0]) == float(same[1])
+
+
+def test_grousers_pull_more_and_do_nothing_without_height_or_number() -> None:
+    on = ground("ploughed_soil", friction_cap=5.0)
+    plain = steady(on, 1.0, (0.5, 0.0)).traction_x_n
+    assert steady(on, 1.0, (0.5, 0.0), shape=SPIKED).traction_x_n > 1.05 * plain
+    for idle in (SPIKED._replace(grouser_height_m=0.0), SPIKED._replace(grouser_count=0.0)):
+        assert steady(on, 1.0, (0.5, 0.0), shape=idle).traction_x_n == plain
+
+
+def _graph() -> tuple[Any, Any]:
+    """All inputs of a contact as one vector, and its outputs."""
+    x = ca.SX.sym("x", 8)
+    soil = ca.SX.sym("soil", len(SOIL_PARAMETERS))
+    on = Ground(*(soil[i] for i in range(len(SOIL_PARAMETERS))))
+    c = contact(on, x[7], x[0], (x[1], x[2]), (x[3], x[4]), x[5], x[6], SPIKED, 0.5)
+    return ca.vertcat(x, soil), ca.vertcat(*c)
+
+
+@pytest.mark.parametrize("name", soil_names())
+@pytest.mark.parametrize("state", [np.zeros(7), np.array([1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0])])
+def test_second_derivatives_are_finite_at_rest_and_at_zero_slip(name, state) -> None:
+    inputs, outputs = _graph()
+    total = ca.sum1(outputs)
+    hessian = ca.Function("h", [inputs], [ca.hessian(total, inputs)[0], ca.jacobian(outputs, inputs)])
+    at = np.concatenate([state, [LOAD_N], soil_vector(load_soil(name))])
+    for derivative in hessian(at):
+        assert np.isfinite(np.asarray(derivative)).all()
+
+
+@settings(max_examples=25, deadline=None)
+@given(name=SOILS, state=st.tuples(*[st.floats(-1.0, 1.0)] * 6), clog=st.floats(0.0, 1.0), load=LOADS)
+def test_derivatives_are_those_of_finite_differences(name, state, clog, load) -> None:
+    inputs, outputs = _graph()
+    function = ca.Function("f", [inputs], [outputs, ca.jacobian(outputs, inputs)])
+    scale = np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01])
+    at = np.concatenate([np.array(state) * scale, [clog, load], soil_vector(load_soil(name))])
+    exact = np.asarray(function(at)[1])[:, :8]
+    for k, step in enumerate(1e-6 * np.array([1.0, 1.0, 1.0, 0.01, 0.01, 0.01, 1.0, load])):
+        change = np.zeros(len(at))
+        change[k] = step
+        numeric = (np.asarray(function(at + change)[0]) - np.asarray(function(at - change)[0])).ravel() / (
+            2 * step
+        )
+        np.testing.assert_allclose(
+            numeric, exact[:, k], rtol=1e-3, atol=1e-3 * (1.0 + np.abs(exact[:, k]).max())
+        )
