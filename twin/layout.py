@@ -61,6 +61,7 @@ VEHICLE_PARAMETERS = (
     "gravity_x_mps2", "gravity_y_mps2", "gravity_normal_mps2",
     "battery_full_v", "battery_empty_v", "battery_ohm", "battery_j", "battery_charge",
     "grouser_height_m", "grouser_count",
+    "no_load_a",
 )  # fmt: skip
 """Parameters that hold for a whole run; gravity is given along the plane's x and y and into it.
 
@@ -119,7 +120,7 @@ def vehicle_vector(
             downhill * math.cos(aspect_rad), downhill * math.sin(aspect_rad),
             GRAVITY_MPS2 * math.cos(slope_rad),
             battery.full_v, battery.empty_v, battery.resistance_ohm, 3600.0 * battery.capacity_wh,
-            battery.charge, wheel.grouser_height_m, wheel.grouser_count,
+            battery.charge, wheel.grouser_height_m, wheel.grouser_count, drive.no_load_current_a,
         ]
     )  # fmt: skip
 

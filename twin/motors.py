@@ -12,6 +12,8 @@ from typing import Any
 
 SMOOTHING_S = 0.02
 """Time constant of the current behind the battery's sag (assumed)."""
+TURNING_RADPS = 0.05
+"""Wheel speed within which the no-load current changes its sign."""
 DRAW_WIDTH_W = 1e-3
 """A motor's power is cut off at zero within this width: the bridge does not feed back."""
 
@@ -43,13 +45,15 @@ def motor_current(p: Any, torque_nm: Any, speed_radps: Any) -> Any:
 
     The gearbox takes its share of the power that flows through it, whichever
     way it flows: 1/efficiency when driving, efficiency when braking, joined
-    such that its loss is never negative.
+    such that its loss is never negative. The no-load current turns motor and
+    gears against their own friction, whatever the torque.
     """
     power = torque_nm * speed_radps
     way = power / (power * power + 1e-2) ** 0.5
     driving, braking = 1.0 / p["gear_efficiency"] - 1.0, 1.0 - p["gear_efficiency"]
     loss = 1.0 + way * (0.5 * (driving + braking) + 0.5 * way * (driving - braking))
-    return torque_nm / p["gear_ratio"] * loss * p["no_load_radps"] / p["supply_v"]
+    turning = speed_radps / (speed_radps * speed_radps + TURNING_RADPS**2) ** 0.5
+    return torque_nm / p["gear_ratio"] * loss * p["no_load_radps"] / p["supply_v"] + p["no_load_a"] * turning
 
 
 def motor_voltage(p: Any, current_a: Any, speed_radps: Any) -> Any:
@@ -68,7 +72,7 @@ def winding_loss(p: Any, current_a: Any) -> Any:
 
 
 def gear_loss(p: Any, current_a: Any, torque_nm: Any, speed_radps: Any) -> Any:
-    """Heat in a gearbox, W: the motor's power at its shaft less that at the wheel."""
+    """Heat of friction in motor and gearbox, W: the power of the motor's field less that at the wheel."""
     back_emf = p["supply_v"] / p["no_load_radps"] * p["gear_ratio"] * speed_radps
     return back_emf * current_a - torque_nm * speed_radps
 

@@ -53,7 +53,8 @@ class Drive:
     """One motor and gearbox a wheel, its speed loop, and the command limits.
 
     Torque-speed line: stall torque at rest falling to zero at the no-load
-    speed; the current limit caps it at `torque_limit_nm` (motor shaft).
+    speed; the current limit caps it at `torque_limit_nm` (motor shaft). The
+    no-load current is what friction in motor, gears and belts takes at any load.
     """
 
     gear_ratio: Annotated[float, Quantity("", 1.0, 1000.0)]
@@ -69,6 +70,7 @@ class Drive:
     max_speed_mps: Annotated[float, Quantity("m/s", 0.05, 50.0)]
     max_accel_mps2: Annotated[float, Quantity("m/s2", 0.05, 50.0)]
     max_yaw_accel_radps2: Annotated[float, Quantity("rad/s2", 0.05, 50.0)]
+    no_load_current_a: Annotated[float, Quantity("A", 0.0, 100.0)] = 0.0
 
     def torque_constant_nm_per_a(self) -> float:
         """Motor constant, N m/A, from supply voltage and no-load speed (ideal DC motor: k_t = k_e)."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import os
+from pathlib import Path
 
 import casadi as ca
 import numpy as np
@@ -216,6 +218,31 @@ def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps,
     summary = summarise(driven, motion, setup.vehicle, slip_ratios(states, motion, setup.vehicle))
     assert summary.immobilised_cause == cause
     assert summary.immobilised_at_s == pytest.approx(3.0)  # from its first command on
+
+
+def test_the_no_load_current_flows_at_any_load_and_turns_to_heat() -> None:
+    p = P | {"no_load_a": 0.5}
+    speed, torque = np.array([-5.0, 0.0, 5.0]), np.zeros(3)
+    current = motor_current(p, torque, speed)
+    np.testing.assert_allclose(current, [-0.5, 0.0, 0.5], rtol=1e-3)
+    back_emf = p["supply_v"] / p["no_load_radps"] * p["gear_ratio"] * speed
+    np.testing.assert_allclose(gear_loss(p, current, torque, speed), np.abs(0.5 * back_emf), rtol=1e-3)
+
+
+@pytest.mark.parametrize("ground", ["ASPHALT", "ICE"])
+def test_a_husky_draws_the_current_of_the_field_logs(ground) -> None:
+    """Straight on, above 0.5 m/s: the twin on asphalt within the logs' 10th and 90th percentile. Its
+    no-load current is from the asphalt runs; a rink rolls as easily."""
+    root = Path(os.environ.get("TERRAFUSION_DATA", "nowhere")) / "borealtc" / ground
+    if not root.is_dir():
+        pytest.skip("TERRAFUSION_DATA names no folder with borealtc: the field logs are not at hand")
+    logs = [np.genfromtxt(path, delimiter=",", names=True) for path in sorted(root.glob("pro_*.csv"))]
+    left, right, current = (np.concatenate([log[name] for log in logs]) for name in ("velL", "velR", "curL"))
+    current = 0.5 * (current + np.concatenate([log["curR"] for log in logs]))
+    straight = (np.abs(left - right) < 0.05) & (left > 0.5)
+    low, high = np.percentile(current[straight], [10, 90])
+    made = simulate_run("straight", vehicle="husky", terrain="asphalt", noiseless=True).recording.motor
+    assert low < made.current_a[200:500].mean() < high
 
 
 def test_a_stalled_motor_draws_its_current_limit() -> None:
