@@ -15,7 +15,7 @@ from terrafusion.twin.study.criteria import VERDICTS
 from terrafusion.twin.study.published import CASES, FRICTION, TITLE
 from terrafusion.twin.study.robot import platform_figures
 from terrafusion.twin.study.study import Study
-from terrafusion.twin.study.text import TAB4_HEAD, noise_sentence, table_cells
+from terrafusion.twin.study.text import ASSUMED_HEAD, TAB4_HEAD, assumed_rows, noise_sentence, table_cells
 
 
 def write_study_page(path: Path, study: Study, provenance: Mapping[str, object] | None = None) -> Path:
@@ -233,7 +233,14 @@ def _method(study: Study) -> str:
         "Uneven ground: strength with a standard deviation of 20 % and a correlation length of 0.5 m "
         "(assumed), another one for each seed.",
     ]
-    return "<h2>How it is processed</h2>\n" + bullets(escape(item) for item in items)
+    return "\n".join(
+        [
+            "<h2>How it is processed</h2>",
+            bullets(escape(item) for item in items),
+            '<p class="dim">Tab. 4 under other cut-offs and thresholds of motion, mean percent:</p>',
+            _table(ASSUMED_HEAD, assumed_rows(study), range(1, 10)),
+        ]
+    )
 
 
 def _figures(parts: Iterable[tuple[object, str]]) -> str:

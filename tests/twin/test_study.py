@@ -11,7 +11,7 @@ from terrafusion.datasets.recording import Imu
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.study import measures, processing
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
-from terrafusion.twin.study.gnss_noise import NoisyRun, fit_noise, mean_error
+from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, fit_noise, mean_error, rate_for
 from terrafusion.twin.study.processing import Profiles, differenced_speed, imu_speed, low_pass, match
 from terrafusion.twin.study.published import CASES
 from terrafusion.twin.study.robot import platform_figures
@@ -150,6 +150,12 @@ def test_gnss_noise_that_was_added_is_found_again(medium: CaseRun) -> None:
     assert fit.alone_m["medium_sand"] == pytest.approx(0.08, rel=0.02)
     assert fit.common_m == pytest.approx(0.08, rel=0.02)
     assert fit.worst_factor({"medium_sand": fit.common_error["medium_sand"] / 2.0}) == pytest.approx(2.0)
+
+
+def test_the_rate_for_a_noise_lies_between_the_fits() -> None:
+    fits = [NoiseFit(rate, {"m": 0.4 / rate}, 0.0, {}, {}) for rate in (1.0, 10.0, 100.0)]
+    assert rate_for(fits, "m", 0.02) == pytest.approx(20.0)
+    assert np.isnan(rate_for(fits, "m", 5.0))
 
 
 def test_an_error_that_no_noise_gives_has_no_size(medium: CaseRun) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from terrafusion.twin.ground import Variation
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import RunSummary, simulate_run
-from terrafusion.twin.study.processing import Profiles, SpeedErrors, profiles_of, speed_errors
+from terrafusion.twin.study.processing import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
 from terrafusion.twin.study.published import Case
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -35,6 +35,7 @@ class CaseRun:
         seed: of the sensors' noise and of uneven ground.
         profiles: the study's common arrays.
         errors: the run's row of Tab. 4.
+        other_errors: the same under each of `processing.OTHERS`; empty on uneven ground.
         summary: the twin's own account of the run.
         truth_t_s, truth_enu_m: (N,) s and (N, 2) m, true path of the body origin.
         gnss_enu_m: (K, 2) m, positions as the receiver reports them.
@@ -44,6 +45,7 @@ class CaseRun:
     seed: int
     profiles: Profiles
     errors: SpeedErrors
+    other_errors: tuple[SpeedErrors, ...]
     summary: RunSummary
     truth_t_s: Array
     truth_enu_m: Array
@@ -58,12 +60,15 @@ def run_case(case: Case, seed: int, variation: Variation | None = None) -> CaseR
     recording = run.recording
     if recording.truth is None or recording.gnss is None:
         raise ValueError("the twin's recording lacks truth or GNSS")
-    profiles = profiles_of(recording, vehicle.odometry.wheel_radius_m)
+    radius_m = vehicle.odometry.wheel_radius_m
+    profiles = profiles_of(recording, radius_m)
+    others = OTHERS if variation is None else ()
     return CaseRun(
         case=case,
         seed=seed,
         profiles=profiles,
         errors=speed_errors(profiles),
+        other_errors=tuple(speed_errors(profiles_of(recording, radius_m, other)) for other in others),
         summary=run.summary,
         truth_t_s=np.asarray((recording.truth.t_ns - recording.start_ns) * 1e-9),
         truth_enu_m=recording.truth.position_m[:, :2],

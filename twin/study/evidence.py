@@ -16,7 +16,7 @@ from terrafusion.twin.study.batch import (
 )
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.field_drive import FieldDrive, field_measures
-from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun
+from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, least_ratio
 from terrafusion.twin.study.published import CASES, FRICTION
 from terrafusion.twin.study.robot import platform_figures
 from terrafusion.twin.study.spread import Spread, spread
@@ -106,6 +106,8 @@ def noise_evidence(
     fit = next(fit for fit in fits if fit.rate_hz == rate_hz)
     wanted = {case.terrain: case.gnss for case in CASES}
     found: Evidence = {"gnss.noise.worst_factor": spread([min(f.worst_factor(wanted) for f in fits)])}
+    ratio = least_ratio(noisy["loose_sand"], noisy["medium_sand"], fit.common_m)
+    found["gnss.noise.loose_over_medium"] = spread([ratio])
     for terrain, of in noisy.items():
         found[f"{terrain}.gnss_gaussian"] = spread(run.error(fit.common_m) for run in of)
     medium = (measures.gnss_quality(run.noisy(fit.common_m)) for run in noisy["medium_sand"])

@@ -17,7 +17,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.study.cases import CaseRun
-from terrafusion.twin.study.processing import Profiles, differenced_speed, match, mean_percent
+from terrafusion.twin.study.processing import (
+    OTHERS,
+    USUAL,
+    Assumed,
+    Profiles,
+    differenced_speed,
+    match,
+    mean_percent,
+)
 
 Array = NDArray[np.float64]
 
@@ -71,20 +79,29 @@ class NoisyRun:
         unit = np.random.default_rng([run.seed, round(rate_hz)]).normal(size=enu.shape)
         return cls(run.profiles, t_s, enu, unit)
 
-    def noisy(self, sigma_m: float) -> Profiles:
+    def noisy(self, sigma_m: float, assumed: Assumed = USUAL) -> Profiles:
         """The run with GNSS speed from positions with noise of `sigma_m` on each axis."""
-        t_s, speed = differenced_speed(self.t_s, self.enu_m + sigma_m * self.unit)
-        return dataclasses.replace(self.profiles, gnss=match(t_s, speed, self.profiles.t_s))
+        t_s, speed = differenced_speed(self.t_s, self.enu_m + sigma_m * self.unit, assumed.cutoff_hz)
+        matched = match(t_s, speed, self.profiles.t_s)
+        return dataclasses.replace(self.profiles, gnss=matched, assumed=assumed)
 
-    def error(self, sigma_m: float) -> float:
+    def error(self, sigma_m: float, assumed: Assumed = USUAL) -> float:
         """Mean GNSS speed error, percent."""
-        noisy = self.noisy(sigma_m)
+        noisy = self.noisy(sigma_m, assumed)
         return mean_percent(noisy.error(noisy.gnss))
 
 
-def mean_error(runs: Sequence[NoisyRun], sigma_m: float) -> float:
+def mean_error(runs: Sequence[NoisyRun], sigma_m: float, assumed: Assumed = USUAL) -> float:
     """Mean of the runs' errors, percent."""
-    return float(np.mean([run.error(sigma_m) for run in runs]))
+    return float(np.mean([run.error(sigma_m, assumed) for run in runs]))
+
+
+def least_ratio(upper: Sequence[NoisyRun], lower: Sequence[NoisyRun], sigma_m: float) -> float:
+    """Least quotient of two grounds' errors with the same noise, whatever is assumed of the processing."""
+    return min(
+        mean_error(upper, sigma_m, assumed) / mean_error(lower, sigma_m, assumed)
+        for assumed in (USUAL, *OTHERS)
+    )
 
 
 def fit_noise(
@@ -109,6 +126,14 @@ def fit_noise(
         common_error={name: mean_error(runs[name], common) for name in wanted},
         data_sheet_error={name: mean_error(runs[name], DATA_SHEET_M) for name in wanted},
     )
+
+
+def rate_for(fits: Sequence[NoiseFit], terrain: str, sigma_m: float = DATA_SHEET_M) -> float:
+    """Rate at which noise of this size gives a terrain's error, Hz, between the fitted ones; NaN outside."""
+    log_sigma = [-math.log(fit.alone_m[terrain]) for fit in fits]
+    log_rate = [math.log(fit.rate_hz) for fit in fits]
+    found = np.interp(-math.log(sigma_m), log_sigma, log_rate, left=math.nan, right=math.nan)
+    return float(np.exp(found))
 
 
 def _sigma_for(runs: Sequence[NoisyRun], error: float) -> float:

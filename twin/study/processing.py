@@ -21,13 +21,26 @@ Array = NDArray[np.float64]
 MATCH_S = 0.050
 """Samples further apart in time are not compared (the study's figure)."""
 CUTOFF_HZ = 1.0
-"""Cut-off of the low-pass on all velocity profiles (assumed)."""
+"""Usual cut-off of the low-pass on all velocity profiles (assumed)."""
 MOVING_MPS = 0.1
-"""Errors and slip are averaged over samples whose true speed is above this (assumed)."""
+"""Usual threshold of the true speed above which errors and slip are averaged (assumed)."""
 REST_S = 2.0
 """The forward acceleration's mean over this first rest is taken off (the study's figure)."""
 AVERAGE_S = 0.5
 """Moving average over the forward acceleration (the study's figure)."""
+
+
+@dataclass(frozen=True)
+class Assumed:
+    """What the study does not state of its processing: cut-off of the low-pass, threshold of motion."""
+
+    cutoff_hz: float = CUTOFF_HZ
+    moving_mps: float = MOVING_MPS
+
+
+USUAL = Assumed()
+OTHERS = (Assumed(cutoff_hz=0.5), Assumed(cutoff_hz=2.0), Assumed(moving_mps=0.05), Assumed(moving_mps=0.3))
+"""Other choices, each tried alone, to see how far the assumptions matter."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +53,7 @@ class Profiles:
         truth, odometry, imu, gnss: forward speeds, m/s, low-passed.
         yaw_rate: of the IMU, rad/s, low-passed; `gyro` is the same as measured.
         true_yaw_rate: of the body, rad/s.
+        assumed: how they were made, and from which speed on the robot counts as moving.
     """
 
     t_s: Array
@@ -51,10 +65,11 @@ class Profiles:
     yaw_rate: Array
     gyro: Array
     true_yaw_rate: Array
+    assumed: Assumed = USUAL
 
     def moving(self) -> NDArray[np.bool_]:
         """Where the true speed is above the threshold."""
-        return np.abs(self.truth) > MOVING_MPS
+        return np.abs(self.truth) > self.assumed.moving_mps
 
     def slip(self) -> Array:
         """The study's proxy s = 1 - v_odom / v_gt (eq. 2), NaN at rest; negative where wheels run ahead."""
@@ -87,7 +102,7 @@ def speed_errors(profiles: Profiles) -> SpeedErrors:
     )
 
 
-def profiles_of(recording: Recording, wheel_radius_m: float, cutoff_hz: float = CUTOFF_HZ) -> Profiles:
+def profiles_of(recording: Recording, wheel_radius_m: float, assumed: Assumed = USUAL) -> Profiles:
     """The recording as the study's common arrays.
 
     Raises:
@@ -102,7 +117,7 @@ def profiles_of(recording: Recording, wheel_radius_m: float, cutoff_hz: float = 
     def clock(t_ns: NDArray[np.int64]) -> Array:
         return np.asarray((t_ns - recording.start_ns) * 1e-9)
 
-    t_s = clock(wheels.t_ns)
+    t_s, cutoff_hz = clock(wheels.t_ns), assumed.cutoff_hz
     t_truth, t_imu = clock(truth.t_ns), clock(imu.t_ns)
     t_gnss, v_gnss = gnss_speed(gnss, recording.start_ns, cutoff_hz)
     odometry = wheels.side_speeds_mps(wheel_radius_m).mean(axis=1)
@@ -117,6 +132,7 @@ def profiles_of(recording: Recording, wheel_radius_m: float, cutoff_hz: float = 
         yaw_rate=match(t_imu, low_pass(t_imu, gyro, cutoff_hz), t_s),
         gyro=match(t_imu, gyro, t_s),
         true_yaw_rate=match(t_truth, truth.twist_body[:, 5], t_s),
+        assumed=assumed,
     )
 
 
