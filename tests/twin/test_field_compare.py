@@ -22,6 +22,7 @@ from terrafusion.twin.field.scores import METRICS, interval, medians, scores
 from terrafusion.twin.field.slip import MEASURED, slip_rows
 from terrafusion.twin.field.sources import read
 from terrafusion.twin.field.splits import evenly, folds
+from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
 
 SAMPLES = N_PAST + N_FUTURE + 1
@@ -168,6 +169,25 @@ def test_lines_count_every_fork_once_and_name_the_rule(small):
     rows = list(summary.line_rows(lines))
     assert json.loads(json.dumps(rows, allow_nan=False)) == rows
     assert summary.markdown(lines, compare.SAME).count("\n") == len(lines) + 2
+
+
+def test_a_simulated_drive_is_read_as_it_was_driven():
+    made = simulate("figure_eight", vehicle="husky", terrain="asphalt", noiseless=True)
+    (one,) = field_runs("made", [made])
+    truth = made.truth
+    assert truth is not None
+    assert truth.twist_body is not None
+    assert made.imu is not None
+    clock = (truth.t_ns - made.imu.t_ns[0]) * 1e-9
+    inner = slice(40, -40)
+    for channel, found in ((0, one.velocity_mps[:, 0]), (5, one.yaw_rate_radps)):
+        told = np.interp(one.t_s, clock, truth.twist_body[:, channel])
+        assert np.sqrt(np.mean((found[inner] - told[inner]) ** 2)) < 0.01
+        assert np.abs(found[inner] - told[inner]).max() < 0.1  # a corner of the speed, between knots
+    assert np.isfinite(one.told_radps[inner]).all()
+    still = dataclasses.replace(made, imu=None)
+    with pytest.raises(DataError, match="no gyro"):
+        field_runs("made", [still])
 
 
 def test_a_folder_without_drives_is_refused(tmp_path):

@@ -51,6 +51,7 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
             print(f"\r\x1b[K{time.monotonic() - started:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
 
     drives = read(data, progress)
+    _folder(out)
     lines: list[summary.Line] = []
     slips: list[tuple[str, SlipRow]] = []
     forks: list[dict[str, Any]] = []
@@ -65,19 +66,22 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
         slips += [(name, row) for row in rows]
         if figures and results:
             progress(f"{name}: figures")
-            _folder(out)
             plots.save_all(name, own, rows, results, out)
     progress("")
     if not lines:
         raise DataError("no drive is long enough to compare", file=data[0], remedy="give longer logs")
     _write(out, lines, forks, slips, numbers, drives.left_out)
-    print(_report(lines, slips, drives.left_out))
+    print(_report(lines, slips, drives.left_out, (SAME,)))
+    print(f"all tables: {out / 'field.md'}")
 
 
-def _report(lines: list[summary.Line], slips: list[tuple[str, SlipRow]], left_out: dict[str, str]) -> str:
-    parts = [
-        f"## Trained on: {scheme}\n\n{summary.markdown(lines, scheme)}" for scheme in (SAME, POOLED, OTHER)
-    ]
+def _report(
+    lines: list[summary.Line],
+    slips: list[tuple[str, SlipRow]],
+    left_out: dict[str, str],
+    schemes: tuple[str, ...],
+) -> str:
+    parts = [f"## Trained on: {scheme}\n\n{summary.markdown(lines, scheme)}" for scheme in schemes]
     parts.append(f"## Slip and effective track\n\n{summary.slip_markdown(slips)}")
     parts.append("## Left out\n\n" + "".join(f"- {name}: {why}\n" for name, why in left_out.items()))
     return "\n".join(parts)
@@ -91,7 +95,6 @@ def _write(
     numbers: list[dict[str, Any]],
     left_out: dict[str, str],
 ) -> None:
-    _folder(out)
     rows = list(summary.line_rows(lines))
     slip = [flat for name, row in slips for flat in summary.slip_table_rows(name, [row])]
     _csv(out / "field.csv", rows)
@@ -99,7 +102,7 @@ def _write(
     _csv(out / "slip.csv", slip)
     everything = {"lines": rows, "slip": slip, "models": numbers, "left_out": left_out}
     (out / "field.json").write_text(json.dumps(everything, indent=1, allow_nan=False), encoding="utf-8")
-    (out / "field.md").write_text(_report(lines, slips, left_out), encoding="utf-8")
+    (out / "field.md").write_text(_report(lines, slips, left_out, (SAME, POOLED, OTHER)), encoding="utf-8")
 
 
 def _csv(path: Path, rows: Iterable[dict[str, Any]]) -> None:

@@ -101,7 +101,7 @@ def slip(rows: Sequence[SlipRow]) -> Figure:
         ax.set_title(title, fontsize=9)
         ax.set_xticks(range(len(grounds)), [ground or "unknown" for ground in grounds], fontsize=8)
         ax.grid(axis="y", lw=0.4)
-    left.legend(fontsize=7, frameon=False)
+    left.legend(fontsize=7, frameon=False, loc="best")
     return figure
 
 

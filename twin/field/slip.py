@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.field.compare import SAME, Result
 from terrafusion.twin.field.forks import N_PAST, Forks
+from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL
 from terrafusion.twin.field.runs import DT_S
 from terrafusion.twin.field.scores import Interval, drawn, interval
 
@@ -20,6 +21,7 @@ ROLLED_M = 2.5
 TURNED_RAD = 0.3
 """Horizons in which the robot turns less than this by its geometric track say nothing about the track."""
 MEASURED = "measured"
+SOURCES = (TWIN_NOMINAL, TWIN, "radius, track", BEST_KINEMATIC)
 
 
 @dataclass(frozen=True)
@@ -54,7 +56,7 @@ def slip_rows(results: Sequence[Result], radius_m: float, track_m: float) -> lis
         names = list(dict.fromkeys(r.name for r in own))
         recordings = sorted({str(name) for r in own for name in r.forks.recording})
         for recording in ["", *recordings] if len(recordings) > 1 else [""]:
-            for source in [MEASURED, *names]:
+            for source in [MEASURED, *(name for name in SOURCES if name in names)]:
                 of = [r for r in own if r.name == (names[0] if source == MEASURED else source)]
                 rows.append(_row(ground, recording, source, of, radius_m, track_m))
     return rows
@@ -65,11 +67,13 @@ def _row(
 ) -> SlipRow:
     parts = []
     for r in results:
-        motion = r.forks.motion[:, N_PAST:] if source == MEASURED else r.prediction
+        true = r.forks.motion[:, N_PAST:]
+        travel = _travel(true if source == MEASURED else r.prediction, r.forks, radius_m)
         keep = np.full(len(r.forks), True) if not recording else r.forks.recording == recording
-        parts.append([*(column[keep] for column in _travel(motion, r.forks, radius_m)), r.forks.group[keep]])
-    way, rolled, apart, turned, group = (np.concatenate(c) for c in zip(*parts, strict=True))
-    far = (np.abs(rolled) > ROLLED_M) & np.isfinite(way)
+        known = np.isfinite(true[..., 0]).all(axis=1)
+        parts.append([*(column[keep] for column in (*travel, known, r.forks.group))])
+    way, rolled, apart, turned, known, group = (np.concatenate(c) for c in zip(*parts, strict=True))
+    far = (np.abs(rolled) > ROLLED_M) & known
     slip = 1.0 - way[far] / rolled[far]
     turning = np.abs(apart) / track_m > TURNED_RAD
     low, high = np.percentile(slip, [10.0, 90.0]) if far.any() else (np.nan, np.nan)

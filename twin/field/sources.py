@@ -11,6 +11,7 @@ import numpy as np
 from terrafusion.datasets.catalog import CatalogFile, load_catalog
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.open import open_recordings
+from terrafusion.datasets.recording import Recording
 from terrafusion.twin.field.runs import FieldRun, field_runs
 
 SETS = ("norlab_drive", "umich_husky", "wvu_pathfinder")
@@ -37,8 +38,7 @@ def read(data: Sequence[Path | str], progress: Callable[[str], None] = lambda _:
     for name, path in _logs(data, drives.left_out):
         progress(f"reading {name}")
         recordings = open_recordings(path)
-        first = recordings[0]
-        if first.wheels is None or first.imu is None or not len(first.wheels):
+        if not all(map(_can_be_told, recordings)):
             drives.left_out[name] = "no wheels or no gyro"
             continue
         runs = field_runs(name, recordings)
@@ -50,6 +50,14 @@ def read(data: Sequence[Path | str], progress: Callable[[str], None] = lambda _:
             continue
         drives.runs.setdefault(runs[0].vehicle.name, []).extend(runs)
     return drives
+
+
+def _can_be_told(recording: Recording) -> bool:
+    """Whether it has what a model needs: wheels, and a gyro for the heading."""
+    wheels, imu = recording.wheels, recording.imu
+    if wheels is None or imu is None or min(len(wheels), len(imu)) < 2:
+        return False
+    return int(np.isfinite(imu.gyro_radps[:, 2]).sum()) >= 2
 
 
 def _logs(data: Sequence[Path | str], left_out: dict[str, str]) -> list[tuple[str, Path | str]]:
