@@ -194,6 +194,14 @@ def test_the_model_predicts_the_trials_it_was_not_fitted_on(scores, output) -> N
 
 
 @pytest.mark.parametrize("output", ["tractive_force_n", "side_force_n", "sinkage_m"])
+def test_no_split_into_halves_is_needed_to_be_lucky(scores, output) -> None:
+    """Over 20 splits the fitted model's worst half beats the linear model's median."""
+    fitted, linear = scores["halves"]["fitted"][output], scores["halves"]["linear"][output]
+    assert fitted[1] > linear[0]
+    assert fitted[0] > 0.8
+
+
+@pytest.mark.parametrize("output", ["tractive_force_n", "side_force_n", "sinkage_m"])
 def test_it_extrapolates_in_side_slip_better_than_the_rivals(scores, output) -> None:
     angle = scores["splits"]["angle"]["models"]
     assert angle["fitted"][output]["r2"] > 0.5

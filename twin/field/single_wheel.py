@@ -58,7 +58,9 @@ def evaluate(trials: WheelTrials, seed: int = 0) -> tuple[dict[str, Any], dict[s
         }
     scatter = [value if math.isfinite(value) else None for value in judge.noise_floor(trials).tolist()]
     floor = dict(zip(OUTPUTS, scatter, strict=True))
-    return {"trials": len(trials), "seed": seed, "noise_floor": floor, "splits": splits}, predictions
+    halves = judge.repeated_halves(trials, seed)
+    scores = {"trials": len(trials), "seed": seed, "noise_floor": floor, "splits": splits, "halves": halves}
+    return scores, predictions
 
 
 def _soil(found: Fit) -> dict[str, Any]:
@@ -104,12 +106,15 @@ def _write_rows(writer: Any, trials: WheelTrials, predictions: dict[str, Array])
 
 
 def table(scores: dict[str, Any]) -> str:
-    """The scores as text: one line a split and model."""
+    """The scores as text: one line a split and model, then medians and ranges over repeated halves."""
     lines = [f"{'split':6} {'model':10} " + " ".join(f"{name:>32}" for name in OUTPUTS)]
     for split, found in scores["splits"].items():
         for model, by_output in found["models"].items():
             cells = [_cell(by_output[name]) for name in OUTPUTS]
             lines.append(f"{split:6} {model:10} " + " ".join(f"{cell:>32}" for cell in cells))
+    for model, spread in scores["halves"].items():
+        told = [f"R2 {r[0]:.2f} from {r[1]:.2f} to {r[2]:.2f}" if r else "-" for r in spread.values()]
+        lines.append(f"{'halves':6} {model:10} " + " ".join(f"{cell:>32}" for cell in told))
     floor = " ".join(f"{'-' if v is None else f'rmse {v:.3g}':>32}" for v in scores["noise_floor"].values())
     return "\n".join([*lines, f"{'noise floor':17} {floor}"])
 

@@ -26,6 +26,8 @@ Model = Callable[[WheelTrials, Mask], Array]
 """(trials, rows to fit) -> outputs (N, 3) of all trials; NaN where a model has none."""
 
 RESAMPLES = 2000
+HALVES = 20
+"""Splits into halves over which the luck of one split is judged."""
 PUBLISHED = "pavlov:direct_90_sand"
 
 
@@ -91,6 +93,25 @@ def noise_floor(trials: WheelTrials) -> Array:
     if free == 0:
         return np.full(len(OUTPUTS), np.nan)
     return np.asarray(np.sqrt(np.sum((target - means[group]) ** 2, axis=0) / free))
+
+
+def repeated_halves(trials: WheelTrials, seed: int) -> dict[str, dict[str, list[float] | None]]:
+    """R2 of each model and output on the other half: median, lowest and highest of `HALVES` splits."""
+    target = measured(trials)
+    found: dict[str, list[list[float]]] = {model: [] for model in MODELS}
+    for rows in (half_split(trials, seed + k) for k in range(HALVES)):
+        rest = np.flatnonzero(~rows)
+        for model, function in MODELS.items():
+            out = function(trials, rows)
+            found[model].append([_r2_rmse(target[:, k], out[:, k], rest)[0] for k in range(len(OUTPUTS))])
+    return {model: {name: _spread(r2) for name, r2 in zip(OUTPUTS, zip(*rows, strict=True), strict=True)}
+            for model, rows in found.items()}  # fmt: skip
+
+
+def _spread(values: tuple[float, ...]) -> list[float] | None:
+    if not np.isfinite(values).all():
+        return None
+    return [float(np.median(values)), min(values), max(values)]
 
 
 def score(trials: WheelTrials, predicted: Array, rows: Mask, seed: int) -> dict[str, dict[str, object]]:
