@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.frames import matrix_to_quaternion
-from terrafusion.datasets.recording import Command, Recording, Terrain
+from terrafusion.datasets.recording import Command, Fix, Recording, Terrain
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.twin import sensors
 from terrafusion.twin.drive import Driven, drive
@@ -211,11 +211,12 @@ def _check(scenario: Scenario, vehicle: VehicleParams, seed: int) -> None:
             f"payload {payload:g} kg is out of range", file=vehicle.name, remedy=f"give 0 to {limit:g} kg"
         )
     best = sensors.best_fix(vehicle.sensors.gnss)
-    if scenario.gnss_fix is not None and scenario.gnss_fix > best:
+    fix = scenario.gnss_fix
+    if fix is not None and not Fix.SINGLE <= fix <= best:
         raise ConfigError(
-            f"'gnss_fix' is {scenario.gnss_fix.name.lower()}, beyond the receiver of '{vehicle.name}'",
+            f"'gnss_fix' is {fix.name.lower()}, not a class the receiver of '{vehicle.name}' reaches",
             file=scenario.name,
-            remedy=f"its best is {best.name.lower()}",
+            remedy=f"give single to {best.name.lower()}",
         )
     if seed < 0:
         raise ConfigError(f"seed {seed} is negative", remedy="give a whole number from 0")

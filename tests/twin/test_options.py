@@ -226,7 +226,10 @@ def test_wrong_options_of_a_run_are_told_in_one_line(options, message) -> None:
         simulate("straight", **options)
 
 
-def test_a_class_of_fix_the_receiver_does_not_reach_is_told() -> None:
-    fixed = dataclasses.replace(load_scenario("straight"), gnss_fix=Fix.FIXED)
-    with pytest.raises(ConfigError, match=r"'gnss_fix' is fixed, beyond .* 'husky'; its best is single"):
-        simulate(fixed, vehicle="husky")
+@pytest.mark.parametrize("fix", [Fix.FIXED, Fix.NONE])
+def test_a_class_of_fix_the_receiver_does_not_reach_is_told(fix) -> None:
+    asked = dataclasses.replace(load_scenario("straight"), gnss_fix=fix)
+    with pytest.raises(
+        ConfigError, match=r"'gnss_fix' is .*, not a class .* 'husky' .*; give single to single"
+    ):
+        simulate(asked, vehicle="husky")
