@@ -6,7 +6,7 @@ import functools
 
 import numpy as np
 
-from terrafusion.twin.drive import told
+from terrafusion.twin.drive import follow, told
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.effects.form import Form
@@ -78,8 +78,9 @@ def exciting() -> np.ndarray:
         v[part] = speed
         if turn is not None:
             w[part] = turn
+    v, w = follow(v, 5.0 * DT_S, 0.0), follow(w, 8.0 * DT_S, 0.0)
     half = 0.5 * ELEVATE.odometry.track_m * w
-    return np.stack([v - half, v + half], axis=1) / RADIUS_M * np.minimum(1.0, t)[:, None]
+    return np.stack([v - half, v + half], axis=1) / RADIUS_M * (t > 0.0)[:, None]
 
 
 def drive(
