@@ -92,7 +92,7 @@ class Battery:
 
     def __post_init__(self) -> None:
         if self.empty_v > self.full_v:
-            raise ValueError(f"battery: empty_v {self.empty_v:g} is above full_v {self.full_v:g}")
+            raise ValueError(f"empty_v {self.empty_v:g} is above full_v {self.full_v:g}")
 
 
 @dataclass(frozen=True)

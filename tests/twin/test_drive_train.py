@@ -108,6 +108,11 @@ def test_an_overloaded_battery_neither_reverses_nor_makes_energy(power, current,
     assert taken >= power
 
 
+def test_a_battery_that_rises_as_it_empties_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"empty_v 24 is above full_v 22"):
+        Battery(22.0, 24.0, 0.05, 480.0, 1.0)
+
+
 def test_without_a_battery_the_supply_is_stiff() -> None:
     p = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(fed_by(None)).tolist(), strict=True))
     voltage, taken, _ = battery(p, ca.DM(800.0), ca.DM(1e6), ca.DM(30.0))
