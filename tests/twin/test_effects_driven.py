@@ -8,7 +8,10 @@ import itertools
 import numpy as np
 import pytest
 
+from terrafusion.twin.drive import told
 from terrafusion.twin.dynamics import rhs
+from terrafusion.twin.engine.integrate import integrate
+from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
 from terrafusion.twin.layout import (
     INDEX,
     OUTPUTS,
@@ -207,6 +210,31 @@ def test_lags_of_the_command_delay_a_long_ramp_as_dead_time_does(key) -> None:
     ]
     without = drive({}, sides)[0][-50:, state_slice("wheel_speed")]
     assert np.abs(speed[0] - speed[1]).max() < 0.02 * np.abs(speed[1] - without).min()
+
+
+def test_all_effects_at_once_run_in_both_backends() -> None:
+    values = {key: value for form in FORMS for key, value in at(form, "scale").items()}
+    own, inputs = plant(effects=values), told(exciting()[:1001], DT_S)
+    c, vm = (integrate(np.zeros(len(STATES)), inputs, DT_S, own, backend=name) for name in ("auto", "vm"))
+    np.testing.assert_allclose(c, vm, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize(
+    "key", ["soil_strength/shear", "wheel_radius/scale", "backlash/torque_gap", "dead_time/transport"]
+)
+def test_sensitivities_of_a_run_to_an_effect_meet_finite_differences(key) -> None:
+    """At zero; a smooth command, so that its delay has a derivative."""
+    t = np.arange(0.0, 6.0, DT_S)
+    sides = np.stack([3.0 - 3.0 * np.cos(t), 3.5 - 3.5 * np.cos(1.3 * t)], axis=1)
+    step, rest = 1e-3 * typical(key)[key], np.zeros(len(STATES))
+    ends = [drive({key: sign * step}, sides)[0] for sign in (1.0, -1.0)]
+    directions = Directions.zeros(plant(), 1, [key])
+    directions.effects[key][0] = 1.0
+    tangent = integrate_with_sensitivity(rest, told(sides, DT_S), DT_S, plant(), directions)[1][:, :, 0]
+    for name in ("x", "y", "yaw", "u", "r"):
+        expected = (ends[0] - ends[1])[:, INDEX[name]] / (2.0 * step)
+        got = tangent[:, INDEX[name]]
+        assert np.abs(got - expected).max() < 0.02 * np.abs(expected).max()
 
 
 def test_gear_losses_cost_the_battery() -> None:
