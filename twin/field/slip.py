@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,13 +66,14 @@ def slip_rows(results: Sequence[Result], radius_m: float, track_m: float) -> lis
 def _row(
     ground: str, recording: str, source: str, results: Sequence[Result], radius_m: float, track_m: float
 ) -> SlipRow:
-    parts = []
+    parts: list[list[NDArray[Any]]] = []
     for r in results:
         true = r.forks.motion[:, N_PAST:]
         travel = _travel(true if source == MEASURED else r.prediction, r.forks, radius_m)
         keep = np.full(len(r.forks), True) if not recording else r.forks.recording == recording
         known = np.isfinite(true[..., 0]).all(axis=1)
-        parts.append([*(column[keep] for column in (*travel, known, r.forks.group))])
+        columns: tuple[NDArray[Any], ...] = (*travel, known, r.forks.group)
+        parts.append([column[keep] for column in columns])
     way, rolled, apart, turned, known, group = (np.concatenate(c) for c in zip(*parts, strict=True))
     far = (np.abs(rolled) > ROLLED_M) & known
     slip = 1.0 - way[far] / rolled[far]

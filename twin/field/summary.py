@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.field.compare import OTHER, Result
-from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN
+from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL
 from terrafusion.twin.field.scores import METRICS, Interval, interval, medians
 from terrafusion.twin.field.slip import SlipRow
 from terrafusion.twin.field.twin_model import TwinModel
@@ -19,8 +19,9 @@ from terrafusion.twin.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 
-SHOWN = ("speed_rms_1s_mps", "speed_rms_5s_mps", "turn_rms_1s_radps", "turn_rms_5s_radps", "position_m")
-"""What the printed table shows of `METRICS`; the files hold all."""
+SHOWN = ("speed_rms_5s_mps", "turn_rms_5s_radps", "position_m")
+COLUMNS = ("hold", "plain", "radius, track", "ICR", BEST_KINEMATIC, TWIN_NOMINAL, TWIN)
+"""What the printed tables show of metrics and models; the files hold all."""
 
 
 @dataclass(frozen=True)
@@ -155,18 +156,35 @@ def parameters(vehicle: str, results: Sequence[Result]) -> Iterator[dict[str, An
 
 
 def markdown(all_lines: Sequence[Line], scheme: str) -> str:
-    """Table of one scheme: medians; the twin's with the ratio to the best kinematic model in brackets."""
+    """Tables of one scheme, one a metric: medians by model, and the twin's over the best kinematic's.
+
+    With commands as inputs, the plain and the fitted differential drive stand behind their fitted lags.
+    """
     chosen = [line for line in all_lines if line.scheme == scheme]
-    head = ["vehicle, inputs, ground", "model", "forks (stretches)", *map(_title, SHOWN)]
-    out = [head, ["---"] * len(head)]
+    rows: dict[tuple[str, str, str, str], dict[str, Line]] = {}
     for line in chosen:
-        where = f"{line.vehicle}, {line.inputs}, {line.ground or 'unknown'}"
-        if line.model == chosen[0].model and np.isfinite(line.noise_mps):
-            where += f" (noise {line.noise_mps:.3f} m/s)"
-        if scheme == OTHER:
-            where += f", trained on {line.trained_on}"
-        cells = [_cell(line, metric) for metric in SHOWN]
-        out.append([where, line.model, f"{line.forks} ({line.groups})", *cells])
+        rows.setdefault((line.vehicle, line.inputs, line.ground, line.trained_on), {})[line.model] = line
+    return "\n".join(_table(rows, metric, scheme) for metric in SHOWN)
+
+
+def _table(rows: dict[tuple[str, str, str, str], dict[str, Line]], metric: str, scheme: str) -> str:
+    ratio = f"{TWIN} / {BEST_KINEMATIC}"
+    head = [_title(metric), "forks (stretches)", "noise of truth", *COLUMNS, ratio]
+    out = [head, ["---"] * len(head)]
+    for (vehicle, inputs, ground, source), models in rows.items():
+        own = models[TWIN]
+        if not np.isfinite(own.errors[metric].median):
+            continue
+        where = f"{vehicle}, {inputs}, {ground or 'unknown'}"
+        noise = f"{own.noise_mps:.3f}" if metric.startswith("speed") else ""
+        shown = [models[m] if m == "ICR" else models.get(f"{m} + lag", models[m]) for m in COLUMNS]
+        cells = [f"{line.errors[metric].median:.3f}" for line in shown]
+        out.append(
+            [
+                f"{where}, trained on {source}" if scheme == OTHER else where,
+                f"{own.forks} ({own.groups})", noise, *cells, _interval(own.ratios[metric], ".2f"),
+            ]
+        )  # fmt: skip
     return "".join(f"| {' | '.join(row)} |\n" for row in out)
 
 
@@ -188,16 +206,6 @@ def slip_markdown(rows: Sequence[tuple[str, SlipRow]]) -> str:
         cells = [_interval(row.slip, "+.3f"), spread, _interval(row.track_m, ".2f")]
         out.append([f"{vehicle}, {row.ground or 'unknown'}", row.source, str(row.count), *cells])
     return "".join(f"| {' | '.join(row)} |\n" for row in out)
-
-
-def _cell(line: Line, metric: str) -> str:
-    value = line.errors[metric].median
-    if not np.isfinite(value):
-        return "-"
-    if line.model != TWIN:
-        return f"{value:.3f}"
-    r = line.ratios[metric]
-    return f"**{value:.3f}** ({r.median:.2f}, {r.low:.2f} to {r.high:.2f})"
 
 
 def _title(metric: str) -> str:
