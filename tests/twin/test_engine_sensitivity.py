@@ -106,7 +106,7 @@ def test_derivatives_meet_central_differences(soils, varied) -> None:
     _, tangents = integrate_with_sensitivity(start(), inputs(), DT_S, p, d, substeps=3)
     # A large step bends, a small one costs digits; in a field it must keep the wheels within its cells, where
     # its gradient does not jump.
-    steps, allowed = ((1e-6, 1e-5), 2e-5) if varied else ((1e-5, 1e-4, 1e-3), 1e-6)
+    steps, allowed = ((1e-6, 1e-5), 2e-5) if varied else ((1e-6, 1e-5, 1e-4, 1e-3), 1e-6)
     for m, name in enumerate(names):
         errors = []
         for step in steps:
@@ -117,7 +117,7 @@ def test_derivatives_meet_central_differences(soils, varied) -> None:
 
 
 @needs_compiler
-@pytest.mark.parametrize(("soils", "varied"), CASES)
+@pytest.mark.parametrize(("soils", "varied"), [(("mud",), False), (("loose_sand", "mud"), True)])
 def test_the_virtual_machine_gives_the_same_derivatives(soils, varied) -> None:
     p = plant(*soils, varied=varied)
     _, d = along(p)

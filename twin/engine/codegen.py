@@ -7,7 +7,15 @@ from typing import Any, NamedTuple
 
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine.emit import Emitter
-from terrafusion.twin.engine.graph import CALLS, UnsupportedOperationError, read, with_reciprocals
+from terrafusion.twin.engine.graph import (
+    CALLS,
+    INPUT,
+    Graph,
+    Outputs,
+    UnsupportedOperationError,
+    read,
+    with_reciprocals,
+)
 from terrafusion.twin.engine.linear import eliminated
 from terrafusion.twin.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
 
@@ -53,10 +61,11 @@ def source(variant: Variant) -> str:
         graph, outputs = eliminated(
             graph, outputs, _WIDE, late, lambda name, i: not _changes(active, name, i)
         )
-    emitter = Emitter(
-        graph, outputs, late, _WIDE if kind == TANGENT else (), None if kind == LANES else wheel_of
-    )
+    wide = _WIDE if kind == TANGENT else ()
+    emitter = Emitter(graph, outputs, late, wide, wheel_of, in_vectors=kind != LANES)
     loops = [_text("driver.c"), _text("tangent.c")] if kind == TANGENT else [_text("driver.c")]
+    if kind == TANGENT:
+        loops.insert(0, _read_states(graph, outputs))
     return "\n".join([_sizes(effects), _prelude(kind), emitter.source(), *loops])
 
 
@@ -72,6 +81,13 @@ def _with_tangent(f: Any) -> Any:
     arguments = {**plain, **seeds}
     return ca.Function("tf_tangent", [*arguments.values()], [dx, tangent], [*arguments], ["dx", "dx_wide"],
                        {"cse": True})  # fmt: skip
+
+
+def _read_states(graph: Graph, outputs: Outputs) -> str:
+    """Defines the states whose tangents others depend on, by the graph or by their place on the ground."""
+    inputs = (graph.values[n] for n in graph.reached(outputs["dx_wide"]) if graph.ops[n] == INPUT)
+    read = sorted({i for name, i in inputs if name == "x_wide"} | {INDEX["travel"]})
+    return f"#define TF_READS {len(read)}\n#define TF_READ_STATES {{{', '.join(map(str, read))}}}"
 
 
 def _changes(active: frozenset[tuple[str, int]], argument: str, element: int) -> bool:
@@ -105,13 +121,14 @@ def _sizes(effects: tuple[str, ...]) -> str:
     sizes |= {"NE": len(effects), "WHEELS": len(WHEELS)}
     sizes |= {name.upper(): INDEX[name] for name in ("x", "y", "yaw", "travel")}
     sizes |= {name.upper(): VEHICLE_PARAMETERS.index(f"{name}_m") for name in ("wheelbase", "track")}
-    arguments = {f"{stage.upper()}_ARGUMENTS": text for stage, text in _ARGUMENTS.items()}
+    # No output overlaps what it is made of.
+    arguments = {f"{s.upper()}_ARGUMENTS": text.replace("*", "*restrict ") for s, text in _ARGUMENTS.items()}
     return "".join(f"#define TF_{name} {value}\n" for name, value in {**sizes, **arguments}.items())
 
 
 def _prelude(kind: str) -> str:
     if kind == LANES:
-        return _LANES_HEAD + _kernels("tf_real", "TF_RUNS", "real")
+        return _LANES_HEAD + _kernels("tf_real", "TF_RUNS", "real") + _text("root.h")
     head = _SINGLE_HEAD + _kernels("tf_four", "TF_WHEELS", "four") + _FOURS + _scalar_calls()
     return head + _WIDE_TYPE if kind == TANGENT else head
 

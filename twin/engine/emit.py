@@ -10,11 +10,16 @@ a vector of directions.
 
 from __future__ import annotations
 
+import heapq
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
 from terrafusion.twin.engine.graph import BINARY, CONST, INPUT, Graph, Outputs
 from terrafusion.twin.engine.packing import WHEELS, Atom, LaneOf, packs
+
+_LATENCY = {"sqrt": 21, "div": 13, "exp": 70, "log": 80, "sin": 60, "cos": 60}
+_LATENCY_ELSE = 4
+"""Cycles until a result is there, about, on a processor of today."""
 
 
 @dataclass(frozen=True)
@@ -41,23 +46,29 @@ class Emitter:
     Attributes:
         graph, outputs: what is to be computed.
         late, wide: names of the arguments that change at every evaluation, that are vectors of directions.
-        lane_of: how arguments belong to wheels; None keeps every node by itself.
+        lane_of: how arguments belong to wheels.
+        in_vectors: whether the four wheels' equal operations are one vector operation, or four that stand
+            together (several runs already fill the vectors).
     """
 
     graph: Graph
     outputs: Outputs
     late: Collection[str]
     wide: Collection[str]
-    lane_of: LaneOf | None = None
+    lane_of: LaneOf
+    in_vectors: bool
     sizes: dict[str, int] = field(default_factory=dict)
+    _roots: int = 0
 
     def source(self) -> str:
         """The C functions of the stages that hold anything, and the sizes of what they keep."""
         self._assign_stages()
-        atoms = packs(self.graph, self._needed, self._pack_key, self.lane_of) if self.lane_of else []
+        atoms = packs(self.graph, self._needed, self._pack_key, self.lane_of)
         self._packed = set(atoms)
         self._home = {n: (atom, k) for atom in atoms for k, n in enumerate(atom)}
         self._place()
+        if not self.in_vectors:
+            self._take_apart()
         functions = [self._function(stage) for stage in STAGES if self.wide or not stage.wide]
         defines = [f"#define TF_KEPT_{k.upper()} {max(n, 1)}" for k, n in self.sizes.items()]
         return "\n".join([*defines, *functions])
@@ -97,6 +108,13 @@ class Emitter:
                     self.sizes[kept] += len(atom)
                     wanted[self._stage[atom[0]]].append(atom)
 
+    def _take_apart(self) -> None:
+        """One statement for each wheel. Where they stand together, the processor does them side by side."""
+        for stage, atoms in self._order.items():
+            self._order[stage] = [(n,) for atom in atoms for n in atom]
+        self._slot = {(n,): first + k for atom, first in self._slot.items() for k, n in enumerate(atom)}
+        self._home, self._packed = {}, set()
+
     def _ordered(self, stage: Stage, roots: Iterable[Atom]) -> tuple[list[Atom], list[Atom]]:
         """Atoms of a stage, operands first, and those of earlier stages that it takes."""
         order: dict[Atom, None] = {}
@@ -114,7 +132,37 @@ class Emitter:
                 stack.append((atom, True))
                 args = [a for n in atom for a in self.graph.args[n] if not self._is_leaf(a)]
                 stack.extend((self._atom(a), False) for a in reversed(args))
-        return list(order), list(borrowed)
+        return self._longest_first(list(order)), list(borrowed)
+
+    def _longest_first(self, order: list[Atom]) -> list[Atom]:
+        """The atoms reordered: of those whose operands are there, the one with the longest way to a result.
+
+        A processor looks only some hundred instructions ahead for work that does not wait for a result.
+        """
+        place = {atom: i for i, atom in enumerate(order)}
+        operands = {
+            atom: {self._atom(a) for n in atom for a in self.graph.args[n]} & place.keys() for atom in order
+        }
+        users: dict[Atom, list[Atom]] = {atom: [] for atom in order}
+        for atom in order:
+            for a in operands[atom]:
+                users[a].append(atom)
+        way: dict[Atom, int] = {}
+        for atom in reversed(order):
+            cycles = _LATENCY.get(self.graph.ops[atom[0]], _LATENCY_ELSE)
+            way[atom] = cycles + max((way[user] for user in users[atom]), default=0)
+        waiting = {atom: len(operands[atom]) for atom in order}
+        ready = [(-way[atom], place[atom], atom) for atom in order if not waiting[atom]]
+        heapq.heapify(ready)
+        out = []
+        while ready:
+            atom = heapq.heappop(ready)[2]
+            out.append(atom)
+            for user in users[atom]:
+                waiting[user] -= 1
+                if not waiting[user]:
+                    heapq.heappush(ready, (-way[user], place[user], user))
+        return out
 
     # Writing
 
@@ -151,7 +199,9 @@ class Emitter:
         elif op == "neg":
             value = f"-{args[0]}"
         else:
-            value = f"tf_{op}_{suffix}({', '.join(args)})"
+            self._roots += op == "sqrt"
+            by_product = op == "sqrt" and not self.in_vectors and self._roots % 2  # see root.h
+            value = f"tf_{'root' if by_product else op}_{suffix}({', '.join(args)})"
         return f"const {kind} {_name(atom)} = {value};"
 
     def _operand(self, stage: Stage, t: Atom) -> str:

@@ -21,7 +21,7 @@ CALLS = {
 """Operations that are functions in C, and their numbers of arguments."""
 
 
-_FOLDED = {"add": add, "sub": sub, "mul": mul, "div": truediv, "neg": neg}
+_FOLDED: dict[str, Callable[..., float]] = {"add": add, "sub": sub, "mul": mul, "div": truediv, "neg": neg}
 
 
 class UnsupportedOperationError(ValueError):
@@ -164,7 +164,8 @@ def with_reciprocals(
 
 
 def _rewritten(graph: Graph, outputs: Outputs, rule: Any) -> tuple[Graph, Outputs]:
-    new, moved = Graph(), {}
+    new = Graph()
+    moved: dict[int, int] = {}
     for n in graph.reached(_all(outputs)):
         moved[n] = rule(new, n, tuple(moved[a] for a in graph.args[n]))
     return new, {name: [moved[n] for n in nodes] for name, nodes in outputs.items()}

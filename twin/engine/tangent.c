@@ -3,6 +3,9 @@
  */
 #define TF_BLOCKS 4
 
+/* The states whose tangents are read within a step; the others are integrals beside the model. */
+static const int tf_read[TF_READS] = TF_READ_STATES;
+
 /* What one block of directions changes, and the tangents of the ground. */
 typedef struct {
   const double *table; /* (knots, TF_NP, TF_DIRECTIONS) */
@@ -92,26 +95,30 @@ static void tf_slope_wide(tf_runs *runs, tf_block *block, double t, const double
 static void tf_rk4_wide(tf_tangents *all, double t, double h, double *x, tf_wide s[TF_BLOCKS][TF_NX],
                         double u[3][TF_NU]) {
   tf_runs *runs = &all->runs;
-  double k[TF_NX] = {0}, sum[TF_NX] = {0}, y[TF_NX];
-  tf_wide ks[TF_BLOCKS][TF_NX] = {0}, sums[TF_BLOCKS][TF_NX] = {0}, ys[TF_NX];
+  double k[4][TF_NX], y[TF_NX];
+  tf_wide ks[4][TF_BLOCKS][TF_NX], ys[TF_NX];
   if (runs->ground[0].plant->rows > 0) {
     tf_fields(runs, x);
     for (long b = 0; b < all->count; ++b) tf_field_wide(&runs->ground[0], &all->blocks[b], x, s[b]);
   }
   for (int stage = 0; stage < 4; ++stage) {
-    const double ahead = tf_stage_at[stage] * h, weight = tf_stage_weight[stage];
-    for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + ahead * k[i];
-    tf_slope(runs, t + ahead, y, u[tf_stage_input[stage]], k);
-    for (int i = 0; i < TF_NX; ++i) sum[i] += weight * k[i];
+    const double ahead = tf_stage_at[stage] * h, *at = stage ? y : x, *input = u[tf_stage_input[stage]];
+    if (stage)
+      for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + ahead * k[stage - 1][i];
+    tf_slope(runs, t + ahead, at, input, k[stage]);
     for (long b = 0; b < all->count; ++b) {
-      for (int i = 0; i < TF_NX; ++i) ys[i] = s[b][i] + ahead * ks[b][i];
-      tf_slope_wide(runs, &all->blocks[b], t + ahead, y, u[tf_stage_input[stage]], ys, ks[b]);
-      for (int i = 0; i < TF_NX; ++i) sums[b][i] += weight * ks[b][i];
+      if (stage)
+        for (int r = 0; r < TF_READS; ++r) {
+          const int i = tf_read[r];
+          ys[i] = s[b][i] + ahead * ks[stage - 1][b][i];
+        }
+      tf_slope_wide(runs, &all->blocks[b], t + ahead, at, input, stage ? ys : s[b], ks[stage][b]);
     }
   }
-  for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * sum[i];
+  for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
   for (long b = 0; b < all->count; ++b)
-    for (int i = 0; i < TF_NX; ++i) s[b][i] += h / 6.0 * sums[b][i];
+    for (int i = 0; i < TF_NX; ++i)
+      s[b][i] += h / 6.0 * (ks[0][b][i] + 2.0 * ks[1][b][i] + 2.0 * ks[2][b][i] + ks[3][b][i]);
 }
 
 /* One sample: the states into out (TF_NX), the tangents into out_wide (TF_NX, blocks, TF_DIRECTIONS). */

@@ -1,0 +1,97 @@
+"""Many runs at once: each is what it is alone, whatever runs beside it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.drive import told
+from terrafusion.twin.engine.integrate import compiled, integrate
+from terrafusion.twin.engine.lanes import integrate_many
+from terrafusion.twin.engine.plant import Plant, RouteTable, SoilField
+from terrafusion.twin.layout import INDEX, SOIL_PARAMETERS, STATES, soil_vector, vehicle_vector
+from terrafusion.twin.soil import load_soil, soil_names
+from terrafusion.twin.vehicle import load_vehicle, vehicle_names
+
+DT_S = 0.01
+needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
+
+
+def plants() -> list[Plant]:
+    """Every soil and vehicle, a border, and a field."""
+    vehicles, soils = vehicle_names(), [soil_vector(load_soil(name)) for name in soil_names()]
+    some = []
+    for k in range(max(len(vehicles), len(soils)) + 1):
+        vehicle = vehicle_vector(load_vehicle(vehicles[k % len(vehicles)]), slope_rad=0.02 * k)
+        some.append(Plant(vehicle, RouteTable("travel", np.zeros(1), soils[k % len(soils)][None])))
+    border = RouteTable("travel", np.array([0.3, 0.6]), np.array(soils[:2]))
+    response = np.zeros(len(SOIL_PARAMETERS))
+    response[SOIL_PARAMETERS.index("friction_cap")] = 1.0
+    grid = np.random.default_rng(2).normal(0.0, 0.3, (4, 5))
+    field = SoilField(0.5, grid, response, np.abs(grid), soils[-1])
+    return [
+        *some,
+        Plant(some[0].vehicle, border),
+        Plant(some[1].vehicle, dataclasses.replace(border, field=field)),
+    ]
+
+
+def commands(count: int, seconds: float = 3.0) -> np.ndarray:
+    """Inputs (B, N + 1, U): off, a turn, a stop."""
+    t = np.arange(round(seconds / DT_S) + 1) * DT_S
+    speed = np.interp(t, [0.0, 1.0, 0.7 * seconds, 0.8 * seconds], [0.0, 4.0, 4.0, 0.0])
+    turns = np.linspace(-0.3, 0.3, count)
+    return np.array([told(np.stack([speed * (1 - k), speed * (1 + k)], axis=1), DT_S) for k in turns])
+
+
+def starts(count: int) -> np.ndarray:
+    x0 = np.zeros((count, len(STATES)))
+    x0[:, INDEX["yaw"]] = np.linspace(-3.0, 3.0, count)
+    return x0
+
+
+@needs_compiler
+@pytest.mark.parametrize("jobs", [1, 2])
+def test_a_run_has_the_same_bits_alone_and_among_others(jobs) -> None:
+    some = plants()
+    inputs, x0 = commands(len(some)), starts(len(some))
+    together = integrate_many(x0, inputs, DT_S, some, jobs=jobs)
+    for k, plant in enumerate(some):
+        np.testing.assert_array_equal(together[k], integrate(x0[k], inputs[k], DT_S, plant), err_msg=str(k))
+
+
+@pytest.mark.parametrize("backend", ["vm", pytest.param("c", marks=needs_compiler)])
+def test_shared_inputs_and_every_so_many_th_sample(backend) -> None:
+    some, inputs = plants()[:3], commands(1, 1.0)[0]
+    whole = integrate_many(starts(3), np.stack([inputs] * 3), DT_S, some, backend=backend)
+    thin = integrate_many(starts(3), inputs, DT_S, some, every=7, backend=backend)
+    np.testing.assert_array_equal(whole[:, ::7], thin)
+
+
+@pytest.mark.parametrize("backend", ["vm", pytest.param("c", marks=needs_compiler)])
+def test_a_run_that_diverges_is_blank_from_there_and_leaves_the_others_alone(backend) -> None:
+    some = plants()[:5]
+    inputs = commands(5, 1.0)
+    good = integrate_many(starts(5), inputs, DT_S, some, backend=backend)
+    inputs[2, 50:] = np.nan
+    mixed = integrate_many(starts(5), inputs, DT_S, some, backend=backend)
+    assert np.isnan(mixed[2, 50:]).all()
+    np.testing.assert_array_equal(mixed[2, :50], good[2, :50])
+    np.testing.assert_array_equal(np.delete(mixed, 2, axis=0), np.delete(good, 2, axis=0))
+
+
+@needs_compiler
+def test_compiled_and_interpreted_runs_agree_on_every_vehicle_and_soil() -> None:
+    some = plants()
+    inputs, x0 = commands(len(some)), starts(len(some))
+    c, vm = (integrate_many(x0, inputs, DT_S, some, backend=b) for b in ("c", "vm"))
+    scale = np.abs(vm).max(axis=1, keepdims=True) + 1e-6
+    assert (np.abs(c - vm) / scale).max() < 1e-9
+
+
+def test_no_run_is_no_work_and_misshapen_inputs_are_named() -> None:
+    assert integrate_many(starts(0), commands(1)[0], DT_S, []).shape[0] == 0
+    with pytest.raises(ValueError, match="misshapen"):
+        integrate_many(starts(2), commands(3), DT_S, plants()[:2])
