@@ -21,6 +21,7 @@ from terrafusion.twin.identify.predict import FOLLOWING
 from terrafusion.twin.identify.problem import Problem
 from terrafusion.twin.identify.residuals import channel_fits
 from terrafusion.twin.identify.result import Calibration, Fitted
+from terrafusion.twin.identify.sandwich import scattered
 from terrafusion.twin.identify.solver import OUTCOMES, Solution, solve
 from terrafusion.twin.soil import SoilParams, load_soil
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
@@ -118,7 +119,8 @@ def search(
             "the twin diverges at the start values", file=problem.logs[0].name,
             remedy="check vehicle and soil, or give other start values",
         )  # fmt: skip
-    told = examine(problem.names, covariance_of(problem, solution))
+    P = len(problem.coordinates)
+    told = examine(problem.names, covariance_of(problem, solution)[:P, :P])
     lost = np.array([status == UNTOLD for status in told.status])
     if lost.any():
         w = np.where(lost, 0.0, solution.point.w)
@@ -126,34 +128,39 @@ def search(
         second = solve(problem, free=~lost, start=again, progress=progress)
         if second.normal is not None:
             solution = dataclasses.replace(second, first=solution.first, runs=solution.runs + second.runs)
-            covariance = covariance_of(problem, solution)
+            covariance = covariance_of(problem, solution)[:P, :P]
             told = dataclasses.replace(examine(problem.names, covariance), status=told.status)
     return solution, told
 
 
 def covariance_of(problem: Problem, solution: Solution) -> Array:
-    """Covariance (P, P) of the numbers in prior sigmas; offsets and poses marginalised."""
+    """Covariance (G, G) of the numbers in prior sigmas, then of the sensors' errors; poses marginalised.
+
+    That of the noise model; where the scores scatter more than it says, sigma is raised to what they show.
+    """
     if solution.normal is None:
-        return np.eye(len(problem.coordinates))
-    P = len(problem.coordinates)
-    return np.asarray(np.linalg.inv(solution.normal.H)[:P, :P])
+        return np.eye(len(problem.coordinates) + len(problem.logs) * len(problem.errors))
+    modelled = np.linalg.inv(solution.normal.H)
+    shown = scattered(problem, solution.blocks, solution.normal, solution.noise)
+    raised = np.sqrt(np.maximum(np.diag(shown) / np.diag(modelled), 1.0))
+    return np.asarray(modelled * np.outer(raised, raised))
 
 
 def _answer(problem: Problem, solution: Solution, told: Identifiability, notes: list[str]) -> Calibration:
-    cov, point = covariance_of(problem, solution), solution.point
+    whole, point, P = covariance_of(problem, solution), solution.point, len(problem.coordinates)
+    cov = whole[:P, :P]
     sigma = np.sqrt(np.diag(cov))
     fitted = [
         _fitted(c, float(w), float(s), told.status[i], float(told.ratio[i]))
         for i, (c, w, s) in enumerate(zip(problem.coordinates, point.w, sigma, strict=True))
     ]
     rate = np.array([c.rate(float(w)) for c, w in zip(problem.coordinates, point.w, strict=True)])
-    inverse = np.linalg.inv(solution.normal.H) if solution.normal is not None else np.eye(1)
-    P, B = len(fitted), len(problem.errors)
+    B = len(problem.errors)
     errors = {
         log.name: {
             e.name: (
                 float(point.errors[i, k] * e.sigma),
-                float(math.sqrt(inverse[P + B * i + k, P + B * i + k]) * e.sigma),
+                float(math.sqrt(whole[P + B * i + k, P + B * i + k]) * e.sigma),
             )
             for k, e in enumerate(problem.errors)
             if any(o.channel == e.channel for o in log.observed)

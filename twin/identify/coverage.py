@@ -1,8 +1,8 @@
 """How honest sigma is: twin drives with known numbers, calibrated, and the truth counted within two sigma.
 
 `python -m terrafusion.twin.identify.coverage --cases 100` draws for each case a ground, a drive and the
-true numbers (uniformly within +-20 to 30 % of the files' values), simulates it with all sensor noise, calibrates
-it from the files' values and prints, for each number, how often the truth lies within two sigma.
+true numbers (uniformly within +-20 to 30 % of the files' values), simulates it with all sensor noise,
+calibrates it from the files' values and prints, for each number, how often the truth lies within two sigma.
 """
 
 from __future__ import annotations

@@ -23,6 +23,8 @@ DT_S = 0.01
 """Sample interval of the twin's runs."""
 MOVING_RADPS = 0.3
 """A log that starts with faster wheels starts on the move."""
+STEP = 4.0
+"""Commands that change this many times faster than the robot may accelerate are steps."""
 LONGEST_GAP_S = 0.5
 """A longer gap in measured wheel speeds voids what falls into it."""
 
@@ -96,7 +98,7 @@ def _measured(recording: Recording, vehicle: VehicleParams) -> Told:
 def _commands(recording: Recording, vehicle: VehicleParams) -> Told:
     """Commanded twists within the vehicle's own limits.
 
-    Between two commands the twist runs linearly where the robot could follow; a larger change is a step.
+    Between two commands the twist runs smoothly; a sudden change is a step.
     """
     command = recording.command
     assert command is not None
@@ -115,13 +117,13 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> Told:
 
 
 def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:
-    """Commands (n,) at times (n,) on the grid (N,): smooth where changes keep to the limit, else steps."""
+    """Commands (n,) at times (n,) on the grid (N,): a smooth course with steps."""
     from scipy.interpolate import CubicHermiteSpline
 
     before = np.clip(np.searchsorted(t_s, grid + 1e-6, side="right") - 1, 0, len(t_s) - 1)
     out = wanted[before]
     apart = np.append(np.diff(t_s), np.inf)
-    follows = np.append(np.abs(np.diff(wanted)) <= limit * np.diff(t_s) * 1.001, False)
+    follows = np.append(np.abs(np.diff(wanted)) <= STEP * limit * np.diff(t_s), False)
     # A slope at a sample is the central difference where both neighbours are reached smoothly.
     slopes = np.where(follows, np.diff(wanted, append=wanted[-1]) / apart, 0.0)
     both = follows & np.append(False, follows[:-1])

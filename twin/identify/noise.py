@@ -25,8 +25,6 @@ MAX_ORDER = 12
 """Highest order of the autoregressive process."""
 LEAST_ROWS = 40
 """A channel with fewer rows is taken as white."""
-LEAST_SHARE = 1e-4
-"""The noise is never taken as less than this share of the first guess: exact data would divide by zero."""
 NUGGET = 0.01
 """White share that is added to every correlation: no frequency is taken as free of noise."""
 OUTLIER_SIGMAS = 4.0

@@ -25,6 +25,8 @@ BIN_S = 0.1
 """Rates and accelerations are compared as means over this long."""
 TRUTH_SIGMA = (0.01, 0.005)
 """First guess of a reference's sigma (assumed): m, rad; the residuals correct it."""
+LEAST_SHARE = 1e-4
+"""Noise that is learnt is never less than this share of the first guess: exact data would divide by zero."""
 CURRENT_SIGMA_A = 0.05
 """Least first guess of a current sensor's sigma (assumed)."""
 
@@ -39,6 +41,7 @@ class Observed:
         value: (n,) measured.
         sigma: (n,) first guess of the noise's 1 sigma.
         slot: (n,) number of the row on a regular clock of `slot_s` seconds.
+        least: the noise is never taken as less than this share of `sigma`.
         correlation: share of the variance that is correlated in time, and its time constant in s,
             where a data sheet says it; None: it is estimated.
     """
@@ -50,6 +53,7 @@ class Observed:
     sigma: Array
     slot: Rows
     slot_s: float
+    least: float
     correlation: tuple[float, float] | None = None
 
     def select(self, rows: NDArray[np.bool_]) -> Observed:
@@ -85,11 +89,14 @@ def sample_interval_s(t_s: Array) -> float:
     return float(np.median(np.diff(t_s))) if len(t_s) > 1 else BIN_S
 
 
-def binned(channel: str, t_s: Array, values: Array, sheet_sigma: float, *, instant: bool = False) -> Observed:
+def binned(
+    channel: str, t_s: Array, values: Array, sheet_sigma: float, *, instant: bool = False, trust: bool = True
+) -> Observed:
     """Means of `values` (N,) at times (N,) over bins.
 
     A sample is taken as the mean since the one before or, with `instant`, as holding about its stamp.
-    The first guess of sigma is the data sheet's or the scatter from bin to bin, whichever is larger.
+    The first guess of sigma is the data sheet's or the scatter from bin to bin, whichever is larger. Without
+    `trust` the data sheet's is also the least.
     """
     known = np.isfinite(values)
     t_s, values = t_s[known], values[known]
@@ -101,15 +108,15 @@ def binned(channel: str, t_s: Array, values: Array, sheet_sigma: float, *, insta
     )
     if not len(slots):
         empty = np.zeros(0)
-        return Observed(channel, empty, empty, empty, empty, np.zeros(0, dtype=np.int64), width)
+        return Observed(channel, empty, empty, empty, empty, np.zeros(0, dtype=np.int64), width, 1.0)
     mean = np.add.reduceat(values, first) / count
     last = t_s[first + count - 1]
     ahead = 0.5 * span if instant else 0.0
     begin, end = t_s[first] - span + ahead, last + ahead
-    sigma = np.full(len(slots), max(sheet_sigma, scatter(mean), 1e-9))
-    return Observed(channel, begin, end, mean, sigma, slots, width).select(
-        count * span >= 0.5 * (end - begin)
-    )
+    guess = max(sheet_sigma, scatter(mean), 1e-9)
+    least = LEAST_SHARE if trust else sheet_sigma / guess
+    rows = Observed(channel, begin, end, mean, np.full(len(slots), guess), slots, width, least)
+    return rows.select(count * span >= 0.5 * (end - begin))
 
 
 def scatter(values: Array) -> float:
@@ -131,14 +138,13 @@ def _wheels(recording: Recording, vehicle: VehicleParams, start_ns: int) -> list
     radius = vehicle.odometry.wheel_radius_m
     t_s = _seconds(wheels.t_ns, start_ns)
     sides = wheels.side_speeds_mps(radius) / radius
-    # A difference of angles over a bin is good to a quantum over the bin's length.
-    sheet = max(
-        vehicle.sensors.wheels.quantum_rad / BIN_S, 0.1 * vehicle.sensors.wheels.speed_sigma_mps / radius
-    )
+    # Counts are finer than wheels are round: no log makes them better than the vehicle's file says.
+    per_bin = max(1.0, BIN_S / sample_interval_s(t_s))
+    sheet = max(vehicle.sensors.wheels.speed_sigma_mps / radius / math.sqrt(per_bin), 1e-6)
     if not wheels.has_sides():
-        return [binned("wheel_mean_radps", t_s[1:], sides[1:, 0], sheet)]
+        return [binned("wheel_mean_radps", t_s[1:], sides[1:, 0], sheet, trust=False)]
     names = ("wheel_left_radps", "wheel_right_radps")
-    return [binned(name, t_s[1:], sides[1:, i], sheet) for i, name in enumerate(names)]
+    return [binned(name, t_s[1:], sides[1:, i], sheet, trust=False) for i, name in enumerate(names)]
 
 
 def _imu(recording: Recording, vehicle: VehicleParams, start_ns: int) -> list[Observed]:
@@ -197,7 +203,7 @@ def _instants(
 ) -> Observed:
     slot_s = sample_interval_s(t_s) if len(t_s) > 1 else 1.0
     slots = np.round(t_s / max(slot_s, 1e-6)).astype(np.int64)
-    rows = Observed(channel, t_s, t_s, values, sigma, slots, slot_s, correlation)
+    rows = Observed(channel, t_s, t_s, values, sigma, slots, slot_s, LEAST_SHARE, correlation)
     return rows.select(np.append(True, np.diff(slots) > 0)[: len(slots)])
 
 

@@ -16,20 +16,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin.identify.noise import LEAST_SHARE, Noise, autoregressive, clipped, gauss_markov
+from terrafusion.twin.identify.noise import Noise, autoregressive, clipped, gauss_markov
 from terrafusion.twin.identify.problem import Block, Key, Normal, Point, Problem
 
 Array = NDArray[np.float64]
 
 MAX_STEP = 1.5
 """Longest step of a parameter, in prior sigmas."""
-MAX_RUNS = 40
+MAX_RUNS = 80
 """The search ends after this many evaluations of the twin."""
-GOALS = (1.0, 1e-3)
+GOALS = (10.0, 1e-3)
 """A pass ends when a step promises to lower the cost by less than this (in nats), at first and in the end: a
 parameter then moves by less than sqrt(2 x) of its sigma."""
 SETTLED = 1.3
 """The scales of the noise are settled when none changes by more than this factor."""
+MOST_AHEAD = 0.2
+"""Scales are taken ahead of what the residuals show by this factor at most."""
 MAX_RESCALES, CORRELATED_PASSES = 6, 2
 """Passes with white noise until the scales are settled, at most; passes with correlated noise."""
 DAMPING = (1e-3, 1e-8, 1e8)
@@ -117,7 +119,7 @@ def solve(
             settled = all(1.0 / SETTLED < new[k].scale / noise[k].scale < SETTLED for k in new)
             if learn is rescaled and settled:
                 continue
-            noise = _ahead(noise, new) if learn is rescaled else new
+            noise = _ahead(problem, noise, new) if learn is rescaled else new
             normal = problem.normal(point, blocks, noise)
         point, blocks, normal, outcome, costs = _descend(search, point, blocks, normal, noise, free, goal)
         history.append(costs)
@@ -127,10 +129,19 @@ def solve(
     return Solution(point, blocks, normal, noise, outcome, search.runs, first, tuple(history))
 
 
-def _ahead(noise: dict[Key, Noise], new: dict[Key, Noise]) -> dict[Key, Noise]:
+def raised(
+    problem: Problem, blocks: Sequence[Block], normal: Normal, noise: dict[Key, Noise]
+) -> dict[Key, Noise]:
+    """The first guess, raised to what the residuals are at the start: so far off, none is to be trusted."""
+    new = rescaled(problem, blocks, normal, noise)
+    return {k: Noise(max(n.scale, noise[k].scale), n.rho) for k, n in new.items()}
+
+
+def _ahead(problem: Problem, noise: dict[Key, Noise], new: dict[Key, Noise]) -> dict[Key, Noise]:
     """Scales that fall are taken down as much again: they do so because the numbers are still off."""
-    share = {k: min(1.0, new[k].scale / noise[k].scale) for k in new}
-    return {k: Noise(max(n.scale * share[k], LEAST_SHARE), n.rho) for k, n in new.items()}
+    share = {k: min(1.0, max(new[k].scale / noise[k].scale, MOST_AHEAD)) for k in new}
+    least = {k: problem.logs[k[0]].observed[k[1]].least for k in new}
+    return {k: Noise(max(n.scale * share[k], least[k]), n.rho) for k, n in new.items()}
 
 
 Learn = Callable[[Problem, Sequence[Block], Normal, dict[Key, Noise]], dict[Key, Noise]]
@@ -145,7 +156,7 @@ def _passes(whole: bool) -> list[tuple[Learn | None, float]]:
     if not whole:
         return [(None, GOALS[1])]
     white: list[tuple[Learn | None, float]] = [(None, GOALS[0]), *[(rescaled, GOALS[0])] * MAX_RESCALES]
-    return [*white, *[(learnt_noise, GOALS[1])] * CORRELATED_PASSES]
+    return [(raised, GOALS[0]), *white, *[(learnt_noise, GOALS[1])] * CORRELATED_PASSES]
 
 
 def _descend(
@@ -174,8 +185,12 @@ def _descend(
         found = search.blocks(tried)
         new = None if found is None else problem.normal(tried, found, noise)
         if new is not None and found is not None and new.cost < normal.cost:
+            foreseen = -float(normal.g @ d) - 0.5 * float(d @ normal.H @ d) + normal.pose_gain()
+            share = (normal.cost - new.cost) / max(foreseen, 1e-300)
+            damping = (
+                max(damping / 10.0, DAMPING[1]) if share > 0.75 else damping * (3.0 if share < 0.25 else 1.0)
+            )
             point, blocks, normal = tried, found, new
-            damping = max(damping / 10.0, DAMPING[1])
             costs.append(normal.cost)
         else:
             damping *= 10.0
@@ -257,7 +272,7 @@ def rescaled(
         whitened = np.concatenate([problem.whitened(b, noise)[0] for b in mine])
         freedom = max(len(whitened) - used[key], 0.5 * len(whitened), 1.0)
         variance = float(whitened @ whitened) / freedom
-        scale = max(noise[key].scale * math.sqrt(variance), LEAST_SHARE)
+        scale = max(noise[key].scale * math.sqrt(variance), problem.logs[key[0]].observed[key[1]].least)
         out[key] = Noise(scale, noise[key].rho)
     return out
 
