@@ -127,6 +127,14 @@ def test_skid_steering_turns_less_than_its_odometry_says(run) -> None:
     assert 0.2 * assumed < x[INDEX["r"]] < 0.95 * assumed
 
 
+def test_states_of_absent_effects_rest_and_time_passes(run) -> None:
+    x = run("medium_sand", constant(3.0, 5.0, 4.0))
+    resting = [i for name, i in INDEX.items() if name.startswith(("command", "play"))]
+    assert len(resting) == 8
+    assert (x[:, resting] == 0.0).all()
+    np.testing.assert_allclose(x[:, INDEX["elapsed"]], np.arange(len(x)) * 0.01, atol=1e-9)
+
+
 def test_wheel_loads_carry_the_weight_and_lean_downhill() -> None:
     p = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(ELEVATE, slope_rad=0.2).tolist(), strict=True))
     front_left, front_right, rear_left, rear_right = (

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.dynamics import rhs
-from terrafusion.twin.effects.catalogue import Terms, effect_names, forms_of
+from terrafusion.twin.effects.catalogue import effect_names, forms_of
 from terrafusion.twin.effects.form import SENSOR_STAGES, STAGES
 from terrafusion.twin.engine.integrate import MAX_STEP_S
-from terrafusion.twin.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS, WHEELS
+from terrafusion.twin.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS
 from terrafusion.twin.measurement import correction, measured, measurement
 
 from .effect_cases import (
@@ -143,10 +143,10 @@ def test_numbers_and_derivatives_are_finite_everywhere(form, which) -> None:
 @each_form
 def test_derivatives_at_zero_meet_finite_differences(form) -> None:
     states, inputs = samples()
+    _, by_effect, outputs_by_effect, _ = jets_at_zero()
     for p in form.parameters:
         key, step = form.parameter_key(p), 1e-5 * p.scale
         column = KEYS.index(key)
-        _, by_effect, outputs_by_effect, _ = jets()(*arguments(states, inputs, {}))
         for evaluate, jacobian in ((derivatives, by_effect), (readings, outputs_by_effect)):
             ends = [evaluate({key: sign * step}, states, inputs) for sign in (1.0, -1.0)]
             expected = (ends[0] - ends[1]) / (2.0 * step)
@@ -157,6 +157,11 @@ def test_derivatives_at_zero_meet_finite_differences(form) -> None:
 
 def arguments(states: np.ndarray, inputs: np.ndarray, values: dict[str, float]) -> list[np.ndarray]:
     return [states.T, inputs.T, plant("mud", slope_rad=0.08).vehicle, soil("mud"), vector(values), MOUNTING]
+
+
+@functools.cache
+def jets_at_zero():
+    return jets()(*arguments(*samples(), {}))
 
 
 @functools.cache
@@ -233,11 +238,6 @@ def test_exchanging_left_and_right_gives_the_mirrored_motion(form) -> None:
     assert same != (form.key in LOPSIDED)
 
 
-def test_a_term_may_set_only_what_belongs_to_its_stage() -> None:
-    for stage in STAGES:
-        assert set(Terms(KEYS, vector({})).apply("mounting", dict.fromkeys(STAGES["mounting"], 0.0))), stage
-
-
 def test_corrections_are_what_an_effect_adds_to_the_readings_of_a_motion() -> None:
     """A sensor effect adds what it changes; an effect of the motion nothing but what a sensor cannot know."""
     states, inputs = samples()
@@ -251,7 +251,3 @@ def test_corrections_are_what_an_effect_adds_to_the_readings_of_a_motion() -> No
     ):
         added = correction((key,))(*common, [0.02], MOUNTING).full()
         assert {OUTPUTS[i] for i in np.flatnonzero(np.abs(added).max(axis=1) > 1e-9)} == touched, key
-
-
-def test_wheel_names_are_those_the_backlash_reads() -> None:
-    assert all(f"play_{name}" in INDEX for name in WHEELS)

@@ -8,11 +8,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
+from typer.testing import CliRunner
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.cli.effects import effect_lines, effect_values
+from terrafusion.fusion.cli.main import app
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, Parameter, one
 from terrafusion.twin.ground import Variation, under_wheels
@@ -156,12 +159,13 @@ def test_wrong_effects_are_told(effects, said) -> None:
 
 
 def test_words_of_the_command_line() -> None:
-    import typer
-
     assert effect_values(["mass/at_cg=0.1", "gyro_bias/constant=-1e-3"]) == {
         "mass/at_cg": 0.1,
         "gyro_bias/constant": -1e-3,
     }
+    listed = CliRunner().invoke(app, ["simulate", "spin", "--effect", "help"])
+    assert listed.exit_code == 0
+    assert listed.output.splitlines() == [line.rstrip() for line in effect_lines()]
     assert len(effect_lines()) == 1 + len(catalogue.parameters())
     for words in (["mass/at_cg"], ["mass/at_cg=much"], ["mass/at_cg=1", "mass/at_cg=2"]):
         with pytest.raises(typer.BadParameter):
