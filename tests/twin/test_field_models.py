@@ -99,6 +99,13 @@ def test_lag_meets_the_exact_response_to_a_ramp(warthog):
     assert np.allclose(told, t - 0.7 * (1.0 - np.exp(-t / 0.7)), atol=1e-12)
 
 
+def test_lag_without_a_known_start_begins_on_its_target(warthog):
+    empty = forks(np.full((1, SAMPLES, 2), 4.0))
+    model = dataclasses.replace(kinematic.plain(warthog), lag_s=0.7)
+    told = model.predict(dataclasses.replace(empty, motion=np.full_like(empty.motion, np.nan)))
+    assert np.allclose(told[0, :, 0], 4.0 * warthog.odometry.wheel_radius_m)
+
+
 def test_twin_keeps_symmetry_and_mirrors_a_turn(warthog):
     model = TwinModel.nominal(warthog, load_soil("asphalt"), commanded=False)
     inputs = steps(1, 3)

@@ -71,8 +71,8 @@ class Forks:
         return dataclasses.replace(self, **changed)
 
     def start(self) -> Array:
-        """(F, 3) true motion at the fork; unknown speeds as 0."""
-        return np.nan_to_num(self.motion[:, N_PAST])
+        """(F, 3) true motion at the fork, NaN where unknown."""
+        return self.motion[:, N_PAST]
 
     def truth(self) -> Array:
         """(F, BINS, 3) half-second means of the true motion, NaN where unknown."""

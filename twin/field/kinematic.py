@@ -136,7 +136,10 @@ def _delayed(inputs: Array, dead_time_s: float) -> Array:
 
 
 def _lagged(target: Array, start: Array, lag_s: float) -> Array:
-    """First-order response (F, T) to a target (F, T), exact for one that is linear between samples."""
+    """First-order response (F, T) to a target (F, T), exact for one that is linear between samples.
+
+    From an unknown start (NaN) it begins on the target.
+    """
     ratio = DT_S / max(lag_s, 1e-6)
     decay = float(np.exp(-ratio))
     if ratio > 50.0:
@@ -144,7 +147,7 @@ def _lagged(target: Array, start: Array, lag_s: float) -> Array:
     # x' = (u - x) / T with u linear: x1 = e x0 + (m - e) u0 + (1 - m) u1, m = (1 - e) / ratio.
     mean = (1.0 - decay) / ratio
     out = np.empty_like(target)
-    out[:, 0] = start
+    out[:, 0] = np.where(np.isfinite(start), start, target[:, 0])
     for k in range(N_FUTURE):
         out[:, k + 1] = decay * out[:, k] + (mean - decay) * target[:, k] + (1.0 - mean) * target[:, k + 1]
     return out

@@ -34,7 +34,9 @@ Array = NDArray[np.float64]
 HEAVY = 100.0
 """Wheels that are to turn as measured get this many times their inertia: the ground hardly slows them."""
 FOLLOW_S = 0.01
-"""Time constant with which they follow, and the motors' lag in all runs here."""
+"""Time constant with which they follow; the inputs are sent ahead by as much."""
+LAG_S = 0.005
+"""The motors' lag in all runs here."""
 NO_LIMIT_NM = 1e5
 SUBSTEPS_DRIVEN, SUBSTEPS = 8, 15
 """RK4 steps a sample; heavy wheels allow longer ones (tested against the default step)."""
@@ -123,7 +125,9 @@ class TwinModel:
         inputs = self._sides(forks.inputs_radps[k], motion, forks.given_turn)
         past = self._sides(forks.past_radps[k], motion, forks.given_turn)
         driven = self._plant(driven=True)
-        before = _integrated(self._start(past[0], motion[0]), told(past, DT_S), driven, SUBSTEPS_DRIVEN)
+        before = _integrated(
+            self._start(past[0], motion[0]), told(past, DT_S, -FOLLOW_S), driven, SUBSTEPS_DRIVEN
+        )
         start = self._corrected(before[-1], motion[N_PAST])
         if self.commanded:
             late = float(self.vehicle[_V["dead_time_s"]])
@@ -131,7 +135,7 @@ class TwinModel:
             start = self._at_work(start, before, future[0, :2], driven.vehicle)
             states = _integrated(start, future, self._plant(driven=False), SUBSTEPS)
         else:
-            states = _integrated(start, told(inputs[N_PAST:], DT_S), driven, SUBSTEPS_DRIVEN)
+            states = _integrated(start, told(inputs[N_PAST:], DT_S, -FOLLOW_S), driven, SUBSTEPS_DRIVEN)
         turn = states[:, INDEX["r"]]
         forward = states[:, INDEX["u"]] + turn * self.vehicle[_V["cg_left_m"]]
         aside = states[:, INDEX["v"]] - turn * self.vehicle[_V["cg_forward_m"]]
@@ -139,13 +143,13 @@ class TwinModel:
 
     def _plant(self, *, driven: bool) -> Plant:
         vehicle = self.vehicle.copy()
-        vehicle[_V["lag_s"]] = FOLLOW_S
+        vehicle[_V["lag_s"]] = LAG_S
         vehicle[_V["dead_time_applied_s"]] = vehicle[_V["dead_time_s"]]
         if driven:
             inertia = HEAVY * vehicle[_V["wheel_inertia_kgm2"]]
             vehicle[_V["wheel_inertia_kgm2"]] = inertia
-            vehicle[_V["loop_p_nms"]] = 0.25 * inertia / FOLLOW_S
-            vehicle[_V["loop_i_nm"]] = 0.5 * inertia / FOLLOW_S
+            vehicle[_V["loop_p_nms"]] = inertia / FOLLOW_S
+            vehicle[_V["loop_i_nm"]] = inertia / FOLLOW_S
             vehicle[_V["stall_torque_nm"]] = vehicle[_V["torque_limit_nm"]] = NO_LIMIT_NM
             vehicle[_V["no_load_radps"]] *= 100.0
             vehicle[_V["battery_ohm"]] = 0.0
