@@ -13,6 +13,7 @@ import typer
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.cli import (
+    calibrate,
     convert,
     demo,
     fetch,
@@ -38,6 +39,7 @@ app.command("fetch")(fetch.fetch)
 app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("sweep")(sweep.sweep)
+app.command("calibrate")(calibrate.calibrate)
 app.command("study")(study.study)
 app.command("replay")(replay.replay)
 app.add_typer(terrain.app, name="terrain")

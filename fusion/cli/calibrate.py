@@ -1,0 +1,148 @@
+"""`terrafusion calibrate`: soil and vehicle numbers fitted to logs, with sigma and what is not told."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from terrafusion.fusion.cli.common import (
+    ColumnsOption,
+    RepairClockOption,
+    StampsOption,
+    TopicOption,
+    clock_accepted,
+    load_rig,
+    progress_bar,
+    reading,
+)
+
+if TYPE_CHECKING:
+    from terrafusion.twin.identify.coordinates import Prior
+    from terrafusion.twin.identify.result import Calibration
+
+LogsArgument = Annotated[
+    list[str], typer.Argument(metavar="LOG...", help="Log folders, bags or catalogue names of one vehicle.")
+]
+OutOption = Annotated[
+    Path, typer.Option("--out", help="Folder for calibration.json, YAML files, report.html.")
+]
+TerrainOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--terrain", metavar="SOIL|LABEL=SOIL",
+        help="Soil of all logs, by name or YAML file; or of one label (repeat). Default: the logs' labels.",
+    ),
+]  # fmt: skip
+PriorOption = Annotated[
+    list[str] | None,
+    typer.Option("--prior", metavar="NAME=VALUE+-SIGMA", help="What is known of a number; repeat for more."),
+]
+
+
+def calibrate(
+    logs: LogsArgument,
+    out: OutOption,
+    vehicle: Annotated[str, typer.Option(help="Vehicle to start from, by name or YAML file.")] = "elevate",
+    terrain: TerrainOption = None,
+    parameters: Annotated[
+        str | None, typer.Option(help="Dotted names with commas, such as soil.shear.friction_cap.")
+    ] = None,
+    prior: PriorOption = None,
+    source: Annotated[
+        str, typer.Option("--input", help="What drives the twin: auto, command, wheels.")
+    ] = "auto",
+    truth: Annotated[bool, typer.Option("--truth", help="Use the reference pose, too.")] = False,
+    robust: Annotated[bool, typer.Option("--robust", help="Weigh outliers down (Huber).")] = False,
+    channels: Annotated[str | None, typer.Option(help="Use these channels only, with commas.")] = None,
+    window_s: Annotated[float, typer.Option(help="The pose starts anew after so long.")] = 10.0,
+    slope_deg: Annotated[float, typer.Option(help="Slope of the ground, 0 to 25 deg.")] = 0.0,
+    aspect_deg: Annotated[float, typer.Option(help="The way uphill, deg from east to the left.")] = 0.0,
+    payload_kg: Annotated[float, typer.Option(help="Payload at the centre of gravity, kg.")] = 0.0,
+    topic: TopicOption = None,
+    stamps: StampsOption = "header",
+    columns: ColumnsOption = None,
+    repair_clock: RepairClockOption = False,
+) -> None:
+    """Fit soil and vehicle numbers to logs, tell how sure they are and what the logs cannot tell.
+
+    Writes calibration.json, vehicle.yaml and soil.yaml with the new numbers, and report.html.
+
+    Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
+    """
+    from terrafusion.datasets.readers import open_recordings
+    from terrafusion.fusion.calibrate_page import write_calibration
+    from terrafusion.twin.identify.calibrate import PARAMETERS
+    from terrafusion.twin.identify.calibrate import calibrate as fit
+    from terrafusion.twin.scenario import MAX_SLOPE_DEG
+
+    if not 0.0 <= slope_deg <= MAX_SLOPE_DEG:
+        raise typer.BadParameter(f"{slope_deg:g} is not in 0 to {MAX_SLOPE_DEG:g}", param_hint="--slope-deg")
+    priors = dict(parse_prior(text) for text in prior or [])
+    soils = parse_terrain(terrain)
+    options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
+    recordings = [r for log in logs for r in open_recordings(log, **options)]
+    if repair_clock:
+        recordings = [clock_accepted(r) for r in recordings]
+    with progress_bar("calibrating") as progress:
+        found = fit(
+            recordings, vehicle, soils, split(parameters) or PARAMETERS, priors=priors, source=source,
+            truth=truth, robust=robust, channels=split(channels) or None, window_s=window_s,
+            slope_deg=slope_deg, aspect_deg=aspect_deg, payload_kg=payload_kg, progress=progress,
+        )  # fmt: skip
+    command = " ".join(["terrafusion", *sys.argv[1:]])
+    write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command})
+    for line in summary(found):
+        print(line)
+    print(f"written to {out}")
+
+
+def split(text: str | None) -> tuple[str, ...]:
+    """Words between commas."""
+    return tuple(word.strip() for word in (text or "").split(",") if word.strip())
+
+
+def parse_terrain(entries: list[str] | None) -> str | dict[str, str] | None:
+    """One soil for all logs, or soils by label; a mixture of both is wrong usage (exit status 2)."""
+    entries = entries or []
+    if not any("=" in entry for entry in entries):
+        if len(entries) > 1:
+            raise typer.BadParameter("give one soil, or LABEL=SOIL for each label", param_hint="--terrain")
+        return entries[0] if entries else None
+    pairs = [entry.partition("=") for entry in entries]
+    if not all(label and soil for label, _, soil in pairs):
+        raise typer.BadParameter("give one soil, or LABEL=SOIL for each label", param_hint="--terrain")
+    return {label: soil for label, _, soil in pairs}
+
+
+def named_soils(soils: str | dict[str, str] | None, found: Calibration) -> dict[str, str]:
+    """The files or names that the soils of the calibration came from."""
+    return dict.fromkeys(found.model.soils, soils) if isinstance(soils, str) else dict(soils or {})
+
+
+def parse_prior(text: str) -> tuple[str, Prior]:
+    """`NAME=VALUE+-SIGMA`; a malformed one is wrong usage (exit status 2)."""
+    from terrafusion.twin.identify.coordinates import Prior
+
+    name, _, rest = text.partition("=")
+    value, _, sigma = rest.partition("+-")
+    try:
+        return name.strip(), Prior(float(value), float(sigma))
+    except ValueError:
+        raise typer.BadParameter(f"'{text}' is not NAME=VALUE+-SIGMA", param_hint="--prior") from None
+
+
+def summary(found: Calibration) -> list[str]:
+    """The result in a few lines of text."""
+    width = max(len(f.name) for f in found.fitted)
+    lines = [f"{len(found.sensor_errors)} logs, {found.seconds_of_data:.0f} s; {found.sentence}"]
+    for f in found.fitted:
+        status = "" if f.status == "told" else f"   {f.status}"
+        lines.append(
+            f"{f.name:{width}s}  {f.value:.5g} +- {f.sigma:.2g} {f.unit}".rstrip()
+            + f" (was {f.start:.5g}){status}"
+        )
+    lines += [direction.sentence for direction in found.identifiability.weak]
+    return lines + [f"note: {note}" for note in found.notes]

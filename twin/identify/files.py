@@ -1,0 +1,89 @@
+"""Vehicle and soil files with the calibrated numbers in place, each with where it comes from."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.twin.identify.result import Calibration, Fitted
+from terrafusion.twin.library import read_named
+
+
+def write_files(
+    calibration: Calibration,
+    out: Path,
+    vehicle: str | Path,
+    soils: Mapping[str, str | Path] | None = None,
+) -> list[Path]:
+    """Write `vehicle.yaml`, and `soil.yaml` (or `soil_NAME.yaml` for several), which load as they are.
+
+    Args:
+        out: an existing folder.
+        vehicle, soils: names or files that the calibration started from; a soil is taken by its own name
+            where it is not given.
+
+    Raises:
+        ConfigError: one of those cannot be read.
+        DataError: the folder cannot be written.
+    """
+    model, logs = calibration.model, ", ".join(calibration.sensor_errors)
+    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith("vehicle.")}
+    written = [_write(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]
+    for name, soil in model.soils.items():
+        raw, _ = read_named("soils", (soils or {}).get(name, name), kind="terrain")
+        mine = {
+            f.name.removeprefix(f"{name}."): f for f in calibration.fitted if f.name.startswith(f"{name}.")
+        }
+        target = out / ("soil.yaml" if len(model.soils) == 1 else f"soil_{name}.yaml")
+        written.append(_write(target, _updated(raw, soil, mine, logs)))
+    return written
+
+
+def _updated(raw: dict[str, Any], values: Any, fitted: Mapping[str, Fitted], logs: str) -> dict[str, Any]:
+    out = copy.deepcopy(raw)
+    _overridden(out, values)
+    for name, f in fitted.items():
+        section, parts = out, name.split(".")
+        for part in parts[:-1]:
+            section = section.setdefault(part, {})
+        section[parts[-1]] = {"value": f.value, "source": _source(f, logs)}
+    return out
+
+
+def _source(f: Fitted, logs: str) -> str:
+    if f.status == "told":
+        return f"calibrated from {logs}: 1 sigma {f.sigma:.3g}"
+    return f"{f.status} by the calibration from {logs} (1 sigma {f.sigma:.3g}); before: {f.start:.6g}"
+
+
+def _overridden(raw: dict[str, Any], values: Any) -> None:
+    """Numbers that the log itself gave go before those of the file."""
+    for name, entry in raw.items():
+        value = getattr(values, name, None)
+        if not isinstance(entry, dict) or value is None:
+            continue
+        if "value" not in entry:
+            _overridden(entry, value)
+        elif entry["value"] != (list(value) if isinstance(value, tuple) else value):
+            entry["value"] = list(value) if isinstance(value, tuple) else value
+            entry["source"] = "as the log says"
+
+
+def _write(path: Path, content: dict[str, Any]) -> Path:
+    from ruamel.yaml import YAML
+
+    yaml = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False
+    try:
+        with path.open("w", encoding="utf-8") as file:
+            yaml.dump(content, file)
+    except OSError as error:
+        raise DataError(
+            f"cannot be written: {error.strerror}", file=path, remedy="check the folder"
+        ) from None
+    return path
