@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.frames import enu_to_geodetic
 from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.twin.scenario import DriveSegment, Interval, RouteLeg, Scenario
+from terrafusion.twin.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.study.cases import UNEVEN, VEHICLE
 from terrafusion.twin.study.processing import CUTOFF_HZ, imu_speed, low_pass
@@ -48,7 +48,9 @@ FIELD_DRIVE = Scenario(
     ),
     variation=UNEVEN,
     gnss_fix=Fix.SINGLE,
-    gnss_outages=tuple(Interval(start, length) for start, length in ((52.0, 3.0), (97.0, 2.0), (176.0, 4.0))),
+    canopy=(
+        Canopy(Interval(30.0, 40.0), 0.3), Canopy(Interval(95.0, 25.0), 0.3), Canopy(Interval(165.0, 45.0), 0.3),
+    ),
 )  # fmt: skip
 HIGH_HZ = 2.0
 """Above this the robot's own speed profile holds nothing: what is faster is vibration and shock."""
