@@ -153,7 +153,8 @@ def _expressions(effects: tuple[str, ...]) -> tuple[list[Any], Any]:
         "mounting", g.quantities | dict(zip(MOUNTING, ca.vertsplit(symbols), strict=True))
     )
     read = _readings(g, g.quantities, g.wheels, mounting)
-    q = g.terms.apply("measurement", _known(g) | read)
+    felt = {f"specific_force_{axis}_mps2": read[f"accel_{axis}_mps2"] for axis in ("x", "y")}
+    q = g.terms.apply("measurement", _known(g) | felt | read)
     if g.terms.at("stamp"):
         q = g.terms.apply("stamp", q | _rates(g, q))
     return [*g.arguments, symbols], ca.vertcat(*(q[name] for name in OUTPUTS))

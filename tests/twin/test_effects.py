@@ -7,6 +7,7 @@ import functools
 import numpy as np
 import pytest
 
+from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.effects.catalogue import effect_names, forms_of
 from terrafusion.twin.effects.form import SENSOR_STAGES, STAGES
@@ -82,6 +83,21 @@ def test_every_parameter_has_one_key_and_a_range_that_holds_its_typical_size() -
             assert p.low <= 0.0 <= p.scale <= p.high, form.parameter_key(p)
         assert form.equation
         assert form.source
+
+
+def test_an_unknown_name_makes_no_graph() -> None:
+    for graph in (rhs, measurement):
+        with pytest.raises(ConfigError, match="did you mean wheel_radius/scale"):
+            graph(("wheel_radius/skale",))
+
+
+def test_a_mast_bends_with_what_it_feels_not_with_what_an_accelerometer_reads() -> None:
+    states, inputs = samples()
+    bent, biased = {"gnss_lever_arm/mast": 0.1}, {"accel_bias/constant/x": 1.0}
+    both, alone = (
+        readings(v, states, inputs)[:, OUTPUTS.index("gnss_east_m")] for v in (bent | biased, bent)
+    )
+    assert np.array_equal(both, alone)
 
 
 def test_every_stage_is_used_and_tells_what_may_be_set() -> None:

@@ -7,6 +7,8 @@ import itertools
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from terrafusion.twin.drive import told
 from terrafusion.twin.dynamics import rhs
@@ -48,6 +50,14 @@ PASSIVE = (
     "lateral_anisotropy/strength", "rate_dependent_shear/logarithmic", "soil_strength/shear",
 )  # fmt: skip
 """Forms that can only take energy out of the robot."""
+
+
+DRAGGING = (
+    "motion_resistance/ploughing", "motion_resistance/viscous", "mud_adhesion/build_up",
+    "drivetrain_friction/coulomb", "drivetrain_friction/viscous", "aerodynamic_drag/still_air",
+    "backlash/torque_gap",
+)  # fmt: skip
+"""Of these, the forms without a memory: they take power at every instant."""
 
 
 def ramped(left_mps: float, right_mps: float, seconds: float = 8.0) -> np.ndarray:
@@ -258,6 +268,29 @@ def test_passive_effects_create_no_energy(key, which) -> None:
         x = drive(at(form, which), np.zeros((301, 2)), start=start)[0]
         gained = kinetic_j(x) - kinetic_j(x)[0] - x[:, INDEX["motor_work"]]
         assert gained.max() < 1e-6
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(
+    key=st.sampled_from(DRAGGING),
+    share=st.floats(0.0, 1.0),
+    body=st.tuples(st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-2.0, 2.0)),
+    wheels=st.tuples(*[st.floats(-12.0, 12.0)] * 4),
+    torques=st.tuples(*[st.floats(-15.0, 15.0)] * 4),
+    play=st.floats(-1.0, 1.0),
+)
+def test_drag_takes_power_whatever_the_robot_does(key, share, body, wheels, torques, play) -> None:
+    """The change of the rate of kinetic energy, less that of the motors' work, is no gain."""
+    x = np.zeros((1, len(STATES)))
+    x[0, [INDEX[name] for name in BODY]] = body
+    x[0, state_slice("wheel_speed")], x[0, state_slice("torque")] = wheels, torques
+    x[0, state_slice("play")], x[0, INDEX["travel"]] = play, 3.0
+    value = share * next(p.high for form in FORMS if form.key == key for p in form.parameters)
+    change = (derivatives({key: value}, x, np.zeros((1, 4))) - derivatives({}, x, np.zeros((1, 4))))[0]
+    u, v, r = (change[INDEX[name]] * own for name, own in zip(BODY, body, strict=True))
+    power = ELEVATE.body.mass_kg * (u + v) + ELEVATE.body.yaw_inertia_kgm2 * r
+    power += ELEVATE.wheel.inertia_kgm2 * (change[state_slice("wheel_speed")] @ np.array(wheels))
+    assert power - change[INDEX["motor_work"]] < 1e-9
 
 
 def kinetic_j(x: np.ndarray) -> np.ndarray:

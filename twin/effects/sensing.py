@@ -67,7 +67,7 @@ def _resonance(q: Quantities) -> Any:
 
 
 def _bent_mast(q: Quantities, compliance: Any) -> dict[str, Any]:
-    x, y = (-compliance / GRAVITY_MPS2 * q[name] for name in ACCELS)
+    x, y = (-compliance / GRAVITY_MPS2 * q[f"specific_force_{axis}_mps2"] for axis in ("x", "y"))
     cos, sin = q["cos_yaw"], q["sin_yaw"]
     return _added(q, POSITION, (cos * x - sin * y, sin * x + cos * y))
 
