@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.recording import Fix, Recording
+from terrafusion.twin.layout import state_slice
 from terrafusion.twin.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
 from terrafusion.twin.sensing.encoders import counted
 from terrafusion.twin.sensing.gnss import LADDERS, Sky, fix_classes
 from terrafusion.twin.sensing.imu import triad
 from terrafusion.twin.sensing.noise import Noise, gauss_markov
 from terrafusion.twin.sensing.realism import GnssRealism
-from terrafusion.twin.simulate import simulate
+from terrafusion.twin.simulate import simulate, simulate_run
+from terrafusion.twin.soil import load_soil, soil_names
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 ELEVATE = load_vehicle("elevate")
@@ -104,6 +106,18 @@ def test_scale_and_misalignment_are_found_by_regression() -> None:
     ]
     fitted = np.linalg.lstsq(np.hstack([rest, np.ones((4, 1))]), np.array(felt), rcond=None)[0][:3].T
     np.testing.assert_allclose(fitted, wanted, atol=2e-3)
+
+
+@pytest.mark.parametrize("name", soil_names())
+def test_vibration_rises_with_speed_to_the_level_of_the_soil(name) -> None:
+    level = load_soil(name).vibration.accel_mps2_at_1mps * ELEVATE.realism.vibration_gain
+    for speed in (0.4, 0.8):
+        scenario = Scenario("s", 25.0, drive=(DriveSegment(25.0, v_mps=speed),))
+        run = simulate_run(scenario, terrain=name)
+        driving = slice(500, None)
+        rim = np.abs(run.states[1:][driving, state_slice("wheel_speed")]).mean() * ELEVATE.wheel.radius_m
+        felt = run.recording.imu.accel_mps2[driving, 2].std()
+        assert felt == pytest.approx(level * rim, rel=0.12)
 
 
 def test_a_sensor_saturates_at_its_range_and_counts_in_its_quantum() -> None:
