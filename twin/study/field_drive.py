@@ -49,7 +49,8 @@ FIELD_DRIVE = Scenario(
     variation=UNEVEN,
     gnss_fix=Fix.SINGLE,
     canopy=(
-        Canopy(Interval(30.0, 40.0), 0.3), Canopy(Interval(95.0, 25.0), 0.3), Canopy(Interval(165.0, 45.0), 0.3),
+        Canopy(Interval(30.0, 40.0), 0.3), Canopy(Interval(95.0, 25.0), 0.3),
+        Canopy(Interval(165.0, 45.0), 0.3),
     ),
 )  # fmt: skip
 HIGH_HZ = 2.0
