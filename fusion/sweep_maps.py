@@ -16,7 +16,7 @@ Columns = Mapping[str, NDArray[Any]]
 NUMERIC_AXES = ("friction", "slope_deg", "payload_kg", "speed_mps")
 MAX_LEVELS = 40
 """An axis with more distinct values, as in a random sweep, is cut into bins."""
-RUNS_A_CELL = 10
+RUNS_A_CELL = 20
 """Bins are as fine as leaves a cell of two such axes about so many runs."""
 
 

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin.simulate import simulate_run
+from terrafusion.twin.drive import Driven
+from terrafusion.twin.simulate import drive_through, set_up, simulate_run
 from terrafusion.twin.sweep import Sweep, load_sweep
-from terrafusion.twin.sweeping import rows as module
+from terrafusion.twin.sweeping import batch
+from terrafusion.twin.sweeping import rows as rows_module
 from terrafusion.twin.sweeping.rows import DONE, FAILED, IMMOBILISED, Row, arguments, columns, run_chunk
 
 DRIVE = """\
 drive:
-  - {duration_s: 1}
+  - {duration_s: 3}
   - {duration_s: 9, v_mps: 1.0, yaw_rate_radps: YAW}
 """
 
@@ -115,19 +117,53 @@ def test_seeds_change_sensors_only(tmp_path: Path) -> None:
 
 
 def test_a_run_that_fails_is_a_row_that_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fails_on_slopes(setup):  # type: ignore[no-untyped-def]
-        if setup.scenario.slope_deg == 5.0:
-            raise TerrafusionError("the simulation diverged", time_s=1.0)
-        if setup.scenario.slope_deg == 6.0:
+    def no_setup_at_6_deg(*args: Any, **kw: Any) -> Any:
+        if kw["slope_deg"] == 6.0:
             raise ZeroDivisionError("float division by zero")
-        return honest(setup)
+        return honest_setup(*args, **kw)
 
-    honest = module.drive_through
-    monkeypatch.setattr(module, "drive_through", fails_on_slopes)
-    found = all_rows(sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 5, 6]}"))
-    assert [row["status"] for row in found] == [DONE, FAILED, FAILED]
-    assert found[1]["error"] == "t = 1.000 s: the simulation diverged"
-    assert found[2]["error"] == "ZeroDivisionError: float division by zero"
-    assert found[1]["distance_m"] is None
-    assert found[1]["slope_deg"] == 5.0
+    def second_diverges(*args: Any, **kw: Any) -> Any:
+        motions = honest(*args, **kw)
+        if kw.get("t0_s", 0.0) == 0.0:
+            motions[1][100:] = np.nan
+        return motions
+
+    honest_setup, honest = rows_module.set_up, batch.integrate_many
+    monkeypatch.setattr(rows_module, "set_up", no_setup_at_6_deg)
+    monkeypatch.setattr(batch, "integrate_many", second_diverges)
+    found = all_rows(sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 6, 5, 4]}"))
+    assert [row["status"] for row in found] == [DONE, FAILED, FAILED, DONE]
+    assert found[1]["error"] == "ZeroDivisionError: float division by zero"
+    assert str(found[2]["error"]).startswith("t = 1.000 s: the simulation diverged")
+    assert found[2]["distance_m"] is None
+    assert found[2]["slope_deg"] == 5.0
     assert found[0]["error"] is None
+
+
+def test_where_driving_together_fails_each_run_is_driven_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def out_of_memory(*args: Any, **kw: Any) -> Any:
+        raise MemoryError
+
+    sweep = sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 5]}")
+    together = all_rows(sweep)
+    monkeypatch.setattr(batch, "integrate_many", out_of_memory)
+    assert all_rows(sweep) == together
+
+
+@pytest.mark.parametrize("scenario", ["straight", "mixed_terrain", "figure_eight", "waypoints"])
+def test_runs_side_by_side_are_the_runs_one_by_one(scenario: str, tmp_path: Path) -> None:
+    (tmp_path / "own.yaml").write_text(
+        f"scenario: {scenario}\nrandom: 5\n"
+        "axes: {friction: {from: 0.4, to: 1.0}, slope_deg: {from: 0, to: 8}, payload_kg: {from: 0, to: 60}, "
+        "speed_scale: {from: 0.5, to: 1.2}}\n"
+    )
+    sweep = load_sweep(tmp_path / "own.yaml")
+    sweep = dataclasses.replace(sweep, scenario=dataclasses.replace(sweep.scenario, duration_s=12.0))
+    setups = [set_up(**arguments(sweep, case)) for case in sweep.cases()]
+    for setup, found in zip(setups, batch.drive_many(setups), strict=True):
+        assert isinstance(found, Driven)
+        alone = drive_through(setup)
+        np.testing.assert_array_equal(found.wanted, alone.wanted)
+        np.testing.assert_allclose(found.states, alone.states, rtol=1e-9, atol=1e-12)

@@ -67,7 +67,7 @@ class Case:
     terrain: str | None = None
     friction: float | None = None
     slope_deg: float | None = None
-    payload_kg: float = 0.0
+    payload_kg: float | None = None
     speed_scale: float | None = None
     speed_mps: float | None = None
     seed: int = 0

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,24 +13,25 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.recording import Recording
-from terrafusion.twin.engine.integrate import compiled
+from terrafusion.twin.drive import Driven
 from terrafusion.twin.layout import INDEX, state_slice
-from terrafusion.twin.simulate import RunSetup, drive_through, set_up, simulate_run
+from terrafusion.twin.simulate import RunSetup, set_up, simulate_run
 from terrafusion.twin.soil import SoilParams
 from terrafusion.twin.summary import RunSummary, slip_ratios, summarise
+from terrafusion.twin.sweeping.batch import TOGETHER, attempt, drive_many
 from terrafusion.twin.sweeping.plan import Case, Sweep, at_speed, top_speed_mps
+from terrafusion.twin.validity import check_slip
 from terrafusion.twin.vehicle import VehicleParams
 
 Array = NDArray[np.float64]
 Row = dict[str, str | float | int | None]
 
-DONE, SPINNING, IMMOBILISED, SLID, FAILED = "done", "spinning", "immobilised", "slid", "failed"
+DONE, SPINNING, IMMOBILISED, SLID, FAILED = ("done", "spinning", "immobilised", "slid", "failed")
 STATUSES = (DONE, SPINNING, IMMOBILISED, SLID, FAILED)
 """How a run ended: it drove on; its wheels turned, but it made less than a tenth of its way; it came
 to rest for good; it ended behind its start, as on too steep a slope; it could not be computed."""
 MOBILE_RATIO = 0.1
-"""A robot that makes less than this share of its commanded way spins (assumed; the share falls
-from about a half to a twentieth within one step of friction or slope)."""
+"""A robot that makes less than this share of its commanded way spins (assumed)."""
 MIN_COMMANDED_M = 0.5
 """A drive that is told to cover less has no travel ratio."""
 
@@ -88,14 +88,14 @@ def columns(sensors: bool) -> tuple[Column, ...]:
     return (*_AXES, *_RESULTS, *(_SENSORS if sensors else ()), _ERROR)
 
 
-_BUILDING = threading.Lock()
-
-
 def run_chunk(sweep: Sweep, cases: Sequence[Case]) -> list[Row]:
     """The rows of some runs, in their order. A run that fails is a row that says why."""
-    with _BUILDING:  # a Dask worker may have several threads, and CasADi builds graphs in one
-        compiled()
-    return [_row(sweep, case) for case in cases]
+    rows: list[Row] = []
+    for first in range(0, len(cases), TOGETHER):
+        some = cases[first : first + TOGETHER]
+        outcomes = _with_sensors(sweep, some) if sweep.sensors else _without(sweep, some)
+        rows += [_row(sweep, case, outcome) for case, outcome in zip(some, outcomes, strict=True)]
+    return rows
 
 
 def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
@@ -123,18 +123,27 @@ def _capped(soil: SoilParams, friction: float) -> SoilParams:
     return dataclasses.replace(soil, shear=dataclasses.replace(soil.shear, friction_cap=friction))
 
 
-def _row(sweep: Sweep, case: Case) -> Row:
+def _with_sensors(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
+    def sensed(case: Case) -> Row:
+        run = simulate_run(**arguments(sweep, case))
+        row = _results(run.t_s, run.wanted, run.states, run.summary, sweep.vehicle)
+        return row | _sensor_errors(run.recording, sweep.vehicle)
+
+    return [attempt(sensed, case) for case in cases]
+
+
+def _without(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
+    setups = [attempt(lambda c: set_up(**arguments(sweep, c)), case) for case in cases]
+    return [attempt(results, *run) for run in zip(setups, drive_many(setups), strict=True)]
+
+
+def _row(sweep: Sweep, case: Case, outcome: Row | Exception) -> Row:
     row = _axes(sweep, case)
-    try:
-        if sweep.sensors:
-            run = simulate_run(**arguments(sweep, case))
-            row |= _results(run.t_s, run.states, run.wanted, run.summary, sweep.vehicle)
-            row |= _sensor_errors(run.recording, sweep.vehicle)
-        else:
-            row |= results(set_up(**arguments(sweep, case)))
-    except Exception as error:  # whatever goes wrong in one run, the others are worth having
-        told = error if isinstance(error, TerrafusionError) else f"{type(error).__name__}: {error}"
-        row |= {"status": FAILED, "error": str(told)}
+    if isinstance(outcome, Exception):
+        known = isinstance(outcome, TerrafusionError)
+        row |= {"status": FAILED, "error": str(outcome) if known else f"{type(outcome).__name__}: {outcome}"}
+    else:
+        row |= outcome
     return {column.name: _plain(row.get(column.name)) for column in columns(sweep.sensors)}
 
 
@@ -149,23 +158,23 @@ def _axes(sweep: Sweep, case: Case) -> Row:
         "terrain": " + ".join(dict.fromkeys(legs)),
         "friction": caps.pop() if len(caps) == 1 else None,
         "slope_deg": sweep.scenario.slope_deg if case.slope_deg is None else case.slope_deg,
-        "payload_kg": case.payload_kg,
+        "payload_kg": sweep.scenario.payload_kg if case.payload_kg is None else case.payload_kg,
         "speed_scale": scale,
         "speed_mps": scale * top_speed_mps(sweep.scenario),
         "seed": case.seed,
     }
 
 
-def results(setup: RunSetup) -> Row:
-    """What comes of driving a run without sensors."""
-    driven = drive_through(setup)
-    motion = setup.motion(driven.states)
+def results(setup: RunSetup, driven: Driven) -> Row:
+    """What comes of a run without sensors; the same checks as in `simulate_run`."""
+    motion = setup.motion(driven.states, driven.inputs)
     slip = slip_ratios(driven.states, motion, setup.vehicle)
+    check_slip(setup.route, setup.plant.route.field, setup.t_s, driven.states, slip)
     summary = summarise(driven, motion, setup.vehicle, slip)
-    return _results(setup.t_s, driven.states, driven.wanted, summary, setup.vehicle)
+    return _results(setup.t_s, driven.wanted, driven.states, summary, setup.vehicle)
 
 
-def _results(t_s: Array, states: Array, wanted: Array, summary: RunSummary, vehicle: VehicleParams) -> Row:
+def _results(t_s: Array, wanted: Array, states: Array, summary: RunSummary, vehicle: VehicleParams) -> Row:
     travel = float(states[-1, INDEX["travel"]])
     commanded = float(np.sum(wanted[:, 0])) * float(t_s[1] - t_s[0])
     ratio = travel / commanded if abs(commanded) >= MIN_COMMANDED_M else None
@@ -174,12 +183,12 @@ def _results(t_s: Array, states: Array, wanted: Array, summary: RunSummary, vehi
         status = IMMOBILISED
     elif ratio is not None and ratio < MOBILE_RATIO:
         status = SLID if ratio < 0.0 else SPINNING
+    turned = float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]])
     return dataclasses.asdict(summary) | {
         "status": status,
         "travel_m": travel,
         "travel_ratio": ratio,
-        "yaw_error_rad": _odometry_yaw(states, vehicle)
-        - float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]]),
+        "yaw_error_rad": _odometry_yaw(states, vehicle) - turned,
     }
 
 
@@ -193,11 +202,7 @@ def _sensor_errors(recording: Recording, vehicle: VehicleParams) -> Row:
     from terrafusion.twin.study.processing import profiles_of, speed_errors
 
     errors = speed_errors(profiles_of(recording, vehicle.odometry.wheel_radius_m))
-    return {
-        "odometry_error_pct": errors.odometry,
-        "imu_error_pct": errors.imu,
-        "gnss_error_pct": errors.gnss,
-    }
+    return {"odometry_error_pct": errors.odometry, "imu_error_pct": errors.imu, "gnss_error_pct": errors.gnss}
 
 
 def _plain(value: Any) -> Any:
