@@ -11,6 +11,7 @@ from terrafusion.twin.effects.form import Form, one
 
 Quantities = Mapping[str, Any]
 
+# Constants of the laws, assumed unless a source is given; the equations below tell them.
 AIR_KG_PER_M3 = 1.2
 WIND_MPS = 5.0
 CALM_MPS = 1e-3

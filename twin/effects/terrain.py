@@ -14,6 +14,7 @@ from terrafusion.twin.wheel import RESISTANCE_SPEED_MPS
 
 Quantities = Mapping[str, Any]
 
+# Constants of the laws, assumed unless a source is given; the equations below tell them.
 RATE_SPEED_MPS = 0.01
 """Slip speed at which a logarithmic rate law departs from its value at rest."""
 DRIFT_M, DRIFT_PLACE_M, DRIFT_S = 50.0, 20.0, 60.0

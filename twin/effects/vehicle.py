@@ -15,6 +15,7 @@ from terrafusion.twin.smooth import smooth_max
 
 Quantities = Mapping[str, Any]
 
+# Constants of the laws, assumed unless a source is given; the equations below tell them.
 SHORTEST_LAG_S = 0.002
 """A filter of the command path is this fast where its parameter is zero: no stiffer than the motor lag."""
 FRICTION_SPEED_RADPS = 0.1
@@ -104,7 +105,8 @@ FORMS = (
     ),
     Form(
         "cg_lateral", "shift", one("m", 0.02, -0.2, 0.2),
-        {"vehicle": lambda q, e: {"cg_left_m": q["cg_left_m"] + e}}, "centre of gravity e to the left",
+        {"vehicle": lambda q, e: {"cg_left_m": q["cg_left_m"] + e}},
+        "centre of gravity e to the left", "geometry",
     ),
     Form(
         "cg_lateral", "transfer", one("m", 0.1, -0.5, 0.5),
@@ -113,7 +115,8 @@ FORMS = (
     ),
     Form(
         "cg_longitudinal", "shift", one("m", 0.02, -0.2, 0.2),
-        {"vehicle": lambda q, e: {"cg_forward_m": q["cg_forward_m"] + e}}, "centre of gravity e forward",
+        {"vehicle": lambda q, e: {"cg_forward_m": q["cg_forward_m"] + e}},
+        "centre of gravity e forward", "geometry",
     ),
     Form(
         "cg_longitudinal", "transfer", one("m", 0.1, -0.5, 0.5),
