@@ -77,13 +77,19 @@ class Condition:
 
 
 def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path:
-    """A soil file in `folder`: the library's `terrain` with its numbers scattered by `SOIL_SCATTER`."""
+    """A soil file in `folder`: the library's `terrain` with its numbers scattered by `SOIL_SCATTER`.
+
+    A number stays inside the range its source covers.
+    """
     from ruamel.yaml import YAML
 
     raw = copy.deepcopy(read_named("soils", terrain, kind="terrain")[0])
     for section, ranges in SOIL_SCATTER.items():
         for key, share in ranges.items():
-            raw[section][key]["value"] *= float(rng.uniform(1.0 - share, 1.0 + share))
+            entry = raw[section][key]
+            drawn = entry["value"] * float(rng.uniform(1.0 - share, 1.0 + share))
+            low, high = entry.get("valid", (drawn, drawn))
+            entry["value"] = min(max(drawn, low), high)
     path = folder / f"{terrain}.yaml"
     with path.open("w", encoding="utf-8") as out:
         YAML(typ="safe", pure=True).dump(raw, out)
