@@ -77,9 +77,11 @@ def told(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
     rates are those of the interval that ends at the delayed time: the late
     command's derivative by the dead time is minus the rate.
     """
+    steps = np.diff(sides, axis=0, prepend=sides[:1]) / dt_s
+    if dead_time_s == 0.0:
+        return np.hstack([sides, steps])
     count = len(sides)
     at = np.arange(count) - dead_time_s / dt_s
-    steps = np.diff(sides, axis=0, prepend=sides[:1]) / dt_s
     whole = np.clip(np.ceil(at).astype(int), 0, count - 1)
     late = np.stack([np.interp(at, np.arange(count), side) for side in sides.T], axis=1)
     return np.hstack([late, np.where(at[:, None] > 0.0, steps[whole], 0.0)])

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
-from terrafusion.twin.drive import follow
+from terrafusion.twin.drive import follow, told
 
 SPEEDS = st.floats(-3.0, 3.0).map(lambda v: round(v, 2))
 
@@ -31,3 +31,12 @@ def test_following_a_goal(goal: np.ndarray, step: float, start: float) -> None:
 
 def test_a_step_is_a_ramp_that_ends_on_the_goal() -> None:
     np.testing.assert_allclose(follow(np.full(6, 1.0), 0.3, 0.0), [0.3, 0.6, 0.9, 1.0, 1.0, 1.0], atol=1e-15)
+
+
+def test_a_command_that_is_not_late_is_the_limit_of_one_that_is_hardly_late() -> None:
+    sides = np.random.default_rng(1).normal(size=(50, 2))
+    prompt = told(sides, 0.01)
+    np.testing.assert_array_equal(prompt[:, :2], sides)
+    hardly = told(sides, 0.01, 1e-12)
+    np.testing.assert_allclose(hardly[1:], prompt[1:], atol=1e-6)
+    np.testing.assert_array_equal(prompt[0, 2:], 0.0)
