@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from terrafusion.twin.drive import told
+from terrafusion.twin.engine import native
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.plant import Plant, RouteTable, SoilField
@@ -89,6 +91,18 @@ def test_compiled_and_interpreted_runs_agree_on_every_vehicle_and_soil() -> None
     c, vm = (integrate_many(x0, inputs, DT_S, some, backend=b) for b in ("c", "vm"))
     scale = np.abs(vm).max(axis=1, keepdims=True) + 1e-6
     assert (np.abs(c - vm) / scale).max() < 1e-9
+
+
+@needs_compiler
+def test_threads_do_not_disturb_each_other() -> None:
+    """A driver keeps no state between calls, and drivers may be asked for from several threads."""
+    native.forget()
+    some = plants()
+    inputs, x0 = commands(len(some)), starts(len(some))
+    with ThreadPoolExecutor(4) as pool:
+        threaded = list(pool.map(lambda k: integrate(x0[k], inputs[k], DT_S, some[k]), range(len(some))))
+    for k, plant in enumerate(some):
+        np.testing.assert_array_equal(threaded[k], integrate(x0[k], inputs[k], DT_S, plant))
 
 
 def test_no_run_is_no_work_and_misshapen_inputs_are_named() -> None:

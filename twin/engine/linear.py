@@ -43,13 +43,13 @@ def eliminated(
         before[v] = _terms(graph, v, is_wide) if is_late[v] and graph.ops[v] != INPUT else {}
         for p, c in before[v].items():
             after[p][v] = c
-    inner = {v for v in vertices if before[v] and v not in ends}
-    while inner:
-        saving, v = min((_growth(before, after, v), v) for v in inner)
-        if saving >= 0:
+    growth = {v: _growth(before, after, v) for v in vertices if before[v] and v not in ends}
+    while growth:
+        v = min(growth, key=lambda n: (growth[n], n))
+        if growth.pop(v) >= 0:
             break
-        inner.discard(v)
-        _eliminate(graph, before, after, v)
+        for n in _eliminate(graph, before, after, v) & growth.keys():
+            growth[n] = _growth(before, after, n)
     zeros = {n: graph.const(0.0) for n, some in enumerate(graph.depends(wide)) if some and not is_wide[n]}
     return _rebuilt(graph, outputs, vertices, before, zeros)
 
@@ -79,14 +79,18 @@ def _growth(before: _Edges, after: _Edges, v: int) -> int:
     return new - len(before[v]) - len(after[v])
 
 
-def _eliminate(graph: Graph, before: _Edges, after: _Edges, v: int) -> None:
+def _eliminate(graph: Graph, before: _Edges, after: _Edges, v: int) -> set[int]:
+    """Join the neighbours of a vertex; those whose `_growth` may have changed."""
+    touched = {*before[v], *after[v]}
     for s, outer in after.pop(v).items():
         del before[s][v]
         for p, inner in before[v].items():
             total = _sum(graph, before[s].get(p), _product(graph, outer, inner))
             before[s][p] = after[p][s] = total
+        touched.update(before[s])
     for p in before.pop(v):
         del after[p][v]
+    return touched
 
 
 def _rebuilt(
