@@ -1,0 +1,75 @@
+"""`terrafusion calibrate`: its files, its words, its errors."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from terrafusion.twin.soil import load_soil
+from terrafusion.twin.vehicle import load_vehicle
+
+NAMES = "soil.resistance.rolling,vehicle.wheel.radius_m,vehicle.body.cg_height_m"
+
+
+def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "fit"
+    done = terrafusion(
+        "calibrate",
+        good_log,
+        "--parameters",
+        NAMES,
+        "--prior",
+        "vehicle.wheel.radius_m=0.175+-0.01",
+        "--out",
+        out,
+    )
+    assert done.status == 0, done.err
+    assert "vehicle.body.cg_height_m is not told by this data" in done.out
+    found = json.loads((out / "calibration.json").read_text())
+    assert found["schema"] == "terrafusion.calibration/1"
+    assert found["outcome"] == "converged"
+    radius = found["parameters"]["vehicle.wheel.radius_m"]
+    assert radius["value"] == pytest.approx(0.175, abs=4.0 * radius["sigma"])
+    assert radius["unit"] == "m"
+    assert found["parameters"]["vehicle.body.cg_height_m"]["status"] == "not told"
+    assert len(found["correlation"]) == 3
+    assert load_vehicle(out / "vehicle.yaml").wheel.radius_m == radius["value"]
+    rolling = found["parameters"]["asphalt.resistance.rolling"]["value"]
+    assert load_soil(out / "soil.yaml").resistance.rolling == rolling
+    page = (out / "report.html").read_text()
+    assert "Twin against log" in page
+    assert page.count("<figure>") == 3
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--parameters", "soil.mass"), ("unknown parameter",)),
+        (("--vehicle", "nobody"), ("unknown vehicle",)),
+        (("--terrain", "cheese"), ("unknown terrain", "asphalt")),
+        (("--input", "thought"), ("unknown input",)),
+        (("--window-s", "0.1"), ("out of range",)),
+        (("--parameters", "vehicle.drive.lag_s", "--input", "wheels"), ("cannot be told",)),
+    ],
+)
+def test_one_line_errors(terrafusion, good_log: Path, tmp_path: Path, words: tuple[str, ...], told) -> None:
+    terrafusion("calibrate", good_log, "--out", tmp_path / "fit", *words).refused(*told)
+
+
+def test_no_such_log(terrafusion, tmp_path: Path) -> None:
+    terrafusion("calibrate", tmp_path / "none", "--out", tmp_path / "fit").refused("none")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--prior", "x=1"),
+        ("--prior", "x=a+-b"),
+        ("--slope-deg", "40"),
+        ("--terrain", "a=b", "--terrain", "c"),
+    ],
+)
+def test_wrong_usage(terrafusion, good_log: Path, tmp_path: Path, words: tuple[str, ...]) -> None:
+    assert terrafusion("calibrate", good_log, "--out", tmp_path / "fit", *words).status == 2
