@@ -96,8 +96,8 @@ def _agreement(rows: Sequence[Row]) -> str:
     return (
         "<h2>All statements and numbers</h2>\n"
         + _table(heads, lines, (1, 2))
-        + '<p class="dim">The verdict is computed by the criterion. Calibrated: the twin was fitted to this '
-        "number; given: it was taken over. Agreement proves little there.</p>"
+        + '<p class="dim">The verdict is computed by the criterion. Calibrated: the twin was fitted to '
+        "this, or it follows from what it was fitted to; given: taken over. Agreement proves little there.</p>"
     )
 
 

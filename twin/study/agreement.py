@@ -24,7 +24,8 @@ class Claim:
         measure: its key in the evidence.
         criterion: what decides.
         unit, digits: how its value is told.
-        basis: `PREDICTED`, or why agreement proves little: `CALIBRATED` to this, or `GIVEN` to the twin.
+        basis: `PREDICTED`, or why agreement proves little: it follows from what the twin was `CALIBRATED`
+            to, or was `GIVEN` to it.
         why: what in the twin makes it agree.
         why_not: what stands in the way where it does not; empty where it never was looked into.
     """
