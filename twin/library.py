@@ -10,6 +10,7 @@ from typing import Any
 
 from terrafusion.datasets.config import read_yaml
 from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.soil_table import is_published, published_soil
 
 
 def known_names(folder: str) -> tuple[str, ...]:
@@ -52,7 +53,10 @@ def _own_file(folder: str, name: str) -> dict[str, Any]:
 def assumed(folder: str, name_or_path: str | Path) -> tuple[int, int]:
     """How many numbers of a file are assumed by their sources, and how many it has; (0, 0) for no file."""
     try:
-        raw, _ = read_named(folder, name_or_path, kind="file")
+        if folder == "soils" and is_published(str(name_or_path)):
+            raw = published_soil(str(name_or_path))
+        else:
+            raw, _ = read_named(folder, name_or_path, kind="file")
     except ConfigError:
         return 0, 0
     sources = list(_sources(raw))
