@@ -97,7 +97,7 @@ def _agreement(rows: Sequence[Row]) -> str:
         "<h2>All statements and numbers</h2>\n"
         + _table(heads, lines, (1, 2))
         + '<p class="dim">The verdict is computed by the criterion. Calibrated: the twin was fitted to '
-        "this, or it follows from what it was fitted to; given: taken over. Agreement proves little there.</p>"
+        "this, or it follows from what it was fitted to; given: taken over. That proves little.</p>"
     )
 
 
