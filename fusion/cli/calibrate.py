@@ -61,6 +61,9 @@ def calibrate(
     slope_deg: Annotated[float, typer.Option(help="Slope of the ground, 0 to 25 deg.")] = 0.0,
     aspect_deg: Annotated[float, typer.Option(help="The way uphill, deg from east to the left.")] = 0.0,
     payload_kg: Annotated[float, typer.Option(help="Payload at the centre of gravity, kg.")] = 0.0,
+    suggest: Annotated[
+        bool, typer.Option("--suggest", help="Try drives in the twin that would tell what is left open.")
+    ] = False,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
@@ -96,6 +99,11 @@ def calibrate(
     write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command})
     for line in summary(found):
         print(line)
+    if suggest:
+        from terrafusion.twin.identify.suggest import suggest as tried
+
+        for suggestion in tried(found):
+            print(suggestion.sentence())
     print(f"written to {out}")
 
 

@@ -16,6 +16,7 @@ from terrafusion.twin.identify.files import write_files
 from terrafusion.twin.identify.log import prepare
 from terrafusion.twin.identify.model import Model, resolve
 from terrafusion.twin.identify.problem import Point, Problem
+from terrafusion.twin.identify.suggest import suggest
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import load_soil
@@ -122,6 +123,16 @@ def test_what_is_not_told_keeps_its_value() -> None:
     assert found[height].value == nominal().value(height)
     assert found[height].sigma == pytest.approx(0.1, rel=0.02)
     assert any(height in direction.sentence for direction in found.identifiability.weak)
+
+
+def test_a_slope_is_suggested_for_the_height_of_the_centre_of_gravity() -> None:
+    """On level ground the height enters no load of the quasi-static twin; on a slope it does."""
+    height = "vehicle.body.cg_height_m"
+    found = calibrate(drive(), "elevate", SOIL, (*NAMES[:2], height))
+    best = suggest(found, (("spin", 0.0), ("circle", 10.0)))
+    assert [(s.name, s.scenario, s.slope_deg) for s in best] == [(height, "circle", 10.0)]
+    assert best[0].ratio_then < 0.8 < best[0].ratio_now
+    assert "slope of 10 deg" in best[0].sentence()
 
 
 def test_two_that_act_as_one_are_told_in_combination() -> None:

@@ -76,7 +76,7 @@ def _overridden(raw: dict[str, Any], values: Any) -> None:
 def _write(path: Path, content: dict[str, Any]) -> Path:
     from ruamel.yaml import YAML
 
-    yaml = YAML(typ="safe", pure=True)
+    yaml: Any = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False
     try:
