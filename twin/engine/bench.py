@@ -17,7 +17,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -141,7 +141,7 @@ def scipy_lines() -> Iterator[Line]:
     fine = integrate(x0, u, DT_S, p, substeps=48)
     ours = path_error_m(integrate(x0, u, DT_S, p), fine)
 
-    def solve(method: str, tolerance: float) -> Array:
+    def solve(method: Any, tolerance: float) -> Array:
         def slope(at: float, x: Array) -> Array:
             i = min(int(at / DT_S), len(u) - 2)
             return f(x, u[i] + (at / DT_S - i) * (u[i + 1] - u[i]))
@@ -166,11 +166,12 @@ def _plain_rhs() -> Callable[[Array, Array], Array]:
     p, function = plant(), rhs(())
     buffer, call = function.buffer()
     x, u, dx = np.zeros(len(STATES)), np.zeros(function.size1_in("u")), np.zeros(len(STATES))
-    held = (x, u, p.vehicle.copy(), np.tile(p.route.soil[0], 4), np.zeros(0))
+    held: tuple[Any, ...] = (x, u, p.vehicle.copy(), np.tile(p.route.soil[0], 4), np.zeros(0))
     for i, array in enumerate(held):
         if array.size:
             buffer.set_arg(i, memoryview(array))
-    buffer.set_res(0, memoryview(dx))
+    result: Any = dx
+    buffer.set_res(0, memoryview(result))
 
     def slope(state: Array, command: Array) -> Array:
         x[:], u[:] = state, command
