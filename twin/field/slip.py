@@ -71,7 +71,7 @@ def _row(
         true = r.forks.motion[:, N_PAST:]
         travel = _travel(true if source == MEASURED else r.prediction, r.forks, radius_m)
         keep = np.full(len(r.forks), True) if not recording else r.forks.recording == recording
-        known = np.isfinite(true[..., 0]).all(axis=1)
+        known = np.asarray(np.isfinite(true[..., 0]).all(axis=1))
         columns: tuple[NDArray[Any], ...] = (*travel, known, r.forks.group)
         parts.append([column[keep] for column in columns])
     way, rolled, apart, turned, known, group = (np.concatenate(c) for c in zip(*parts, strict=True))
