@@ -62,11 +62,14 @@ def _accumulate(
     n = len(inputs) - 1
     out = np.full((n + 1, len(x0)), np.nan)
     out[0] = x0
+    chunks: dict[int, Any] = {}
     for first in range(0, n, _CHUNK):
         count = min(_CHUNK, n - first)
         times = t0_s + dt_s * np.arange(first, first + count)
         # mapaccum holds one column of each argument a step: what is constant is repeated by the map.
-        block = one.mapaccum("tf_chunk", count)(
+        if count not in chunks:
+            chunks[count] = one.mapaccum("tf_chunk", count)
+        block = chunks[count](
             out[first], times[None, :], inputs[first : first + count].T,
             inputs[first + 1 : first + 1 + count].T, *(_repeated(c, count) for c in constants),
         )  # fmt: skip
