@@ -9,10 +9,12 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.drive import told
+from terrafusion.twin.effects.catalogue import moves, parameters
 from terrafusion.twin.engine import native
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.plant import Plant, RouteTable, SoilField
+from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
 from terrafusion.twin.layout import INDEX, SOIL_PARAMETERS, STATES, soil_vector, vehicle_vector
 from terrafusion.twin.soil import load_soil, soil_names
 from terrafusion.twin.vehicle import load_vehicle, vehicle_names
@@ -91,6 +93,25 @@ def test_compiled_and_interpreted_runs_agree_on_every_vehicle_and_soil() -> None
     c, vm = (integrate_many(x0, inputs, DT_S, some, backend=b) for b in ("c", "vm"))
     scale = np.abs(vm).max(axis=1, keepdims=True) + 1e-6
     assert (np.abs(c - vm) / scale).max() < 1e-9
+
+
+@needs_compiler
+def test_backends_agree_with_every_effect_in_the_graph() -> None:
+    """All optional effects that move the robot at once, on one ground, over a border and in a field."""
+    values = {k: 0.2 * min(p.scale, p.high) for k, (_, p) in parameters().items() if moves(k)}
+    some = [Plant(p.vehicle, p.route, values) for p in plants()[-3:]]
+    inputs, x0 = commands(3, 2.0), starts(3)
+    c, vm = (integrate_many(x0, inputs, DT_S, some, backend=b) for b in ("c", "vm"))
+    assert (np.abs(c - vm) / (np.abs(vm).max(axis=1, keepdims=True) + 1e-6)).max() < 1e-9
+    np.testing.assert_array_equal(c[0], integrate(x0[0], inputs[0], DT_S, some[0]))
+
+    d = Directions.zeros(some[0], len(values), values)
+    for m, key in enumerate(values):
+        d.effects[key][m] = 1.0
+    few = inputs[0][:31]
+    tangents = [integrate_with_sensitivity(x0[0], few, DT_S, some[0], d, backend=b)[1] for b in ("c", "vm")]
+    scale = np.abs(tangents[1]).max(axis=0) + 1e-6
+    assert (np.abs(tangents[0] - tangents[1]) / scale).max() < 1e-9
 
 
 @needs_compiler
