@@ -58,6 +58,9 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
     numbers: list[dict[str, Any]] = []
     for name, runs in drives.runs.items():
         results = compare(runs, lambda text, name=name: progress(f"{name}: {text}"))  # type: ignore[misc]
+        scored = {str(recording) for r in results for recording in r.forks.recording}
+        few = sorted({run.recording for run in runs} - scored)
+        drives.left_out |= dict.fromkeys(few, "too few horizons of 5 s in which it drives")
         vehicle, own = runs[0].vehicle, summary.lines(name, results)
         lines += own
         forks += summary.fork_rows(name, results)
@@ -70,7 +73,10 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
     progress("")
     if not lines:
         raise DataError("no drive is long enough to compare", file=data[0], remedy="give longer logs")
-    _write(out, lines, forks, slips, numbers, drives.left_out)
+    try:
+        _write(out, lines, forks, slips, numbers, drives.left_out)
+    except OSError as error:
+        raise _unwritable(out, error) from None
     print(_report(lines, slips, drives.left_out, (SAME,)))
     print(f"all tables: {out / 'field.md'}")
 
@@ -83,7 +89,8 @@ def _report(
 ) -> str:
     parts = [f"## Trained on: {scheme}\n\n{summary.markdown(lines, scheme)}" for scheme in schemes]
     parts.append(f"## Slip and effective track\n\n{summary.slip_markdown(slips)}")
-    parts.append("## Left out\n\n" + "".join(f"- {name}: {why}\n" for name, why in left_out.items()))
+    if left_out:
+        parts.append("## Left out\n\n" + "".join(f"- {name}: {why}\n" for name, why in left_out.items()))
     return "\n".join(parts)
 
 
@@ -117,9 +124,11 @@ def _folder(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DataError(
-            f"cannot be written: {error.strerror}", file=out, remedy="give another --out"
-        ) from None
+        raise _unwritable(out, error) from None
+
+
+def _unwritable(out: Path, error: OSError) -> DataError:
+    return DataError(f"cannot be written: {error.strerror or error}", file=out, remedy="give another --out")
 
 
 def _default() -> Path:

@@ -164,7 +164,8 @@ def markdown(all_lines: Sequence[Line], scheme: str) -> str:
     rows: dict[tuple[str, str, str, str], dict[str, Line]] = {}
     for line in chosen:
         rows.setdefault((line.vehicle, line.inputs, line.ground, line.trained_on), {})[line.model] = line
-    return "\n".join(_table(rows, metric, scheme) for metric in SHOWN)
+    tables = (_table(rows, metric, scheme) for metric in SHOWN)
+    return "\n".join(table for table in tables if table)
 
 
 def _table(rows: dict[tuple[str, str, str, str], dict[str, Line]], metric: str, scheme: str) -> str:
@@ -185,7 +186,7 @@ def _table(rows: dict[tuple[str, str, str, str], dict[str, Line]], metric: str, 
                 f"{own.forks} ({own.groups})", noise, *cells, _interval(own.ratios[metric], ".2f"),
             ]
         )  # fmt: skip
-    return "".join(f"| {' | '.join(row)} |\n" for row in out)
+    return "".join(f"| {' | '.join(row)} |\n" for row in out) if len(out) > 2 else ""
 
 
 def slip_markdown(rows: Sequence[tuple[str, SlipRow]]) -> str:
