@@ -138,9 +138,10 @@ def following(u_mps: Scalar, v_mps: Scalar, wheelbase_m: Scalar, width_m: Scalar
     """Share from 0 to 1 in which an axle (`end` 1 front, -1 rear) rolls in the rut of the other.
 
     Smooth in the direction of travel. The tracks lie wheelbase * v / u apart, v the side speed midway
-    between the axles: in a steady turn the rear wheels follow, in a side-slip they do not.
+    between the axles: in a steady turn the rear wheels follow, in a side-slip they do not. The share falls
+    to a half where the tracks overlap by half a width.
     """
     speed = smooth_abs(u_mps, FOLLOWING_SPEED_MPS)
     behind = 0.5 * (1.0 - end * u_mps / speed)
-    apart = wheelbase_m * v_mps / (speed * width_m)
+    apart = 2.0 * wheelbase_m * v_mps / (speed * width_m)
     return behind * behind / (1.0 + apart * apart)

@@ -92,11 +92,15 @@ class Contact(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """Sinkage and length of the contact, m, and how much the wheel skids over it, 0 to 2."""
+    """Sinkage and length of the contact, m, and how much the wheel skids over it, 0 to 2.
+
+    `wall_m` is how deep its side stands in the ground, the rut it rolls in included.
+    """
 
     sinkage_m: Scalar
     length_m: Scalar
     skid: Scalar
+    wall_m: Scalar
 
 
 def slipping(rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar]) -> tuple[Scalar, Scalar, Scalar, Scalar]:
@@ -121,7 +125,8 @@ def footprint(
 
     z = z0 (1 - m f)(1 + k_ss d + k_sk s) + z_clog q^4: the static sinkage z0 (Bekker 1969), less what the
     wheel ahead has left to do in its rut (f = `following`, m = `multipass`), grown in proportion to the
-    driven slip d (Lyasko 2010 has 1.5 to 3 for k_ss) and to the skid s, and by clogging q.
+    driven slip d (Lyasko 2010 has 1.5 to 3 for k_ss) and to the skid s, and by clogging q. What it sinks
+    less in a rut the rut is deep already: its side meets ground as high as in fresh soil, at least.
     """
     transport = slipping(rim_mps, hub_mps)[2]
     static = tm.static_sinkage(ground.k_c, ground.k_phi, ground.exponent, load_n, shape)
@@ -130,8 +135,15 @@ def footprint(
     dug = ground.slip_sinkage * tm.driven_slip(rim_mps, hub_mps[0], transport) + ground.skid_sinkage * skid
     clog_square = clog * clog
     grown = fresh * (1.0 + dug) + ground.clog_sinkage_m * clog_square * clog_square
-    z = saturate(grown, tm.SINKAGE_LIMIT_RADII * shape.radius_m)
-    return Footprint(z, ca.sqrt(2.0 * shape.radius_m * z - z * z + ground.contact_floor_m**2), skid)
+    limit = tm.SINKAGE_LIMIT_RADII * shape.radius_m
+    z = saturate(grown, limit)
+    rut = ground.multipass * following * static * (1.0 + dug)
+    return Footprint(z, _chord(ground, z, shape), skid, saturate(grown + rut, limit))
+
+
+def _chord(ground: Ground, depth_m: Scalar, shape: WheelShape) -> Scalar:
+    """Length of the contact of a wheel that stands at a depth, m."""
+    return ca.sqrt(2.0 * shape.radius_m * depth_m - depth_m * depth_m + ground.contact_floor_m**2)
 
 
 def contact(
@@ -166,12 +178,12 @@ def contact(
     """
     u, v = hub_mps
     slip_x, slip_y, transport, slip = slipping(rim_mps, hub_mps)
-    z, length, skid = footprint(ground, load_n, rim_mps, hub_mps, clog, shape, following)
+    z, length, skid, wall = footprint(ground, load_n, rim_mps, hub_mps, clog, shape, following)
     damping = SHEAR_DAMPING_S / (1.0 + transport / SHEAR_DAMPING_FADE_MPS)
     jx = shear_m[0] + damping * slip_x
     jy = shear_m[1] + damping * slip_y
     stiffness = _shear_stiffness(ground, load_n, (jx, jy), length, shape)
-    front, side = _bulldozing(ground, z, length, shape)
+    front, side = _bulldozing(ground, (z, wall), (length, _chord(ground, wall, shape)), shape)
     traction_x = stiffness * jx
     traction_y = stiffness * jy + side * tm.mobilised(jy, ground.shear_modulus_m)
 
@@ -221,11 +233,15 @@ def _shear_stiffness(
 
 
 def _bulldozing(
-    ground: Ground, sinkage_m: Scalar, length_m: Scalar, shape: WheelShape
+    ground: Ground, depth_m: tuple[Scalar, Scalar], length_m: tuple[Scalar, Scalar], shape: WheelShape
 ) -> tuple[Scalar, Scalar]:
-    """Passive force of the soil on the wheel's front and on its side, N, where fully mobilised."""
+    """Passive force of the soil on the wheel's front and on its side, N, where fully mobilised.
+
+    Depths and contact lengths are those of front and side: in a rut the side also meets its wall.
+    """
     pressures = tm.passive_pressures(ground.cohesion_pa, ground.tan_friction, ground.unit_weight_n_per_m3)
-    front, side = tm.bulldozed(pressures, sinkage_m, length_m, shape.width_m)
+    front, _ = tm.bulldozed(pressures, depth_m[0], length_m[0], shape.width_m)
+    _, side = tm.bulldozed(pressures, depth_m[1], length_m[1], shape.width_m)
     return ground.bulldozing * front, ground.bulldozing * side
 
 

@@ -50,7 +50,7 @@ def test_traction_goes_with_the_slip_and_stays_below_its_limits(name, rim, u, v,
     wheel = steady(on, rim, (u, v), load)
     assert wheel.traction_x_n * (rim - u) >= -1e-12
     assert wheel.traction_y_n * -v >= -1e-12
-    z, length, _ = (float(x) for x in footprint(on, load, rim, (u, v), 0.0, SMOOTH))
+    z, length = (float(x) for x in footprint(on, load, rim, (u, v), 0.0, SMOOTH)[:2])
     strength = on.cohesion_pa * SMOOTH.width_m * length + load * on.tan_friction
     assert abs(wheel.traction_x_n) <= min(strength, on.friction_cap * load) * (1.0 + 1e-9)
     assert 0.0 < z <= 1.5 * SMOOTH.radius_m
@@ -162,6 +162,17 @@ def test_a_following_wheel_sinks_and_resists_less() -> None:
     bare = on._replace(multipass=0.0)
     same = [footprint(bare, LOAD_N, 1.0, (1.0, 0.0), 0.0, SMOOTH, share) for share in (0.0, 1.0)]
     assert float(same[0].sinkage_m) == float(same[1].sinkage_m)
+
+
+def test_the_wall_of_a_rut_holds_a_wheel_sideways_as_fresh_ground_does() -> None:
+    def wall_n(following: float) -> float:
+        with_it, without = (
+            contact(on, LOAD_N, 1.0, (1.0, -0.1), (0.0, 0.01), 0.0, 0.0, SMOOTH, following).traction_y_n
+            for on in (ground("loose_sand", bulldozing=6.0), ground("loose_sand", bulldozing=0.0))
+        )
+        return float(with_it) - float(without)
+
+    assert wall_n(1.0) == pytest.approx(wall_n(0.0), rel=1e-3)
 
 
 def test_grousers_pull_more_and_do_nothing_without_height_or_number() -> None:

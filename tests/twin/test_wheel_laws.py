@@ -97,7 +97,8 @@ def test_the_axle_behind_follows_and_which_one_that_is_turns_smoothly() -> None:
     assert share(1.0, 0.0, -1) == pytest.approx(1.0, abs=0.01)
     assert share(1.0, 0.0, 1) < 1e-5
     assert share(-1.0, 0.0, 1) == pytest.approx(share(1.0, 0.0, -1))
-    assert share(1.0, 0.3, -1) < 0.6
+    overlap = [0.145 * part / 0.42 for part in (0.25, 0.5, 0.75)]  # side speeds: tracks so many widths apart
+    assert [share(1.0, v, -1) for v in overlap] == pytest.approx([0.75, 0.5, 0.25], abs=0.07)
     assert share(1.0, 0.3, -1) == share(1.0, -0.3, -1)
     speeds = np.linspace(-0.5, 0.5, 101)
     assert (np.diff([share(u, 0.0, -1) for u in speeds]) > 0.0).all()
@@ -109,6 +110,19 @@ def test_saturation_is_the_identity_below_and_the_limit_above(value) -> None:
     held = float(saturate(value, 1.0))
     assert held <= min(value, 1.0) + 1e-12
     assert held >= 0.91 * min(value, 1.0)
+
+
+def test_a_cross_slope_makes_the_robot_slide_more_than_turn() -> None:
+    """The rear wheels, in the rut, hold less than the front ones: it turns uphill, but slowly."""
+    drive = Scenario("across", 8.0, drive=(DriveSegment(8.0, v_mps=1.0),), route=(RouteLeg("loose_sand"),))
+    turned = []
+    for cross in (10.0, -10.0):
+        run = simulate_run(drive, cross_slope_deg=cross, noiseless=True)
+        u, v, r = run.states[-1, 3:6]
+        assert 0.06 < -np.sign(cross) * v / u < 0.15
+        assert abs(r) < 0.03 * u
+        turned.append(r)
+    assert turned[0] == pytest.approx(-turned[1], rel=1e-6)
 
 
 def test_rear_wheels_in_the_rut_save_energy_both_ways() -> None:
