@@ -145,7 +145,8 @@ def parse_prior(text: str) -> tuple[str, Prior]:
 def summary(found: Calibration) -> list[str]:
     """The result in a few lines of text."""
     width = max(len(f.name) for f in found.fitted)
-    lines = [f"{len(found.sensor_errors)} logs, {found.seconds_of_data:.0f} s; {found.sentence}"]
+    count = len(found.sensor_errors)
+    lines = [f"{count} log{'s' if count > 1 else ''}, {found.seconds_of_data:.0f} s; {found.sentence}"]
     for f in found.fitted:
         status = "" if f.status == "told" else f"   {f.status}"
         lines.append(

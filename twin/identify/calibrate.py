@@ -142,7 +142,9 @@ def covariance_of(problem: Problem, solution: Solution) -> Array:
         return np.eye(len(problem.coordinates) + len(problem.logs) * len(problem.errors))
     modelled = np.linalg.inv(solution.normal.H)
     shown = scattered(problem, solution.blocks, solution.normal, solution.noise)
-    raised = np.sqrt(np.maximum(np.diag(shown) / np.diag(modelled), 1.0))
+    # No number is less known after the log than before it.
+    most = np.maximum(1.0 / np.diag(modelled), 1.0)
+    raised = np.sqrt(np.clip(np.diag(shown) / np.diag(modelled), 1.0, most))
     return np.asarray(modelled * np.outer(raised, raised))
 
 
