@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from html import escape
 from pathlib import Path
 
+from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion import calibrate_plots as plots
-from terrafusion.fusion.outputs import write_atomically
 from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
 from terrafusion.twin.identify.files import write_files
 from terrafusion.twin.identify.result import Calibration

@@ -15,7 +15,6 @@ from __future__ import annotations
 import dataclasses
 import json
 import math
-import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import write_tum
 from terrafusion.fusion.estimate import STATUS, Estimate, WeightChange
@@ -141,29 +140,6 @@ def write_outputs(
         "weights.jsonl": lambda path: _write_lines(path, _change_lines(estimate, recording.start_ns)),
     }
     return {name: write_atomically(directory / name, write) for name, write in writers.items()}
-
-
-def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
-    """Let `write` fill a file beside `path`, then rename it to `path`.
-
-    Raises:
-        TerrafusionError: the folder cannot be made or written.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write(temporary)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise TerrafusionError(
-            f"cannot be written: {error.strerror or error}",
-            file=path,
-            remedy="choose a folder you may write to, with room on the disk",
-        ) from None
-    finally:
-        if path.parent.is_dir():
-            temporary.unlink(missing_ok=True)
-    return path
 
 
 def finite(value: Any) -> Any:

@@ -15,7 +15,7 @@ from importlib import metadata, resources
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from terrafusion.fusion.outputs import write_atomically
+from terrafusion.datasets.atomic import write_atomically
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

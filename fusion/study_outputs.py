@@ -18,7 +18,8 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from terrafusion.fusion.outputs import finite, to_json, write_atomically
+from terrafusion.datasets.atomic import write_atomically
+from terrafusion.fusion.outputs import finite, to_json
 from terrafusion.fusion.study_page import write_study_page
 from terrafusion.twin.study.agreement import BASES, Row, counts
 from terrafusion.twin.study.batch import CellResult

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from terrafusion.fusion.outputs import write_atomically
+from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
 from terrafusion.fusion.sweep_maps import Columns, columns_of
 from terrafusion.fusion.sweep_plots import figures

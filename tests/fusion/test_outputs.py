@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
+from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.trajectory import read_tum
 from terrafusion.fusion.metrics import HeldOut, Outage, Scores, score
@@ -22,7 +23,6 @@ from terrafusion.fusion.outputs import (
     rejected_counts,
     terrain_shares,
     to_json,
-    write_atomically,
     write_outputs,
 )
 

@@ -163,7 +163,7 @@ def model_sha256() -> str:
     digest = hashlib.sha256()
     root = resources.files("terrafusion.twin")
     with resources.as_file(root) as folder:
-        files = sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c"))
+        files = sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c", ".h"))
         for file in files:
             digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
             digest.update(file.read_bytes().replace(b"\r\n", b"\n") + b"\0")

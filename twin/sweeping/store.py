@@ -10,12 +10,12 @@ A process that is killed loses the chunks it was computing, nothing else.
 from __future__ import annotations
 
 import json
-import os
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.atomic import unwritable, write_atomically
 from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.twin.sweeping.plan import Sweep, model_sha256, version
 from terrafusion.twin.sweeping.rows import Row, columns
@@ -41,7 +41,7 @@ class Store:
         try:
             (folder / PARTS_FOLDER).mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise _unwritable(folder, error) from None
+            raise unwritable(folder, error) from None
         if not self.complete():
             self._write_about(None)
 
@@ -112,7 +112,7 @@ class Store:
             "config": self.sweep.config(),
         }
         text = json.dumps(about, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-        _whole(self.folder / SWEEP_FILE, lambda part: part.write_text(text, encoding="utf-8"))
+        write_atomically(self.folder / SWEEP_FILE, lambda part: part.write_text(text, encoding="utf-8"))
 
     def _holds(self, file: Path, rows: int) -> bool:
         """Whether `file` is a whole table of this sweep with so many rows."""
@@ -138,7 +138,7 @@ class Store:
     def _write_table(self, file: Path, table: Any) -> None:
         import pyarrow.parquet as pq
 
-        _whole(file, lambda part: pq.write_table(table, part))
+        write_atomically(file, lambda part: pq.write_table(table, part))
 
 
 def _require_pyarrow() -> None:
@@ -149,23 +149,3 @@ def _require_pyarrow() -> None:
             "a sweep writes Parquet, and the package pyarrow is not installed",
             remedy="pip install 'terrafusion[parquet]'",
         ) from None
-
-
-def _whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a file beside `path`, then move it there."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        write(beside)
-        os.replace(beside, path)
-    except OSError as error:
-        raise _unwritable(path, error) from None
-    finally:
-        beside.unlink(missing_ok=True)
-
-
-def _unwritable(path: Path, error: OSError) -> TerrafusionError:
-    return TerrafusionError(
-        f"cannot be written: {error.strerror or error}",
-        file=path,
-        remedy="choose a folder you may write to, with room on the disk",
-    )

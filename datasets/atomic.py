@@ -1,0 +1,37 @@
+"""Files that appear only when they are whole."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from terrafusion.datasets.errors import TerrafusionError
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
+    """Let `write` fill a file beside `path`, then rename it to `path`; missing folders are made.
+
+    Raises:
+        TerrafusionError: the folder cannot be made or written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        if path.parent.is_dir():
+            temporary.unlink(missing_ok=True)
+    return path
+
+
+def unwritable(path: Path, error: OSError) -> TerrafusionError:
+    """The error that tells why `path` cannot be written."""
+    return TerrafusionError(
+        f"cannot be written: {error.strerror or error}",
+        file=path,
+        remedy="choose a folder you may write to, with room on the disk",
+    )
