@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.errors import ConfigError
+
 Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
@@ -162,7 +164,25 @@ def main(vehicle: str = "elevate", hours: float = 2.0, seeds: int = 4) -> list[s
     return lines
 
 
-if __name__ == "__main__":
+def command(arguments: list[str] | None = None) -> int:
+    """`python -m terrafusion.twin.allan [VEHICLE]`: 0 when done, 1 with one line for an unknown vehicle."""
+    import argparse
     import sys
 
-    print("\n".join(main(sys.argv[1] if len(sys.argv) > 1 else "elevate")))
+    parser = argparse.ArgumentParser(
+        prog="python -m terrafusion.twin.allan",
+        description="Allan deviation of a vehicle's simulated IMU: 2 h at rest, some seconds of work.",
+        epilog="example: python -m terrafusion.twin.allan elevate",
+    )
+    parser.add_argument("vehicle", nargs="?", default="elevate", help="name, or YAML file")
+    try:
+        lines = main(parser.parse_args(arguments).vehicle)
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(lines))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(command())

@@ -205,13 +205,18 @@ class Scenario:
         """The same drive with another payload, at another place, where given.
 
         Raises:
-            ConfigError: the place is not three numbers within 5 m of the body origin.
+            ConfigError: the place is not three numbers within 5 m of the body origin, or has no payload.
         """
         changed = self
         if payload_kg is not None:
             changed = dataclasses.replace(changed, payload_kg=payload_kg)
         if payload_at_m is not None:
             checked_number(payload_at_m, PLACE, file="the run", key="payload_at_m")
+            # A mass of 0 that is told is a level of a batch; one that is not was forgotten.
+            if payload_kg is None and self.payload_kg == 0.0:
+                raise ConfigError(
+                    "the payload has a place but no mass", file=self.name, remedy="give its mass in kg, too"
+                )
             changed = dataclasses.replace(changed, payload_at_m=payload_at_m)
         return changed
 

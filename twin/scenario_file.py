@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from terrafusion.datasets.config import Quantity, checked_number
+from terrafusion.datasets.config import Quantity, checked_number, shown
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Fix
 from terrafusion.twin.ground import Patches, Variation
@@ -63,8 +63,8 @@ def scenario_of(raw: dict[str, Any], file: str, stem: str) -> Scenario:
     words = ("name", "description", "route_over", "gnss_fix")
     _known(raw, (*_NUMBERS, *lists, *words, "payload_at_m", "variation", "patches"), file, "")
     values: dict[str, Any] = {
-        "name": str(raw.get("name", stem)),
-        "description": str(raw.get("description", "")),
+        "name": _text(raw, "name", stem, file),
+        "description": _text(raw, "description", "", file),
     }
     values |= {
         key: checked_number(raw[key], q, file=file, key=key) for key, q in _NUMBERS.items() if key in raw
@@ -168,7 +168,7 @@ def _section(
             raise ConfigError(f"'{key}.{name}' is missing", file=file, remedy="add it")
     for name in words:
         if not isinstance(section[name], str):
-            raise ConfigError(f"'{key}.{name}' is '{section[name]}'", file=file, remedy="give a name")
+            raise ConfigError(f"'{key}.{name}' is '{shown(section[name])}'", file=file, remedy="give a name")
     numbers = {n: checked_number(section[n], q, file=file, key=f"{key}.{n}") for n, q in quantities.items()}
     return numbers | {name: section[name] for name in words}
 
@@ -176,21 +176,32 @@ def _section(
 def _list(raw: dict[str, Any], key: str, file: str) -> list[Any]:
     value = raw.get(key, [])
     if not isinstance(value, list):
-        raise ConfigError(f"'{key}' is '{value}'", file=file, remedy="give a list")
+        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy="give a list")
     return value
 
 
 def _word(raw: dict[str, Any], key: str, allowed: tuple[str, ...], file: str) -> str:
     value = raw.get(key, allowed[0])
     if value not in allowed:
-        raise ConfigError(f"'{key}' is '{value}'", file=file, remedy=f"give one of {', '.join(allowed)}")
+        raise ConfigError(
+            f"'{key}' is '{shown(value)}'", file=file, remedy=f"give one of {', '.join(allowed)}"
+        )
     return str(value)
+
+
+def _text(raw: dict[str, Any], key: str, default: str, file: str) -> str:
+    value = raw.get(key, default)
+    if not isinstance(value, str):
+        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy="give a text")
+    return value
 
 
 def _known(row: Any, names: tuple[str, ...], file: str, here: str) -> None:
     if not isinstance(row, Mapping):
-        raise ConfigError(f"'{here}' is '{row}'", file=file, remedy=f"give a mapping of {', '.join(names)}")
+        raise ConfigError(
+            f"'{here}' is '{shown(row)}'", file=file, remedy=f"give a mapping of {', '.join(names)}"
+        )
     for name in row:
         if name not in names:
-            key = f"{here}.{name}" if here else str(name)
+            key = f"{here}.{shown(name)}" if here else shown(name)
             raise ConfigError(f"unknown key '{key}'", file=file, remedy=f"known here: {', '.join(names)}")

@@ -210,6 +210,12 @@ def _check(scenario: Scenario, vehicle: VehicleParams, seed: int) -> None:
         raise ConfigError(
             f"payload {payload:g} kg is out of range", file=vehicle.name, remedy=f"give 0 to {limit:g} kg"
         )
+    if scenario.payload_at_m is not None and scenario.payload_at_m[2] < 0.0:
+        raise ConfigError(
+            f"the payload is {-scenario.payload_at_m[2]:g} m below the ground",
+            file=scenario.name,
+            remedy="give its height above the ground, 0 to 5 m",
+        )
     best = sensors.best_fix(vehicle.sensors.gnss)
     fix = scenario.gnss_fix
     if fix is not None and not Fix.SINGLE <= fix <= best:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -100,14 +101,20 @@ def _place(text: str) -> tuple[float, float, float]:
 def summary_lines(run: SimulatedRun) -> list[str]:
     """The run in a few lines of text."""
     summary = run.summary
+    slip = _where_defined(100 * summary.mean_abs_slip, ".1f", " %", "undefined (never above 0.1 m/s)")
+    energy = _where_defined(summary.energy_per_m_j, ".0f", " J/m", "a metre undefined (less than 0.1 m)")
     return [
         run.recording.description,
         f"distance {summary.distance_m:.1f} m in {summary.duration_s:.1f} s, "
-        f"mean |slip| {100 * summary.mean_abs_slip:.1f} %, energy {summary.energy_per_m_j:.0f} J/m",
+        f"mean |slip| {slip}, energy {energy}",
         _energy_line(summary),
         _immobilised_line(summary),
         *run.recording.notes,
     ]
+
+
+def _where_defined(value: float, form: str, unit: str, otherwise: str) -> str:
+    return otherwise if math.isnan(value) else f"{value:{form}}{unit}"
 
 
 def _energy_line(summary: RunSummary) -> str:
@@ -118,7 +125,7 @@ def _energy_line(summary: RunSummary) -> str:
         "height and speed": summary.motor_work_j - summary.resistance_work_j - summary.slip_work_j,
     }
     whole = max(summary.energy_j, 1e-9)
-    shares = ", ".join(f"{100 * part / whole:.0f} % {name}" for name, part in parts.items())
+    shares = ", ".join(f"{100 * part / whole:z.0f} % {name}" for name, part in parts.items())
     return (
         f"battery {summary.energy_j / 1000:.1f} kJ, power {summary.mean_power_w:.0f} W mean, "
         f"{summary.peak_power_w:.0f} W peak: {shares}"

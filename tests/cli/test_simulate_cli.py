@@ -61,6 +61,15 @@ def test_immobilisation_is_told_with_place_and_cause(tmp_path: Path) -> None:
     assert " m: motors stalled" in done.output
 
 
+def test_what_a_turn_on_the_spot_leaves_undefined_is_told_in_words(tmp_path: Path) -> None:
+    (tmp_path / "turn.yaml").write_text("drive: [{duration_s: 4, yaw_rate_radps: 0.5}]\n")
+    done = CliRunner().invoke(app, ["simulate", "turn.yaml", "--out", "log"])
+    assert done.exit_code == 0, done.output
+    assert "mean |slip| undefined (never above 0.1 m/s), energy a metre undefined" in done.output
+    assert "nan" not in done.output
+    assert "-0 %" not in done.output
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.twin.allan import allan_deviation, expected_deviation, inertial_noise
+from terrafusion.twin.allan import allan_deviation, command, expected_deviation, inertial_noise
 from terrafusion.twin.sensing.imu import at_rest
 from terrafusion.twin.sensing.noise import Noise, flicker, white_and_walk
 from terrafusion.twin.vehicle import load_vehicle
@@ -90,3 +90,14 @@ def test_the_simulated_imu_has_the_noise_of_its_data_sheet() -> None:
 def test_too_short_a_series_is_told() -> None:
     with pytest.raises(ValueError, match="9 values are too few"):
         allan_deviation(np.zeros(9), RATE_HZ)
+
+
+def test_the_command_tells_an_unknown_vehicle_in_one_line_and_helps(capsys) -> None:
+    assert command(["nope"]) == 1
+    err = capsys.readouterr().err
+    assert err.startswith("error: unknown vehicle 'nope'; known are ")
+    assert len(err.splitlines()) == 1
+    with pytest.raises(SystemExit) as ended:
+        command(["--help"])
+    assert ended.value.code == 0
+    assert "example: python -m terrafusion.twin.allan elevate" in capsys.readouterr().out

@@ -202,6 +202,14 @@ def test_the_example_of_the_documents_drives(tmp_path) -> None:
         ("canopy: [{start_m: 0, length_m: 5, density: 2}]", r"'canopy\[0\].density' is 2, out of range"),
         ("canopy: [{start_m: 0, duration_s: 5, density: 1}]", r"unknown key 'canopy\[0\].duration_s'"),
         ("gnss_outages: [{start_m: 0}]", r"'gnss_outages\[0\].length_m' is missing"),
+        ("canopy: [[[[x]]]]", r"'canopy\[0\]' is '\[\[\[...\]\]\]'; give a mapping"),
+        ("gnss_fix: [[[[x]]]]", r"'gnss_fix' is '\[\[\[...\]\]\]'; give one of"),
+        ("name: [1, 2]", r"'name' is '\[1, 2\]'; give a text"),
+        ("description: {a: 1}", r"'description' is .*; give a text"),
+        (
+            "payload_kg: 5\npayload_at_m: [0, 0, -0.2]",
+            "the payload is 0.2 m below the ground; give its height",
+        ),
         ("gnss_outages: [5]", r"'gnss_outages\[0\]' is '5'; give a mapping"),
     ],
 )
@@ -218,6 +226,7 @@ def test_a_wrong_option_in_a_file_is_told_by_key(tmp_path, text, message) -> Non
         ({"cross_slope_deg": -26.0}, "cross-slope -26 deg is out of range; give -25 to 25 deg"),
         ({"cross_slope_deg": float("nan")}, "cross-slope nan deg is out of range"),
         ({"payload_at_m": (0.0, float("nan"), 0.0)}, "'payload_at_m' is .*nan.*, out of range"),
+        ({"payload_at_m": (0.0, 0.0, 0.3)}, "the payload has a place but no mass; give its mass"),
         ({"payload_kg": float("nan")}, "payload nan kg is out of range"),
     ],
 )
