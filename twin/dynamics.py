@@ -183,13 +183,15 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
         WheelShape(w["radius_m"], w["width_m"], w["grouser_height_m"], w["grouser_count"]), w["following"],
     )  # fmt: skip
     w |= c._asdict() | {"ground_slip": c.slip}
+    for axis in ("x", "y"):  # a term may have changed what the displacement counts, not how it is renewed
+        w[f"shear_rate_{axis}"] = w[f"slip_{axis}_mps"] - w[f"shear_{axis}"] * c.renewal_per_s
 
     w["command_radps"] = q["command_left_radps"] if side > 0 else q["command_right_radps"]
     w["loop_speed_radps"], w["d_play"] = w["wheel_speed"], 0.0
     w = terms.apply("motor", w)
     error = w["command_radps"] - w["loop_speed_radps"]
     wanted, w["d_speed_error"] = motor_torque(
-        w, w["loop_speed_radps"], error, w["speed_error"], w["voltage_share"]
+        w, w["wheel_speed"], error, w["speed_error"], w["voltage_share"]
     )
     w["d_torque"] = (wanted - w["torque"]) / w["lag_s"]
     w["current_a"] = motor_current(w, w["torque"], w["wheel_speed"])

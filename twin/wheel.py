@@ -76,7 +76,7 @@ class Contact(NamedTuple):
     resistance and drag, body axes), `traction_x_n` turns the wheel back (`traction_y_n` is its side part),
     `drag_torque_nm` brakes it. `shear_rate_x`, `shear_rate_y` are the time
     derivatives of the shear displacement, m/s, `brake_rate` that of the bristle
-    deflection behind the braking torque.
+    deflection behind the braking torque, `renewal_per_s` the rate at which the wheel meets fresh soil.
     """
 
     force_x_n: Scalar
@@ -89,6 +89,7 @@ class Contact(NamedTuple):
     slip: Scalar
     sinkage_m: Scalar
     traction_y_n: Scalar
+    renewal_per_s: Scalar
 
 
 class Footprint(NamedTuple):
@@ -206,6 +207,7 @@ def contact(
         slip=slip,
         sinkage_m=z,
         traction_y_n=traction_y,
+        renewal_per_s=transport / length,
     )
 
 

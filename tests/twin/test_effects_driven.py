@@ -148,7 +148,7 @@ SIGNS = [
     ("aerodynamic_drag/still_air", "reverse", "current_left_a", -1.0),
     ("aerodynamic_drag/wind", "straight", "current_left_a", -1.0),
 ]
-"""Form, drive on loose sand, output and the sign of its change at the end (of a step: over all of it)."""
+"""Form, drive, output and the sign of its change at the end (of a step: over all of it)."""
 
 RESTATED = [
     ("mass/at_cg", {"mass_kg": "scale", "yaw_inertia_kgm2": "scale"}),
@@ -174,8 +174,9 @@ def typical(key: str) -> dict[str, float]:
 
 @pytest.mark.parametrize(("key", "name", "output", "sign"), SIGNS)
 def test_an_effect_acts_in_the_direction_it_should(key, name, output, sign) -> None:
-    before = plain(name, "loose_sand")[2]
-    change = drive(typical(key), DRIVES[name])[2] - before
+    # On loose sand the longer arm of the thrust makes up for what a wider track turns more slowly.
+    terrain = "medium_sand" if key.startswith("track_width") else "loose_sand"
+    change = drive(typical(key), DRIVES[name], terrain)[2] - plain(name, terrain)[2]
     window = slice(None) if name == "step" else slice(-100, None)
     assert sign * change[window, Y[output]].mean() > 1e-6
 
@@ -204,6 +205,39 @@ def test_a_larger_wheel_goes_faster_and_a_false_encoder_slower_by_its_share() ->
     assert speed["wheel"] / speed["none"] == pytest.approx(1.05, rel=2e-3)
     assert speed["loop"] / speed["none"] == pytest.approx(1.0 / 1.05, rel=2e-3)
     assert y["loop"][Y["wheel_left_radps"]] == pytest.approx(y["none"][Y["wheel_left_radps"]], rel=2e-3)
+
+
+def test_ground_stiffer_sideways_lets_the_robot_slide_less_for_good() -> None:
+    on = plant("medium_sand", effects={"lateral_anisotropy/stiffness": 1.0}), plant("medium_sand")
+    inputs, aside = told(np.full((1001, 2), 5.0), DT_S), VEHICLE_PARAMETERS.index("gravity_y_mps2")
+    slides = []
+    for ground in on:
+        ground.vehicle[aside] = -1.0
+        slides.append(integrate(np.zeros(len(STATES)), inputs, DT_S, ground)[-1, INDEX["v"]])
+    assert slides[0] == pytest.approx(0.5 * slides[1], rel=0.03)
+
+
+@pytest.mark.parametrize("terrain", ["snow", "mud"])
+def test_no_form_leaves_its_law_where_wheels_turn_against_their_way(terrain) -> None:
+    against = np.zeros(len(STATES))
+    against[INDEX["u"]], against[state_slice("wheel_speed")] = 1.0, -6.0
+    for form in FORMS:
+        for end in ("low", "high"):
+            values = at(form, end)
+            dx = rhs(tuple(values))(
+                against, np.zeros(4), plant().vehicle, soil(terrain), np.array([*values.values()])
+            )
+            assert np.isfinite(dx.full()).all(), form.key
+
+
+def test_a_false_encoder_leaves_the_motors_limits_at_the_speed_the_wheel_has() -> None:
+    fast, inputs = np.zeros(len(STATES)), np.array([-50.0, -50.0, 0.0, 0.0])
+    fast[state_slice("wheel_speed")], ground = 9.0, soil("asphalt")
+    rate = [
+        rhs(names)(fast, inputs, plant().vehicle, ground, values).full()[state_slice("torque"), 0]
+        for names, values in (((), []), (("encoder_scale/in_loop",), [0.2]))
+    ]
+    np.testing.assert_allclose(rate[0], rate[1], rtol=1e-3)
 
 
 def test_dead_time_delays_the_whole_drive() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.smooth import smooth_abs
+from terrafusion.twin.smooth import saturate, smooth_abs
 from terrafusion.twin.wheel import RESISTANCE_SPEED_MPS
 
 Quantities = Mapping[str, Any]
@@ -44,6 +44,11 @@ def _compacted(q: Quantities, gain: Any) -> dict[str, Any]:
     """Ground that the wheel ahead has passed: stiffer against sinkage and in shear."""
     gain = gain * q["following"]
     return scaled_bearing(q, ca.exp(gain)) | {"shear_modulus_m": q["shear_modulus_m"] * ca.exp(-0.5 * gain)}
+
+
+def _slid(q: Quantities) -> Any:
+    """|s|, not beyond 1: a wheel that turns against its way has 2, where Bekker's law ends (n below 3)."""
+    return saturate(smooth_abs(q["slip"], 0.01) - 0.01, 1.0)
 
 
 def _slip_speed(q: Quantities) -> Any:
@@ -111,8 +116,8 @@ FORMS = (
     ),
     Form(
         "slip_sinkage", "exponent", one("", 0.1, 0.0, 0.8),
-        {"ground": lambda q, e: {"exponent": q["exponent"] + e * (smooth_abs(q["slip"], 0.01) - 0.01)}},
-        "n = n0 + e abs(s)", "Ding et al. 2010",
+        {"ground": lambda q, e: {"exponent": q["exponent"] + e * _slid(q)}},
+        "n = n0 + e abs(s), abs(s) saturating at 1", "Ding et al. 2010",
     ),
     Form(
         "rate_dependent_shear", "logarithmic", one("", 0.05, -0.15, 0.5),
