@@ -72,10 +72,6 @@ class Drive:
     max_yaw_accel_radps2: Annotated[float, Quantity("rad/s2", 0.05, 50.0)]
     no_load_current_a: Annotated[float, Quantity("A", 0.0, 100.0)] = 0.0
 
-    def torque_constant_nm_per_a(self) -> float:
-        """Motor constant, N m/A, from supply voltage and no-load speed (ideal DC motor: k_t = k_e)."""
-        return self.supply_v / self.no_load_speed_radps
-
 
 @dataclass(frozen=True)
 class Battery:

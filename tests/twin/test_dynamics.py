@@ -159,7 +159,7 @@ def test_sinkage_is_bekkers_where_nothing_saturates() -> None:
 
 def test_gearbox_takes_power_both_ways() -> None:
     p = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(ELEVATE).tolist(), strict=True))
-    k_t = ELEVATE.drive.torque_constant_nm_per_a()
+    k_t = ELEVATE.drive.supply_v / ELEVATE.drive.no_load_speed_radps
     driving, braking = (motor_current(p, np.array(tau), 8.0) for tau in (5.0, -5.0))
     assert driving == pytest.approx(5.0 / (107.2 * 0.75 * k_t), rel=1e-3)
     assert braking == pytest.approx(-5.0 * 0.75 / (107.2 * k_t), rel=1e-3)

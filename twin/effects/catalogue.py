@@ -50,11 +50,6 @@ def effect_names() -> tuple[str, ...]:
     return tuple(dict.fromkeys(form.effect for form in catalogue().values()))
 
 
-def forms_of(effect: str) -> tuple[Form, ...]:
-    """The functional forms of one effect."""
-    return tuple(form for form in catalogue().values() if form.effect == effect)
-
-
 def parameters() -> dict[str, tuple[Form, Parameter]]:
     """Every parameter by its key."""
     return {form.parameter_key(p): (form, p) for form in catalogue().values() for p in form.parameters}

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -90,8 +89,3 @@ def stopped_s(run: CaseRun) -> float:
 def between(run: CaseRun, start_s: float, end_s: float) -> NDArray[np.bool_]:
     """Samples (N,) of the run's arrays in [start_s, end_s)."""
     return (run.profiles.t_s >= start_s) & (run.profiles.t_s < end_s)
-
-
-def errors_by_seed(runs: Sequence[CaseRun], name: str) -> list[float]:
-    """One column of Tab. 4, percent, over the runs."""
-    return [getattr(run.errors, name) for run in runs]

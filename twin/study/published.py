@@ -39,9 +39,5 @@ CASES = (
 FRICTION = {"mud": (0.1, 0.2), "loose_sand": (0.4, 0.6), "medium_sand": (0.8, 1.0)}
 """Tab. 3: range of the effective friction coefficient of each terrain."""
 
-MUD_STOPS_AFTER_S = 60.0
-"""Fig. 4: on mud, odometry and truth follow the command for about this long."""
 FIELD_MEAN_MPS, FIELD_MAX_MPS = 0.9, 2.5
 """Fig. 14: ground speed of the drive on sand."""
-FIELD_ALTITUDE_M = 1.0
-"""Fig. 12: the altitude stays within about this of the GNSS origin."""
