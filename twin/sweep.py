@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.pools import open_pool
 from terrafusion.twin.sweeping.load import load_sweep, sweep_names
 from terrafusion.twin.sweeping.plan import MAX_RUNS, Case, Sweep
-from terrafusion.twin.sweeping.pools import open_pool
 from terrafusion.twin.sweeping.recordings import check_runs, write_recordings
 from terrafusion.twin.sweeping.rows import Row, run_chunk
 from terrafusion.twin.sweeping.store import RUNS_FILE, Store

@@ -18,8 +18,8 @@ from pathlib import Path
 import pytest
 
 from terrafusion.datasets.errors import ConfigError, TerrafusionError
+from terrafusion.twin import pools
 from terrafusion.twin.sweep import Sweep, load_sweep, run_sweep
-from terrafusion.twin.sweeping import pools
 
 pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
 

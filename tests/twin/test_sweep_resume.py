@@ -19,8 +19,8 @@ import pytest
 
 from terrafusion.datasets.errors import ConfigError, TerrafusionError
 from terrafusion.twin import sweep as module
+from terrafusion.twin.pools import open_pool
 from terrafusion.twin.sweep import Case, Sweep, load_sweep, read_table, run_sweep, write_recordings
-from terrafusion.twin.sweeping.pools import open_pool
 from terrafusion.twin.sweeping.rows import columns
 
 SWEEP = """\

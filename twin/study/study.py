@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.pools import open_pool
 from terrafusion.twin.study.agreement import Row, judge
 from terrafusion.twin.study.batch import CellResult, grid, run_cell, slip_cells
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
@@ -28,7 +29,6 @@ from terrafusion.twin.study.evidence import (
 from terrafusion.twin.study.field_drive import FieldDrive, drive_field
 from terrafusion.twin.study.gnss_noise import RATES_HZ, NoiseFit, NoisyRun, fit_noise
 from terrafusion.twin.study.published import CASES, Case
-from terrafusion.twin.sweeping.pools import open_pool
 
 SEEDS, QUICK_SEEDS, MOST_SEEDS = 10, 2, 1000
 STUDY_LIKE_HZ = 5.0

@@ -8,13 +8,11 @@ from __future__ import annotations
 
 import dataclasses
 import enum
-import functools
 import hashlib
 import json
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from importlib import metadata, resources
 from typing import Any
 
 import numpy as np
@@ -22,6 +20,7 @@ import numpy as np
 from terrafusion.twin.scenario import Scenario
 from terrafusion.twin.soil import SoilParams
 from terrafusion.twin.vehicle import VehicleParams
+from terrafusion.twin.version import model_sha256, version
 
 AXES = ("terrain", "friction", "slope_deg", "payload_kg", "speed_scale", "speed_mps", "seed")
 """Names of the axes, in the order of the cross product; `speed_scale` and `speed_mps` exclude each other."""
@@ -147,27 +146,6 @@ class Sweep:
             f"{self.runs} runs of {self.scenario.duration_s:g} s ({how}; {hours:.3g} h of driving), "
             f"{'with' if self.sensors else 'without'} sensors"
         )
-
-
-def version() -> str:
-    """Version of terrafusion."""
-    try:
-        return metadata.version("terrafusion")
-    except metadata.PackageNotFoundError:
-        return "not installed"
-
-
-@functools.cache
-def model_sha256() -> str:
-    """Hash of the twin's Python and C sources: runs of two versions of the model are not mixed."""
-    digest = hashlib.sha256()
-    root = resources.files("terrafusion.twin")
-    with resources.as_file(root) as folder:
-        files = sorted(p for p in folder.rglob("*") if p.suffix in (".py", ".c", ".h"))
-        for file in files:
-            digest.update(file.relative_to(folder).as_posix().encode() + b"\0")
-            digest.update(file.read_bytes().replace(b"\r\n", b"\n") + b"\0")
-    return digest.hexdigest()
 
 
 def top_speed_mps(scenario: Scenario) -> float:

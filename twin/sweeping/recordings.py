@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from terrafusion.datasets.errors import ConfigError, TerrafusionError
+from terrafusion.twin.pools import open_pool
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.sweeping.plan import Case, Sweep
-from terrafusion.twin.sweeping.pools import open_pool
 from terrafusion.twin.sweeping.rows import arguments
 
 FORMATS = ("folder", "mcap")

@@ -17,8 +17,9 @@ from typing import Any
 
 from terrafusion.datasets.atomic import unwritable, write_atomically
 from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
-from terrafusion.twin.sweeping.plan import Sweep, model_sha256, version
+from terrafusion.twin.sweeping.plan import Sweep
 from terrafusion.twin.sweeping.rows import Row, columns
+from terrafusion.twin.version import model_sha256, version
 
 SCHEMA = 1
 SWEEP_FILE, RUNS_FILE, PARTS_FOLDER = "sweep.json", "runs.parquet", "parts"

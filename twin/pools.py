@@ -21,7 +21,7 @@ from typing import Any, TypeVar
 
 from terrafusion.datasets.errors import ConfigError, TerrafusionError
 from terrafusion.twin.engine.integrate import compiled
-from terrafusion.twin.sweeping.plan import model_sha256, version
+from terrafusion.twin.version import model_sha256, version
 
 T = TypeVar("T")
 
