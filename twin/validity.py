@@ -16,7 +16,7 @@ from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.twin.engine.plant import SoilField
 from terrafusion.twin.ground import patch_share
-from terrafusion.twin.layout import INDEX
+from terrafusion.twin.layout import INDEX, state_slice
 from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import Scenario
 from terrafusion.twin.soil import SoilParams
@@ -25,8 +25,10 @@ from terrafusion.twin.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 MOVING_MPS = 0.1
+TURNING_RADPS = 0.5
+"""A robot that stands while a wheel turns faster than this is digging: its slip counts as well."""
 SLIP_SHARE = 0.01
-"""Slip may lie outside its range for this share of the moving time: corners of a command."""
+"""Slip may lie outside its range for this share of the time it moves: corners of a command."""
 
 
 def ground_pressure_pa(soil: SoilParams, radius_m: float, width_m: float, load_n: float) -> float:
@@ -90,7 +92,8 @@ def check_slip(route: Route, field: SoilField | None, t_s: Array, states: Array,
     Raises:
         ConfigError: the ground, the slip and what is allowed.
     """
-    moving = np.abs(states[:, INDEX["u"]]) > MOVING_MPS
+    turning = np.abs(states[:, state_slice("wheel_speed")]).max(axis=1) > TURNING_RADPS
+    moving = turning | (np.abs(states[:, INDEX["u"]]) > MOVING_MPS)
     patch = patch_share(field, states[:, INDEX["x"]], states[:, INDEX["y"]])
     labels = route.labels(route.along(t_s, states[:, INDEX["travel"]]), patch)
     for soil in {soil.name: soil for soil in (*route.soils, route.patch_soil) if soil is not None}.values():

@@ -9,17 +9,19 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from terrafusion.datasets.config import read_yaml
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import TERRAINS
-from terrafusion.twin.layout import SOIL_PARAMETERS, soil_vector
+from terrafusion.twin.layout import SOIL_PARAMETERS, STATES, soil_vector, state_slice
+from terrafusion.twin.route import Route
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import Validity, load_soil, soil_names
 from terrafusion.twin.soil_table import published_soils
-from terrafusion.twin.validity import check_wheel, ground_pressure_pa
+from terrafusion.twin.validity import check_slip, check_wheel, ground_pressure_pa
 from terrafusion.twin.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.wheel import Ground, WheelShape, steady_contact
 
@@ -134,6 +136,17 @@ def test_slip_beyond_what_was_measured_is_told() -> None:
         simulate_run(SHORT, soils={"loose_sand": narrow})
     wide = dataclasses.replace(sand, validity=Validity(slip=(-1.0, 1.0)))
     assert simulate_run(SHORT, soils={"loose_sand": wide}).summary.distance_m > 3.0
+
+
+def test_slip_of_a_robot_that_digs_in_on_the_spot_counts() -> None:
+    sand = load_soil("loose_sand")
+    narrow = dataclasses.replace(sand, validity=Validity(slip=(-0.8, 0.8)))
+    route = Route.of(SHORT, {"loose_sand": narrow})
+    states, slip = np.zeros((100, len(STATES))), np.ones((100, 4))
+    check_slip(route, None, np.arange(100.0), states, slip)
+    states[:, state_slice("wheel_speed")] = 5.0
+    with pytest.raises(ConfigError, match=r"slip reached 1.00 on 'loose_sand', 100 %"):
+        check_slip(route, None, np.arange(100.0), states, slip)
 
 
 @pytest.mark.parametrize("name", published_soils())
