@@ -51,6 +51,10 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
         (("--terrain", "cheese"), ("unknown terrain", "asphalt")),
         (("--input", "thought"), ("unknown input",)),
         (("--window-s", "0.1"), ("out of range",)),
+        (("--aspect-deg", "inf"), ("'aspect_deg' is inf, out of range",)),
+        (("--payload-kg", "nan"), ("'payload_kg' is nan, out of range",)),
+        (("--payload-kg", "-1"), ("'payload_kg' is -1.0, out of range",)),
+        (("--terrain", "lava=mud"), ("no log drives on 'lava'", "asphalt")),
         (("--parameters", "vehicle.drive.lag_s", "--input", "wheels"), ("cannot be told",)),
     ],
 )

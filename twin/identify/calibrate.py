@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.config import Quantity, checked_number
 from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.identify.coordinates import Coordinate, Prior
@@ -20,9 +21,11 @@ from terrafusion.twin.identify.model import Model, resolve
 from terrafusion.twin.identify.predict import FOLLOWING
 from terrafusion.twin.identify.problem import Problem
 from terrafusion.twin.identify.residuals import channel_fits
-from terrafusion.twin.identify.result import Calibration, Fitted
+from terrafusion.twin.identify.result import CONVERGED, Calibration, Fitted
 from terrafusion.twin.identify.sandwich import scattered
 from terrafusion.twin.identify.solver import OUTCOMES, Solution, solve
+from terrafusion.twin.scenario import MAX_SLOPE_DEG
+from terrafusion.twin.scenario import MAX_SLOPE_DEG
 from terrafusion.twin.soil import SoilParams, load_soil
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
 
@@ -33,6 +36,14 @@ PARAMETERS = (
     "vehicle.wheel.radius_m", "vehicle.body.track_m", "vehicle.body.mass_kg",
 )  # fmt: skip
 """What is calibrated where nothing is named."""
+
+GROUND = (
+    Quantity("deg", 0.0, MAX_SLOPE_DEG), Quantity("deg", -360.0, 360.0), Quantity("kg", 0.0, 5000.0)
+)  # fmt: skip
+"""Slope, aspect and payload that may be told, as in a scenario."""
+
+MISFIT = 5.0
+"""A channel that is off by more than this many times its noise is told of (assumed)."""
 
 Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
 
@@ -79,8 +90,13 @@ def calibrate(
         DataError: a log without what the fit needs.
         TerrafusionError: the twin diverges at the start values.
     """
-    logs_in = (recordings,) if isinstance(recordings, Recording) else tuple(recordings)
+    logs_in = _named_apart((recordings,) if isinstance(recordings, Recording) else tuple(recordings))
     _check(logs_in, source, window_s)
+    _check_load(slope_deg, aspect_deg, payload_kg)
+    for name, value, quantity in zip(
+        ("slope_deg", "aspect_deg", "payload_kg"), (slope_deg, aspect_deg, payload_kg), GROUND, strict=True
+    ):
+        checked_number(value, quantity, file="the calibration", key=name)
     start, ground = _start(logs_in, vehicle, soils, effects or {})
     start = dataclasses.replace(
         start, slope_rad=math.radians(slope_deg), aspect_rad=math.radians(aspect_deg), payload_kg=payload_kg
@@ -102,7 +118,7 @@ def calibrate(
     problem = Problem(logs, start, coordinates, robust=robust)
     solution, told = search(problem, progress)
     notes = [f"{log.name}: {note}" for log in logs for note in log.notes]
-    return _answer(problem, solution, told, [*notes, *assumptions(problem)])
+    return _answer(problem, solution, told, [*notes, *misfits(problem, solution), *assumptions(problem)])
 
 
 def search(
@@ -127,7 +143,11 @@ def search(
         again = dataclasses.replace(solution, point=dataclasses.replace(solution.point, w=w))
         second = solve(problem, free=~lost, start=again, progress=progress)
         if second.normal is not None:
-            solution = dataclasses.replace(second, first=solution.first, runs=solution.runs + second.runs)
+            # Noise and what is told come from the first search: if it did not converge, neither did the whole.
+            outcome = second.outcome if solution.outcome in CONVERGED else solution.outcome
+            solution = dataclasses.replace(
+                second, first=solution.first, runs=solution.runs + second.runs, outcome=outcome
+            )
             covariance = covariance_of(problem, solution)[:P, :P]
             told = dataclasses.replace(examine(problem.names, covariance), status=told.status)
     return solution, told
@@ -184,6 +204,16 @@ def _fitted(c: Coordinate, w: float, sigma: float, status: str, ratio: float) ->
     )  # fmt: skip
 
 
+def misfits(problem: Problem, solution: Solution) -> list[str]:
+    """Channels whose residuals are `MISFIT` times what the sensor and its scatter explain, in sentences."""
+    return [
+        f"{problem.logs[i].name}: {problem.logs[i].observed[k].channel} is off by {noise.scale:.0f} times "
+        "its noise: is it the right vehicle, ground, slope, load and frame?"
+        for (i, k), noise in solution.noise.items()
+        if noise.scale > MISFIT
+    ]
+
+
 def assumptions(problem: Problem) -> list[str]:
     """What was taken for granted, in sentences."""
     model = problem.model
@@ -213,6 +243,26 @@ def _check(recordings: tuple[Recording, ...], source: str, window_s: float) -> N
         raise ConfigError(f"a window of {window_s:g} s is out of range", remedy="give 1 to 600 s")
 
 
+def _check_load(slope_deg: float, aspect_deg: float, payload_kg: float) -> None:
+    if not (0.0 <= slope_deg <= MAX_SLOPE_DEG and math.isfinite(aspect_deg)):
+        raise ConfigError(
+            f"a slope of {slope_deg:g} deg up towards {aspect_deg:g} deg is out of range",
+            remedy=f"give a slope of 0 to {MAX_SLOPE_DEG:g} deg",
+        )
+    if not 0.0 <= payload_kg < math.inf:
+        raise ConfigError(f"a payload of {payload_kg:g} kg is out of range", remedy="give 0 or more")
+
+
+def _named_apart(recordings: tuple[Recording, ...]) -> tuple[Recording, ...]:
+    """The logs, those of one name numbered: results go by name."""
+    out: list[Recording] = []
+    for recording in recordings:
+        count = sum(r.name == recording.name for r in recordings[: len(out)])
+        name = f"{recording.name} ({count + 1})" if count else recording.name
+        out.append(dataclasses.replace(recording, name=name))
+    return tuple(out)
+
+
 def _start(
     recordings: tuple[Recording, ...],
     vehicle: str | Path | VehicleParams,
@@ -221,6 +271,12 @@ def _start(
 ) -> tuple[Model, str | None]:
     """The model to start from, and the name of the one ground where there is one for all logs."""
     loaded = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
+    for recording in recordings[1:]:
+        if recording.overrides != recordings[0].overrides:
+            raise DataError(
+                f"it tells another geometry of the vehicle than {recordings[0].name}",
+                file=recording.name, remedy="calibrate logs of one vehicle only",
+            )  # fmt: skip
     loaded = with_overrides(loaded, recordings[0].overrides)
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
@@ -231,6 +287,10 @@ def _start(
         for label in dict.fromkeys(grounds(recording, recording.start_ns)[0]):
             if label not in found:
                 found[label] = _soil(given.get(label, label), label, recording)
+    if unmet := sorted(set(given) - set(found)):
+        raise ConfigError(
+            f"no log drives on '{unmet[0]}'", channel="terrain", remedy=f"their grounds: {', '.join(found)}"
+        )
     return Model(loaded, found, dict(effects)), None
 
 
