@@ -68,6 +68,13 @@ def test_exact_data_give_the_exact_numbers() -> None:
         assert found[name].value == pytest.approx(value, rel=1e-4)
 
 
+def test_on_a_slope_the_rest_before_the_drive_is_not_believed() -> None:
+    """How brakes and motors share the weight at rest depends on what was before the log."""
+    found = calibrate(drive(noiseless=True, slope_deg=5.0), "elevate", SOIL, NAMES, slope_deg=5.0)
+    for name, value in TRUTH.items():
+        assert found[name].value == pytest.approx(value, rel=0.01)
+
+
 def test_noisy_data_give_them_within_their_sigma() -> None:
     found = calibrate(drive(), "elevate", SOIL, NAMES)
     scores = [(found[name].value - value) / found[name].sigma for name, value in TRUTH.items()]

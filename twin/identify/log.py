@@ -17,8 +17,8 @@ from terrafusion.twin.identify.observations import Observed, observe
 Array = NDArray[np.float64]
 
 START_S = 1.0
-"""The first second of a log that starts on the move is not compared: how its soil and motors were loaded
-is not known."""
+"""The first second of a log that starts on the move, or of the motion on a slope, is not compared: how soil,
+brakes and motors shared the load is not known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,8 +82,7 @@ def prepare(
         observed = tuple(o for o in observed if o.channel.startswith(channels))
     ends = [float(o.end_s[-1]) for o in observed]
     end_s = min(told.end_s(), max(ends, default=0.0))
-    moving = bool(np.abs(told.sides[0]).max() > MOVING_RADPS)
-    windows = _windows(START_S if moving else 0.0, end_s, window_s)
+    windows = _windows(_begin_s(told.sides, model.slope_rad), end_s, window_s)
     observed = tuple(filter(_enough, (_within(o, windows, told.gaps) for o in observed)))
     if not observed:
         raise DataError(
@@ -100,6 +99,14 @@ def prepare(
         recording.name, told.sides, told.follows, labels, borders, windows, start, observed, posed,
         tuple(notes),
     )  # fmt: skip
+
+
+def _begin_s(sides: Array, slope_rad: float) -> float:
+    """Time from which the log is compared; a robot at rest on the flat is loaded by nothing."""
+    moving = np.abs(sides).max(axis=1) > MOVING_RADPS
+    if moving[0]:
+        return START_S
+    return START_S + float(np.argmax(moving)) * DT_S if slope_rad > 0.0 and moving.any() else 0.0
 
 
 def grounds(recording: Recording, start_ns: int) -> tuple[tuple[str, ...], Array]:
