@@ -95,11 +95,33 @@ def scenario_of(raw: dict[str, Any], file: str, stem: str) -> Scenario:
         )
     if values["drive"] and points:
         raise ConfigError("'drive' and 'waypoints' exclude each other", file=file, remedy="keep one of them")
+    for key, missing in (("stops", "drive"), ("waypoint_speed_mps", "waypoints")):
+        if raw.get(key) and not values[missing]:
+            raise ConfigError(f"'{key}' has no effect without '{missing}'", file=file, remedy="leave it out")
     if "duration_s" not in values:
         if points:
             raise ConfigError("'duration_s' is missing", file=file, remedy="say how long the robot may take")
         values["duration_s"] = sum(segment.duration_s for segment in values["drive"])
-    return Scenario(**values)
+    scenario = Scenario(**values)
+    _check_times(scenario, file)
+    return scenario
+
+
+def _check_times(scenario: Scenario, file: str) -> None:
+    """Refuses what would begin after the drive: it would do nothing."""
+    canopy = tuple(trees.zone for trees in scenario.canopy)
+    for key, zones in (
+        ("stops", scenario.stops),
+        ("gnss_outages", scenario.gnss_outages),
+        ("canopy", canopy),
+    ):
+        for i, zone in enumerate(zones):
+            if isinstance(zone, Interval) and zone.start_s >= scenario.duration_s:
+                raise ConfigError(
+                    f"'{key}[{i}].start_s' is {zone.start_s:g}, after the drive's {scenario.duration_s:g} s",
+                    file=file,
+                    remedy="let it begin earlier, or leave it out",
+                )
 
 
 def _route(raw: dict[str, Any], over: str, file: str) -> tuple[RouteLeg, ...]:

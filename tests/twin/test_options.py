@@ -204,6 +204,10 @@ def test_the_example_of_the_documents_drives(tmp_path) -> None:
         ("gnss_outages: [{start_m: 0}]", r"'gnss_outages\[0\].length_m' is missing"),
         ("canopy: [[[[x]]]]", r"'canopy\[0\]' is '\[\[\[...\]\]\]'; give a mapping"),
         ("gnss_fix: [[[[x]]]]", r"'gnss_fix' is '\[\[\[...\]\]\]'; give one of"),
+        ("stops: [{start_s: 5, duration_s: 2}]", r"'stops\[0\].start_s' is 5, after the drive's 5 s"),
+        ("gnss_outages: [{start_s: 9, duration_s: 2}]", r"'gnss_outages\[0\].start_s' is 9, after the drive"),
+        ("canopy: [{start_s: 9, duration_s: 2, density: 1}]", r"'canopy\[0\].start_s' is 9, after the drive"),
+        ("waypoint_speed_mps: 2", "'waypoint_speed_mps' has no effect without 'waypoints'; leave it out"),
         ("name: [1, 2]", r"'name' is '\[1, 2\]'; give a text"),
         ("description: {a: 1}", r"'description' is .*; give a text"),
         (
@@ -217,6 +221,13 @@ def test_a_wrong_option_in_a_file_is_told_by_key(tmp_path, text, message) -> Non
     own = tmp_path / "own.yaml"
     own.write_text(f"drive: [{{duration_s: 5}}]\n{text}\n")
     with pytest.raises(ConfigError, match=message):
+        simulate(own)
+
+
+def test_stops_of_a_robot_that_follows_waypoints_are_refused(tmp_path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text("waypoints: [[5, 0]]\nduration_s: 9\nstops: [{start_s: 2, duration_s: 3}]\n")
+    with pytest.raises(ConfigError, match="'stops' has no effect without 'drive'"):
         simulate(own)
 
 
