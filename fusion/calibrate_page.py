@@ -9,7 +9,7 @@ from pathlib import Path
 
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion import calibrate_plots as plots
-from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
+from terrafusion.fusion.report_page import bullets, figure, table, where_from, write_page
 from terrafusion.twin.identify.files import write_files
 from terrafusion.twin.identify.result import Calibration
 
@@ -58,22 +58,17 @@ def _head(title: str, c: Calibration) -> str:
 
 
 def _numbers(c: Calibration) -> str:
-    rows = "".join(
-        f'<tr><th>{escape(f.name)}</th><td class="n">{f.start:.5g}</td><td class="n">{f.value:.5g}</td>'
-        f'<td class="n">{f.sigma:.2g}</td><td>{escape(f.unit)}</td><td class="n">{f.ratio:.3f}</td>'
-        f"<td>{escape(f.status)}{' (at the end of its range)' if f.at_bound else ''}</td></tr>"
+    rows = [
+        (
+            escape(f.name), f"{f.start:.5g}", f"{f.value:.5g}", f"{f.sigma:.2g}", escape(f.unit),
+            f"{f.ratio:.3f}", f"{escape(f.status)}{' (at the end of its range)' if f.at_bound else ''}",
+        )
         for f in c.fitted
-    )
-    head = (
-        '<th></th><th class="n">before</th><th class="n">after</th><th class="n">1 sigma</th><th>unit</th>'
-        '<th class="n">sigma after / before</th><th>told?</th>'
-    )
+    ]  # fmt: skip
+    heads = ("", "before", "after", "1 sigma", "unit", "sigma after / before", "told?")
     fig, _ = plots.plot_numbers(c)
     caption = "Each number over its prior value, with two sigma; the grey bar is two sigma of the prior."
-    return (
-        f'<h2>Numbers</h2>\n<div class="scroll"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody>'
-        f"</table></div>\n{figure(fig, caption)}"
-    )
+    return f"<h2>Numbers</h2>\n{table(heads, rows, (1, 2, 3, 5))}\n{figure(fig, caption)}"
 
 
 def _told(c: Calibration) -> str:
@@ -85,22 +80,19 @@ def _told(c: Calibration) -> str:
 
 
 def _fits(c: Calibration) -> str:
-    rows = "".join(
-        f'<tr><th>{escape(f.log)}</th><td>{escape(f.channel)}</td><td class="n">{len(f.measured)}</td>'
-        f'<td class="n">{f.rms(f.before):.3g}</td><td class="n">{f.rms(f.after):.3g}</td>'
-        f'<td class="n">{f.sigma:.3g}</td><td class="n">{f.correlation:.2f}</td>'
-        f'<td class="n">{f.left:.2f}</td><td class="n">{100.0 * f.outliers:.1f} %</td></tr>'
+    rows = [
+        (
+            escape(f.log), escape(f.channel), str(len(f.measured)), f"{f.rms(f.before):.3g}",
+            f"{f.rms(f.after):.3g}", f"{f.sigma:.3g}", f"{f.correlation:.2f}", f"{f.left:.2f}",
+            f"{100.0 * f.outliers:.1f} %",
+        )
         for f in c.channels
-    )
-    head = "".join(
-        f'<th class="n">{word}</th>'
-        for word in ("rows", "rms before", "rms after", "noise", "neighbours", "whitened", "outliers")
-    )
+    ]  # fmt: skip
+    heads = ("log", "channel", "rows", "before", "after", "noise", "neighbours", "whitened", "outliers")
     parts = [
-        '<h2>Twin against log</h2>\n<div class="scroll"><table><thead><tr><th>log</th><th>channel</th>'
-        f"{head}</tr></thead><tbody>{rows}</tbody></table></div>",
-        '<p class="dim">Noise: 1 sigma of a row, estimated. Neighbours: correlation of residuals one row '
-        "apart, and what whitening leaves of it. Outliers: beyond four sigma.</p>",
+        f"<h2>Twin against log</h2>\n{table(heads, rows, range(2, 9))}",
+        '<p class="dim">Before, after: root-mean-square residual. Noise: 1 sigma of a row, estimated. '
+        "Neighbours: correlation of residuals one row apart, and what whitening leaves of it. Outliers: beyond four sigma.</p>",
     ]
     for log in list(c.sensor_errors)[:MOST_FIGURES]:
         fig, _ = plots.plot_channels(c, log)

@@ -9,7 +9,7 @@ import base64
 import io
 import platform
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from html import escape
 from importlib import metadata, resources
 from pathlib import Path
@@ -73,6 +73,26 @@ def where_from(lines: Mapping[str, object], packages: Sequence[str] = ("gtsam", 
 def bullets(items: Iterable[str]) -> str:
     """A list of items that are HTML already."""
     return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = ()) -> str:
+    """A table with a head a row and a column.
+
+    Args:
+        heads: of the columns, plain text.
+        rows: cells that are HTML already; the first of a row is its head.
+        numbers: columns that are aligned as numbers.
+    """
+
+    def line(cells: Sequence[str], tag: str) -> str:
+        kinds = [' class="n"' if column in numbers else "" for column in range(len(cells))]
+        tags = ["th", *[tag] * (len(cells) - 1)]
+        told = (f"<{t}{kind}>{cell}</{t}>" for t, kind, cell in zip(tags, kinds, cells, strict=True))
+        return f"<tr>{''.join(told)}</tr>"
+
+    top = line([escape(head) for head in heads], "th")
+    body = "".join(line(row, "td") for row in rows)
+    return f'<div class="scroll"><table><thead>{top}</thead><tbody>{body}</tbody></table></div>'
 
 
 def figure(fig: Figure, caption: str) -> str:

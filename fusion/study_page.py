@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
 from terrafusion.fusion import study_plots as plots
 from terrafusion.fusion import study_plots_field as field
-from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
+from terrafusion.fusion.report_page import bullets, figure, table, where_from, write_page
 from terrafusion.twin.study.agreement import PREDICTED, Row, counts
 from terrafusion.twin.study.batch import CellResult
 from terrafusion.twin.study.criteria import VERDICTS
@@ -62,7 +62,7 @@ def _tab4(study: Study) -> str:
     return "\n".join(
         [
             "<h2>Tab. 4: twin / study</h2>",
-            _table(TAB4_HEAD, rows, range(1, 7)),
+            table(TAB4_HEAD, rows, range(1, 7)),
             '<p class="dim">Mean percent over moving samples, with the 95 % interval of the mean over the '
             "seeds. On even ground the motion knows no seed: slip and odometry do not scatter.</p>",
             figure(fig, "Each point is one run of the twin; the diamonds are the study's single runs."),
@@ -77,7 +77,7 @@ def _open(rows: Sequence[Row]) -> str:
         (_told(row), escape(row.study), escape(row.twin), _verdict(row), escape(row.why)) for row in found
     ]
     heads = ("statement and what is measured", "study", "twin", "verdict", "why")
-    return "<h2>What does not agree</h2>\n" + _table(heads, lines, (1, 2))
+    return "<h2>What does not agree</h2>\n" + table(heads, lines, (1, 2))
 
 
 def _agreement(rows: Sequence[Row]) -> str:
@@ -95,7 +95,7 @@ def _agreement(rows: Sequence[Row]) -> str:
     heads = ("statement and what is measured", "study", "twin", "verdict", "criterion", "why")
     return (
         "<h2>All statements and numbers</h2>\n"
-        + _table(heads, lines, (1, 2))
+        + table(heads, lines, (1, 2))
         + '<p class="dim">The verdict is computed by the criterion. Calibrated: the twin was fitted to '
         "this, or it follows from what it was fitted to; given: taken over. That proves little.</p>"
     )
@@ -123,9 +123,9 @@ def _tables(study: Study) -> str:
     return "\n".join(
         [
             "<h2>Tab. 3: effective friction</h2>",
-            _table(("terrain", "friction", "mean |s| over it, flat", "mean |s| over it, 5 deg"), tab3),
+            table(("terrain", "friction", "mean |s| over it, flat", "mean |s| over it, 5 deg"), tab3),
             "<h2>Tabs. 1 and 2: robot, sensors, profile</h2>",
-            _table(("figure", "study", "twin"), robot, (1, 2)),
+            table(("figure", "study", "twin"), robot, (1, 2)),
         ]
     )
 
@@ -238,23 +238,10 @@ def _method(study: Study) -> str:
             "<h2>How it is processed</h2>",
             bullets(escape(item) for item in items),
             '<p class="dim">Tab. 4 under other cut-offs and thresholds of motion, mean percent:</p>',
-            _table(ASSUMED_HEAD, assumed_rows(study), range(1, 10)),
+            table(ASSUMED_HEAD, assumed_rows(study), range(1, 10)),
         ]
     )
 
 
 def _figures(parts: Iterable[tuple[object, str]]) -> str:
     return "\n".join(figure(fig, caption) for fig, caption in parts)  # type: ignore[arg-type]
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = ()) -> str:
-    """A table of cells that are HTML already; `numbers` are the columns to align as such."""
-
-    def line(cells: Sequence[str], tag: str) -> str:
-        kinds = [' class="n"' if column in numbers else "" for column in range(len(cells))]
-        told = (f"<{tag}{kind}>{cell}</{tag}>" for kind, cell in zip(kinds, cells, strict=True))
-        return f"<tr>{''.join(told)}</tr>"
-
-    top = line([escape(head) for head in heads], "th")
-    body = "".join(line(row, "td") for row in rows)
-    return f'<div class="scroll"><table><thead>{top}</thead><tbody>{body}</tbody></table></div>'

@@ -11,6 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
+from terrafusion.fusion.report_page import table as page_table
 from terrafusion.fusion.sweep_maps import Columns, columns_of
 from terrafusion.fusion.sweep_plots import figures
 
@@ -85,16 +86,12 @@ def _lead(sweep: Sweep) -> str:
 
 def _outcome(columns: Columns) -> str:
     status = columns["status"]
-    rows = "".join(
-        f'<tr><th>{word}<span class="about">{meaning}</span></th><td class="n">{count}</td>'
-        f'<td class="n">{100.0 * count / len(status):.1f} %</td></tr>'
+    rows = [
+        (f'{word}<span class="about">{meaning}</span>', str(count), f"{100.0 * count / len(status):.1f} %")
         for word, meaning in MEANINGS.items()
         if (count := int((status == word).sum()))
-    )
-    return (
-        '<h2>How the runs ended</h2>\n<div class="scroll"><table><thead><tr><th></th>'
-        f'<th class="n">runs</th><th class="n">share</th></tr></thead><tbody>{rows}</tbody></table></div>'
-    )
+    ]
+    return f"<h2>How the runs ended</h2>\n{page_table(('', 'runs', 'share'), rows, (1, 2))}"
 
 
 def _numbers(columns: Columns) -> str:
@@ -103,15 +100,9 @@ def _numbers(columns: Columns) -> str:
         values = factor * columns[name][np.isfinite(columns[name])] if name in columns else np.empty(0)
         if len(values):
             cells = [*np.percentile(values, [0.0, 25.0, 50.0, 75.0, 100.0]), len(values)]
-            numbers = "".join(f'<td class="n">{value:.4g}</td>' for value in cells)
-            rows.append(f"<tr><th>{escape(label)}, {unit}</th>{numbers}</tr>")
-    heads = "".join(
-        f'<th class="n">{word}</th>' for word in ("least", "25 %", "median", "75 %", "most", "runs")
-    )
-    return (
-        f'<h2>The runs in numbers</h2>\n<div class="scroll"><table><thead><tr><th></th>{heads}</tr></thead>'
-        f"<tbody>{''.join(rows)}</tbody></table></div>\n<h2>Plots</h2>"
-    )
+            rows.append([f"{escape(label)}, {unit}", *(f"{value:.4g}" for value in cells)])
+    heads = ("", "least", "25 %", "median", "75 %", "most", "runs")
+    return f"<h2>The runs in numbers</h2>\n{page_table(heads, rows, range(1, 7))}\n<h2>Plots</h2>"
 
 
 def _failures(columns: Columns) -> str:

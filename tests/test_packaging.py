@@ -16,6 +16,12 @@ LAYERS = ("datasets", "twin", "twin.gap", "fusion")
 """Each may import only itself and what stands to its left."""
 
 
+COMMANDS = (
+    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "calibrate", "study", "replay",
+    "terrain", "policy",
+)  # fmt: skip
+
+
 def sources() -> list[Path]:
     return [path for top in ("datasets", "twin", "fusion") for path in sorted((ROOT / top).rglob("*.py"))]
 
@@ -30,6 +36,21 @@ def test_every_subpackage_is_listed() -> None:
     listed = set(tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"])
     found = {"terrafusion." + ".".join(path.parent.relative_to(ROOT).parts) for path in sources()}
     assert found == listed
+
+
+def test_every_data_file_is_listed() -> None:
+    """So is a data file that no pattern of its package names."""
+    tool = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    listed: set[Path] = set()
+    for package, patterns in tool["package-data"].items():
+        folder = ROOT.joinpath(*package.split(".")[1:])
+        listed.update(path for pattern in patterns for path in folder.glob(pattern))
+    kept = {
+        path for top in ("datasets", "twin", "fusion") for path in (ROOT / top).rglob("*") if path.is_file()
+    }
+    data = {path for path in kept if path.suffix not in (".py", ".pyc")}
+    assert data
+    assert data <= listed
 
 
 def test_data_files_are_installed() -> None:
@@ -58,7 +79,7 @@ def test_help_answers_at_once_and_lists_the_commands() -> None:
     started = time.perf_counter()
     out = subprocess.run(command, capture_output=True, text=True, check=True, env={"COLUMNS": "100"}).stdout
     took = time.perf_counter() - started
-    for name in ("demo", "inspect", "convert", "simulate", "replay", "terrain", "policy"):
+    for name in COMMANDS:
         assert name in out
     assert took < 2.0  # 0.2 s when measured alone; the bound leaves room for a busy machine
 
@@ -66,7 +87,8 @@ def test_help_answers_at_once_and_lists_the_commands() -> None:
 def test_help_does_not_import_the_heavy_packages() -> None:
     code = (
         "import sys, terrafusion.fusion.cli.main;"
-        "heavy = ('gtsam', 'casadi', 'pandas', 'matplotlib', 'scipy', 'rosbags');"
+        "heavy = ('gtsam', 'casadi', 'pandas', 'matplotlib', 'scipy', 'rosbags',"
+        " 'joblib', 'pyarrow', 'dask');"
         "print([m for m in heavy if m in sys.modules])"
     )
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
