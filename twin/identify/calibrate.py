@@ -25,7 +25,6 @@ from terrafusion.twin.identify.result import CONVERGED, Calibration, Fitted
 from terrafusion.twin.identify.sandwich import scattered
 from terrafusion.twin.identify.solver import OUTCOMES, Solution, solve
 from terrafusion.twin.scenario import MAX_SLOPE_DEG
-from terrafusion.twin.scenario import MAX_SLOPE_DEG
 from terrafusion.twin.soil import SoilParams, load_soil
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
 
@@ -92,7 +91,6 @@ def calibrate(
     """
     logs_in = _named_apart((recordings,) if isinstance(recordings, Recording) else tuple(recordings))
     _check(logs_in, source, window_s)
-    _check_load(slope_deg, aspect_deg, payload_kg)
     for name, value, quantity in zip(
         ("slope_deg", "aspect_deg", "payload_kg"), (slope_deg, aspect_deg, payload_kg), GROUND, strict=True
     ):
@@ -143,7 +141,7 @@ def search(
         again = dataclasses.replace(solution, point=dataclasses.replace(solution.point, w=w))
         second = solve(problem, free=~lost, start=again, progress=progress)
         if second.normal is not None:
-            # Noise and what is told come from the first search: if it did not converge, neither did the whole.
+            # Noise and what is told come from the first search: where it did not converge, nor did the whole.
             outcome = second.outcome if solution.outcome in CONVERGED else solution.outcome
             solution = dataclasses.replace(
                 second, first=solution.first, runs=solution.runs + second.runs, outcome=outcome
@@ -241,16 +239,6 @@ def _check(recordings: tuple[Recording, ...], source: str, window_s: float) -> N
         raise ConfigError(f"unknown input '{source}'", remedy=f"give one of {', '.join(SOURCES)}")
     if not 1.0 <= window_s <= 600.0:
         raise ConfigError(f"a window of {window_s:g} s is out of range", remedy="give 1 to 600 s")
-
-
-def _check_load(slope_deg: float, aspect_deg: float, payload_kg: float) -> None:
-    if not (0.0 <= slope_deg <= MAX_SLOPE_DEG and math.isfinite(aspect_deg)):
-        raise ConfigError(
-            f"a slope of {slope_deg:g} deg up towards {aspect_deg:g} deg is out of range",
-            remedy=f"give a slope of 0 to {MAX_SLOPE_DEG:g} deg",
-        )
-    if not 0.0 <= payload_kg < math.inf:
-        raise ConfigError(f"a payload of {payload_kg:g} kg is out of range", remedy="give 0 or more")
 
 
 def _named_apart(recordings: tuple[Recording, ...]) -> tuple[Recording, ...]:

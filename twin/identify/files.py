@@ -30,6 +30,8 @@ def write_files(
         DataError: the folder cannot be written.
     """
     model, logs = calibration.model, ", ".join(calibration.sensor_errors)
+    if not calibration.converged():
+        logs += " by a search that did not converge"
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
     mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith("vehicle.")}
     written = [_write(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]

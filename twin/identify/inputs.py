@@ -102,10 +102,18 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> Told:
     """
     command = recording.command
     assert command is not None
-    start = int(command.t_ns[0])
-    t_s: Array = (command.t_ns - start).astype(float) * 1e-9
-    twist = np.nan_to_num(np.stack([command.v_mps, command.yaw_rate_radps], axis=1))
-    ends = [int(channel.t_ns[-1]) for channel in recording.channels().values()]
+    twist = np.stack([command.v_mps, command.yaw_rate_radps], axis=1)
+    known = np.isfinite(twist).all(axis=1)
+    if known.sum() < 2:
+        raise DataError(
+            "the commands are not numbers", file=recording.name, channel="command",
+            remedy="repair them or use --input wheels",
+        )  # fmt: skip
+    twist, stamps = twist[known], command.t_ns[known]
+    start = int(stamps[0])
+    t_s: Array = (stamps - start).astype(float) * 1e-9
+    ends = [int(channel.t_ns[-1]) for channel in recording.channels().values() if len(channel)]
+    _in_one_time(recording, max(ends) - int(stamps[-1]))
     count = round((max(ends) - start) * 1e-9 / DT_S) + 1
     grid: Array = DT_S * np.arange(float(count))
     limits = np.array([vehicle.drive.max_accel_mps2, vehicle.drive.max_yaw_accel_radps2])
@@ -113,7 +121,27 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> Told:
     first = np.zeros(2) if _rests(recording, vehicle) else wanted[0]
     free = Scenario(name=recording.name, duration_s=math.inf, max_accel_mps2=math.inf)
     sides = side_speeds(limit_slew(wanted, DT_S, vehicle, free, first), vehicle)
-    return Told(start, sides, False, np.zeros((0, 2)), ())
+    gaps = _holes(t_s)
+    notes = [f"the commands have {len(gaps)} hole(s) of up to {np.diff(gaps).max():.1f} s: what falls into "
+             "them is not compared, the last command is held"] if len(gaps) else []  # fmt: skip
+    return Told(start, sides, False, gaps, tuple(notes))
+
+
+def _holes(t_s: Array) -> Array:
+    """Stretches (G, 2) without commands, where these come at a steady rate; rare ones hold until the next."""
+    if sample_interval_s(t_s) > 0.5 * LONGEST_GAP_S:
+        return np.zeros((0, 2))
+    far = np.flatnonzero(np.diff(t_s) > LONGEST_GAP_S)
+    return np.stack([t_s[far], t_s[far + 1]], axis=1)
+
+
+def _in_one_time(recording: Recording, after_ns: int) -> None:
+    """Refuse a log that goes on for a day after its last command: its clocks differ."""
+    if after_ns > 86_400 * 10**9:
+        raise DataError(
+            f"the log goes on for {after_ns * 1e-9:.0f} s after its last command: its clocks differ",
+            file=recording.name, channel="command", remedy="try --stamps receive",
+        )  # fmt: skip
 
 
 def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:

@@ -19,6 +19,8 @@ Array = NDArray[np.float64]
 START_S = 1.0
 """The first second of a log that starts on the move, or of the motion on a slope, is not compared: how soil,
 brakes and motors shared the load is not known."""
+LEAST_ROWS = 4
+"""A channel with fewer rows is left out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,7 +85,10 @@ def prepare(
     ends = [float(o.end_s[-1]) for o in observed]
     end_s = min(told.end_s(), max(ends, default=0.0))
     windows = _windows(_begin_s(told.sides, model.slope_rad), end_s, window_s)
+    named = [o.channel for o in observed]
     observed = tuple(filter(_enough, (_within(o, windows, told.gaps) for o in observed)))
+    if lost := [name for name in named if name not in {o.channel for o in observed}]:
+        notes.append(f"left out, with less than {LEAST_ROWS} rows while the twin drives: {', '.join(lost)}")
     if not observed:
         raise DataError(
             "nothing in the log can be compared with the twin",
@@ -149,4 +154,4 @@ def window_of(observed: Observed, windows: NDArray[np.int64]) -> NDArray[np.int6
 
 
 def _enough(observed: Observed) -> bool:
-    return len(observed.value) >= 4
+    return len(observed.value) >= LEAST_ROWS

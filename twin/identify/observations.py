@@ -201,6 +201,8 @@ def _gnss(recording: Recording, vehicle: VehicleParams, start_ns: int) -> list[O
 def _instants(
     channel: str, t_s: Array, values: Array, sigma: Array, correlation: tuple[float, float] | None
 ) -> Observed:
+    known = np.isfinite(values)
+    t_s, values, sigma = t_s[known], values[known], sigma[known]
     slot_s = sample_interval_s(t_s) if len(t_s) > 1 else 1.0
     slots = np.round(t_s / max(slot_s, 1e-6)).astype(np.int64)
     rows = Observed(channel, t_s, t_s, values, sigma, slots, slot_s, LEAST_SHARE, correlation)
@@ -219,7 +221,8 @@ def _truth(recording: Recording, start_ns: int) -> list[Observed]:
             sigma = np.full(len(t_s), TRUTH_SIGMA[0])
             found.append(_instants(name, t_s, truth.position_m[:, i], sigma, None))
     if truth.quaternion is not None and ("yaw" in holds or "orientation" in holds):
-        forward = quaternion_to_matrix(truth.quaternion)[:, :, 0]
+        seen = np.isfinite(truth.quaternion).all(axis=1)
+        forward = quaternion_to_matrix(truth.quaternion[seen])[:, :, 0]
         yaw = np.unwrap(np.arctan2(forward[:, 1], forward[:, 0]))
-        found.append(_instants("truth_yaw_rad", t_s, yaw, np.full(len(t_s), TRUTH_SIGMA[1]), None))
+        found.append(_instants("truth_yaw_rad", t_s[seen], yaw, np.full(len(yaw), TRUTH_SIGMA[1]), None))
     return found

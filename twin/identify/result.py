@@ -14,6 +14,8 @@ from terrafusion.twin.identify.model import Model
 Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.calibration/1"
+CONVERGED = ("converged", "at_bound")
+"""Outcomes of a search that came to its end."""
 
 
 @dataclass(frozen=True)
@@ -113,8 +115,8 @@ class Calibration:
         return len(self.model.soils) == 1 and f"soil.{spelt.partition('.')[2]}" == name
 
     def converged(self) -> bool:
-        """Whether the search came to its end."""
-        return self.outcome in ("converged", "at_bound")
+        """Whether the search came to its end; if not, values and sigma are not to be trusted."""
+        return self.outcome in CONVERGED
 
     def untold(self) -> tuple[Fitted, ...]:
         """Numbers that the data do not tell by themselves."""
@@ -130,8 +132,9 @@ class Calibration:
             "seconds": round(self.seconds_of_data, 3),
             "outcome": self.outcome,
             "sentence": self.sentence,
+            "converged": self.converged(),
             "runs": self.runs,
-            "parameters": {f.name: _entry(f) for f in self.fitted},
+            "parameters": {f.name: _entry(f, self.converged()) for f in self.fitted},
             "order": [f.name for f in self.fitted],
             "correlation": self.correlation.tolist(),
             "covariance": self.covariance.tolist(),
@@ -159,9 +162,9 @@ class Calibration:
         }  # fmt: skip
 
 
-def _entry(f: Fitted) -> dict[str, Any]:
+def _entry(f: Fitted, converged: bool) -> dict[str, Any]:
     return {
         "value": f.value, "sigma": f.sigma, "unit": f.unit, "interval_2_sigma": [f.low, f.high],
         "start": f.start, "prior": f.prior, "prior_sigma": f.prior_sigma, "status": f.status,
-        "posterior_over_prior": f.ratio, "at_bound": f.at_bound,
+        "posterior_over_prior": f.ratio, "at_bound": f.at_bound, "sigma_valid": converged,
     }  # fmt: skip

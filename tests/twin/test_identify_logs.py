@@ -1,0 +1,136 @@
+"""Calibration of logs that are not plain: several grounds, a reference, effects, holes, other clocks."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.recording import Overrides, Recording
+from terrafusion.twin.identify import solver
+from terrafusion.twin.identify.calibrate import calibrate
+from terrafusion.twin.identify.files import write_files
+from terrafusion.twin.identify.model import Model
+from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate_run
+from terrafusion.twin.soil import load_soil
+from terrafusion.twin.vehicle import load_vehicle
+
+SOIL, OTHER = "loose_sand", "asphalt"
+SHEAR = f"{SOIL}.shear.shear_modulus_m"
+NAMES = (SHEAR, "vehicle.wheel.radius_m", "vehicle.body.mass_kg")
+DRIVE = Scenario(
+    "short", 15.0, route=(RouteLeg(SOIL),),
+    drive=(DriveSegment(1.0), DriveSegment(7.0, 0.8, 0.4), DriveSegment(7.0, 1.2, -0.5)),
+)  # fmt: skip
+TRUTH = {SHEAR: 0.013, "vehicle.wheel.radius_m": 0.18, "vehicle.body.mass_kg": 36.0}
+
+
+@functools.cache
+def drive(*, effect: tuple[str, float] | None = None) -> Recording:
+    """The short drive with `TRUTH`."""
+    model = Model(load_vehicle("elevate"), {SOIL: load_soil(SOIL)}).replaced(TRUTH)
+    effects = dict([effect]) if effect else {}
+    return simulate_run(DRIVE, vehicle=model.vehicle, soils=model.soils, seed=3, effects=effects).recording
+
+
+def scores(found, truth) -> list[float]:
+    return [(found[name].value - value) / found[name].sigma for name, value in truth.items()]
+
+
+def test_two_labelled_grounds_in_one_log() -> None:
+    truth = {SHEAR: 0.02, f"{OTHER}.shear.shear_modulus_m": 0.003, "vehicle.wheel.radius_m": 0.18}
+    model = Model(load_vehicle("elevate"), {name: load_soil(name) for name in (SOIL, OTHER)})
+    model = model.replaced(truth)
+    legs = (RouteLeg(SOIL, 10.0), RouteLeg(OTHER))
+    turns = (DriveSegment(1.0), DriveSegment(12.0, 1.0, 0.4), DriveSegment(11.0, 1.2, -0.5))
+    run = simulate_run(
+        Scenario("two", 24.0, route=legs, drive=turns), vehicle=model.vehicle, soils=model.soils, seed=2
+    )
+    found = calibrate(run.recording, "elevate", None, ("soil.shear.shear_modulus_m", *NAMES[1:2]))
+    assert found.converged()
+    assert [f.name for f in found.fitted] == list(truth)
+    assert all(f.status == "told" for f in found.fitted)
+    assert np.max(np.abs(scores(found, truth))) < 3.5
+
+
+def test_a_reference_pose_sharpens() -> None:
+    blind, seeing = (calibrate(drive(), "elevate", SOIL, NAMES, truth=truth) for truth in (False, True))
+    assert any(c.channel == "truth_yaw_rad" for c in seeing.channels)
+    for name, value in TRUTH.items():
+        assert seeing[name].sigma < blind[name].sigma
+        assert seeing[name].value == pytest.approx(value, rel=1e-4)
+
+
+def test_an_effect_is_a_parameter() -> None:
+    key, value = "drivetrain_friction/coulomb", 1.5
+    found = calibrate(drive(effect=(key, value)), "elevate", SOIL, (*NAMES[:2], f"effects.{key}"))
+    truth = {**{name: TRUTH[name] for name in NAMES[:2]}, f"effects.{key}": value}
+    assert found.converged()
+    assert found[f"effects.{key}"].status == "told"
+    assert np.max(np.abs([scores(found, truth)])) < 60.0
+
+
+@pytest.mark.parametrize("field", ["position_m", "quaternion"])
+def test_holes_in_the_reference_are_left_out(field: str) -> None:
+    reference = drive().truth
+    assert reference is not None
+    spoilt = getattr(reference, field).copy()
+    spoilt[500:600] = np.nan
+    log = dataclasses.replace(drive(), truth=dataclasses.replace(reference, **{field: spoilt}))
+    found = calibrate(log, "elevate", SOIL, NAMES, truth=True)
+    assert found[SHEAR].value == pytest.approx(TRUTH[SHEAR], rel=1e-4)
+
+
+def test_unknown_commands_are_a_hole_and_not_a_stop() -> None:
+    command = drive().command
+    assert command is not None
+    v = command.v_mps.copy()
+    v[100:300] = np.nan
+    log = dataclasses.replace(drive(), command=dataclasses.replace(command, v_mps=v))
+    found = calibrate(log, "elevate", SOIL, NAMES)
+    assert any("1 hole(s) of up to 4" in note for note in found.notes)
+    assert np.max(np.abs(scores(found, TRUTH))) < 3.5
+    v[:] = np.nan
+    with pytest.raises(DataError, match="not numbers"):
+        calibrate(log, "elevate", SOIL, NAMES)
+
+
+def test_other_clocks_are_told_or_refused() -> None:
+    gnss = drive().gnss
+    assert gnss is not None
+    late, early = (
+        dataclasses.replace(drive(), gnss=dataclasses.replace(gnss, t_ns=gnss.t_ns + way * 10**15))
+        for way in (1, -1)
+    )
+    with pytest.raises(DataError, match="clocks differ"):
+        calibrate(late, "elevate", SOIL, NAMES)
+    assert any("gnss_east_m" in note for note in calibrate(early, "elevate", SOIL, NAMES).notes)
+
+
+def test_a_wrong_vehicle_is_told_of() -> None:
+    right, wrong = (calibrate(drive(), name, SOIL, NAMES) for name in ("elevate", "husky"))
+    assert not any("times its noise" in note for note in right.notes)
+    assert any("current_left_a is off by" in note for note in wrong.notes)
+
+
+def test_logs_of_one_name_stay_apart_and_geometries_agree() -> None:
+    found = calibrate([drive(), drive()], "elevate", SOIL, NAMES)
+    assert list(found.sensor_errors) == ["short", "short (2)"]
+    assert len({(c.log, c.channel) for c in found.channels}) == len(found.channels)
+    other = dataclasses.replace(drive(), name="other", overrides=Overrides(track_m=0.5))
+    with pytest.raises(DataError, match="another geometry"):
+        calibrate([drive(), other], "elevate", SOIL, NAMES)
+
+
+def test_a_search_that_is_cut_short_says_so_everywhere(monkeypatch, tmp_path) -> None:
+    monkeypatch.setattr(solver, "MAX_RUNS", 2)
+    found = calibrate(drive(), "elevate", SOIL, (*NAMES, "vehicle.body.cg_height_m"))
+    said = found.as_dict()
+    assert (found.outcome, said["converged"]) == ("too_long", False)
+    assert not any(entry["sigma_valid"] for entry in said["parameters"].values())
+    write_files(found, tmp_path, "elevate")
+    assert "did not converge" in (tmp_path / "soil.yaml").read_text()
