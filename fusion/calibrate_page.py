@@ -92,7 +92,8 @@ def _fits(c: Calibration) -> str:
     parts = [
         f"<h2>Twin against log</h2>\n{table(heads, rows, range(2, 9))}",
         '<p class="dim">Before, after: root-mean-square residual. Noise: 1 sigma of a row, estimated. '
-        "Neighbours: correlation of residuals one row apart, and what whitening leaves of it. Outliers: beyond four sigma.</p>",
+        "Neighbours: correlation of residuals one row apart, and what whitening leaves of it. "
+        "Outliers: beyond four sigma.</p>",
     ]
     for log in list(c.sensor_errors)[:MOST_FIGURES]:
         fig, _ = plots.plot_channels(c, log)
