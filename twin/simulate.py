@@ -280,6 +280,8 @@ def _description(setup: RunSetup, seed: int, noiseless: bool) -> str:
     grounds = ", ".join(dict.fromkeys([*(leg.terrain for leg in scenario.route), *patches]))
     extras = "exact sensors" if noiseless else f"seed {seed}"
     extras += "".join(f"; {key} = {value:g}" for key, value in setup.effects.items())
+    if (varied := scenario.variation) is not None:
+        grounds += f", strength varies by {varied.strength_sigma:g} over {varied.length_m:g} m"
     across = f", across {scenario.cross_slope_deg:g} deg" if scenario.cross_slope_deg else ""
     place = f" at {', '.join(f'{x:g}' for x in scenario.payload_at_m)} m" if scenario.payload_at_m else ""
     return (
@@ -299,7 +301,8 @@ def _notes(setup: RunSetup, motion: Motion, vehicle: str | Path | VehicleParams)
             f"from {motion.t_s[tipped[0]]:.1f} s on the robot would tip over: a wheel carries no load, "
             "and the model keeps it down"
         )
-    parts = [("terrain", "soils", leg.terrain) for leg in scenario.route]
+    patches = [scenario.patches.terrain] if scenario.patches else []
+    parts = [("terrain", "soils", name) for name in [*(leg.terrain for leg in scenario.route), *patches]]
     if not isinstance(vehicle, VehicleParams):
         parts.insert(0, ("vehicle", "vehicles", str(vehicle)))
     counts = {(kind, name): assumed(folder, name) for kind, folder, name in parts}

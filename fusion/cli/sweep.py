@@ -74,17 +74,22 @@ def sweep(
         from terrafusion.fusion.sweep_report import write_sweep_report
 
         write_sweep_report(out, plan, table, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
-    for line in [*summary_lines(table.column("status").to_pylist()), *failures]:
+    statuses, errors = (table.column(name).to_pylist() for name in ("status", "error"))
+    for line in [*summary_lines(statuses, errors), *failures]:
         print(line)
     print(f"written to {out}")
 
 
-def summary_lines(statuses: Sequence[str]) -> list[str]:
-    """How the runs ended, in a line."""
+def summary_lines(statuses: Sequence[str], errors: Sequence[str | None]) -> list[str]:
+    """How the runs ended, in a line; where some failed, why the first did."""
     from terrafusion.twin.sweeping.rows import STATUSES
 
     told = [f"{statuses.count(word)} {word}" for word in STATUSES if word in statuses]
-    return [f"{len(statuses)} runs: {', '.join(told)}"]
+    lines = [f"{len(statuses)} run{'s' if len(statuses) != 1 else ''}: {', '.join(told)}"]
+    if "failed" in statuses:
+        first = statuses.index("failed")
+        lines.append(f"run {first} failed: {errors[first]} (column 'error' has the others)")
+    return lines
 
 
 def _numbers(entries: list[str], plan: Sweep) -> list[int]:

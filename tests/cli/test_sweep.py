@@ -112,3 +112,11 @@ def test_known_errors_are_one_line(terrafusion: Any, file: Path) -> None:
 def test_wrong_usage_has_status_2(terrafusion: Any, file: Path, words: tuple[str, str]) -> None:
     assert terrafusion("sweep", file, "--out", "out", *words).status == 2
     assert not Path("out").exists()
+
+
+def test_a_run_that_fails_is_told_with_its_reason(terrafusion: Any, file: Path) -> None:
+    Path("drive.yaml").write_text("drive: [{duration_s: 2, v_mps: 1.0}]\npayload_at_m: [0, 0, -2]\n")
+    file.write_text("scenario: drive.yaml\naxes: {payload_kg: [20]}\n")
+    done = terrafusion("sweep", file, "--out", "out", "--jobs", 1, "--no-plots")
+    assert done.status == 0
+    assert "1 run: 1 failed\nrun 0 failed: drive: the payload is 2 m below the ground; give" in done.out

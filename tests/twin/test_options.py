@@ -139,6 +139,17 @@ def test_a_robot_that_would_tip_over_is_told() -> None:
     assert any("would tip over: a wheel carries no load" in note for note in notes)
 
 
+def test_patches_and_varying_strength_are_told(tmp_path) -> None:
+    own = tmp_path / "own.yaml"
+    own.write_text(
+        "drive: [{duration_s: 2}]\nvariation: {strength_sigma: 0.2, length_m: 2}\n"
+        "patches: {terrain: mud, share: 0.3, length_m: 1}\n"
+    )
+    log = simulate(own)
+    assert "asphalt, mud, strength varies by 0.2 over 2 m; slope" in log.description
+    assert "of terrain 'mud'" in next(n for n in log.notes if n.startswith("assumed"))
+
+
 def test_what_is_assumed_is_noted() -> None:
     (note,) = simulate("straight", terrain="mud").notes
     assert note.startswith("assumed, as their sources say: ")
