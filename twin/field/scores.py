@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.twin.field.bootstrap import resamples
 from terrafusion.twin.field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
 from terrafusion.twin.field.runs import DT_S
 from terrafusion.twin.field.truth import heading
@@ -63,7 +64,7 @@ def medians(values: Array, group: NDArray[np.str_]) -> tuple[Array, Array]:
 
     Unknown values (NaN) are left out, column by column.
     """
-    draws = np.array([_medians(values[rows]) for rows in drawn(group)])
+    draws = np.array([_medians(values[rows]) for rows in resamples(group, DRAWS, SEED)])
     return _medians(values), draws
 
 
@@ -82,13 +83,3 @@ def _medians(values: Array) -> Array:
     columns = np.arange(values.shape[1])
     low, high = np.maximum((known - 1) // 2, 0), np.minimum(known // 2, len(values) - 1)
     return np.where(known > 0, 0.5 * (ordered[low, columns] + ordered[high, columns]), np.nan)
-
-
-def drawn(group: NDArray[np.str_]) -> list[NDArray[np.int64]]:
-    """Rows of `DRAWS` resamples of the groups, with replacement."""
-    rng = np.random.default_rng(SEED)
-    names, index = np.unique(group, return_inverse=True)
-    members = [np.flatnonzero(index == k) for k in range(len(names))]
-    return [
-        np.concatenate([members[k] for k in rng.integers(len(names), size=len(names))]) for _ in range(DRAWS)
-    ]

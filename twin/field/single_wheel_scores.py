@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.single_wheel import WheelTrials
+from terrafusion.twin.field.bootstrap import resamples
 from terrafusion.twin.field.single_wheel_fit import (
     EXPONENT,
     FREE,
@@ -121,12 +122,8 @@ def score(trials: WheelTrials, predicted: Array, rows: Mask, seed: int) -> dict[
     spread that R2 is held against is taken about the mean of the same resample.
     """
     target, group = measured(trials), conditions(trials)
-    known = np.unique(group[rows])
-    members = [np.flatnonzero(rows & (group == g)) for g in known]
-    rng = np.random.default_rng(seed)
-    drawn = [np.concatenate([members[i] for i in rng.integers(0, len(known), len(known))])
-             for _ in range(RESAMPLES)]  # fmt: skip
     whole = np.flatnonzero(rows)
+    drawn = [whole[at] for at in resamples(group[whole], RESAMPLES, seed)]
     out: dict[str, dict[str, object]] = {}
     for k, name in enumerate(OUTPUTS):
         if not np.isfinite(predicted[:, k]).all():

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.twin.field.bootstrap import resamples
 from terrafusion.twin.field.compare import SAME, Result
 from terrafusion.twin.field.forks import N_PAST, Forks
 from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL
 from terrafusion.twin.field.runs import DT_S
-from terrafusion.twin.field.scores import Interval, drawn, interval
+from terrafusion.twin.field.scores import DRAWS, SEED, Interval, interval
 
 Array = NDArray[np.float64]
 
@@ -101,8 +102,8 @@ def _track(apart: Array, turned: Array) -> float:
     return float((apart**2).sum() / (apart * turned).sum())
 
 
-def _interval(statistic, group: NDArray[np.str_]) -> Interval:  # type: ignore[no-untyped-def]
+def _interval(statistic: Callable[[NDArray[np.int64]], Any], group: NDArray[np.str_]) -> Interval:
     if not len(group):
         return Interval(np.nan, np.nan, np.nan)
-    draws = np.array([statistic(rows) for rows in drawn(group)])
+    draws = np.array([statistic(rows) for rows in resamples(group, DRAWS, SEED)])
     return interval(float(statistic(np.arange(len(group)))), draws)
