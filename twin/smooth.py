@@ -25,6 +25,11 @@ def smooth_min(a: Scalar, b: Scalar, width: float) -> Scalar:
     return 0.5 * (a + b - smooth_abs(a - b, width))
 
 
+def grown(way: Scalar, length: float) -> Scalar:
+    """From 0 at `way` 0 towards 1, half at `length`, whichever way it goes."""
+    return way * way / (way * way + length * length)
+
+
 def saturate(value: Scalar, limit: Scalar) -> Scalar:
     """value / (1 + (value/limit)^8)^(1/8) for value >= 0: identity when small, `limit` when large.
 

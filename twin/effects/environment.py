@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 
-from terrafusion.twin.effects.form import Form, one
-
-Quantities = Mapping[str, Any]
+from terrafusion.twin.effects.form import Form, Quantities, one
 
 # Constants of the laws, assumed unless a source is given; the equations below tell them.
 AIR_KG_PER_M3 = 1.2

@@ -15,7 +15,9 @@ from typing import Any
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
-Term = Callable[..., Mapping[str, Any]]
+Quantities = Mapping[str, Any]
+"""What a stage knows, by name: CasADi expressions."""
+Term = Callable[..., Quantities]
 """term(quantities by name, *values of the parameters) -> new values of some of the stage's quantities."""
 
 STAGES: dict[str, tuple[str, ...]] = {

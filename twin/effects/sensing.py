@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, Parameter, one, two
-from terrafusion.twin.effects.terrain import grown
-from terrafusion.twin.smooth import smooth_abs
-
-Quantities = Mapping[str, Any]
+from terrafusion.twin.effects.form import Form, Parameter, Quantities, one, two
+from terrafusion.twin.smooth import grown, smooth_abs
 
 WHEEL_SPEEDS = ("wheel_left_radps", "wheel_right_radps")
 ACCELS = ("accel_x_mps2", "accel_y_mps2")

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 
-from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.smooth import saturate, smooth_abs
+from terrafusion.twin.effects.form import Form, Quantities, one
+from terrafusion.twin.smooth import grown, saturate, smooth_abs
 from terrafusion.twin.wheel import RESISTANCE_SPEED_MPS
-
-Quantities = Mapping[str, Any]
 
 # Constants of the laws, assumed unless a source is given; the equations below tell them.
 RATE_SPEED_MPS = 0.01
@@ -33,11 +30,6 @@ def scaled_shear(q: Quantities, gain: Any) -> dict[str, Any]:
 def scaled_bearing(q: Quantities, gain: Any) -> dict[str, Any]:
     """The ground's resistance to sinkage times `gain`."""
     return {name: q[name] * gain for name in ("k_c", "k_phi")}
-
-
-def grown(way: Any, length: float) -> Any:
-    """From 0 at `way` 0 towards 1, half at `length`, whichever way it goes."""
-    return way * way / (way * way + length * length)
 
 
 def _compacted(q: Quantities, gain: Any) -> dict[str, Any]:

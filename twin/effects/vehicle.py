@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import casadi as ca
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.effects.terrain import grown
+from terrafusion.twin.effects.form import Form, Quantities, one
 from terrafusion.twin.layout import WHEELS
-from terrafusion.twin.smooth import smooth_max
-
-Quantities = Mapping[str, Any]
+from terrafusion.twin.smooth import grown, smooth_max
 
 # Constants of the laws, assumed unless a source is given; the equations below tell them.
 SHORTEST_LAG_S = 0.002
