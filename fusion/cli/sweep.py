@@ -78,6 +78,8 @@ def sweep(
     for line in [*summary_lines(statuses, errors), *failures]:
         print(line)
     print(f"written to {out}")
+    if statuses and set(statuses) == {"failed"}:
+        raise typer.Exit(1)
 
 
 def summary_lines(statuses: Sequence[str], errors: Sequence[str | None]) -> list[str]:

@@ -118,5 +118,6 @@ def test_a_run_that_fails_is_told_with_its_reason(terrafusion: Any, file: Path) 
     Path("drive.yaml").write_text("drive: [{duration_s: 2, v_mps: 1.0}]\npayload_at_m: [0, 0, -2]\n")
     file.write_text("scenario: drive.yaml\naxes: {payload_kg: [20]}\n")
     done = terrafusion("sweep", file, "--out", "out", "--jobs", 1, "--no-plots")
-    assert done.status == 0
+    assert done.status == 1
+    assert Path("out/runs.parquet").is_file()
     assert "1 run: 1 failed\nrun 0 failed: drive: the payload is 2 m below the ground; give" in done.out

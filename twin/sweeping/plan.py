@@ -143,7 +143,7 @@ class Sweep:
             how = " x ".join(f"{axis.name} {len(axis.levels)}" for axis in self.axes)
         hours = self.runs * self.scenario.duration_s / 3600.0
         return (
-            f"{self.runs} runs of {self.scenario.duration_s:g} s ({how}; {hours:.3g} h of driving), "
+            f"{self.runs} run{'' if self.runs == 1 else 's'} of {self.scenario.duration_s:g} s ({how}; {hours:.3g} h of driving), "
             f"{'with' if self.sensors else 'without'} sensors"
         )
 
