@@ -142,8 +142,9 @@ class Sweep:
         else:
             how = " x ".join(f"{axis.name} {len(axis.levels)}" for axis in self.axes)
         hours = self.runs * self.scenario.duration_s / 3600.0
+        runs = "1 run" if self.runs == 1 else f"{self.runs} runs"
         return (
-            f"{self.runs} run{'' if self.runs == 1 else 's'} of {self.scenario.duration_s:g} s ({how}; {hours:.3g} h of driving), "
+            f"{runs} of {self.scenario.duration_s:g} s ({how}; {hours:.3g} h of driving), "
             f"{'with' if self.sensors else 'without'} sensors"
         )
 
