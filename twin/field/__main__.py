@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.atomic import unwritable
 from terrafusion.datasets.catalog import DATA_VARIABLE
 from terrafusion.datasets.errors import DataError, TerrafusionError
 from terrafusion.twin.field import plots, summary
@@ -76,7 +77,7 @@ def run(data: list[Path], out: Path, *, figures: bool = True) -> None:
     try:
         _write(out, lines, forks, slips, numbers, drives.left_out)
     except OSError as error:
-        raise _unwritable(out, error) from None
+        raise unwritable(out, error) from None
     print(_report(lines, slips, drives.left_out, (SAME,)))
     print(f"all tables: {out / 'field.md'}")
 
@@ -124,11 +125,7 @@ def _folder(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise _unwritable(out, error) from None
-
-
-def _unwritable(out: Path, error: OSError) -> DataError:
-    return DataError(f"cannot be written: {error.strerror or error}", file=out, remedy="give another --out")
+        raise unwritable(out, error) from None
 
 
 def _default() -> Path:

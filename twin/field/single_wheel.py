@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.atomic import unwritable
 from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.single_wheel import WheelTrials, read_wheel_trials
 from terrafusion.twin.field import single_wheel_scores as judge
@@ -80,7 +81,7 @@ def write(trials: WheelTrials, scores: dict[str, Any], predictions: dict[str, Ar
     """`scores.json`, `trials.csv` and `single_wheel.png` in `folder`.
 
     Raises:
-        ConfigError: the folder cannot be written.
+        TerrafusionError: the folder cannot be written.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -88,9 +89,7 @@ def write(trials: WheelTrials, scores: dict[str, Any], predictions: dict[str, Ar
         with (folder / "trials.csv").open("w", encoding="utf-8", newline="") as file:
             _write_rows(csv.writer(file, lineterminator="\n"), trials, predictions)
     except OSError as error:
-        raise ConfigError(
-            f"cannot be written: {error.strerror}", file=folder, remedy="give another folder"
-        ) from None
+        raise unwritable(folder, error) from None
     from terrafusion.twin.field.single_wheel_plot import plot
 
     figure = plot(trials, predictions["half"], judge.half_split(trials, scores["seed"]))
@@ -142,7 +141,7 @@ def main(arguments: list[str] | None = None) -> int:
         scores, predictions = evaluate(trials, told.seed)
         write(trials, scores, predictions, told.out)
     except TerrafusionError as error:
-        print(error, file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)
         return 1
     print(table(scores))
     return 0

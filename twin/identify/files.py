@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.atomic import write_atomically
 from terrafusion.twin.identify.result import Calibration, Fitted
 from terrafusion.twin.library import read_named
 
@@ -21,13 +21,13 @@ def write_files(
     """Write `vehicle.yaml`, and `soil.yaml` (or `soil_NAME.yaml` for several), which load as they are.
 
     Args:
-        out: an existing folder.
+        out: the folder; it is made where it is missing.
         vehicle, soils: names or files that the calibration started from; a soil is taken by its own name
             where it is not given.
 
     Raises:
         ConfigError: one of those cannot be read.
-        DataError: the folder cannot be written.
+        TerrafusionError: the folder cannot be written.
     """
     model, logs = calibration.model, ", ".join(calibration.sensor_errors)
     if not calibration.converged():
@@ -81,11 +81,9 @@ def _write(path: Path, content: dict[str, Any]) -> Path:
     yaml: Any = YAML(typ="safe", pure=True)
     yaml.default_flow_style = False
     yaml.sort_base_mapping_type_on_output = False
-    try:
-        with path.open("w", encoding="utf-8") as file:
+
+    def dump(part: Path) -> None:
+        with part.open("w", encoding="utf-8") as file:
             yaml.dump(content, file)
-    except OSError as error:
-        raise DataError(
-            f"cannot be written: {error.strerror}", file=path, remedy="check the folder"
-        ) from None
-    return path
+
+    return write_atomically(path, dump)
