@@ -58,9 +58,10 @@ def _head(title: str, c: Calibration) -> str:
 
 
 def _numbers(c: Calibration) -> str:
+    doubt = "" if c.converged() else " (not valid)"
     rows = [
         (
-            escape(f.name), f"{f.start:.5g}", f"{f.value:.5g}", f"{f.sigma:.2g}", escape(f.unit),
+            escape(f.name), f"{f.start:.5g}", f"{f.value:.5g}", f"{f.sigma:.2g}{doubt}", escape(f.unit),
             f"{f.ratio:.3f}", f"{escape(f.status)}{' (at the end of its range)' if f.at_bound else ''}",
         )
         for f in c.fitted
