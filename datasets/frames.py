@@ -93,13 +93,3 @@ def gtsam_to_ros_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> A
     J[..., :3, 3:] = R
     J[..., 3:, :3] = R
     return np.asarray(J @ P @ np.swapaxes(J, -1, -2))
-
-
-def ros_to_gtsam_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> Array:
-    """The inverse of `gtsam_to_ros_covariance`."""
-    P = np.asarray(covariance, dtype=float)
-    R_body_world = np.swapaxes(np.asarray(R_world_body, dtype=float), -1, -2)
-    J = np.zeros(P.shape)
-    J[..., :3, 3:] = R_body_world
-    J[..., 3:, :3] = R_body_world
-    return np.asarray(J @ P @ np.swapaxes(J, -1, -2))

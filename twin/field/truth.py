@@ -18,14 +18,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 KNOT_S = 0.25
+"""Velocity is linear between knots this far apart (assumed: half of what errors are averaged over)."""
 CHUNK_S = 2.0
 """Positions are compared within a chunk only: an offset a chunk takes out the drift of map and gyro."""
 ACCEL_WALK = 2.0
 """Assumed random walk of the body's acceleration, m/s2 a square root of a second: sets the smoothing."""
 LEAST_SIGMA_M = 0.003
+"""Poses are not taken as better than this (assumed)."""
 MOVING_MPS = 0.2
-HUBER = 1.5
-ROUNDS = 5
+HUBER, ROUNDS = 1.5, 5
+"""Residuals beyond so many sigma are weighed down (Huber 1964), in so many reweighted fits."""
 
 
 @dataclass(frozen=True, eq=False)
