@@ -134,3 +134,18 @@ def test_a_search_that_is_cut_short_says_so_everywhere(monkeypatch, tmp_path) ->
     assert not any(entry["sigma_valid"] for entry in said["parameters"].values())
     write_files(found, tmp_path, "elevate")
     assert "did not converge" in (tmp_path / "soil.yaml").read_text()
+
+
+def test_validity_ranges_stay_or_are_said_to_be_left(tmp_path) -> None:
+    """The file's range stays beside a number inside it; one outside loads again and says so."""
+    wide = calibrate(drive(), "elevate", SOIL, NAMES)
+    write_files(wide, tmp_path, "elevate")
+    text = (tmp_path / "soil.yaml").read_text()
+    assert "valid:" in text.partition("shear_modulus_m:")[2].partition("source:")[0]
+    outside = dataclasses.replace(wide.fitted[0], value=0.1)
+    model = wide.model.replaced({SHEAR: 0.1})
+    write_files(
+        dataclasses.replace(wide, fitted=(outside, *wide.fitted[1:]), model=model), tmp_path, "elevate"
+    )
+    assert "outside the validity range" in (tmp_path / "soil.yaml").read_text()
+    assert load_soil(tmp_path / "soil.yaml").shear.shear_modulus_m == 0.1

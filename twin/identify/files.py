@@ -47,13 +47,23 @@ def write_files(
 
 def _updated(raw: dict[str, Any], values: Any, fitted: Mapping[str, Fitted], logs: str) -> dict[str, Any]:
     out = copy.deepcopy(raw)
-    _overridden(out, values)
     for name, f in fitted.items():
         section, parts = out, name.split(".")
         for part in parts[:-1]:
             section = section.setdefault(part, {})
-        section[parts[-1]] = {"value": f.value, "source": _source(f, logs)}
+        section[parts[-1]] = _entry(section.get(parts[-1]), f.value, _source(f, logs))
+    _overridden(out, values)
     return out
+
+
+def _entry(before: Any, value: Any, source: str) -> dict[str, Any]:
+    """A number in the place of an entry; a range `valid` that it lies outside of is left to its source."""
+    valid = before.get("valid") if isinstance(before, dict) else None
+    if valid is None:
+        return {"value": value, "source": source}
+    if isinstance(value, float) and valid[0] <= value <= valid[1]:
+        return {"value": value, "valid": valid, "source": source}
+    return {"value": value, "source": f"{source}; outside the validity range {valid} of the file before"}
 
 
 def _source(f: Fitted, logs: str) -> str:
@@ -64,15 +74,15 @@ def _source(f: Fitted, logs: str) -> str:
 
 def _overridden(raw: dict[str, Any], values: Any) -> None:
     """Numbers that the log itself gave go before those of the file."""
-    for name, entry in raw.items():
+    for name, entry in list(raw.items()):
         value = getattr(values, name, None)
         if not isinstance(entry, dict) or value is None:
             continue
         if "value" not in entry:
             _overridden(entry, value)
         elif entry["value"] != (list(value) if isinstance(value, tuple) else value):
-            entry["value"] = list(value) if isinstance(value, tuple) else value
-            entry["source"] = "as the log says"
+            plain = list(value) if isinstance(value, tuple) else value
+            raw[name] = _entry(entry, plain, "as the log says")
 
 
 def _write(path: Path, content: dict[str, Any]) -> Path:
