@@ -149,3 +149,11 @@ def test_validity_ranges_stay_or_are_said_to_be_left(tmp_path) -> None:
     )
     assert "outside the validity range" in (tmp_path / "soil.yaml").read_text()
     assert load_soil(tmp_path / "soil.yaml").shear.shear_modulus_m == 0.1
+
+
+def test_a_published_soil_is_written_too(tmp_path) -> None:
+    soil = "pavlov:direct_90_sand"
+    found = calibrate(drive(), "elevate", soil, NAMES[1:])
+    (name,) = found.model.soils
+    write_files(found, tmp_path, "elevate", {name: soil})
+    assert load_soil(tmp_path / "soil.yaml") == found.model.soils[name]

@@ -10,6 +10,7 @@ from typing import Any
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.twin.identify.result import Calibration, Fitted
 from terrafusion.twin.library import read_named
+from terrafusion.twin.soil_table import is_published, published_soil
 
 
 def write_files(
@@ -36,7 +37,8 @@ def write_files(
     mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith("vehicle.")}
     written = [_write(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]
     for name, soil in model.soils.items():
-        raw, _ = read_named("soils", (soils or {}).get(name, name), kind="terrain")
+        given = str((soils or {}).get(name, name))
+        raw = published_soil(given) if is_published(given) else read_named("soils", given, kind="terrain")[0]
         mine = {
             f.name.removeprefix(f"{name}."): f for f in calibration.fitted if f.name.startswith(f"{name}.")
         }
