@@ -78,3 +78,9 @@ def fit(
         diff_step=DIFFERENCE, xtol=1e-4, ftol=1e-4,
     )  # fmt: skip
     return np.asarray(value(found.x))
+
+
+def cost(prediction: Array, forks: Forks) -> float:
+    """The criterion: half the sum of the loss over the residuals."""
+    square = residuals(prediction, forks) ** 2
+    return float(np.sum(np.sqrt(1.0 + square) - 1.0))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.field import kinematic
+from terrafusion.twin.field.fitting import cost
 from terrafusion.twin.field.forks import N_FUTURE, Forks
 from terrafusion.twin.field.twin_model import ACTUATION, GROUND, TwinModel, calibrated
 from terrafusion.twin.soil import SoilParams, load_soil, soil_names
@@ -51,12 +52,18 @@ def for_wheels(vehicle: VehicleParams, ground: str, forks: Forks) -> dict[str, M
         vehicle: nominal parameters.
         ground: of the forks, chooses the soil the twin starts from.
         forks: to fit on.
+
+    The twin is fitted from the ground's soil and from the firm one; the better fit is kept. The slopes of
+    its misfit lead nowhere where all wheels slide.
     """
     nominal = TwinModel.nominal(vehicle, nominal_soil(ground), commanded=False)
+    firm = TwinModel.nominal(vehicle, load_soil(FIRM), commanded=False)
+    starts = (nominal, firm) if nominal_soil(ground).name != FIRM else (nominal,)
+    found = [calibrated(start, GROUND, forks) for start in starts]
     return {
         **_kinematic(vehicle, forks, lagged=False),
         TWIN_NOMINAL: nominal,
-        TWIN: calibrated(nominal, GROUND, forks),
+        TWIN: min(found, key=lambda model: cost(model.predict(forks), forks)),
     }
 
 
