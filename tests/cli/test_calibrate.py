@@ -60,10 +60,12 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
 )
 def test_one_line_errors(terrafusion, good_log: Path, tmp_path: Path, words: tuple[str, ...], told) -> None:
     terrafusion("calibrate", good_log, "--out", tmp_path / "fit", *words).refused(*told)
+    assert not (tmp_path / "fit").exists()
 
 
 def test_no_such_log(terrafusion, tmp_path: Path) -> None:
     terrafusion("calibrate", tmp_path / "none", "--out", tmp_path / "fit").refused("none")
+    assert not (tmp_path / "fit").exists()
 
 
 @pytest.mark.parametrize(

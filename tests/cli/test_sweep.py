@@ -96,6 +96,8 @@ def test_known_errors_are_one_line(terrafusion: Any, file: Path) -> None:
     address = ("--backend", "dask", "--address", "127.0.0.1")
     file.write_text(SWEEP)
     terrafusion("sweep", file, "--out", "out", *address).refused("no address of a scheduler", "tcp://")
+    assert not list(Path(".").rglob("*.parquet"))
+    assert Path("taken").read_text() == ""
 
 
 @pytest.mark.parametrize(
