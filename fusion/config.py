@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.sensors import Rig
-from terrafusion.fusion.weighting import Policy, load_policy
+from terrafusion.fusion.weights.policy import Policy, load_policy
 
 MODES = ("adaptive", "fixed")
 

@@ -17,19 +17,19 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
-from terrafusion.fusion.alignment import Start, heading_from_motion, level_start
-from terrafusion.fusion.chain import Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
-from terrafusion.fusion.factors import at_rest, bridge, wheel_increment
-from terrafusion.fusion.gates import WheelGate
-from terrafusion.fusion.gnss import GnssUpdater
-from terrafusion.fusion.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
-from terrafusion.fusion.markov import markov_step
-from terrafusion.fusion.preintegration import Preintegrator
-from terrafusion.fusion.streams import GnssFix, ImuSegment, ImuStream, WheelStream
-from terrafusion.fusion.terrain_weights import TerrainWeights
-from terrafusion.fusion.wheel_factor import WheelIncrement
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.factors import at_rest, bridge, wheel_increment
+from terrafusion.fusion.graph.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
+from terrafusion.fusion.graph.markov import markov_step
+from terrafusion.fusion.graph.preintegration import Preintegrator
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.alignment import Start, heading_from_motion, level_start
+from terrafusion.fusion.inputs.gates import WheelGate
+from terrafusion.fusion.inputs.gnss import GnssUpdater
+from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
 

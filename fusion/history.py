@@ -9,7 +9,7 @@ import numpy as np
 from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.fusion.estimate import Estimate, Innovation, State, WeightChange
-from terrafusion.fusion.weighting import SensorNoise
+from terrafusion.fusion.weights.policy import SensorNoise
 
 
 class History:

@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import gtsam_to_ros_covariance
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
-from terrafusion.fusion.chain import Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.history import History
-from terrafusion.fusion.key_state import POSE, SLIP, VELOCITY, KeyState, quaternion_of
-from terrafusion.fusion.metrics import Outage, Scores, score
-from terrafusion.fusion.weighting import Policy, load_policy
+from terrafusion.fusion.scores.metrics import Outage, Scores, score
+from terrafusion.fusion.weights.policy import Policy, load_policy
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
 
 Array = NDArray[np.float64]

@@ -76,7 +76,7 @@ def calibrate(
     Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
     """
     from terrafusion.datasets.readers import open_recordings
-    from terrafusion.fusion.calibrate_page import write_calibration
+    from terrafusion.fusion.calibration.page import write_calibration
     from terrafusion.twin.identify.calibrate import PARAMETERS
     from terrafusion.twin.identify.calibrate import calibrate as fit
     from terrafusion.twin.scenario import MAX_SLOPE_DEG

@@ -30,7 +30,7 @@ def fit(
     Example: terrafusion policy fit --out policy.yaml
     """
     from terrafusion.fusion.cli.terrain import checked_output, progress
-    from terrafusion.fusion.policy_fit import default_grid, fit_policy, write_policy
+    from terrafusion.fusion.weights.policy_fit import default_grid, fit_policy, write_policy
 
     checked_output(out)
     grid = default_grid(seeds)

@@ -68,9 +68,9 @@ def replay(
     from terrafusion.datasets.errors import errors_of
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config import MODES
-    from terrafusion.fusion.metrics import parse_outage
     from terrafusion.fusion.replay import replay as run
-    from terrafusion.fusion.results import write_replay
+    from terrafusion.fusion.report.results import write_replay
+    from terrafusion.fusion.scores.metrics import parse_outage
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
@@ -109,7 +109,7 @@ def replay(
 
 def summary(result: Replay) -> list[str]:
     """The result in a few lines of text."""
-    from terrafusion.fusion.outputs import final_status
+    from terrafusion.fusion.report.outputs import final_status
 
     scores = result.scores
     status = final_status(result.estimate)

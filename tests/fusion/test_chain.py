@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 
-from terrafusion.fusion import gnss_factor, markov, wheel_factor
-from terrafusion.fusion.chain import Chain
-from terrafusion.fusion.gnss_factor import GnssPosition
-from terrafusion.fusion.key_state import DIM, MARKOV, POSE, KeyState
-from terrafusion.fusion.markov import markov_step
-from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
+from terrafusion.fusion.graph import gnss_factor, markov, wheel_factor
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.key_state import DIM, MARKOV, POSE, KeyState
+from terrafusion.fusion.graph.markov import markov_step
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 STEP = markov_step(0.1, mean=[0.05, 0.0, 0.0], sigma=[0.1, 0.5, 0.5], time_s=[5.0, 30.0, 30.0])
 SIGMAS = np.array([0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5])

@@ -14,8 +14,8 @@ from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate
 from terrafusion.fusion.estimator import Estimator
-from terrafusion.fusion.metrics import Outage
 from terrafusion.fusion.replay import choose_vehicle, replay, split_fixes
+from terrafusion.fusion.scores.metrics import Outage
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.stats import chi2
 
-from terrafusion.fusion.gates import GnssGate, Verdict, WheelGate
+from terrafusion.fusion.inputs.gates import GnssGate, Verdict, WheelGate
 
 GATE = float(chi2.ppf(0.999, 2))
 

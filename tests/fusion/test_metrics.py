@@ -14,8 +14,8 @@ from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.frames import rpy_to_quaternion
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.fusion.error_series import Errors, travelled_m
-from terrafusion.fusion.metrics import Outage, Scores, parse_outage, rpe_percent, score
+from terrafusion.fusion.scores.error_series import Errors, travelled_m
+from terrafusion.fusion.scores.metrics import Outage, Scores, parse_outage, rpe_percent, score
 
 
 def without_truth(recording: Recording) -> Recording:

@@ -14,8 +14,7 @@ from jsonschema import Draft202012Validator
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.trajectory import read_tum
-from terrafusion.fusion.metrics import HeldOut, Outage, Scores, score
-from terrafusion.fusion.outputs import (
+from terrafusion.fusion.report.outputs import (
     MODES,
     build_metrics,
     final_status,
@@ -25,6 +24,7 @@ from terrafusion.fusion.outputs import (
     to_json,
     write_outputs,
 )
+from terrafusion.fusion.scores.metrics import HeldOut, Outage, Scores, score
 
 SCHEMA = json.loads(
     (Path(__file__).parents[2] / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8")

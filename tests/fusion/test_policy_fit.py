@@ -9,7 +9,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.policy_fit import (
+from terrafusion.fusion.terrain.drives import Grid
+from terrafusion.fusion.weights.policy import Policy, load_policy
+from terrafusion.fusion.weights.policy_fit import (
     LAG_S,
     RADIUS_SIGMA,
     SLIP_S,
@@ -23,8 +25,6 @@ from terrafusion.fusion.policy_fit import (
     row_of,
     write_policy,
 )
-from terrafusion.fusion.terrain.drives import Grid
-from terrafusion.fusion.weighting import Policy, load_policy
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 

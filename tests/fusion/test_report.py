@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.recording import Fix, Gnss, Recording, Terrain
-from terrafusion.fusion import plots, plots_map
 from terrafusion.fusion.estimate import WeightChange
-from terrafusion.fusion.metrics import Outage, score
-from terrafusion.fusion.outputs import build_metrics, final_status, rejected_counts, terrain_shares
-from terrafusion.fusion.plot_style import colour_of, plain, thin
-from terrafusion.fusion.report import ReportRun, write_report
-from terrafusion.fusion.report_text import Row, head_of_many, number, pick_pair, table_rows
+from terrafusion.fusion.report import plots, plots_map
+from terrafusion.fusion.report.outputs import build_metrics, final_status, rejected_counts, terrain_shares
+from terrafusion.fusion.report.plot_style import colour_of, plain, thin
+from terrafusion.fusion.report.report import ReportRun, write_report
+from terrafusion.fusion.report.text import Row, head_of_many, number, pick_pair, table_rows
+from terrafusion.fusion.scores.metrics import Outage, score
 
 HOSTILE = '<script>alert("x")</script>&_$\\frac{'
 OUTAGES = (Outage(40.0, 30.0),)

@@ -18,7 +18,7 @@ from terrafusion.fusion.terrain.drives import Condition, Grid, windows_of
 from terrafusion.fusion.terrain.evaluate import Route, changes_in, evaluate, splice
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.terrain.train import Plan, calibrate, drives_of, train
-from terrafusion.fusion.weighting import load_policy
+from terrafusion.fusion.weights.policy import load_policy
 from terrafusion.twin.simulate import simulate
 
 CLASSES = load_policy().names()

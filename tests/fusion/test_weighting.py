@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError
-from terrafusion.fusion.weighting import SCHEMA, Policy, SensorNoise, load_policy
+from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise, load_policy
 
 FIELDS = [f.name for f in dataclasses.fields(SensorNoise)]
 ZERO_MEAN = [

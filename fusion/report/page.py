@@ -120,4 +120,4 @@ def _svg(fig: Figure) -> bytes:
 
 
 def _stylesheet() -> str:
-    return (resources.files("terrafusion.fusion") / "report.css").read_text(encoding="utf-8")
+    return (resources.files("terrafusion.fusion.report") / "report.css").read_text(encoding="utf-8")

@@ -25,11 +25,11 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from terrafusion.fusion import gnss_factor
-from terrafusion.fusion.gnss_factor import GnssPosition
-from terrafusion.fusion.key_state import BIAS, DIM, DRIFT, MARKOV, NAV, POSE, SLIP, VELOCITY, KeyState
-from terrafusion.fusion.markov import MarkovStep
-from terrafusion.fusion.wheel_factor import WheelIncrement, jacobians, residual
+from terrafusion.fusion.graph import gnss_factor
+from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.key_state import BIAS, DIM, DRIFT, MARKOV, NAV, POSE, SLIP, VELOCITY, KeyState
+from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from pathlib import Path
 
-from terrafusion.fusion import study_plots as plots
-from terrafusion.fusion import study_plots_field as field
-from terrafusion.fusion.report_page import bullets, figure, table, where_from, write_page
+from terrafusion.fusion.report.page import bullets, figure, table, where_from, write_page
+from terrafusion.fusion.study import plots
+from terrafusion.fusion.study import plots_field as field
 from terrafusion.twin.study.agreement import PREDICTED, Row, counts
 from terrafusion.twin.study.batch import CellResult
 from terrafusion.twin.study.criteria import VERDICTS

@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.atomic import write_atomically
-from terrafusion.fusion.outputs import finite, to_json
-from terrafusion.fusion.study_page import write_study_page
+from terrafusion.fusion.report.outputs import finite, to_json
+from terrafusion.fusion.study.page import write_study_page
 from terrafusion.twin.study.agreement import BASES, Row, counts
 from terrafusion.twin.study.batch import CellResult
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE

@@ -13,12 +13,11 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.recording import Gnss, Recording
-from terrafusion.fusion import plot_style as style
-from terrafusion.fusion import plots, plots_map
-from terrafusion.fusion import report_text as words
 from terrafusion.fusion.estimate import Estimate, WeightChange
-from terrafusion.fusion.metrics import Outage, Scores
-from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
+from terrafusion.fusion.report import plots, plots_map, style
+from terrafusion.fusion.report import text as words
+from terrafusion.fusion.report.page import bullets, figure, where_from, write_page
+from terrafusion.fusion.scores.metrics import Outage, Scores
 
 MOST_REASONS = 20
 """How many of the changes of weight the report lists; `weights.jsonl` has them all."""

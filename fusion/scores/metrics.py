@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.recording import Gnss, Recording
-from terrafusion.fusion.error_series import (
+from terrafusion.fusion.estimate import Estimate
+from terrafusion.fusion.scores.error_series import (
     Errors,
     align_both,
     errors_against_fixes,
@@ -38,7 +39,6 @@ from terrafusion.fusion.error_series import (
     known_keyframes,
     travelled_m,
 )
-from terrafusion.fusion.estimate import Estimate
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]

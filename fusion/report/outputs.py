@@ -26,7 +26,7 @@ from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import write_tum
 from terrafusion.fusion.estimate import STATUS, Estimate, WeightChange
-from terrafusion.fusion.metrics import Scores
+from terrafusion.fusion.scores.metrics import Scores
 
 SCHEMA = "terrafusion.replay/1"
 MODES = ("adaptive", "fixed", "robust", "innovation")

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.fusion.chain import Chain
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
-from terrafusion.fusion.factors import antenna_lever, gnss_velocity
-from terrafusion.fusion.gates import GnssGate, Verdict
-from terrafusion.fusion.gnss_factor import GnssPosition, antenna_jacobian
-from terrafusion.fusion.key_state import DIM, DRIFT, POSE
-from terrafusion.fusion.streams import GnssFix
-from terrafusion.fusion.weighting import SensorNoise
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
+from terrafusion.fusion.graph.gnss_factor import GnssPosition, antenna_jacobian
+from terrafusion.fusion.graph.key_state import DIM, DRIFT, POSE
+from terrafusion.fusion.inputs.gates import GnssGate, Verdict
+from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from terrafusion.datasets.recording import Fix, Gnss, Recording
-from terrafusion.fusion import plot_style as style
-from terrafusion.fusion.error_series import Errors
 from terrafusion.fusion.estimate import Estimate
-from terrafusion.fusion.metrics import Outage
-from terrafusion.fusion.plots import TIME, shade_outages
+from terrafusion.fusion.report import plot_style as style
+from terrafusion.fusion.report.plots import TIME, shade_outages
+from terrafusion.fusion.scores.error_series import Errors
+from terrafusion.fusion.scores.metrics import Outage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

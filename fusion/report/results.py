@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafusion.fusion.outputs import build_metrics, final_status, terrain_shares, write_outputs
 from terrafusion.fusion.replay import Replay
-from terrafusion.fusion.report import ReportRun, write_report
+from terrafusion.fusion.report.outputs import build_metrics, final_status, terrain_shares, write_outputs
+from terrafusion.fusion.report.report import ReportRun, write_report
 
 
 def metrics_of(result: Replay) -> dict[str, Any]:

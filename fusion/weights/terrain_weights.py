@@ -12,10 +12,10 @@ from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State, WeightChange
-from terrafusion.fusion.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.terrain.classifier import load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
-from terrafusion.fusion.weighting import SensorNoise
+from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.streams import GnssFix, ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion import plot_style as style
-from terrafusion.fusion.sweep_maps import (
+from terrafusion.fusion.report import plot_style as style
+from terrafusion.fusion.sweep.maps import (
     CellAxis,
     Columns,
     in_cells,

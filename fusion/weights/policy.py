@@ -107,7 +107,7 @@ def load_policy(path: Path | None = None) -> Policy:
         ConfigError: unknown or missing key, wrong type, out of range, no `unknown` class.
     """
     if path is None:
-        with resources.as_file(resources.files("terrafusion.fusion") / "policy.yaml") as shipped:
+        with resources.as_file(resources.files("terrafusion.fusion.weights") / "policy.yaml") as shipped:
             return _parse(read_yaml(shipped), shipped)
     return _parse(read_yaml(path), path)
 

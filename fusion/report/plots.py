@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
-from terrafusion.fusion import plot_style as style
-from terrafusion.fusion.error_series import Errors
 from terrafusion.fusion.estimate import Estimate, WeightChange
-from terrafusion.fusion.metrics import Outage
+from terrafusion.fusion.report import plot_style as style
+from terrafusion.fusion.scores.error_series import Errors
+from terrafusion.fusion.scores.metrics import Outage
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

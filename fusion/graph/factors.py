@@ -10,10 +10,10 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.key_state import KeyState
-from terrafusion.fusion.streams import ImuSegment
-from terrafusion.fusion.weighting import SensorNoise
-from terrafusion.fusion.wheel_factor import WheelIncrement
+from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 

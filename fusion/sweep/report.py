@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from terrafusion.datasets.atomic import write_atomically
-from terrafusion.fusion.report_page import bullets, figure, where_from, write_page
-from terrafusion.fusion.report_page import table as page_table
-from terrafusion.fusion.sweep_maps import Columns, columns_of
-from terrafusion.fusion.sweep_plots import figures
+from terrafusion.fusion.report.page import bullets, figure, where_from, write_page
+from terrafusion.fusion.report.page import table as page_table
+from terrafusion.fusion.sweep.maps import Columns, columns_of
+from terrafusion.fusion.sweep.plots import figures
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -44,7 +44,7 @@ from terrafusion.datasets.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.recording import Fix, Recording
 from terrafusion.datasets.sensors import ImuSpec
 from terrafusion.fusion.terrain.drives import Grid, run_all, seconds, wheel_samples
-from terrafusion.fusion.weighting import SCHEMA, Policy, SensorNoise
+from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 Array = NDArray[np.float64]

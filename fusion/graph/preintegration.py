@@ -7,7 +7,7 @@ import numpy as np
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import ImuSpec
-from terrafusion.fusion.streams import ImuSegment
+from terrafusion.fusion.inputs.streams import ImuSegment
 
 INTEGRATION_SIGMA_M = 1e-4
 """Position error of the integration itself, m/sqrt(s): keeps the square root full rank."""

@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 
 from terrafusion.datasets.atomic import write_atomically
-from terrafusion.fusion import calibrate_plots as plots
-from terrafusion.fusion.report_page import bullets, figure, table, where_from, write_page
+from terrafusion.fusion.calibration import plots
+from terrafusion.fusion.report.page import bullets, figure, table, where_from, write_page
 from terrafusion.twin.identify.files import write_files
 from terrafusion.twin.identify.result import Calibration
 
