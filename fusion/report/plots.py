@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.estimate import Estimate, WeightChange
-from terrafusion.fusion.report import plot_style as style
+from terrafusion.fusion.report import style
 from terrafusion.fusion.scores.error_series import Errors
 from terrafusion.fusion.scores.metrics import Outage
 

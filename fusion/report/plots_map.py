@@ -9,7 +9,7 @@ import numpy as np
 
 from terrafusion.datasets.recording import Fix, Gnss, Recording
 from terrafusion.fusion.estimate import Estimate
-from terrafusion.fusion.report import plot_style as style
+from terrafusion.fusion.report import style
 from terrafusion.fusion.report.plots import TIME, shade_outages
 from terrafusion.fusion.scores.error_series import Errors
 from terrafusion.fusion.scores.metrics import Outage

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.report import plot_style as style
+from terrafusion.fusion.report import style
 from terrafusion.twin.study.field_drive import FieldDrive
 
 if TYPE_CHECKING:

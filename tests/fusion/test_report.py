@@ -15,8 +15,8 @@ from terrafusion.datasets.recording import Fix, Gnss, Recording, Terrain
 from terrafusion.fusion.estimate import WeightChange
 from terrafusion.fusion.report import plots, plots_map
 from terrafusion.fusion.report.outputs import build_metrics, final_status, rejected_counts, terrain_shares
-from terrafusion.fusion.report.plot_style import colour_of, plain, thin
 from terrafusion.fusion.report.report import ReportRun, write_report
+from terrafusion.fusion.report.style import colour_of, plain, thin
 from terrafusion.fusion.report.text import Row, head_of_many, number, pick_pair, table_rows
 from terrafusion.fusion.scores.metrics import Outage, score
 
