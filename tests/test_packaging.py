@@ -56,7 +56,7 @@ def test_every_data_file_is_listed() -> None:
 def test_data_files_are_installed() -> None:
     from importlib import resources
 
-    for package, pattern in (("twin.params", "vehicles/husky.yaml"), ("fusion", "policy.yaml")):
+    for package, pattern in (("twin.params", "vehicles/husky.yaml"), ("fusion.weights", "policy.yaml")):
         assert resources.files(f"terrafusion.{package}").joinpath(pattern).is_file()
     assert resources.files("terrafusion.fusion.terrain").joinpath("model.yaml").is_file()
     assert resources.files("terrafusion.twin.engine").joinpath("driver.c").is_file()
