@@ -49,6 +49,8 @@ class State:
         gnss_drift_m: (2,) slow error of the GNSS positions, east and north.
         covariance: (6, 6) of the pose, ROS order (translation then rotation, world axes).
         velocity_covariance: (3, 3), world.
+        twist_covariance: (6, 6) of the body twist, linear then angular.
+        bias_sigma: (6,) 1 sigma of the gyro biases (rad/s), then of the accelerometer's (m/s2).
         terrain: class name -> probability.
         status: a key of `STATUS`.
     """
@@ -65,6 +67,8 @@ class State:
     gnss_drift_m: Array
     covariance: Array
     velocity_covariance: Array
+    twist_covariance: Array
+    bias_sigma: Array
     terrain: dict[str, float]
     status: str
 
@@ -103,6 +107,8 @@ class Estimate:
     innovations: tuple[Innovation, ...]
     status: NDArray[Any]
     notes: tuple[str, ...] = ()
+    twist_covariance: Array | None = None
+    bias_sigma: Array | None = None
 
     def dominant_terrain(self) -> NDArray[Any]:
         """The most probable class (N,) at each keyframe."""

@@ -19,6 +19,7 @@ from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
+from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import at_rest, bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
@@ -364,6 +365,10 @@ def _mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     total = sum(s.dt_s for s in segments)
     gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
     accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
+            twist_covariance=twist_covariance(
+                P, R, key.velocity, gyro_sigma_radps(self.config, self.weights.row)
+            ),
+            bias_sigma=bias_sigma(P),
     return gyro, accel
 
 

@@ -18,6 +18,7 @@ from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.history import History
@@ -151,7 +152,7 @@ def replay(
         estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, history, progress
     )
     if archive is not None and history.states:
-        _smooth(archive, history)
+        _smooth(archive, history, config)
     seconds = time.perf_counter() - started
     if not history.states:
         raise _never_started(recording, used)
@@ -251,7 +252,7 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
     estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v)
 
 
-def _smooth(chain: Chain, history: History) -> None:
+def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
     """Replace the live states by the batch solution over the whole drive, which starts from them."""
     offset = len(chain.nodes) - len(history.states)
     for i, state in enumerate(history.states):
@@ -259,8 +260,10 @@ def _smooth(chain: Chain, history: History) -> None:
     chain.optimise()
     covariances = chain.covariances()
     history.states[:] = [
-        _smoothed(state, chain, chain.first + offset + i, covariances[offset + i])
-        for i, state in enumerate(history.states)
+        _smoothed(
+            state, chain, chain.first + offset + i, covariances[offset + i], gyro_sigma_radps(config, row)
+        )
+        for i, (state, row) in enumerate(zip(history.states, history.rows, strict=True))
     ]
 
 
@@ -271,9 +274,9 @@ def _key_state(state: State) -> KeyState:
     return KeyState(pose, state.velocity_mps, bias, state.slip, state.gnss_drift_m)
 
 
-def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
+def _smoothed(live: State, chain: Chain, k: int, P: Array, gyro_sigma: float) -> State:
     key = chain.state(k)
-    rotation = key.pose.rotation()
+    R = key.pose.rotation().matrix()
     return dataclasses.replace(
         live,
         position_m=np.asarray(key.pose.translation()),
@@ -285,8 +288,10 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
         slip=key.slip,
         gnss_drift_m=key.drift,
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
-        covariance=gtsam_to_ros_covariance(P[POSE, POSE], rotation.matrix()),
+        covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
         velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+        twist_covariance=twist_covariance(P, R, key.velocity, gyro_sigma),
+        bias_sigma=bias_sigma(P),
     )
 
 
