@@ -9,6 +9,7 @@ state = est.latest()
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import gtsam
@@ -24,12 +25,13 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import at_rest, bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.graph.markov import markov_step
-from terrafusion.fusion.graph.preintegration import Preintegrator
+from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.alignment import Start, heading_from_motion, level_start
 from terrafusion.fusion.inputs.gates import WheelGate
 from terrafusion.fusion.inputs.gnss import GnssUpdater
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.propagate import Propagator
 from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
@@ -38,6 +40,7 @@ LONGEST_IMU_GAP_S = 0.5
 SMOOTH_EVERY = 5
 SMOOTH_WINDOW = 50
 OUTAGE_S = 2.0
+UNKNOWN = np.full(3, np.nan)
 STILL_GYRO_RADPS = 0.03
 STILL_ACCEL_MPS2 = 0.6
 
@@ -58,15 +61,15 @@ class Estimator:
         on_innovation: Callable[[Innovation], None] | None = None,
         archive: Chain | None = None,
     ) -> None:
-        self.config = config
+        self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
         self.chain = Chain(archive)
-        self.imu = ImuStream()
+        self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
         self.gnss = GnssUpdater(config, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
-        self._preintegrator = Preintegrator(config.rig.sensors.imu)
+        self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._step_ns = round(config.keyframe_s * 1e9)
         self._keep = round(config.lag_s / config.keyframe_s)
@@ -76,6 +79,7 @@ class Estimator:
         self._covariance = np.zeros((DIM, DIM))
         self._silent = False
         self._rest = 0
+        self._propagator = Propagator(self._preintegrator)
 
     @classmethod
     def for_vehicle(cls, name: str, mode: str = "adaptive") -> Estimator:
@@ -84,8 +88,13 @@ class Estimator:
 
         return cls(EstimatorConfig(load_vehicle(name).rig(), name, mode))
 
-    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
-        """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample."""
+    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
+        """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.
+
+        Where `config.inputs` declares no more than gyro z, all but the yaw rate may be NaN.
+        """
+        if self.config.inputs.imu == "none":
+            raise DataError("the estimator was told to expect no IMU", channel="imu", remedy="mend `inputs`")
         self.imu.add(t_ns, gyro_radps, accel_mps2)
         self._advance()
 
@@ -99,6 +108,9 @@ class Estimator:
     ) -> None:
         """Circumferential speed of each side, m/s, and its travelled distance, m, where encoders count it."""
         self.wheels.add(t_ns, left_mps, right_mps, left_m, right_m)
+        if self.config.inputs.imu == "none":  # the wheels are the clock, and their difference the yaw rate
+            self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m), UNKNOWN)
+            self._advance()
 
     def add_gnss(
         self,
@@ -126,6 +138,12 @@ class Estimator:
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
         return self._state
+
+    def odometry(self) -> State | None:
+        """The newest state carried to the newest IMU sample; None before the start."""
+        if self._state is None:
+            return None
+        return self._propagator.carry(self._state, self._covariance, self.imu, self.weights.row)
 
     @property
     def status(self) -> str:
@@ -165,7 +183,7 @@ class Estimator:
             start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
             if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
                 self._begin(start)
-        elif not self.gnss.waiting and (last or elapsed > self.config.start_without_gnss_s):
+        elif not self.gnss.waiting and (last or elapsed > self.config.longest_wait_s):
             self.gnss.local = True
             self._begin(self._level)
         return self._start is not None
@@ -217,6 +235,8 @@ class Estimator:
         before = self.chain.state(self.chain.last)
         row = self.weights.row
         segments = self.imu.segments(before_ns, t_ns)
+        if self.config.inputs.planar:
+            segments = in_a_turn(segments, before)
         wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
         link = gtsam.NonlinearFactorGraph()
@@ -230,7 +250,8 @@ class Estimator:
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), before.bias)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip, before.drift)
             link.add(_imu_factor(k, measured))
-            wheels = self._gated(t_ns, wheels, before, point, dt, switch)
+            if not self.config.inputs.planar:  # the planar link is no witness against the wheels
+                wheels = self._gated(t_ns, wheels, before, point, dt, switch)
         mean = row.slip_at(float(before.pose.rotation().matrix()[2, 0]))
         drift, drift_s = self.gnss.drift_sigma_m, self.gnss.drift_time_s
         markov = markov_step(
@@ -242,6 +263,8 @@ class Estimator:
         )
         gyro, accel = _mean_rates(segments)
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel)
+        if self.config.inputs.planar:
+            self.chain.add(k, held_level(k), "X")
         self._zero_velocity(k, wheels, segments, before, link)
         self._finish_keyframe(t_ns, gyro)
 
@@ -349,6 +372,10 @@ class Estimator:
             slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+            twist_covariance=twist_covariance(
+                P, R, key.velocity, gyro_sigma_radps(self.config, self.weights.row)
+            ),
+            bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),
             status=status,
         )
@@ -365,10 +392,6 @@ def _mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     total = sum(s.dt_s for s in segments)
     gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
     accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
-            twist_covariance=twist_covariance(
-                P, R, key.velocity, gyro_sigma_radps(self.config, self.weights.row)
-            ),
-            bias_sigma=bias_sigma(P),
     return gyro, accel
 
 
