@@ -107,7 +107,7 @@ def run(plan: Plan, progress: Callable[[float], None] | None = None) -> tuple[Ce
         for seed in range(FIRST_SEED, FIRST_SEED + plan.seeds):
             recording = Condition(plan.scenario, terrain, plan.slope_deg, 0.0, seed).run()
             for mode in plan.modes:
-                found[mode].append(test_drive(recording, mode))
+                found[mode].append(checked_drive(recording, mode))
                 done += 1
                 if progress is not None:
                     progress(done / plan.runs())
@@ -116,7 +116,7 @@ def run(plan: Plan, progress: Callable[[float], None] | None = None) -> tuple[Ce
     return tuple(cells)
 
 
-def test_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
+def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
     """Replay one drive; its quantities, those against the truth apart inside and outside the outage."""
     from terrafusion.fusion.replay import replay
     from terrafusion.fusion.scores.metrics import Outage
