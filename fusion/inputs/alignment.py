@@ -6,8 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
@@ -87,17 +88,39 @@ def _mean_speed_mps(wheels: WheelStream, start_ns: int, end_ns: int) -> float:
     return 0.0 if rolled is None else 0.5 * sum(rolled) / ((end_ns - start_ns) * 1e-9)
 
 
-def given_start(
-    level: Start, position_m: Array, yaw_rad: float, position_sigma_m: float, yaw_sigma_rad: float
-) -> Start:
-    """The start at a position (3,) and heading that are known, ENU; attitude and bias stay those of `level`."""
-    return dataclasses.replace(
-        level,
-        position_m=position_m,
-        yaw_rad=yaw_rad,
-        position_sigma_m=position_sigma_m,
-        yaw_sigma_rad=yaw_sigma_rad,
-    )
+@dataclass(frozen=True, eq=False)
+class GivenStart:
+    """A position (3,) and heading, ENU, that are known beforehand, with their 1 sigmas."""
+
+    position_m: Array
+    yaw_rad: float
+    position_sigma_m: float
+    yaw_sigma_rad: float
+
+    def at(self, level: Start) -> Start:
+        """The start there; attitude, speed and bias are those of `level`."""
+        return dataclasses.replace(level, **vars(self))
+
+
+def checked_given(
+    position_m: ArrayLike, yaw_rad: float, position_sigma_m: float, yaw_sigma_rad: float
+) -> GivenStart:
+    """A given start.
+
+    Raises:
+        DataError: not three finite coordinates and a finite heading with positive sigmas.
+    """
+    position = np.asarray(position_m, dtype=float)
+    if position.shape != (3,) or not np.isfinite(position.sum() + yaw_rad):
+        raise DataError(
+            f"start at {position.tolist()} with yaw {yaw_rad} is no pose", remedy="give x, y, z and yaw"
+        )
+    if not (0.0 < position_sigma_m < np.inf and 0.0 < yaw_sigma_rad < np.inf):
+        raise DataError(
+            f"sigmas {position_sigma_m} m, {yaw_sigma_rad} rad of the start are not positive",
+            remedy="give 1 sigma",
+        )
+    return GivenStart(position, float(yaw_rad), position_sigma_m, yaw_sigma_rad)
 
 
 def turn_between(
