@@ -17,6 +17,7 @@ part: a keyframe is at most `wheel_wait_s` and one step behind the IMU.
 
 from __future__ import annotations
 
+import bisect
 import dataclasses
 import math
 
@@ -52,14 +53,20 @@ class Propagator:
         newest_ns = imu.t_ns[-1]
         if newest_ns <= state.t_ns:
             return state
-        if self._state is not state:
+        if self._state is not state or self._taken(imu) != self._count:
             self._begin(state, covariance, row)
         for piece in imu.segments(self._until_ns, newest_ns):
             self._measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
         self._until_ns = newest_ns
+        self._count = self._taken(imu)
         density = row.gyro_inflation * self._preintegrator.spec.gyro_noise_radps_sqrthz
         interval_s = max(newest_ns - imu.t_ns[-2], 1) * 1e-9 if len(imu.t_ns) > 1 else 1.0
         return self._carried(state, imu.gyro[-1], density / math.sqrt(interval_s))
+
+    def _taken(self, imu: ImuStream) -> int:
+        """How many samples lie between keyframe and `_until_ns`: it changes when a late one comes."""
+        assert self._state is not None
+        return bisect.bisect_right(imu.t_ns, self._until_ns) - bisect.bisect_right(imu.t_ns, self._state.t_ns)
 
     def _begin(self, state: State, covariance: Array, row: SensorNoise) -> None:
         x, y, z, w = state.quaternion
@@ -68,7 +75,7 @@ class Propagator:
         self._from = gtsam.NavState(pose, state.velocity_mps)
         self._R = pose.rotation().matrix()
         self._bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
-        self._covariance = covariance
+        self._covariance, self._count = covariance, 0
         self._measured = self._preintegrator.integrate(
             [], self._bias, row.gyro_inflation, row.accel_inflation
         )

@@ -296,6 +296,12 @@ class Chain:
         if self.archive is not None:
             self.archive.set_markov(k, step)
 
+    def rebuild(self) -> None:
+        """Make the variables of GTSAM anew from the keyframes, which hold the same."""
+        self.values = gtsam.Values()
+        for k, node in enumerate(self.nodes, self.first):
+            self._insert(k, node.point)
+
     def move_to(self, k: int, point: KeyState) -> None:
         """Linearise keyframe k about another state."""
         node = self.nodes[k - self.first]
