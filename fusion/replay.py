@@ -257,7 +257,8 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
         return
     velocity = None if gnss.velocity_enu_mps is None else gnss.velocity_enu_mps[i]
     sigma_v = float("nan") if gnss.sigma_v_mps is None else float(gnss.sigma_v_mps[i])
-    estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v)
+    fix = int(gnss.fix[i])
+    estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v, fix)
 
 
 def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
