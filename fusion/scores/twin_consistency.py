@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError, TerrafusionError
+from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.scores.consistency import (
     CONFIDENCE,
@@ -90,8 +90,16 @@ class Plan:
         return self.seeds * len(self.terrains) * len(self.modes)
 
 
-def run(plan: Plan, progress: Callable[[float], None] | None = None) -> tuple[Cell, ...]:
-    """Drive, replay and test; the same plan gives the same cells.
+@dataclass(frozen=True)
+class Found:
+    """What the drives of a plan gave; `refused` says which of them could not be estimated, and why."""
+
+    cells: tuple[Cell, ...]
+    refused: tuple[str, ...] = ()
+
+
+def run(plan: Plan, progress: Callable[[float], None] | None = None) -> Found:
+    """Drive, replay and test; the same plan finds the same.
 
     Raises:
         ConfigError: no seeds, or an unknown ground or scenario.
@@ -101,19 +109,23 @@ def run(plan: Plan, progress: Callable[[float], None] | None = None) -> tuple[Ce
     if plan.seeds < 1:
         raise ConfigError(f"{plan.seeds} seeds are none", remedy="give --seeds 1 or more")
     cells: list[Cell] = []
+    refused: list[str] = []
     done = 0
     for terrain in plan.terrains:
-        found: dict[str, list[tuple[Consistency, ...]]] = {mode: [] for mode in plan.modes}
+        drives: dict[str, list[tuple[Consistency, ...]]] = {mode: [] for mode in plan.modes}
         for seed in range(FIRST_SEED, FIRST_SEED + plan.seeds):
             recording = Condition(plan.scenario, terrain, plan.slope_deg, 0.0, seed).run()
             for mode in plan.modes:
-                found[mode].append(checked_drive(recording, mode))
+                try:
+                    drives[mode].append(checked_drive(recording, mode))
+                except DataError as error:
+                    refused.append(f"{terrain}, {mode}, seed {seed}: {error}")
                 done += 1
                 if progress is not None:
                     progress(done / plan.runs())
         for mode in plan.modes:
-            cells += pool(terrain, mode, found[mode])
-    return tuple(cells)
+            cells += pool(terrain, mode, drives[mode])
+    return Found(tuple(cells), tuple(refused))
 
 
 def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
@@ -207,15 +219,15 @@ def command(arguments: list[str] | None = None) -> int:
     asked = Plan(given.seeds, tuple(given.terrain), tuple(given.mode), given.scenario, given.slope_deg)
     try:
         with progress_bar("consistency") as progress:
-            cells = run(asked, progress)
+            found = run(asked, progress)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
-    print("\n".join(report(asked, cells)))
+    print("\n".join(report(asked, found)))
     return 0
 
 
-def report(plan: Plan, cells: Sequence[Cell]) -> list[str]:
+def report(plan: Plan, found: Found) -> list[str]:
     """Everything the command prints."""
     start, seconds = OUTAGE_S
     lines = [
@@ -225,5 +237,5 @@ def report(plan: Plan, cells: Sequence[Cell]) -> list[str]:
         f"(cautious) the {CONFIDENCE:.0%} band of a consistent estimator.",
     ]
     for quantities in TABLES:
-        lines += ["", *table(cells, quantities)]
-    return lines
+        lines += ["", *table(found.cells, quantities)]
+    return [*lines, *(f"not estimated: {line}" for line in found.refused)]

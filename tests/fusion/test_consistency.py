@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Terrain
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.scores import consistency as c
@@ -227,13 +227,28 @@ def test_the_table_marks_what_is_not_consistent():
 
 def test_a_twin_drive_is_tested_inside_and_outside_its_outage():
     plan = twin.Plan(1, terrains=("asphalt",), modes=("adaptive",), scenario="figure_eight")
-    cells = twin.run(plan)
+    found = twin.run(plan)
+    cells = found.cells
     assert {cell.quantity for cell in cells} >= {
         "position", "position, outage", "heading", "heading, outage", "nis gnss", "nis wheels",
     }  # fmt: skip
     assert all(np.isfinite([cell.mean, *cell.band, *cell.interval]).all() for cell in cells)
-    assert twin.run(plan) == cells
-    assert len(twin.report(plan, cells)) > 8
+    assert found.refused == ()
+    assert len(twin.report(plan, found)) > 8
+
+
+def test_a_drive_that_cannot_be_estimated_is_told_and_not_counted(monkeypatch):
+    def refuses(recording, mode):
+        raise DataError("the robot never moved", channel="gnss")
+
+    monkeypatch.setattr(twin, "checked_drive", refuses)
+    plan = twin.Plan(2, terrains=("asphalt",), modes=("fixed",), scenario="straight")
+    found = twin.run(plan)
+    assert found.cells == ()
+    assert [line.split(":")[0] for line in found.refused] == [
+        f"asphalt, fixed, seed {twin.FIRST_SEED + k}" for k in range(2)
+    ]
+    assert sum(line.startswith("not estimated: ") for line in twin.report(plan, found)) == 2
 
 
 def test_no_seeds_is_a_one_line_error(capsys):
