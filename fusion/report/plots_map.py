@@ -57,7 +57,7 @@ def plot_map(
             handles.append(Line2D([], [], color=colour, linewidth=3, label=f"on {style.plain(name)}"))
     elif len(xy):
         handles += ax.plot(xy[:, 0], xy[:, 1], color="#0072b2", linewidth=2.0, label="estimate")
-    handles += _ellipses(ax, estimate, ellipse_rows(estimate, recording.start_ns, outages))
+    handles += _draw_ellipses(ax, ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages)))
     if len(xy):
         handles += ax.plot(
             *xy[0], "^", color="#111111", markersize=8, zorder=6, label="start", linestyle="none"
@@ -236,32 +236,27 @@ def _edge_outages(ax: Axes, estimate: Estimate, start_ns: int, outages: Sequence
     return handles
 
 
-def _ellipses(ax: Axes, estimate: Estimate, rows: NDArray[np.int64]) -> list[Any]:
-    """Draw the ellipses of the position at the keyframes `rows`."""
+def ellipses(estimate: Estimate, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Ellipses (K, 41, 2) of the position, m, at those of the keyframes `rows` whose covariance is known."""
     path = estimate.trajectory
     if path.covariance is None:
-        return []
+        return np.zeros((0, 41, 2))
     P = path.covariance[rows, :2, :2]
     sound = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(path.position_m[rows, :2]).all(axis=1)
-    if not sound.any():
-        return []
     size, axes = np.linalg.eigh(P[sound])
     angle = np.linspace(0.0, 2.0 * np.pi, 41)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = ring * ELLIPSE_SIGMAS * np.sqrt(np.maximum(size, 0.0))[:, None, :]
-    rings = np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[sound], None, :2]
+    return np.asarray(np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[sound], None, :2])
+
+
+def _draw_ellipses(ax: Axes, rings: NDArray[np.float64]) -> list[Any]:
     label = f"{ELLIPSE_SIGMAS:g} sigma of position"
-    for i, loop in enumerate(rings):
-        ax.plot(
-            loop[:, 0],
-            loop[:, 1],
-            color="#0072b2",
-            linewidth=0.7,
-            alpha=0.8,
-            zorder=5,
-            label=label if i == 0 else None,
-        )
-    return [ax.lines[-len(rings)]]
+    lines = [
+        ax.plot(*ring.T, color="#0072b2", linewidth=0.7, alpha=0.8, zorder=5, label=label)[0]
+        for ring in rings
+    ]
+    return lines[:1]
 
 
 def _map_size(estimates: Sequence[Estimate]) -> tuple[float, float]:
