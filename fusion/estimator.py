@@ -24,7 +24,7 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import at_rest, bridge, wheel_increment
+from terrafusion.fusion.graph.factors import bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.graph.markov import markov_step
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
@@ -39,7 +39,9 @@ from terrafusion.fusion.inputs.alignment import (
 from terrafusion.fusion.inputs.gates import WheelGate
 from terrafusion.fusion.inputs.gnss import GnssUpdater, checked_fix
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.monitor import MotionMonitor
 from terrafusion.fusion.propagate import Propagator
+from terrafusion.fusion.rest import RestDetector, hold
 from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
@@ -51,8 +53,6 @@ LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 OUTAGE_S = 2.0
 UNKNOWN = np.full(3, np.nan)
-STILL_GYRO_RADPS = 0.03
-STILL_ACCEL_MPS2 = 0.6
 
 
 class Estimator:
@@ -89,7 +89,8 @@ class Estimator:
         self._state: State | None = None
         self._covariance = np.zeros((DIM, DIM))
         self._silent = False
-        self._rest = 0
+        self._rest = RestDetector(config.rig)
+        self.monitor = MotionMonitor(config.rig)
         self._propagator = Propagator(self._preintegrator)
 
     @classmethod
@@ -156,6 +157,10 @@ class Estimator:
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with the own detector's."""
         self.weights.external(t_ns, probabilities)
+
+    def add_command(self, t_ns: int, v_mps: float) -> None:
+        """Commanded forward speed: it tells a robot that is kept from moving from one that waits."""
+        self.monitor.command(t_ns, v_mps)
 
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
@@ -265,14 +270,14 @@ class Estimator:
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _keyframe(self, t_ns: int) -> None:
-        switch = self.weights.take_switch()
+        switch = self.monitor.forget(self.weights.take_switch())
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
-        row = self.weights.row
+        row = self.monitor.reweighted(self.weights.row)
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
             segments = in_a_turn(segments, before)
-        wheels = self._wheel_increment(before_ns, t_ns, segments, before)
+        rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
         link = gtsam.NonlinearFactorGraph()
         if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
@@ -301,10 +306,10 @@ class Estimator:
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel)
         if self.config.inputs.planar:
             self.chain.add(k, held_level(k), "X")
-        self._zero_velocity(k, wheels, segments, before, link)
-        self._finish_keyframe(t_ns, gyro)
+        self._zero_velocity(k, t_ns, before, link)
+        self._finish_keyframe(t_ns, gyro, rolled.distance_m if rolled else None)
 
-    def _finish_keyframe(self, t_ns: int, gyro: Array) -> None:
+    def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
         chain = self.chain
         chain.solve(SMOOTH_WINDOW)
         self._covariance = chain.covariance()
@@ -317,6 +322,8 @@ class Estimator:
         chain.forget(self._keep)
         self.imu.forget(t_ns - 2_000_000_000)
         self.wheels.forget(t_ns - 2_000_000_000)
+        key, P, row = chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], self.weights.row
+        self.weights.changes += self.monitor.watch(t_ns, key, P, rolled_m, row)
         self._emit(t_ns, gyro)
         state = self._state
         assert state is not None
@@ -347,7 +354,7 @@ class Estimator:
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
         innovation = float(moved[0] - (1.0 - before.slip) * d[0])
-        P, row = self._covariance, self.weights.row
+        P, row = self._covariance, self.monitor.reweighted(self.weights.row)
         forward = before.pose.rotation().matrix()[:, 0]
         variance = (
             wheels.sigma_m[0] ** 2
@@ -362,32 +369,15 @@ class Estimator:
         self.wheels_rejected += not self._silent
         return None
 
-    def _zero_velocity(
-        self,
-        k: int,
-        wheels: WheelIncrement | None,
-        segments: list[ImuSegment],
-        before: KeyState,
-        link: gtsam.NonlinearFactorGraph,
-    ) -> None:
-        """Zero velocity and rate, once wheels and IMU have been still for three keyframes."""
-        rig = self.config.rig
-        quantum = max(1e-4, 1.5 * rig.sensors.wheels.quantum_rad * rig.wheel_radius_m)
-        bias_g, bias_a = before.bias.gyroscope(), before.bias.accelerometer()
-        still = (
-            wheels is not None
-            and abs(wheels.distance_m) < quantum
-            and abs(wheels.turn_rad) * rig.track_m < 2 * quantum
-            and all(np.abs(s.gyro_radps - bias_g).max() < STILL_GYRO_RADPS for s in segments)
-            and all(
-                abs(float(np.linalg.norm(s.accel_mps2 - bias_a)) - GRAVITY_MPS2) < STILL_ACCEL_MPS2
-                for s in segments
-            )
-        )
-        self._rest = self._rest + 1 if still else 0
-        if self._rest >= 3:
-            link.add(at_rest(k))
-            self.chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _REST_NOISE), "V")
+    def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
+        """Zero velocity and rate where the robot has stood for a window."""
+        known = self.gnss.last_used_ns is not None and (t_ns - self.gnss.last_used_ns) * 1e-9 <= OUTAGE_S
+        sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
+        biases = before.bias.gyroscope(), before.bias.accelerometer()
+        if self._rest.stands(
+            t_ns, self.imu, self.wheels, *biases, float(np.linalg.norm(before.velocity)), sigma
+        ):
+            hold(self.chain, k, link)
 
     def _emit(self, t_ns: int, gyro: Array) -> None:
         key = self.chain.state(self.chain.last)
@@ -414,6 +404,8 @@ class Estimator:
             bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),
             status=status,
+            slipping=self.monitor.slipping,
+            immobilised=self.monitor.immobilised,
         )
         if self._on_state is not None and not self._silent:
             self._on_state(self._state)
@@ -429,9 +421,6 @@ def _mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
     accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
     return gyro, accel
-
-
-_REST_NOISE = gtsam.noiseModel.Isotropic.Sigma(3, 0.005)
 
 
 def _imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:

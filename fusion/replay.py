@@ -151,8 +151,9 @@ def replay(
     )
     started = time.perf_counter()
     latencies = _feed(
-        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, history, progress
-    )
+        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, _commands(recording), history,
+        progress,
+    )  # fmt: skip
     if archive is not None and history.states:
         _smooth(archive, history, estimator.config)
     seconds = time.perf_counter() - started
@@ -217,6 +218,7 @@ def _feed(
     imu: Imu | None,
     wheels: tuple[list[int], list[list[float]]],
     gnss: Gnss | None,
+    commands: list[tuple[int, float]],
     history: History,
     progress: Callable[[float], None] | None,
 ) -> Array:
@@ -228,7 +230,7 @@ def _feed(
     gnss_times = [] if gnss is None else gnss.t_ns.tolist()
     clock = wheel_times if imu is None else imu.t_ns.tolist()
     latencies: list[float] = []
-    w = g = made = 0
+    w = g = c = made = 0
     for i, t_ns in enumerate(clock):
         while imu is not None and w < len(wheel_times) and wheel_times[w] <= t_ns:
             estimator.add_wheels(wheel_times[w], *wheel_rows[w])
@@ -237,6 +239,9 @@ def _feed(
             assert gnss is not None
             _give_fix(estimator, gnss, g)
             g += 1
+        while c < len(commands) and commands[c][0] <= t_ns:
+            estimator.add_command(*commands[c])
+            c += 1
         begun = time.perf_counter()
         if imu is None:
             estimator.add_wheels(t_ns, *wheel_rows[i])
@@ -251,6 +256,15 @@ def _feed(
     if progress is not None:
         progress(1.0)
     return np.array(latencies)
+
+
+def _commands(recording: Recording) -> list[tuple[int, float]]:
+    """Times and commanded forward speeds, m/s, as far as the log has them."""
+    command = recording.command
+    if command is None:
+        return []
+    known = np.isfinite(command.v_mps)
+    return list(zip(command.t_ns[known].tolist(), command.v_mps[known].tolist(), strict=True))
 
 
 def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
@@ -311,6 +325,11 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
     if estimator.gnss.too_late:
         notes.append(f"{estimator.gnss.too_late} GNSS fixes came before the start or too late for the lag")
+    if estimator.gnss.turned:
+        notes.append(f"the heading was wrong and was set right from the motion {estimator.gnss.turned} times")
+    for stream in (estimator.imu.late, estimator.wheels.late):
+        if stream.too_late:
+            notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
     return tuple(notes)
 
 
