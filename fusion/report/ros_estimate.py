@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 from terrafusion.fusion.estimate import STATUS, Estimate
+from terrafusion.fusion.report.plots_map import is_local
 
 EVERY_S = 1.0
 """Diagnostics come at least this often while there are keyframes, and at each change."""
@@ -31,7 +32,7 @@ def written_estimate(estimate: Estimate) -> WrittenEstimate:
         )
         for j, i in enumerate(rows.tolist())
     ]
-    frame = "odom" if len(estimate.status) and (estimate.status == "no_gnss").all() else "map"
+    frame = "odom" if is_local(estimate) else "map"
     return WrittenEstimate(estimate.trajectory, estimate.twist_covariance, frame, t_ns, diagnostics)
 
 
