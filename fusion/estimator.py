@@ -270,10 +270,10 @@ class Estimator:
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _keyframe(self, t_ns: int) -> None:
-        switch = self.monitor.forget(self.weights.take_switch())
+        switch = self.weights.take_switch()
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
-        row = self.monitor.reweighted(self.weights.row)
+        row = self.weights.row
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
             segments = in_a_turn(segments, before)
@@ -322,8 +322,7 @@ class Estimator:
         chain.forget(self._keep)
         self.imu.forget(t_ns - 2_000_000_000)
         self.wheels.forget(t_ns - 2_000_000_000)
-        key, P, row = chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], self.weights.row
-        self.weights.changes += self.monitor.watch(t_ns, key, P, rolled_m, row)
+        self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         self._emit(t_ns, gyro)
         state = self._state
         assert state is not None
@@ -354,7 +353,7 @@ class Estimator:
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
         innovation = float(moved[0] - (1.0 - before.slip) * d[0])
-        P, row = self._covariance, self.monitor.reweighted(self.weights.row)
+        P, row = self._covariance, self.weights.row
         forward = before.pose.rotation().matrix()[:, 0]
         variance = (
             wheels.sigma_m[0] ** 2

@@ -13,7 +13,6 @@ it takes `command`, because at the wheels a stall looks like a stop).
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections import deque
 from dataclasses import dataclass
@@ -22,9 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.sensors import Rig
-from terrafusion.fusion.estimate import WeightChange
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
@@ -45,8 +42,6 @@ COMMAND_MPS = 0.1
 """A command of at least this speed asks for motion."""
 COMMAND_HOLD_NS = 500_000_000
 """A command holds so long when no other comes."""
-OPEN_SIGMA = 0.5
-"""1 sigma of slip about one half while wheels spin on the spot: anything from 0 to 1."""
 SPINNING, STALLED = "traction lost", "motors stalled"
 
 
@@ -102,15 +97,11 @@ class MotionMonitor:
         """The commanded forward speed, m/s."""
         self._command = (t_ns, v_mps)
 
-    def watch(
-        self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None, row: SensorNoise
-    ) -> list[WeightChange]:
-        """One keyframe as the estimator has it (covariance (3, 3), world); what it changes of `row`."""
-        was, forward = self.cause, key.pose.rotation().matrix()[:, 0]
+    def watch(self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None) -> None:
+        """`update` from a keyframe's state and the covariance (3, 3) of its velocity, world axes."""
+        forward = key.pose.rotation().matrix()[:, 0]
         sigma = math.sqrt(float(forward @ velocity_covariance @ forward))
         self.update(t_ns, rolled_m, float(forward @ key.velocity), sigma)
-        change = self._change(t_ns, row, was)
-        return [] if change is None else [change]
 
     def update(self, t_ns: int, rolled_m: float | None, speed_mps: float, sigma_mps: float) -> None:
         """One keyframe: wheel travel since the last, before any gate; forward speed and its sigma."""
@@ -127,25 +118,6 @@ class MotionMonitor:
         self._watch_slip(dt)
         stuck = self.travel(STUCK_S)
         self.cause = None if stuck is None else self._cause(stuck)
-
-    def reweighted(self, row: SensorNoise) -> SensorNoise:
-        """The noise row, with slip set free while the wheels spin on the spot."""
-        if self.cause != SPINNING:
-            return row
-        return dataclasses.replace(row, slip_mean=0.5, slip_per_grade=0.0, slip_sigma=OPEN_SIGMA)
-
-    def forget(self, switch: float) -> float:
-        """Probability that slip starts anew at this keyframe: surely so while the wheels spin on the spot."""
-        return 1.0 if self.cause == SPINNING else switch
-
-    def _change(self, t_ns: int, row: SensorNoise, was: str | None) -> WeightChange | None:
-        """The record of slip being set free or bound again, given the cause at the keyframe before."""
-        if (was == SPINNING) == (self.cause == SPINNING):
-            return None
-        sigmas, why = (row.slip_sigma, OPEN_SIGMA), f"immobilised, {SPINNING}"
-        if self.cause != SPINNING:
-            sigmas, why = (OPEN_SIGMA, row.slip_sigma), "no longer immobilised"
-        return WeightChange(t_ns, "wheels", *sigmas, "", f"slip_sigma: {why}")
 
     def travel(self, seconds: float) -> Travel | None:
         """The last `seconds`; None before so much is known, or where wheels are missing.
