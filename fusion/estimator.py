@@ -76,7 +76,7 @@ class Estimator:
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
-        self.gnss = GnssUpdater(config, self._report)
+        self.gnss = GnssUpdater(config, self._report, self.weights.single)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
@@ -364,7 +364,7 @@ class Estimator:
         accepted, nis = self._wheel_gate.test(innovation, float(np.sqrt(variance)))
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
-            return wheels
+            return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
         self.wheels_rejected += not self._silent
         return None
 

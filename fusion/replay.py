@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -114,16 +115,18 @@ def replay(
     outages: Sequence[Outage] = (),
     batch: bool = False,
     progress: Callable[[float], None] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Replay:
     """Estimate and score one drive.
 
     Args:
         vehicle: name or YAML file; by default what the log says.
-        mode: "adaptive" or "fixed".
+        mode: "adaptive", "fixed", "robust" or "innovation".
         policy: weighting policy, or its file; by default the shipped one.
         outages: stretches in which the estimator gets no fix.
         batch: smooth the whole drive at once, instead of a fixed lag as live.
         progress: called with the share done, 0 to 1.
+        settings: further fields of `EstimatorConfig`.
 
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
@@ -140,7 +143,7 @@ def replay(
     rows = policy if isinstance(policy, Policy) else load_policy(policy)
     inputs = inputs_of(recording, used)
     imu, wheels = _usable(recording, inputs)
-    config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs)
+    config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs, **(settings or {}))
     archive = Chain() if batch else None
     history = History()
     estimator = Estimator(

@@ -130,6 +130,14 @@ class Chain:
         if self.archive is not None:
             self.archive.add_fix(k, fix)
 
+    def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
+        """Put another weight on a GNSS position of keyframe k."""
+        fixes = self.nodes[k - self.first].fixes
+        fixes[fixes.index(old)] = new
+        self._dirty = min(self._dirty, k)
+        if self.archive is not None:
+            self.archive.replace_fix(k, old, new)
+
     def at_or_after(self, t_ns: int) -> int | None:
         """The first keyframe held at or after a time; None when none is, or when older ones were dropped."""
         i = bisect.bisect_left(self.nodes, t_ns, key=lambda node: node.t_ns)

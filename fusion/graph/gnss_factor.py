@@ -25,12 +25,16 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class GnssPosition:
-    """A fix at a keyframe: antenna `enu_m`, `lever_m` in the body frame, white 1 `sigma_m`, each (3,)."""
+    """A fix at a keyframe: antenna `enu_m`, `lever_m` in the body frame, white 1 `sigma_m`, each (3,).
+
+    `weight` is what a robust loss leaves of its horizontal part; `sigma_m` holds it already.
+    """
 
     enu_m: Array
     lever_m: Array
     sigma_m: Array
     drift_share: float = 1.0
+    weight: float = 1.0
 
 
 def residual(fix: GnssPosition, pose: Any, drift_m: Array) -> Array:
