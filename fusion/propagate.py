@@ -42,6 +42,9 @@ class Propagator:
     def __init__(self, preintegrator: Preintegrator) -> None:
         self._preintegrator = preintegrator
         self._state: State | None = None
+        self._until_ns = 0
+        self._count = 0
+        self._measured: gtsam.PreintegratedCombinedMeasurements
 
     def carry(self, state: State, covariance: Array, imu: ImuStream, row: SensorNoise) -> State:
         """The state at the newest IMU sample, with `covariance` (DIM, DIM) of the keyframe carried along.
