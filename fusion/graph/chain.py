@@ -184,18 +184,22 @@ class Chain:
             self.smooth(window)
 
     def smooth(self, window: int, iterations: int = 4) -> None:
-        """Bring the newest `window` keyframes up to date; those that moved far are linearised again."""
+        """Bring the newest `window` keyframes up to date; if one has moved far, linearise all held again.
+
+        All, because a factor between a keyframe that was moved and one that was not would
+        be linearised about a step that nobody took; far from the start that step is metres.
+        """
         begin = max(self.last - window + 1, self.first)
         for _ in range(iterations):
             self._eliminate_all()
             self._back_substitute_to(begin)
             deltas = np.abs([node.delta for node in self.nodes[begin - self.first :]])
-            moved = begin + np.flatnonzero((deltas > self.RELINEARISE).any(axis=1))
-            if not moved.size:
+            if not (deltas > self.RELINEARISE).any():
                 return
-            for k in moved.tolist():
+            self._back_substitute_to(self.first)
+            for k in range(self.first, self.last + 1):
                 self._move(k)
-            self._dirty = max(min(self._dirty, int(moved[0]) - 1), self.first)
+            self._dirty = self.first
         self._eliminate_all()
         self._back_substitute_to(begin)
 
