@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -177,7 +178,7 @@ class Estimator:
         return snapshot.dump(self)
 
     @classmethod
-    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Callable[..., None]) -> Estimator:
+    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Estimator:
         """An estimator that goes on where `dump` was called, with the same bits; see `snapshot.restore`."""
         return snapshot.restore(cls(config, **callbacks), data)
 

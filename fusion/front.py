@@ -129,14 +129,18 @@ def _missing(imu: Imu | None) -> str:
         return "the log has no IMU"
     names = [
         f"gyro {axis}"
-        for axis, absent in zip("xyz", np.isnan(imu.gyro_radps).all(axis=0), strict=True)
+        for axis, absent in zip("xyz", np.isnan(imu.gyro_radps).all(axis=0).tolist(), strict=True)
         if absent
     ]
-    absent_accel = np.isnan(imu.accel_mps2).all(axis=0)
+    absent_accel: np.ndarray = np.isnan(imu.accel_mps2).all(axis=0)
     if absent_accel.all():
         names.append("accelerometer")
     else:
-        names += [f"accelerometer {axis}" for axis, absent in zip("xyz", absent_accel, strict=True) if absent]
+        names += [
+            f"accelerometer {axis}"
+            for axis, absent in zip("xyz", absent_accel.tolist(), strict=True)
+            if absent
+        ]
     if names:
         return f"the log has no {', no '.join(names)}"
     return "few rows of the IMU hold all six axes"

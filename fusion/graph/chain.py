@@ -29,6 +29,7 @@ from terrafusion.fusion.graph import gnss_factor
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import BIAS, DIM, DRIFT, MARKOV, NAV, POSE, SLIP, VELOCITY, KeyState
 from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.triangular import back_substitute, triangular
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
@@ -211,8 +212,8 @@ class Chain:
         node = self.nodes[-1]
         own = np.vstack([node.prior, self._unary_rows(self.last)])
         self._error += float(own[len(node.prior) :, DIM] @ own[len(node.prior) :, DIM])
-        self._root = _triangular(own)
-        node.delta = _back_substitute(self._root[:, :DIM], self._root[:, DIM])
+        self._root = triangular(own)
+        node.delta = back_substitute(self._root[:, :DIM], self._root[:, DIM])
 
     def optimise(self, iterations: int = 30, tolerance: float = 1e-6) -> int:
         """Gauss-Newton with step halving over all keyframes (batch); gives the iterations taken."""
@@ -268,7 +269,7 @@ class Chain:
         self._eliminate_all()
         k = self.last if k is None else k
         node = self.nodes[k - self.first]
-        known = self._root if k == self.last else _triangular(np.vstack([node.prior, self._unary_rows(k)]))
+        known = self._root if k == self.last else triangular(np.vstack([node.prior, self._unary_rows(k)]))
         inverse, _ = lapack.dtrtri(known[:, :DIM])
         mean = inverse @ known[:, DIM]
         root = np.linalg.inv(np.linalg.cholesky(inverse @ inverse.T + np.diag(extra_variance)))
@@ -426,7 +427,7 @@ class Chain:
         stacked[: len(own), :DIM] = own[:, :DIM]
         stacked[: len(own), 2 * DIM] = own[:, DIM]
         stacked[len(own) :] = link
-        R = _triangular(stacked)
+        R = triangular(stacked)
         node.conditional = R[:DIM]
         self.nodes[k + 1 - self.first].prior = R[DIM : 2 * DIM, DIM:]
 
@@ -435,7 +436,7 @@ class Chain:
         for node in self.nodes[-2 : begin - self.last - 2 : -1]:
             assert node.conditional is not None
             rhs = node.conditional[:, 2 * DIM] - node.conditional[:, DIM : 2 * DIM] @ following
-            node.delta = following = _back_substitute(node.conditional[:, :DIM], rhs)
+            node.delta = following = back_substitute(node.conditional[:, :DIM], rhs)
 
 
 def _covariance_before(node: Node, following: Array) -> Array:
@@ -444,22 +445,3 @@ def _covariance_before(node: Node, following: Array) -> Array:
     inverse, _ = lapack.dtrtri(node.conditional[:, :DIM])
     gain = inverse @ node.conditional[:, DIM : 2 * DIM]
     return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)
-
-
-_UPPER = np.triu(np.ones((2 * DIM, 2 * DIM + 1)))
-
-
-def _triangular(stacked: Array) -> Array:
-    """R of the QR decomposition of (m, n) rows, padded to n rows."""
-    rows, columns = stacked.shape
-    if rows < columns:
-        stacked = np.vstack([stacked, np.zeros((columns - rows, columns))])
-    packed, _, _, _ = lapack.dgeqrf(stacked, overwrite_a=1)
-    return np.asarray(packed[: columns - 1] * _UPPER[: columns - 1, :columns])
-
-
-def _back_substitute(R: Array, rhs: Array) -> Array:
-    solution, info = lapack.dtrtrs(R, rhs)
-    if info or not np.isfinite(solution).all():
-        raise ArithmeticError("a keyframe is not determined by its factors")
-    return np.asarray(solution)

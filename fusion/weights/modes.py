@@ -6,7 +6,7 @@ import dataclasses
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated, Any, get_type_hints
 
 from terrafusion.datasets.config import Quantity, checked_number, read_yaml
 from terrafusion.datasets.errors import ConfigError
@@ -109,7 +109,9 @@ def _parse(content: dict, file: Path) -> ModeTuning:
         raise ConfigError(
             f"schema is '{content['schema']}'", file=file, remedy=f"this version reads {SCHEMA}"
         )
-    sections = {name: _section(cls, content[name], file, name) for name, cls in SECTIONS.items()}
+    sections: dict[str, Any] = {
+        name: _section(cls, content[name], file, name) for name, cls in SECTIONS.items()
+    }
     return ModeTuning(**sections, inputs_sha256=str(content["inputs_sha256"]))
 
 
@@ -129,7 +131,7 @@ def write_modes(tuning: ModeTuning, path: Path, made_by: str) -> None:
     """Write a tuning file: same tuning, same bytes."""
     from ruamel.yaml import YAML
 
-    content = {"schema": SCHEMA, "made_by": made_by, "inputs_sha256": tuning.inputs_sha256}
+    content: dict[str, Any] = {"schema": SCHEMA, "made_by": made_by, "inputs_sha256": tuning.inputs_sha256}
     content |= {name: dataclasses.asdict(getattr(tuning, name)) for name in SECTIONS}
     yaml = YAML()
     yaml.default_flow_style = False

@@ -173,7 +173,8 @@ def _line(tuning: ModeTuning, method: str, name: str, factor: float) -> Iterator
 def fingerprint() -> str:
     """SHA-256 of what the result depends on: policy, drives, their parameter files, steps, first guesses."""
     drives = [dataclasses.astuple(drive) for drive in DRIVES]
-    grid = Grid(*(tuple(dict.fromkeys(column)) for column in _columns()))
+    columns: Any = (tuple(dict.fromkeys(column)) for column in _columns())
+    grid = Grid(*columns)
     settings = [drives, STEPS, dataclasses.astuple(ModeTuning()), load_policy().inputs_sha256]
     faults = [
         FAULTS_FROM_S,

