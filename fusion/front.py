@@ -129,10 +129,10 @@ def _missing(imu: Imu | None) -> str:
         return "the log has no IMU"
     names = [
         f"gyro {axis}"
-        for axis, absent in zip("xyz", np.isnan(imu.gyro_radps).all(axis=0).tolist(), strict=True)
+        for axis, absent in zip("xyz", np.all(np.isnan(imu.gyro_radps), axis=0).tolist(), strict=True)
         if absent
     ]
-    absent_accel: np.ndarray = np.isnan(imu.accel_mps2).all(axis=0)
+    absent_accel = np.asarray(np.all(np.isnan(imu.accel_mps2), axis=0))
     if absent_accel.all():
         names.append("accelerometer")
     else:
