@@ -61,6 +61,8 @@ class TerrainWeights:
         self._labels = config.labels
         self._told: Array | None = None
         fixed = config.tuning.fixed.of(self.policy.fixed)
+        # Where the ground is not known, adaptive weights must not do worse than fixed ones.
+        self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: fixed})
         self.row = self.policy.blend(self._probabilities) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
