@@ -81,7 +81,12 @@ def _geometry(recording: Recording, c: Conventions) -> Recording:
 
 
 def _inertial(recording: Recording, c: Conventions) -> Recording:
-    imu = recording.imu
+    imu, field = recording.imu, recording.magnetometer
+    if field is not None and c.imu_axes != BODY_AXES:
+        turned = dataclasses.replace(field, field_t=_turned(axes_matrix(c.imu_axes), field.field_t))
+        recording = dataclasses.replace(recording, magnetometer=turned).with_notes(
+            "magnetometer: taken to have the IMU's axes, and turned with it"
+        )
     if imu is None:
         return recording
     if c.imu_axes != BODY_AXES:

@@ -229,6 +229,36 @@ class Motor(Channel):
 
 
 @dataclass(frozen=True, eq=False)
+class Barometer(Channel):
+    """Static pressure `pressure_pa` (N,), as measured.
+
+    A pressure and no altitude: an altitude needs a sea-level pressure, which logs do not hold.
+    """
+
+    name: ClassVar[str] = "barometer"
+    pressure_pa: Array
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return {"pressure_pa": self.pressure_pa}
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer(Channel):
+    """Magnetic flux density `field_t` (N, 3), body axes, tesla; the field that the robot stands in."""
+
+    name: ClassVar[str] = "magnetometer"
+    field_t: Array
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.field_t.shape != (len(self), 3):
+            raise ValueError(f"magnetometer: field_t has shape {self.field_t.shape}, not ({len(self)}, 3)")
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return {f"field_{axis}_t": self.field_t[:, i] for i, axis in enumerate("xyz")}
+
+
+@dataclass(frozen=True, eq=False)
 class Terrain(Channel):
     """Terrain `label` (N,) of str, and `probabilities` (N, k) over `classes` where known.
 
@@ -309,8 +339,12 @@ class Recording:
     notes: tuple[str, ...] = ()
     clock_jumps: tuple[ClockJump, ...] = ()
     imu_frame_id: str = ""
+    barometer: Barometer | None = None
+    magnetometer: Magnetometer | None = None
 
-    CHANNELS: ClassVar[tuple[str, ...]] = ("command", "wheels", "imu", "gnss", "motor", "terrain")
+    CHANNELS: ClassVar[tuple[str, ...]] = (
+        "command", "wheels", "imu", "gnss", "motor", "terrain", "barometer", "magnetometer",
+    )  # fmt: skip
 
     def channels(self) -> dict[str, Channel]:
         """The channels that are present, by name, without the truth."""

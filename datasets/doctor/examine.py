@@ -8,6 +8,7 @@ import numpy as np
 
 from terrafusion.datasets.doctor import (
     dilution,
+    environment,
     gnss,
     gnss_frame,
     inertial,
@@ -61,6 +62,8 @@ CHECKS: tuple[Check, ...] = (
     truth.check_unit,
     truth.check_yaw,
     scale.check_speed_scale,
+    environment.check_pressure,
+    environment.check_field,
 )
 
 UNIT_CHECKS: tuple[Check, ...] = (turns.check_gyro_unit, scale.check_speed_scale)

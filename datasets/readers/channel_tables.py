@@ -15,7 +15,17 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.log_meta import Meta
-from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Motor, Terrain, Wheels
+from terrafusion.datasets.recording import (
+    Barometer,
+    Command,
+    Fix,
+    Gnss,
+    Imu,
+    Magnetometer,
+    Motor,
+    Terrain,
+    Wheels,
+)
 from terrafusion.datasets.trajectory import Trajectory
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
@@ -30,6 +40,7 @@ WHEEL_LAYOUTS: Layouts = (
 
 GYRO = ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps")
 ACCEL = ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
+FIELD = ("field_x_t", "field_y_t", "field_z_t")
 GNSS_POSITION = ("east_m", "north_m", "sigma_e_m", "sigma_n_m")
 GNSS_HEIGHT = ("up_m", "sigma_u_m")
 GNSS_VELOCITY = ("v_e_mps", "v_n_mps", "v_u_mps")
@@ -174,6 +185,14 @@ class ChannelReader:
             tuple(name.removeprefix("p_") for name in table.numbers),
             table.stack(list(table.numbers)) if table.numbers else None,
         )
+
+    def barometer(self) -> Barometer | None:
+        table = self._table("barometer", ("pressure_pa",), required=("pressure_pa",))
+        return None if table is None else Barometer(self._t(table), table.numbers["pressure_pa"])
+
+    def magnetometer(self) -> Magnetometer | None:
+        table = self._table("magnetometer", FIELD, required=FIELD)
+        return None if table is None else Magnetometer(self._t(table), table.stack(FIELD))
 
     def truth(self) -> Trajectory | None:
         names = ["x_m", "y_m", "z_m", *QUATERNION, *TRUTH_TWIST, *COVARIANCE]

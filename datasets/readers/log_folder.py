@@ -26,7 +26,7 @@ from terrafusion.datasets.trajectory import Trajectory
 
 META = "meta.yaml"
 TimesNs = NDArray[np.int64]
-CHANNELS = ("command", "wheels", "imu", "gnss", "motor", "terrain", "truth")
+CHANNELS = (*Recording.CHANNELS, "truth")
 
 
 def claims(path: Path, head: bytes) -> bool:

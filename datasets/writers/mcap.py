@@ -43,6 +43,7 @@ def write_mcap(
 
     Topics: `/imu/data` Imu, `/joint_states` JointState (wheels in rad/s) or `/wheel/odom` Odometry
     (in m/s), `/fix` NavSatFix, `/fix_velocity` TwistWithCovarianceStamped (east, north, up),
+    `/pressure` FluidPressure, `/imu/mag` MagneticField,
     `/datum` NavSatFix (the ENU origin, once), `/cmd_vel` TwistStamped, `/terrain` String,
     `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link,
     `/tf` (the estimate) and `/tf_static` (positions of IMU and antenna where known) TFMessage,
@@ -167,6 +168,11 @@ class _Parts:
             yield from self._wheels(r.wheels)
         if r.imu is not None:
             yield self._imu(r.imu)
+        if r.barometer is not None:
+            yield ros.pressure(self._complete("barometer", r.barometer, r.barometer.columns()))
+        if r.magnetometer is not None:
+            complete = self._complete("magnetometer", r.magnetometer, r.magnetometer.columns())
+            yield ros.magnetic_field(complete, self._imu_frame())
         if r.gnss is not None:
             yield from self._gnss(r.gnss)
         if r.terrain is not None:
@@ -201,9 +207,11 @@ class _Parts:
             self.unseen.append(f"{name}: {int((~full).sum())} rows with missing values")
         return channel.select(full)
 
+    def _imu_frame(self) -> str:
+        return "imu_link" if "imu_link" in self._positions() else "base_link"
+
     def _imu(self, imu: Imu) -> Topic:
-        frame = "imu_link" if "imu_link" in self._positions() else "base_link"
-        return ros.imu(self._complete("imu", imu, imu.columns()), frame)
+        return ros.imu(self._complete("imu", imu, imu.columns()), self._imu_frame())
 
     def _wheels(self, wheels: Wheels) -> Iterator[Topic]:
         complete: Wheels = self._complete("wheels", wheels, wheels.columns())

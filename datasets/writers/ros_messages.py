@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
-from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Terrain, Wheels
+from terrafusion.datasets.recording import Barometer, Command, Fix, Gnss, Imu, Magnetometer, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers.cdr import Layout, split
 from terrafusion.datasets.writers.mcap_file import Topic
@@ -57,6 +57,20 @@ def imu(imu: Imu, frame: str) -> Topic:
         layout.field(name, count=3).constant("d", -1.0 if absent else 0.0, *[0.0] * 8)
         fields[name] = np.nan_to_num(values) if absent else values
     return _topic("/imu/data", "sensor_msgs/msg/Imu", layout, imu.t_ns, **fields)
+
+
+def pressure(barometer: Barometer) -> Topic:
+    """sensor_msgs/FluidPressure; the variance is not known, which is 0 there."""
+    layout = Layout().header("base_link").field("pressure").constant("d", 0.0)
+    kind = "sensor_msgs/msg/FluidPressure"
+    return _topic("/pressure", kind, layout, barometer.t_ns, pressure=barometer.pressure_pa)
+
+
+def magnetic_field(magnetometer: Magnetometer, frame: str) -> Topic:
+    """sensor_msgs/MagneticField, tesla; the covariance is not known, which is 0 there (REP-145)."""
+    layout = Layout().header(frame).field("field", count=3).constant("d", *[0.0] * 9)
+    kind = "sensor_msgs/msg/MagneticField"
+    return _topic("/imu/mag", kind, layout, magnetometer.t_ns, field=magnetometer.field_t)
 
 
 def joint_states(wheels: Wheels) -> Topic:

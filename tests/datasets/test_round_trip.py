@@ -15,10 +15,12 @@ from hypothesis.extra import numpy as hnp
 
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.recording import (
+    Barometer,
     ClockJump,
     Command,
     Gnss,
     Imu,
+    Magnetometer,
     Motor,
     Overrides,
     Recording,
@@ -88,6 +90,10 @@ def channels(draw: st.DrawFn, first_ns: int, start_ns: int, last_ns: int) -> dic
             found[name] = Gnss(t, some(3), some(3), fix, perhaps(3), perhaps())
         elif name == "motor":
             found[name] = Motor(t, some(2), perhaps(2))
+        elif name == "barometer":
+            found[name] = Barometer(t, some())
+        elif name == "magnetometer":
+            found[name] = Magnetometer(t, some(3))
         elif name == "terrain":
             label = np.array(draw(st.lists(LABELS, min_size=n, max_size=n)), dtype=object)
             classes = draw(CLASSES)

@@ -99,6 +99,10 @@ def _build(builder: Builder, timing: Timing, datum_stream: Stream | None) -> Rec
         gnss, datum = builder.gnss(streams["gnss"], t["gnss"], datum)
         if gnss is not None and "gnss_velocity" in streams:
             gnss = builder.gnss_velocity(gnss, streams["gnss_velocity"], t["gnss_velocity"])
+    barometer = builder.barometer(streams["barometer"], t["barometer"]) if "barometer" in streams else None
+    magnetometer = None
+    if "magnetometer" in streams:
+        magnetometer = builder.magnetometer(streams["magnetometer"], t["magnetometer"])
     truth, frame = None, "base"
     if "truth" in streams:
         truth, frame = builder.truth(streams["truth"], t["truth"])
@@ -110,6 +114,8 @@ def _build(builder: Builder, timing: Timing, datum_stream: Stream | None) -> Rec
         imu=imu,
         gnss=gnss,
         terrain=builder.terrain(streams["terrain"], t["terrain"]) if "terrain" in streams else None,
+        barometer=barometer,
+        magnetometer=magnetometer,
         truth=truth,
         datum=datum,
         truth_channels=truth_contents(truth) if truth is not None else (),

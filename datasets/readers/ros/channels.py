@@ -15,7 +15,7 @@ from terrafusion.datasets.frames import geodetic_to_enu
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.joints import holding, joint_names, joint_values, wheel_joints
 from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE, Stream, poses, twists
-from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Terrain, Wheels
+from terrafusion.datasets.recording import Barometer, Command, Fix, Gnss, Imu, Magnetometer, Terrain, Wheels
 from terrafusion.datasets.sensors import Rig
 from terrafusion.datasets.trajectory import Trajectory
 
@@ -62,36 +62,58 @@ class Builder:
             if not known.any():
                 self.notes.append(f"imu: {stream.topic} has no {what}")
             self._refuse_nan(values[:, known], t_ns, stream.topic, what)
-        gyro, accel = self._to_body(stream, gyro, accel)
-        return Imu(t_ns, gyro, accel)
+        return Imu(t_ns, *self._to_body("imu", stream, gyro, accel))
 
-    def _to_body(self, stream: Stream, gyro: Array, accel: Array) -> tuple[Array, Array]:
+    def barometer(self, stream: Stream, t_ns: TimesNs) -> Barometer | None:
+        """Pressures; messages without a number are left out."""
+        pressure = stream.column("fluid_pressure").astype(float)
+        held = self._held("barometer", stream.topic, np.asarray(np.isfinite(pressure)))
+        return Barometer(t_ns[held], pressure[held]) if held.any() else None
+
+    def magnetometer(self, stream: Stream, t_ns: TimesNs) -> Magnetometer | None:
+        """Fields in body axes, as the IMU's; messages without a number are left out."""
+        field = stream.vectors("magnetic_field")
+        held = self._held("magnetometer", stream.topic, np.asarray(np.isfinite(field).all(axis=1)))
+        if not held.any():
+            return None
+        return Magnetometer(t_ns[held], self._to_body("magnetometer", stream, field)[0][held])
+
+    def _held(self, name: str, topic: str, held: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        if not held.all():
+            lost = int((~held).sum())
+            self.notes.append(f"{name}: {lost} of {len(held)} messages of {topic} hold no number; left out")
+        return held
+
+    def _to_body(self, name: str, stream: Stream, *vectors: Array) -> tuple[Array, ...]:
         frames = sorted(set(stream.frame_ids.tolist()))
         said = ", ".join(f"'{name}'" for name in frames)
         if self.rig is None:
             if self.known.imu_axes == BODY_AXES:
                 self.notes.append(
-                    f"imu: no vehicle given: {stream.topic} (frame {said}) taken as x forward, y left, z up"
+                    f"{name}: no vehicle given: {stream.topic} (frame {said}) taken as x forward, y left, "
+                    "z up"
                 )
-            return gyro, accel
+            return vectors
         spec = self.rig.sensors.imu
         wanted = spec.frame_id.lstrip("/")
         turn = np.asarray(stream.frame_ids == wanted, dtype=bool)
         if not turn.any():
             self.notes.append(
-                f"imu: {stream.topic} is in frame {said}, not '{wanted}' of the vehicle: not rotated"
+                f"{name}: {stream.topic} is in frame {said}, not '{wanted}' of the vehicle: not rotated"
             )
-            return gyro, accel
+            return vectors
         R = spec.base_from_sensor()
         if not np.array_equal(R, np.eye(3)):
             share = "" if turn.all() else f" ({int(turn.sum())} of {len(turn)} messages)"
-            self.notes.append(f"imu: rotated from {wanted} to the body: axes {', '.join(spec.axes)}{share}")
+            self.notes.append(
+                f"{name}: rotated from {wanted} to the body: axes {', '.join(spec.axes)}{share}"
+            )
         out = []
-        for values in (gyro, accel):
+        for values in vectors:
             turned = values.copy()
             turned[turn] = _rotate(R, values[turn])
             out.append(turned)
-        return out[0], out[1]
+        return tuple(out)
 
     def wheels(self, stream: Stream, t_ns: TimesNs, imu: Imu | None) -> tuple[Wheels | None, float | None]:
         """Wheel speeds, and the nominal track (m) where one had to be assumed."""

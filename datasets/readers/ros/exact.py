@@ -26,7 +26,15 @@ from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.ros.channels import Builder
 from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
-from terrafusion.datasets.readers.ros.topics import IMU, JOINTS, ODOMETRY, STRING, TWIST_STAMPED
+from terrafusion.datasets.readers.ros.topics import (
+    FIELD,
+    IMU,
+    JOINTS,
+    ODOMETRY,
+    PRESSURE,
+    STRING,
+    TWIST_STAMPED,
+)
 from terrafusion.datasets.recording import Recording, Wheels
 
 Key = tuple[str, str]
@@ -42,6 +50,8 @@ STANDARD: dict[str, Key] = {
     "command": ("/cmd_vel", TWIST_STAMPED),
     "wheels": ("/joint_states", JOINTS),
     "imu": ("/imu/data", IMU),
+    "barometer": ("/pressure", PRESSURE),
+    "magnetometer": ("/imu/mag", FIELD),
     "truth": ("/ground_truth/odom", ODOMETRY),
 }
 """Topics whose standard messages hold a channel to the bit, unless it has a table."""

@@ -43,6 +43,8 @@ def wanted_fields(kind: str, msgtype: str) -> tuple[str, ...]:
     elif msgtype == topics.FIX:
         fields += ["status.status", "latitude", "longitude", "altitude", "position_covariance_type"]
         fields += [f"position_covariance.{i}" for i in (0, 4, 8)]
+    elif msgtype in (topics.PRESSURE, topics.FIELD):
+        fields.append("fluid_pressure" if msgtype == topics.PRESSURE else "magnetic_field")
     elif msgtype == topics.JOINTS:
         fields += ["name", "position", "velocity"]
     elif msgtype in TWIST_AT or msgtype in POSE_AT:

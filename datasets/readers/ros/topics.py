@@ -20,6 +20,8 @@ TWIST_STAMPED = "geometry_msgs/msg/TwistStamped"
 TWIST_COVARIANCE = "geometry_msgs/msg/TwistWithCovarianceStamped"
 POSE = "geometry_msgs/msg/PoseStamped"
 POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+PRESSURE = "sensor_msgs/msg/FluidPressure"
+FIELD = "sensor_msgs/msg/MagneticField"
 STRING = "std_msgs/msg/String"
 
 TYPES: dict[str, tuple[str, ...]] = {
@@ -30,6 +32,8 @@ TYPES: dict[str, tuple[str, ...]] = {
     "command": (TWIST_STAMPED, TWIST),
     "truth": (ODOMETRY, POSE_COVARIANCE, POSE),
     "terrain": (STRING,),
+    "barometer": (PRESSURE,),
+    "magnetometer": (FIELD,),
     "datum": (FIX,),
 }
 """Message types of each channel, the more telling ones first."""
@@ -43,6 +47,8 @@ ALIASES = {
     "navsat": "gnss",
     "cmd_vel": "command",
     "ground_truth": "truth",
+    "mag": "magnetometer",
+    "pressure": "barometer",
 }
 JOINT_PREFIX = "joint."
 """`joint.front_left` names the joint of that wheel inside a JointState."""
@@ -182,7 +188,7 @@ def _fits(kind: str, topic: Topic, is_wheel_joints: Callable[[str], bool]) -> bo
         return bool(_COMMAND.search(name))
     if kind == "gnss_velocity":
         return bool(_GNSS_VELOCITY.search(name))
-    if kind == "imu":
+    if kind in ("imu", "barometer", "magnetometer"):
         return True
     if _TRUTH.search(name) or _is_fused(kind, topic):
         return False

@@ -18,6 +18,7 @@ from terrafusion.datasets.readers import log_meta
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,
     COVARIANCE,
+    FIELD,
     GNSS_HEIGHT,
     GNSS_POSITION,
     GNSS_VELOCITY,
@@ -40,6 +41,8 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "gnss": (*GEODETIC, *GNSS_POSITION, *GNSS_HEIGHT, *GNSS_VELOCITY, "sigma_v_mps", "fix"),
     "motor": ("left_a", "right_a", "left_v", "right_v"),
     "terrain": ("label",),
+    "barometer": ("pressure_pa",),
+    "magnetometer": FIELD,
     "truth": ("x_m", "y_m", "z_m", "yaw_rad", *QUATERNION, *TRUTH_TWIST, *COVARIANCE),
 }
 """Fields of each channel: the columns of the log folder, latitude and longitude, and a plain yaw.

@@ -15,6 +15,8 @@ UNITS: dict[str, dict[str, float]] = {
     "m": {"m": 1.0, "km": 1e3, "cm": 1e-2, "mm": 1e-3, "ft": 0.3048},
     "rad": {"rad": 1.0, "deg": DEG, "rev": 2.0 * math.pi},
     "deg": {"deg": 1.0, "rad": 1.0 / DEG, "1e-7 deg": 1e-7},
+    "pa": {"Pa": 1.0, "hPa": 1e2, "mbar": 1e2, "kPa": 1e3},
+    "t": {"T": 1.0, "mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4, "mG": 1e-7},
     "a": {"A": 1.0, "mA": 1e-3},
     "v": {"V": 1.0, "mV": 1e-3},
     "": {"1": 1.0, "%": 1e-2},
