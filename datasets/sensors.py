@@ -96,12 +96,34 @@ class GnssSpec:
 
 
 @dataclass(frozen=True)
+class BarometerSpec:
+    """Barometer: white noise of a sample (1 sigma), and the random walk of weather and wind on top."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.05, 500.0)]
+    noise_pa: Annotated[float, Quantity("Pa", 0.0, 1000.0)]
+    walk_paps_sqrthz: Annotated[float, Quantity("Pa/s/sqrt(Hz)", 0.0, 100.0)]
+    position_m: Position
+
+
+@dataclass(frozen=True)
+class MagnetometerSpec:
+    """Magnetometer in body axes: white noise of a sample and axis, and the hard iron that its calibration
+    leaves on each axis (1 sigma)."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.05, 1000.0)]
+    noise_t: Annotated[float, Quantity("T", 0.0, 1e-4)]
+    hard_iron_sigma_t: Annotated[float, Quantity("T", 0.0, 1e-3)]
+
+
+@dataclass(frozen=True)
 class SensorSuite:
-    """All sensors of a robot."""
+    """All sensors of a robot; barometer and magnetometer only where it has them."""
 
     imu: ImuSpec
     wheels: WheelSpec
     gnss: GnssSpec
+    barometer: BarometerSpec | None = None
+    magnetometer: MagnetometerSpec | None = None
 
 
 @dataclass(frozen=True)

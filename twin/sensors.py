@@ -14,15 +14,18 @@ from __future__ import annotations
 
 from terrafusion.twin.sensing.current import motor_channel
 from terrafusion.twin.sensing.encoders import wheels_channel
+from terrafusion.twin.sensing.environment import barometer_channel, magnetometer_channel
 from terrafusion.twin.sensing.gnss import best_fix, gnss_channel
 from terrafusion.twin.sensing.imu import imu_channel
 from terrafusion.twin.sensing.noise import Noise, rows_at_rate
 
 __all__ = [
     "Noise",
+    "barometer_channel",
     "best_fix",
     "gnss_channel",
     "imu_channel",
+    "magnetometer_channel",
     "motor_channel",
     "rows_at_rate",
     "wheels_channel",

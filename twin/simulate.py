@@ -260,6 +260,8 @@ def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Nois
         gnss=sensors.gnss_channel(t_ns, motion, states[:, INDEX["travel"]], vehicle, scenario, noise),
         motor=sensors.motor_channel(t_ns, motion, states, named, vehicle, noise),
         terrain=Terrain(t_ns[seen], route.labels(along[seen], patch[seen]), source="simulation"),
+        barometer=sensors.barometer_channel(t_ns, motion, DATUM[2], vehicle, noise),
+        magnetometer=sensors.magnetometer_channel(t_ns, motion, vehicle, noise),
         truth=_truth(t_ns, motion),
         datum=DATUM,
         truth_channels=("position", "yaw", "orientation", "velocity"),

@@ -82,6 +82,27 @@ class CurrentRealism:
 
 
 @dataclass(frozen=True)
+class BarometerRealism:
+    """What the weather adds to a standard pressure: an offset and a trend, drawn once a run."""
+
+    offset_sigma_pa: Annotated[float, Quantity("Pa", 0.0, 10000.0)] = 0.0
+    trend_sigma_paps: Annotated[float, Quantity("Pa/s", 0.0, 10.0)] = 0.0
+
+
+@dataclass(frozen=True)
+class MagnetometerRealism:
+    """What iron does to a field besides the hard iron of `MagnetometerSpec`, 1 sigma each.
+
+    Soft iron of the robot mixes the axes, drawn once a run. Iron of the place disturbs each axis by a
+    fixed field over `disturbance_length_m`.
+    """
+
+    soft_iron_sigma: Annotated[float, Quantity("", 0.0, 0.5)] = 0.0
+    disturbance_t: Annotated[float, Quantity("T", 0.0, 1e-3)] = 0.0
+    disturbance_length_m: Annotated[float, Quantity("m", 0.1, 1000.0)] = 5.0
+
+
+@dataclass(frozen=True)
 class SensorRealism:
     """What the twin adds to the data-sheet noise of `SensorSuite`.
 
@@ -102,3 +123,5 @@ class SensorRealism:
     encoder: EncoderRealism = field(default_factory=EncoderRealism)
     gnss: GnssRealism = field(default_factory=GnssRealism)
     current: CurrentRealism = field(default_factory=CurrentRealism)
+    barometer: BarometerRealism = field(default_factory=BarometerRealism)
+    magnetometer: MagnetometerRealism = field(default_factory=MagnetometerRealism)
