@@ -19,7 +19,7 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, quaternion_of
+from terrafusion.fusion.graph.key_state import MARKOV, POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.history import History
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.weights.policy import Policy, load_policy
@@ -268,7 +268,7 @@ def _key_state(state: State) -> KeyState:
     x, y, z, w = state.quaternion
     pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
     bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
-    return KeyState(pose, state.velocity_mps, bias, state.slip, state.gnss_drift_m)
+    return KeyState(pose, state.velocity_mps, bias, state.linear)
 
 
 def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
@@ -283,7 +283,8 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
         slip=key.slip,
-        gnss_drift_m=key.drift,
+        linear=key.linear,
+        linear_sigma=np.sqrt(np.diag(P)[MARKOV]),
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
         covariance=gtsam_to_ros_covariance(P[POSE, POSE], rotation.matrix()),
         velocity_covariance=P[VELOCITY, VELOCITY].copy(),

@@ -9,9 +9,9 @@ keyframes are dropped, what they say stays as a prior: exact marginalisation)
 and, with nothing dropped, the batch Gauss-Newton smoother.
 
 Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world
-(m/s), B(k) IMU bias (accelerometer, gyro), then slip and the drift of GNSS
-(east, north; m); a tangent of 18 numbers in this order. Pose, velocity and bias
-are GTSAM variables; slip and drift are linear and live in the chain alone.
+(m/s), B(k) IMU bias (accelerometer, gyro), then the linear states of
+`key_state.LINEAR`; the tangent has this order. Pose, velocity and bias are GTSAM
+variables; the linear states live in the chain alone.
 """
 
 from __future__ import annotations
@@ -27,12 +27,24 @@ from scipy.linalg import lapack
 
 from terrafusion.fusion.graph import gnss_factor
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import BIAS, DIM, DRIFT, MARKOV, NAV, POSE, SLIP, VELOCITY, KeyState
+from terrafusion.fusion.graph.key_state import (
+    BIAS,
+    DIM,
+    IMU_ROTATION,
+    MARKOV,
+    NAV,
+    POSE,
+    VELOCITY,
+    KeyState,
+    skew,
+)
 from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
 
+N_LINEAR = DIM - 15
+_EYE = np.eye(N_LINEAR)
 _ZERO = np.zeros(3)
 
 
@@ -40,7 +52,8 @@ _ZERO = np.zeros(3)
 class Node:
     """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.
 
-    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before.
+    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before; `preintegrated`
+    tells that `link` is one `CombinedImuFactor` made of them.
     """
 
     point: KeyState
@@ -50,6 +63,7 @@ class Node:
     wheels: WheelIncrement | None
     gyro_radps: Array
     accel_mps2: Array
+    preintegrated: bool = False
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     unary_keys: set[str] = field(default_factory=set)
     fixes: list[GnssPosition] = field(default_factory=list)
@@ -71,10 +85,12 @@ class Chain:
     all, for a batch solution afterwards.
     """
 
-    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf] * 3)
+    RELINEARISE = np.array(
+        [0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf] * (DIM - 15)
+    )
     """Change of a state (rad, m, m/s, m/s2, rad/s, -) beyond which its factors are linearised again.
 
-    Position, slip and drift enter the factors linearly, so they never ask for it."""
+    Position and the linear states enter the factors linearly (nearly), so they never ask for it."""
 
     def __init__(self, archive: Chain | None = None) -> None:
         self.archive = archive
@@ -100,18 +116,19 @@ class Chain:
         wheels: WheelIncrement | None = None,
         gyro_radps: Array = _ZERO,
         accel_mps2: Array = _ZERO,
+        preintegrated: bool = False,
     ) -> int:
         """Add a keyframe with its initial state and its factors to the one before; gives its index.
 
-        `link` must touch X, V and B of both keyframes; `markov` links slip and drift.
+        `link` must touch X, V and B of both keyframes; `markov` links the linear states.
         """
         link = link if link is not None else gtsam.NonlinearFactorGraph()
-        self.nodes.append(Node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2))
+        self.nodes.append(Node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2, preintegrated))
         self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
         if self.archive is not None:
-            self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2)
+            self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
         return self.last
 
     def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
@@ -143,14 +160,14 @@ class Chain:
         return node.point.retract(node.delta)
 
     def covariance(self) -> Array:
-        """Marginal covariance (18, 18) of the newest keyframe."""
+        """Marginal covariance (DIM, DIM) of the newest keyframe."""
         inverse, info = lapack.dtrtri(self._root[:, :DIM])
         if info:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
         return np.asarray(inverse @ inverse.T)
 
     def covariances(self) -> Array:
-        """Marginal covariances (n, 18, 18) of all keyframes, by the backward recursion of the chain."""
+        """Marginal covariances (n, DIM, DIM) of all keyframes, by the backward recursion of the chain."""
         out = np.zeros((len(self.nodes), DIM, DIM))
         out[-1] = self.covariance()
         for i in range(len(self.nodes) - 2, -1, -1):
@@ -244,7 +261,7 @@ class Chain:
             self.first += 1
 
     def restart(self, extra_variance: Array) -> None:
-        """Keep only the newest keyframe, with its marginal as prior, less sure by `extra_variance` (18,).
+        """Keep only the newest keyframe, with its marginal as prior, less sure by `extra_variance` (DIM,).
 
         For an estimate that has proved wrong: what comes next may move it
         freely, and does not bend the past to reach it.
@@ -268,7 +285,7 @@ class Chain:
         self._dirty = min(self._dirty, max(k - 1, self.first))
 
     def set_prior(self, sigmas: Array) -> None:
-        """Prior of the first keyframe at its initial state, independent 1 sigmas (18,)."""
+        """Prior of the first keyframe at its initial state, independent 1 sigmas (DIM,)."""
         self._anchor = None
         self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((DIM, 1))])
         self._dirty = self.first
@@ -306,13 +323,13 @@ class Chain:
         self.values.update(B(k), node.point.bias)
 
     def _unary_rows(self, k: int) -> Array:
-        """Whitened rows over keyframe k alone, shape (m, 19)."""
+        """Whitened rows over keyframe k alone, shape (m, DIM + 1)."""
         node = self.nodes[k - self.first]
         blocks = [self._gtsam_rows(k)] if node.unary_keys else []
         for fix in node.fixes:
             rows = np.zeros((3, DIM + 1))
-            rows[:, POSE], rows[:, DRIFT] = gnss_factor.jacobians(fix, node.point.pose)
-            rows[:, DIM] = -gnss_factor.residual(fix, node.point.pose, node.point.drift)
+            rows[:, POSE], rows[:, MARKOV] = gnss_factor.jacobians(fix, node.point.pose, node.point.linear)
+            rows[:, DIM] = -gnss_factor.residual(fix, node.point.pose, node.point.linear)
             blocks.append(rows / fix.sigma_m[:, None])
         return np.vstack(blocks) if blocks else np.zeros((0, DIM + 1))
 
@@ -334,7 +351,7 @@ class Chain:
         return rows
 
     def _link_rows(self, k: int) -> Array:
-        """Whitened rows over keyframes k - 1 and k, shape (m, 37)."""
+        """Whitened rows over keyframes k - 1 and k, shape (m, 2 DIM + 1)."""
         node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
         ordering = gtsam.Ordering()
         for i in (k - 1, k):
@@ -342,24 +359,31 @@ class Chain:
                 ordering.push_back(symbol(i))
         packed = node.link.linearize(self.values).augmentedJacobian(ordering)
         n = len(packed)
-        rows = np.zeros((n + 6, 2 * DIM + 1))
+        rows = np.zeros((n + N_LINEAR + 4, 2 * DIM + 1))
         rows[:n, NAV] = packed[:, :15]
         rows[:n, DIM : DIM + 15] = packed[:, 15:30]
         rows[:n, 2 * DIM] = packed[:, 30]
+        if node.preintegrated:
+            # The bias walk enters with opposite signs at both ends: their sum is what preintegration does
+            # with a bias, and a small rotation d of the IMU acts as the bias -d x measured.
+            by_bias = packed[:, 9:15] + packed[:, 24:30]
+            turn = by_bias[:, :3] @ skew(node.accel_mps2) + by_bias[:, 3:] @ skew(node.gyro_radps)
+            rows[:n, IMU_ROTATION] = turn
+            rows[:n, 2 * DIM] -= turn @ before.point.of(IMU_ROTATION)
         if node.markov is not None:
             step = node.markov
-            own = rows[n : n + 3]
+            own = rows[n : n + N_LINEAR]
             own[:, MARKOV] = -np.diag(step.decay)
-            own[:, DIM + 15 : DIM + 18] = np.eye(3)
-            own[:, 2 * DIM] = -step.residual(before.point.markov(), node.point.markov())
+            own[:, DIM + 15 : 2 * DIM] = _EYE
+            own[:, 2 * DIM] = -step.residual(before.point.linear, node.point.linear)
             own /= step.sigma[:, None]
         if node.wheels is not None:
-            d, sigma = node.wheels.displacement_m, node.wheels.sigma_m[:, None]
-            H_i, H_j, H_slip = jacobians(before.point.pose, node.point.pose, d)
-            wheel = rows[n + 3 :]
-            wheel[:, 0:6], wheel[:, DIM : DIM + 6], wheel[:, DIM + SLIP] = H_i, H_j, H_slip[:, 0]
-            wheel[:, 2 * DIM] = -residual(before.point.pose, node.point.pose, node.point.slip, d)
-            wheel /= sigma
+            poses = before.point.pose, node.point.pose
+            H_i, H_j, H_linear = jacobians(*poses, node.point.linear, node.wheels)
+            wheel = rows[n + N_LINEAR :]
+            wheel[:, 0:6], wheel[:, DIM : DIM + 6], wheel[:, DIM + 15 : 2 * DIM] = H_i, H_j, H_linear
+            wheel[:, 2 * DIM] = -residual(*poses, node.point.linear, node.wheels)
+            wheel /= node.wheels.sigma[:, None]
         return rows
 
     def _eliminate(self, k: int) -> None:

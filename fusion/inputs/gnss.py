@@ -14,8 +14,8 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
-from terrafusion.fusion.graph.gnss_factor import GnssPosition, antenna_jacobian
-from terrafusion.fusion.graph.key_state import DIM, DRIFT, POSE
+from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
+from terrafusion.fusion.graph.key_state import ANTENNA, DIM, MARKOV, POSE
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -77,7 +77,7 @@ class GnssUpdater:
     def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `covariance` (18, 18) is
+        A fix belongs to the first keyframe after it. `covariance` (DIM, DIM) is
         that of the newest keyframe.
         """
         used = False
@@ -100,13 +100,15 @@ class GnssUpdater:
         R = state.pose.rotation().matrix()
         rate = node.gyro_radps - state.bias.gyroscope()
         accel_world = R @ (node.accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
-        lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
-        predicted = np.asarray(state.pose.translation()) + R @ lever
+        antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
+        lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
+        velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
         share = self._drift_share(fix, row)
         sigma = self._white_sigma(fix, row, share)
-        innovation = fix.enu_m - predicted - np.append(share * state.drift, 0.0)
+        position = GnssPosition(fix.enu_m, lever, sigma, share, velocity)
+        innovation = -residual(position, state.pose, state.linear)
         J = np.zeros((3, DIM))
-        J[:, POSE], J[:, DRIFT] = antenna_jacobian(R, lever), share * np.eye(3)[:, :2]
+        J[:, POSE], J[:, MARKOV] = jacobians(position, state.pose, state.linear)
         P = J @ covariance @ J.T
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
         P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * row.gnss_inflation) ** 2
@@ -118,9 +120,10 @@ class GnssUpdater:
         cut = k == chain.last and self._prepare(chain, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
         if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
-            fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
-            sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
-        chain.add_fix(k, GnssPosition(fix.enu_m, lever, sigma, share))
+            height = (np.asarray(state.pose.translation()) + R @ lever)[2]
+            sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
+            position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
+        chain.add_fix(k, position)
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
