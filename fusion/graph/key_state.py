@@ -30,7 +30,7 @@ LINEAR = (
 
 - slip: 1 - v / (omega R), one for the robot; wanders about the ground's mean.
 - gnss_drift: slow error of the receiver's positions, east and north.
-- yaw_scale: true over wheel yaw rate, less one; skid steering makes it negative (the effective track is wider).
+- yaw_scale: true over wheel yaw rate, less one; negative where skid steering widens the effective track.
 - icr_x: place of the centre of rotation ahead of the body origin; v_lateral = -icr_x yaw_rate.
 - side_slip: lateral over forward speed, what the ground's slope and ruts do.
 - radius_scale: true over nominal wheel radius, less one.
@@ -51,7 +51,7 @@ ANTENNA, IMU_ROTATION, WHEEL_DELAY, GNSS_DELAY = slice(22, 24), slice(24, 27), 2
 
 @dataclass(frozen=True, eq=False)
 class KeyState:
-    """State of one keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `linear` (14,) as `LINEAR`."""
+    """State of a keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `linear` (14,) as `LINEAR`."""
 
     pose: gtsam.Pose3
     velocity: Array

@@ -32,7 +32,7 @@ CALIBRATION_SIGMA = {
 """How well a vehicle file is trusted, 1 sigma (assumed: tyre wear and pressure, a tape measure, a mounting
 plate, clocks of drivers)."""
 _WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
-"""Walk of the calibration, per sqrt(s): hardly any, but a number that is certain for ever cannot be whitened."""
+"""Walk of the calibration, per sqrt(s): hardly any, but what is certain for ever cannot be whitened."""
 
 
 def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
@@ -47,7 +47,7 @@ def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, 
 def step(
     dt_s: float, row: SensorNoise, grade: float, drift_sigma_m: float, drift_time_s: float, switch: float
 ) -> MarkovStep:
-    """The step of all linear states over `dt_s`; `switch` is the share of the ground that has just changed."""
+    """The step of all linear states over `dt_s`; `switch` is the share of the ground that just changed."""
     wandering = markov_step(
         dt_s,
         mean=[row.slip_at(grade), 0.0, 0.0, row.yaw_scale_mean, 0.0, 0.0],

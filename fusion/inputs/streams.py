@@ -161,7 +161,7 @@ class WheelStream:
         return left, right
 
     def speed_change_mps(self, start_ns: int, end_ns: int, over_ns: int = 100_000_000) -> float:
-        """Mean speed of both sides about the end less that about the start, m/s; 0 where samples are missing."""
+        """Speed of both sides about the end less that about the start, m/s; 0 where samples are missing."""
         half = over_ns // 2
         at = [self.travelled(t - half, min(t + half, self.t_ns[-1])) for t in (start_ns, end_ns)]
         if at[0] is None or at[1] is None:
