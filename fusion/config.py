@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.sensors import Rig
+from terrafusion.fusion.front import Inputs
 from terrafusion.fusion.weights.policy import Policy, load_policy
 
 MODES = ("adaptive", "fixed")
@@ -26,7 +27,8 @@ class EstimatorConfig:
         gnss_gate: chi-square probability beyond which a fix is rejected.
         wheel_gate_sigma: normalised wheel innovation beyond which an increment is rejected.
         yaw_sigma_start_rad: heading uncertainty at which the graph is started.
-        start_without_gnss_s: with no fix for so long, start in a local frame.
+        start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
+        inputs: what the estimator will be given; without all six IMU axes the graph is planar.
     """
 
     rig: Rig
@@ -40,6 +42,12 @@ class EstimatorConfig:
     wheel_gate_sigma: float = 6.0
     yaw_sigma_start_rad: float = 0.12
     start_without_gnss_s: float = 30.0
+    inputs: Inputs = field(default_factory=Inputs)
+
+    @property
+    def longest_wait_s(self) -> float:
+        """How long a start waits for the first fix."""
+        return self.start_without_gnss_s if self.inputs.gnss else 0.0
 
     def __post_init__(self) -> None:
         if self.mode not in MODES:

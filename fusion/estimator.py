@@ -9,6 +9,7 @@ state = est.latest()
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 
 import gtsam
@@ -17,9 +18,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
+from terrafusion.datasets.recording import Fix
+from terrafusion.fusion import snapshot
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.graph import slow_states
+from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import at_rest, bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import (
@@ -32,12 +36,19 @@ from terrafusion.fusion.graph.key_state import (
     KeyState,
     quaternion_of,
 )
-from terrafusion.fusion.graph.preintegration import Preintegrator
+from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.alignment import Start, heading_from_motion, level_start
+from terrafusion.fusion.inputs.alignment import (
+    GivenStart,
+    Start,
+    checked_given,
+    heading_from_motion,
+    level_start,
+)
 from terrafusion.fusion.inputs.gates import WheelGate
-from terrafusion.fusion.inputs.gnss import GnssUpdater
-from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.inputs.gnss import GnssUpdater, checked_fix
+from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.propagate import Propagator
 from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
@@ -45,7 +56,10 @@ Array = NDArray[np.float64]
 LONGEST_IMU_GAP_S = 0.5
 SMOOTH_EVERY = 5
 SMOOTH_WINDOW = 50
+LAG_MARGIN = 5
+"""Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 OUTAGE_S = 2.0
+UNKNOWN = np.full(3, np.nan)
 STILL_GYRO_RADPS = 0.03
 STILL_ACCEL_MPS2 = 0.6
 
@@ -53,7 +67,7 @@ STILL_ACCEL_MPS2 = 0.6
 class Estimator:
     """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
 
-    Each sensor is fed in its own time order; keyframes are made as soon as the
+    Samples may come late and out of order (see `streams.Lateness`); keyframes are made as soon as the
     IMU (and the wheels, or their waiting time) cover them. `on_state` is called
     with every new `State`, `on_innovation` with every tested measurement;
     `archive` keeps all factors for a batch solution afterwards.
@@ -66,24 +80,26 @@ class Estimator:
         on_innovation: Callable[[Innovation], None] | None = None,
         archive: Chain | None = None,
     ) -> None:
-        self.config = config
+        self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
         self.chain = Chain(archive)
-        self.imu = ImuStream()
+        self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
         self.gnss = GnssUpdater(config, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
-        self._preintegrator = Preintegrator(config.rig.sensors.imu)
+        self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._step_ns = round(config.keyframe_s * 1e9)
-        self._keep = round(config.lag_s / config.keyframe_s)
+        self._keep = round(config.lag_s / config.keyframe_s) + LAG_MARGIN
         self._start: Start | None = None
+        self._given: GivenStart | None = None
         self._level: Start | None = None
         self._state: State | None = None
         self._covariance = np.zeros((DIM, DIM))
         self._silent = False
         self._rest = 0
+        self._propagator = Propagator(self._preintegrator)
 
     @classmethod
     def for_vehicle(cls, name: str, mode: str = "adaptive") -> Estimator:
@@ -92,8 +108,13 @@ class Estimator:
 
         return cls(EstimatorConfig(load_vehicle(name).rig(), name, mode))
 
-    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
-        """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample."""
+    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
+        """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.
+
+        Where `config.inputs` declares no more than gyro z, all but the yaw rate may be NaN.
+        """
+        if self.config.inputs.imu == "none":
+            raise DataError("the estimator was told to expect no IMU", channel="imu", remedy="mend `inputs`")
         self.imu.add(t_ns, gyro_radps, accel_mps2)
         self._advance()
 
@@ -107,25 +128,39 @@ class Estimator:
     ) -> None:
         """Circumferential speed of each side, m/s, and its travelled distance, m, where encoders count it."""
         self.wheels.add(t_ns, left_mps, right_mps, left_m, right_m)
+        if self.config.inputs.imu == "none":  # the wheels are the clock, and their difference the yaw rate
+            self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m), UNKNOWN)
+            self._advance()
 
     def add_gnss(
         self,
         t_ns: int,
         enu_m: ArrayLike,
-        sigma_m: ArrayLike,
+        sigma_m: ArrayLike | None,
         velocity_mps: ArrayLike | None = None,
         sigma_v_mps: float = float("nan"),
+        fix: Fix | int | str | None = None,
     ) -> None:
-        """Antenna position and 1 sigma (3,), ENU m (a NaN height is unknown); velocity (3,) ENU if known."""
-        position, sigma = np.asarray(enu_m, dtype=float), np.asarray(sigma_m, dtype=float)
-        if position.shape != (3,) or not np.isfinite(position[:2]).all():
-            raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
-        if sigma.shape != (3,) or not (sigma[:2] > 0).all():
-            raise DataError(
-                f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
-            )
-        velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
-        self.gnss.queue(GnssFix(t_ns, position, sigma, velocity, sigma_v_mps))
+        """Antenna position and 1 sigma (3,), ENU m (a NaN height is unknown); velocity (3,) ENU if known.
+
+        `fix` is the class of fix ("single" to "fixed"); without a sensible sigma that of the class counts.
+        """
+        taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
+        if taken is not None:
+            self.gnss.queue(taken)
+
+    def set_start(
+        self,
+        position_m: ArrayLike,
+        yaw_rad: float,
+        position_sigma_m: float = 0.1,
+        yaw_sigma_rad: float = 0.05,
+    ) -> None:
+        """Start at a known position (3,) and heading, ENU, with 1 sigmas, instead of waiting for motion.
+
+        A heading that proves wrong is set right from the motion. Must come before the start.
+        """
+        self._given = checked_given(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
 
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with the own detector's."""
@@ -134,6 +169,21 @@ class Estimator:
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
         return self._state
+
+    def odometry(self) -> State | None:
+        """The newest state carried to the newest IMU sample; None before the start."""
+        if self._state is None:
+            return None
+        return self._propagator.carry(self._state, self._covariance, self.imu, self.weights.row)
+
+    def dump(self) -> bytes:
+        """The state of a running estimator, for `restore`; see `snapshot`."""
+        return snapshot.dump(self)
+
+    @classmethod
+    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Callable[..., None]) -> Estimator:
+        """An estimator that goes on where `dump` was called, with the same bits; see `snapshot.restore`."""
+        return snapshot.restore(cls(config, **callbacks), data)
 
     @property
     def status(self) -> str:
@@ -144,6 +194,7 @@ class Estimator:
 
     def finish(self) -> None:
         """Tell that no more data come: keyframes no longer wait for late samples."""
+        self.imu.late.wait_ns = self.wheels.late.wait_ns = 0
         self._advance(last=True)
 
     def _advance(self, last: bool = False) -> None:
@@ -168,12 +219,14 @@ class Estimator:
             return False
         if self._level is None:
             self._level = level_start(self.imu, self.wheels, begin)
-        if self.gnss.waiting and self.gnss.news():
+        if self._given is not None:
+            self._begin(self._given.at(self._level))
+        elif self.gnss.waiting and self.gnss.news():
             antenna = np.array(self.config.rig.sensors.gnss.antenna_m)
             start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
             if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
                 self._begin(start)
-        elif not self.gnss.waiting and (last or elapsed > self.config.start_without_gnss_s):
+        elif not self.gnss.waiting and (last or elapsed > self.config.longest_wait_s):
             self.gnss.local = True
             self._begin(self._level)
         return self._start is not None
@@ -192,7 +245,8 @@ class Estimator:
             linear,
         )
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
-        yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if not self.gnss.local else start.yaw_sigma_rad
+        from_fixes = not self.gnss.local and self._given is None
+        yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
         level = float(np.hypot(start.level_sigma_rad, spec.accel_bias_sigma_mps2 / GRAVITY_MPS2))
         gyro_sigma = spec.gyro_bias_sigma_radps + 1e-6
         sigmas = [
@@ -210,7 +264,7 @@ class Estimator:
         self.chain.solve(SMOOTH_WINDOW)
         self._covariance = self.chain.covariance()
         self.weights.begin(start.t_ns)
-        newest = min(self.imu.t_ns[-1], self.wheels.t_ns[-1])
+        newest = min(s.t_ns[-1] - s.late.wait_ns for s in (self.imu, self.wheels))
         # Live, what lies before the start has no estimate; a batch has one from the first keyframe on.
         self._silent = self.chain.archive is None
         while self.chain.nodes[-1].t_ns + 2 * self._step_ns <= newest:
@@ -224,6 +278,8 @@ class Estimator:
         before = self.chain.state(self.chain.last)
         row = self.weights.row
         segments = self.imu.segments(before_ns, t_ns)
+        if self.config.inputs.planar:
+            segments = in_a_turn(segments, before)
         wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
         gyro, accel = _mean_rates(segments)
@@ -240,8 +296,9 @@ class Estimator:
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
             link.add(_imu_factor(k, measured))
-            preintegrated = True
-            wheels = self._gated(t_ns, wheels, before, point, dt, switch)
+            if not self.config.inputs.planar:  # the planar link is no witness against the wheels
+                preintegrated = True
+                wheels = self._gated(t_ns, wheels, before, point, dt, switch)
         markov = slow_states.step(
             dt,
             row,
@@ -250,7 +307,10 @@ class Estimator:
             self.gnss.drift_time_s,
             switch,
         )
+        self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
+        if self.config.inputs.planar:
+            self.chain.add(k, held_level(k), "X")
         self._zero_velocity(k, wheels, segments, before, link)
         self._finish_keyframe(t_ns, gyro)
 
@@ -282,7 +342,11 @@ class Estimator:
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         bias_z = float(before.bias.gyroscope()[2])
         change = self.wheels.speed_change_mps(before_ns, t_ns)
-        return wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row, change)
+        increment = wheel_increment(
+            travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row, change
+        )
+        inputs = self.config.inputs
+        return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
         self,
@@ -361,6 +425,10 @@ class Estimator:
             slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+            twist_covariance=twist_covariance(
+                P, R, key.velocity, gyro_sigma_radps(self.config, self.weights.row)
+            ),
+            bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),
             status=status,
         )

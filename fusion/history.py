@@ -62,4 +62,6 @@ class History:
             innovations=tuple(self.innovations),
             status=np.array([s.status for s in states], dtype=object),
             notes=notes,
+            twist_covariance=stack("twist_covariance", (6, 6)),
+            bias_sigma=stack("bias_sigma", (6,)),
         )

@@ -18,6 +18,8 @@ from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import MARKOV, POSE, SLIP, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.history import History
@@ -127,7 +129,6 @@ def replay(
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
     """
     params, notes = choose_vehicle(recording, vehicle)
-    imu, wheels = _usable(recording)
     outages = tuple(outages)
     for outage in outages:
         if outage.start_s >= recording.duration_s():
@@ -137,7 +138,9 @@ def replay(
             )
     used, held_out = split_fixes(recording, outages)
     rows = policy if isinstance(policy, Policy) else load_policy(policy)
-    config = EstimatorConfig(params.rig(), params.name, mode, rows)
+    inputs = inputs_of(recording, used)
+    imu, wheels = _usable(recording, inputs)
+    config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs)
     archive = Chain() if batch else None
     history = History()
     estimator = Estimator(
@@ -151,11 +154,11 @@ def replay(
         estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, history, progress
     )
     if archive is not None and history.states:
-        _smooth(archive, history)
+        _smooth(archive, history, estimator.config)
     seconds = time.perf_counter() - started
     if not history.states:
         raise _never_started(recording, used)
-    notes = (*recording.notes, *notes, *_said(estimator))
+    notes = (*recording.notes, *notes, *inputs.notes(recording), *_said(estimator))
     estimate = history.estimate(estimator.weights.detector.classes, estimator.weights.changes, notes)
     antenna = config.rig.sensors.gnss.antenna_m
     scores = score(
@@ -172,25 +175,24 @@ def replay(
     )  # fmt: skip
 
 
-def _usable(recording: Recording) -> tuple[Imu, Wheels]:
-    """IMU and wheels without rows that lack a value."""
+def _usable(recording: Recording, inputs: Inputs) -> tuple[Imu | None, Wheels]:
+    """IMU, where one is used, and wheels, without rows that lack a value the graph needs."""
     imu, wheels = recording.imu, recording.wheels
-    if imu is None or not len(imu) or not imu.has_gyro() or not imu.has_accel():
-        raise DataError(
-            "the log has no six-axis IMU",
-            channel="imu",
-            remedy="this version estimates from three gyro and three accelerometer axes",
-        )
     if wheels is None or not len(wheels):
         raise DataError(
             "the log has no wheel speeds",
             channel="wheels",
             remedy="name their topic, or add wheels.csv",
         )
-    imu = imu.select(np.isfinite(imu.gyro_radps.sum(axis=1) + imu.accel_mps2.sum(axis=1)))
     wheels = wheels.select(np.isfinite(wheels.speed.sum(axis=1)))
-    if not len(imu) or not len(wheels):
-        raise DataError("no sample has all its values", channel="imu or wheels")
+    if not len(wheels):
+        raise DataError("no sample has all its values", channel="wheels")
+    if inputs.imu == "none":
+        if (wheels.t_ns[-1] - wheels.t_ns[0]) * 1e-9 < 2.0:
+            raise DataError("the log is too short to start from", remedy="give at least two seconds")
+        return None, wheels
+    assert imu is not None
+    imu = imu.select(complete_rows(imu, inputs.imu))
     overlap = (min(imu.t_ns[-1], wheels.t_ns[-1]) - max(imu.t_ns[0], wheels.t_ns[0])) * 1e-9
     if overlap < 2.0:
         raise DataError(
@@ -211,19 +213,23 @@ def _side_motion(wheels: Wheels, radius_m: float) -> tuple[list[int], list[list[
 
 def _feed(
     estimator: Estimator,
-    imu: Imu,
+    imu: Imu | None,
     wheels: tuple[list[int], list[list[float]]],
     gnss: Gnss | None,
     history: History,
     progress: Callable[[float], None] | None,
 ) -> Array:
-    """Give all samples in time order; returns the computing time of each keyframe, ms."""
+    """Give all samples in time order; returns the computing time of each keyframe, ms.
+
+    Keyframes are made as IMU samples come, or, without an IMU, as wheel samples do.
+    """
     wheel_times, wheel_rows = wheels
     gnss_times = [] if gnss is None else gnss.t_ns.tolist()
+    clock = wheel_times if imu is None else imu.t_ns.tolist()
     latencies: list[float] = []
     w = g = made = 0
-    for i, t_ns in enumerate(imu.t_ns.tolist()):
-        while w < len(wheel_times) and wheel_times[w] <= t_ns:
+    for i, t_ns in enumerate(clock):
+        while imu is not None and w < len(wheel_times) and wheel_times[w] <= t_ns:
             estimator.add_wheels(wheel_times[w], *wheel_rows[w])
             w += 1
         while g < len(gnss_times) and gnss_times[g] <= t_ns:
@@ -231,12 +237,15 @@ def _feed(
             _give_fix(estimator, gnss, g)
             g += 1
         begun = time.perf_counter()
-        estimator.add_imu(t_ns, imu.gyro_radps[i], imu.accel_mps2[i])
+        if imu is None:
+            estimator.add_wheels(t_ns, *wheel_rows[i])
+        else:
+            estimator.add_imu(t_ns, imu.gyro_radps[i], imu.accel_mps2[i])
         if len(history.states) != made:
             latencies.append((time.perf_counter() - begun) * 1e3)
             made = len(history.states)
             if progress is not None and made % 50 == 0:
-                progress((i + 1) / len(imu))
+                progress((i + 1) / len(clock))
     estimator.finish()
     if progress is not None:
         progress(1.0)
@@ -248,10 +257,11 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
         return
     velocity = None if gnss.velocity_enu_mps is None else gnss.velocity_enu_mps[i]
     sigma_v = float("nan") if gnss.sigma_v_mps is None else float(gnss.sigma_v_mps[i])
-    estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v)
+    fix = int(gnss.fix[i])
+    estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v, fix)
 
 
-def _smooth(chain: Chain, history: History) -> None:
+def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
     """Replace the live states by the batch solution over the whole drive, which starts from them."""
     offset = len(chain.nodes) - len(history.states)
     for i, state in enumerate(history.states):
@@ -259,8 +269,10 @@ def _smooth(chain: Chain, history: History) -> None:
     chain.optimise()
     covariances = chain.covariances()
     history.states[:] = [
-        _smoothed(state, chain, chain.first + offset + i, covariances[offset + i])
-        for i, state in enumerate(history.states)
+        _smoothed(
+            state, chain, chain.first + offset + i, covariances[offset + i], gyro_sigma_radps(config, row)
+        )
+        for i, (state, row) in enumerate(zip(history.states, history.rows, strict=True))
     ]
 
 
@@ -271,9 +283,9 @@ def _key_state(state: State) -> KeyState:
     return KeyState(pose, state.velocity_mps, bias, state.linear)
 
 
-def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
+def _smoothed(live: State, chain: Chain, k: int, P: Array, gyro_sigma: float) -> State:
     key = chain.state(k)
-    rotation = key.pose.rotation()
+    R = key.pose.rotation().matrix()
     return dataclasses.replace(
         live,
         position_m=np.asarray(key.pose.translation()),
@@ -286,8 +298,10 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array) -> State:
         linear=key.linear,
         linear_sigma=np.sqrt(np.diag(P)[MARKOV]),
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
-        covariance=gtsam_to_ros_covariance(P[POSE, POSE], rotation.matrix()),
+        covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
         velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+        twist_covariance=twist_covariance(P, R, key.velocity, gyro_sigma),
+        bias_sigma=bias_sigma(P),
     )
 
 

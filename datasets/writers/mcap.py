@@ -17,6 +17,7 @@ from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.recording import Fix, Gnss, Imu, Recording, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
+from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
 from terrafusion.datasets.writers.mcap_file import Definition, Topic, write_mcap_file
 from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
 
@@ -33,7 +34,7 @@ END_NS = 2**31 * 10**9
 def write_mcap(
     recording: Recording,
     path: Path | str,
-    estimate: Trajectory | None = None,
+    estimate: WrittenEstimate | Trajectory | None = None,
     *,
     rig: Rig | None = None,
     overwrite: bool = False,
@@ -44,14 +45,15 @@ def write_mcap(
     (in m/s), `/fix` NavSatFix, `/fix_velocity` TwistWithCovarianceStamped (east, north, up),
     `/datum` NavSatFix (the ENU origin, once), `/cmd_vel` TwistStamped, `/terrain` String,
     `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link,
-    `/tf_static` (positions of IMU and antenna where known). Log times are the stamps. What these
+    `/tf` (the estimate) and `/tf_static` (positions of IMU and antenna where known) TFMessage,
+    `/diagnostics` (what the estimate tells of itself) DiagnosticArray. Log times are the stamps. What these
     cannot hold to the bit stands on topics of their own, see `readers/ros/exact.py`.
 
     Args:
         recording: the drive.
         path: the file to write; it appears when it is whole.
-        estimate: poses to write beside it, with covariance in ROS order where known; it is not
-            part of the recording and not read back.
+        estimate: what to write beside it, or its poses alone; it is not part of the recording and
+            not read back.
         rig: gives the track that turns side speeds in m/s into a yaw rate, and the positions of
             the sensors; the recording's own `overrides` go first.
         overwrite: replace a file that exists.
@@ -75,8 +77,8 @@ def write_mcap(
             parts.unseen.append(f"times before 1970: stamps are {shift_ns // 10**9} s later")
         topics = list(parts.standard())
         if estimate is not None:
-            estimate = dataclasses.replace(estimate, t_ns=estimate.t_ns + shift_ns)
-            topics.append(ros.trajectory("/odometry/filtered", estimate, "base_link"))
+            beside = WrittenEstimate(estimate) if isinstance(estimate, Trajectory) else estimate
+            topics += beside.topics(shift_ns)
         saved |= {**parts.saved(), "shift_ns": shift_ns}
         start_ns = min([recording.start_ns, *(int(t.t_ns[0]) for t in topics if len(t.t_ns))])
         topics = [ros.text(META[0], start_ns, json.dumps(saved)), *parts.once(start_ns), *topics]

@@ -101,20 +101,39 @@ def wheel_odometry(wheels: Wheels, track_m: float | None) -> Topic:
     return _odometry("/wheel/odom", ("odom", "base_link"), wheels.t_ns, pose, P_rows, twist, Q_rows)
 
 
-def trajectory(name: str, trajectory: Trajectory, child: str) -> Topic:
-    """nav_msgs/Odometry, map -> `child`; what is unknown is 0 under a variance of 1e6."""
+def trajectory(
+    name: str,
+    trajectory: Trajectory,
+    child: str,
+    *,
+    frame: str = "map",
+    twist_covariance: Array | None = None,
+) -> Topic:
+    """nav_msgs/Odometry, `frame` -> `child`; what is unknown is 0 under a variance of 1e6.
+
+    The covariance of the pose is about the axes of `frame`, that of the twist (N, 6, 6) about those
+    of `child`, as the message asks.
+    """
     n = len(trajectory)
-    q = trajectory.quaternion if trajectory.quaternion is not None else np.tile(IDENTITY, (n, 1))
+    q = _oriented(trajectory)
     P = np.zeros((n, 6, 6)) if trajectory.covariance is None else trajectory.covariance.copy()
     P[np.isnan(trajectory.position_m[:, 2]), 2, 2] = UNKNOWN_VARIANCE
     if trajectory.quaternion is None:
         P[:, [3, 4, 5], [3, 4, 5]] = UNKNOWN_VARIANCE
     twist = trajectory.twist_body if trajectory.twist_body is not None else np.full((n, 6), np.nan)
-    Q = np.zeros((n, 6, 6))
-    Q[:, range(6), range(6)] = np.where(np.isnan(twist), UNKNOWN_VARIANCE, 0.0)
+    Q = np.zeros((n, 6, 6)) if twist_covariance is None else twist_covariance.copy()
+    unknown = np.isnan(twist)
+    Q[unknown[:, :, None] | unknown[:, None, :]] = 0.0
+    Q[:, range(6), range(6)] += np.where(unknown, UNKNOWN_VARIANCE, 0.0)
     pose = np.hstack([_known(trajectory.position_m), q])
     flat = (P.reshape(n, 36), Q.reshape(n, 36))
-    return _odometry(name, ("map", child), trajectory.t_ns, pose, flat[0], _known(twist), flat[1])
+    return _odometry(name, (frame, child), trajectory.t_ns, pose, flat[0], _known(twist), flat[1])
+
+
+def _oriented(trajectory: Trajectory) -> Array:
+    """Orientations (N, 4), the identity where they are unknown."""
+    q = trajectory.quaternion
+    return q if q is not None else np.tile(IDENTITY, (len(trajectory), 1))
 
 
 def _known(values: Array) -> Array:
@@ -193,6 +212,13 @@ def static_transforms(t_ns: int, positions_m: Mapping[str, Sequence[float]]) -> 
         layout.constant("d", *position, *IDENTITY)
     message = split(layout.rows(1))
     return Topic("/tf_static", "tf2_msgs/msg/TFMessage", np.array([t_ns]), lambda r: message[r], latched=True)
+
+
+def transforms(trajectory: Trajectory, frame: str, child: str) -> Topic:
+    """tf2_msgs/TFMessage, `frame` -> `child`, one transform a message; orientations must be known."""
+    layout = Layout().constant("I", 1).header(frame).string(child).field("pose", count=7)
+    pose = np.hstack([_known(trajectory.position_m), _oriented(trajectory)])
+    return _topic("/tf", "tf2_msgs/msg/TFMessage", layout, trajectory.t_ns, pose=pose)
 
 
 def table(channel: str, t_ns: TimesNs, columns: dict[str, Array]) -> Topic:

@@ -50,7 +50,9 @@ def replay(
     ] = False,
     mcap: Annotated[
         bool,
-        typer.Option("--mcap", help="Also write the log with the estimate as odometry to estimate.mcap."),
+        typer.Option(
+            "--mcap", help="Also write the log with the estimate (odometry, diagnostics) to estimate.mcap."
+        ),
     ] = False,
     gnss_outage: OutageOption = None,
     topic: TopicOption = None,
@@ -92,19 +94,20 @@ def replay(
         )
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     if mcap:
-        from terrafusion.datasets.writers.mcap import write_mcap
-
-        for part in write_mcap(
-            recording,
-            out / "estimate.mcap",
-            result.estimate.trajectory,
-            rig=result.vehicle.rig(),
-            overwrite=True,
-        ):
-            print(f"not in standard messages: {part}")
+        _write_bag(result, out / "estimate.mcap")
     for line in summary(result):
         print(line)
     print(f"written to {out}")
+
+
+def _write_bag(result: Replay, path: Path) -> None:
+    """The log and the estimate beside it; prints what is not in standard messages."""
+    from terrafusion.datasets.writers.mcap import write_mcap
+    from terrafusion.fusion.report.ros_estimate import written_estimate
+
+    written = written_estimate(result.estimate)
+    for part in write_mcap(result.recording, path, written, rig=result.vehicle.rig(), overwrite=True):
+        print(f"not in standard messages: {part}")
 
 
 def summary(result: Replay) -> list[str]:

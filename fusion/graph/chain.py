@@ -17,7 +17,7 @@ variables; the linear states live in the chain alone.
 from __future__ import annotations
 
 import bisect
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import gtsam
 import numpy as np
@@ -171,12 +171,15 @@ class Chain:
         out = np.zeros((len(self.nodes), DIM, DIM))
         out[-1] = self.covariance()
         for i in range(len(self.nodes) - 2, -1, -1):
-            rows = self.nodes[i].conditional
-            assert rows is not None
-            inverse, _ = lapack.dtrtri(rows[:, :DIM])
-            gain = inverse @ rows[:, DIM : 2 * DIM]
-            out[i] = inverse @ inverse.T + gain @ out[i + 1] @ gain.T
+            out[i] = _covariance_before(self.nodes[i], out[i + 1])
         return out
+
+    def covariance_at(self, k: int) -> Array:
+        """Marginal covariance (DIM, DIM) of keyframe k, as of the last `solve` or `smooth`."""
+        covariance = self.covariance()
+        for node in self.nodes[-2 : k - self.last - 2 : -1]:
+            covariance = _covariance_before(node, covariance)
+        return covariance
 
     def solve(self, window: int) -> None:
         """Bring the newest keyframe up to date; if that moves it far, the newest `window` of them.
@@ -260,22 +263,61 @@ class Chain:
             self.nodes.pop(0)
             self.first += 1
 
-    def restart(self, extra_variance: Array) -> None:
-        """Keep only the newest keyframe, with its marginal as prior, less sure by `extra_variance` (DIM,).
+    def restart(self, extra_variance: Array, k: int | None = None) -> None:
+        """Drop all before keyframe k (by default the newest); its marginal stays as prior, less sure by
+        `extra_variance` (DIM,). The marginal is that of keyframe k and all before it.
 
         For an estimate that has proved wrong: what comes next may move it
         freely, and does not bend the past to reach it.
         """
         self._eliminate_all()
-        node, k, covariance = self.nodes[-1], self.last, self.covariance() + np.diag(extra_variance)
-        root = np.linalg.inv(np.linalg.cholesky(covariance))
-        graph, point = gtsam.NonlinearFactorGraph(), node.point.retract(node.delta)
-        fresh = Node(point, node.t_ns, graph, None, None, node.gyro_radps, node.accel_mps2)
-        fresh.prior = np.hstack([root, np.zeros((DIM, 1))])
-        self.nodes, self.first, self._dirty, self.values = [fresh], k, k, gtsam.Values()
-        self._anchor = None
-        self._insert(k, fresh.point)
+        k = self.last if k is None else k
+        node = self.nodes[k - self.first]
+        known = self._root if k == self.last else _triangular(np.vstack([node.prior, self._unary_rows(k)]))
+        inverse, _ = lapack.dtrtri(known[:, :DIM])
+        mean = inverse @ known[:, DIM]
+        root = np.linalg.inv(np.linalg.cholesky(inverse @ inverse.T + np.diag(extra_variance)))
+        # Keyframes that follow keep their linearisation, so keyframe k must keep its own, too.
+        shift = mean if k == self.last else np.zeros(DIM)
+        fresh = Node(
+            node.point.retract(shift), node.t_ns, gtsam.NonlinearFactorGraph(), None, None,
+            node.gyro_radps, node.accel_mps2,
+        )  # fmt: skip
+        fresh.prior = np.hstack([root, (root @ (mean - shift))[:, None]])
+        self.nodes, self.first, self._dirty = [fresh, *self.nodes[k - self.first + 1 :]], k, k
+        self._anchor, self.values = None, gtsam.Values()
+        for i, kept in enumerate(self.nodes, k):
+            self._insert(i, kept.point)
         self._eliminate_all()
+
+    def turn(self, yaw_rad: float, from_m: Array, to_m: Array) -> None:
+        """Turn the whole window about the vertical, and shift it so that the point `from_m` comes to `to_m`.
+
+        Motion between keyframes is the same in every frame, so only the prior of the first keyframe knows.
+        """
+        R = gtsam.Rot3.Rz(yaw_rad).matrix()
+        moved = gtsam.Pose3(gtsam.Rot3(R), to_m - R @ from_m)
+        for k, node in enumerate(self.nodes, self.first):
+            self._move(k)
+            pose = moved.compose(node.point.pose)
+            node.point = replace(node.point, pose=pose, velocity=R @ node.point.velocity)
+            self._publish(k)
+        self.nodes[0].prior[:, VELOCITY] = self.nodes[0].prior[:, VELOCITY] @ R.T
+        self._anchor, self._dirty = None, self.first
+        self._eliminate_all()
+
+    def set_markov(self, k: int, step: MarkovStep) -> None:
+        """Another step of slip and drift into keyframe k, which must not be the first."""
+        self.nodes[k - self.first].markov = step
+        self._dirty = min(self._dirty, k - 1)
+        if self.archive is not None:
+            self.archive.set_markov(k, step)
+
+    def rebuild(self) -> None:
+        """Make the variables of GTSAM anew from the keyframes, which hold the same."""
+        self.values = gtsam.Values()
+        for k, node in enumerate(self.nodes, self.first):
+            self._insert(k, node.point)
 
     def move_to(self, k: int, point: KeyState) -> None:
         """Linearise keyframe k about another state."""
@@ -406,6 +448,14 @@ class Chain:
             assert node.conditional is not None
             rhs = node.conditional[:, 2 * DIM] - node.conditional[:, DIM : 2 * DIM] @ following
             node.delta = following = _back_substitute(node.conditional[:, :DIM], rhs)
+
+
+def _covariance_before(node: Node, following: Array) -> Array:
+    """Marginal covariance (DIM, DIM) of a keyframe from that of the one after it."""
+    assert node.conditional is not None
+    inverse, _ = lapack.dtrtri(node.conditional[:, :DIM])
+    gain = inverse @ node.conditional[:, DIM : 2 * DIM]
+    return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)
 
 
 _UPPER = np.triu(np.ones((2 * DIM, 2 * DIM + 1)))

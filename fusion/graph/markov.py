@@ -29,6 +29,13 @@ class MarkovStep:
         """Noise (n,) that leads from `before` to `now`, unwhitened."""
         return np.asarray(now - self.mean - self.decay * (before - self.mean))
 
+    def renewed(self, states: slice) -> MarkovStep:
+        """The same step, but `states` start anew: from their mean, with their stationary spread."""
+        decay, sigma = self.decay.copy(), self.sigma.copy()
+        sigma[states] /= np.sqrt(1.0 - decay[states] ** 2)
+        decay[states] = 0.0
+        return MarkovStep(decay, self.mean, sigma)
+
 
 def markov_step(
     dt_s: float, mean: ArrayLike, sigma: ArrayLike, time_s: ArrayLike, forget: ArrayLike = 0.0

@@ -17,6 +17,7 @@ Martinez et al. 2005, IJRR 24(10); Pentzer, Brennan, Reichard 2014, J. Field Rob
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -59,6 +60,10 @@ class WheelIncrement:
     turn_rad: float
     yaw_rad: float = 0.0
     speed_change_mps: float = 0.0
+
+    def without_turn(self) -> WheelIncrement:
+        """The same, but the turn tells nothing: the sides are not told apart, or the gyro's place is theirs."""
+        return dataclasses.replace(self, sigma=np.append(self.sigma[:3], np.inf))
 
 
 def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:

@@ -24,17 +24,21 @@ class GnssGate:
     """Chi-square test of a fix against its prediction.
 
     When enough rejected fixes in a row agree with each other the estimate, not
-    GNSS, is taken to be wrong: `test` answers REACQUIRE.
+    GNSS, is taken to be wrong: `test` answers REACQUIRE. They agree when they lie on
+    a line over time, since an estimate that is wrong moves on, too. Whatever was
+    rejected before, `limit` fixes in a row are the most that can be kept out.
 
     Attributes:
         threshold: chi-square quantile of the innovations tested.
         patience: rejected fixes in a row that must agree with each other.
         agreement_sigma: how well they must agree, in their own sigmas.
+        limit: rejected fixes in a row after which the next is let in, whether they agree or not.
     """
 
     threshold: float
     patience: int = 5
     agreement_sigma: float = 4.0
+    limit: int = 30
     rejected: list[tuple[Array, float]] = field(default_factory=list)
 
     def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[Verdict, float]:
@@ -47,7 +51,7 @@ class GnssGate:
             self.rejected.clear()
             return Verdict.ACCEPT, nis
         self.rejected.append((innovation_m[:2].copy(), float(np.sqrt(covariance_m2[0, 0]))))
-        if len(self.rejected) >= self.patience and self._agree():
+        if len(self.rejected) > self.limit or (len(self.rejected) >= self.patience and self._agree()):
             self.rejected.clear()
             return Verdict.REACQUIRE, nis
         return Verdict.REJECT, nis
@@ -55,7 +59,10 @@ class GnssGate:
     def _agree(self) -> bool:
         recent = self.rejected[-self.patience :]
         points = np.array([point for point, _ in recent])
-        spread = float(np.linalg.norm((points - points.mean(axis=0)).std(axis=0)))
+        order = np.arange(len(points)) - 0.5 * (len(points) - 1)
+        points = points - points.mean(axis=0)
+        rest = points - np.outer(order, order @ points) / float(order @ order)
+        spread = float(np.sqrt((rest**2).sum() / (len(points) - 2)))
         return spread <= self.agreement_sigma * max(sigma for _, sigma in recent)
 
 

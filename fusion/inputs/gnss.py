@@ -6,19 +6,24 @@ import dataclasses
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.recording import Fix
+from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
-from terrafusion.fusion.graph.key_state import ANTENNA, DIM, MARKOV, POSE
+from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DIM, DRIFT, MARKOV, POSE, SLIP, VELOCITY
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.track import MotionTrack
 from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.twin.sensing.gnss import best_fix
 
 Array = NDArray[np.float64]
 
@@ -30,6 +35,10 @@ WHITE_SHARE = 0.2
 OPTIMISM = 3.0
 """A stand-alone receiver may claim so many times less than its data sheet and drift all the same; one
 that claims even less has fixes of a better class (RTK), which drift in proportion to what they claim."""
+LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
+"""Claims of a receiver outside this range are no sigma; that of its class of fix takes their place."""
+DOUBTFUL_YAW_SIGMA_RAD = 0.2
+"""What is left of the doubt in a heading after it was turned onto the motion (assumed)."""
 
 
 class GnssUpdater:
@@ -40,6 +49,8 @@ class GnssUpdater:
         waiting: fixes not yet used, oldest first.
         local: the graph was started without GNSS; fixes are rejected.
         rejected, too_late: how many fixes the gate refused, or came after their keyframe was dropped.
+        turned: how often the heading was set right from the motion.
+        scale: how many times more than it claims the receiver is seen to scatter, 1 for an honest one.
         last_used_ns: time of the newest fix in the graph.
     """
 
@@ -48,7 +59,15 @@ class GnssUpdater:
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         spec = config.rig.sensors.gnss
+        self.track = MotionTrack(self.antenna_m)
+        self.turned = 0
+        self.scale = 1.0
         self.sheet_sigma_m = spec.sigma_horizontal_m
+        self._best = best_fix(spec)
+        self._class: Fix | None = None
+        self._class_scale: dict[Fix | None, float] = {}
+        imu = config.rig.sensors.imu
+        self._bias_sigma = np.repeat([imu.accel_bias_sigma_mps2, imu.gyro_bias_sigma_radps], 3)
         self.drift_sigma_m = spec.sigma_horizontal_m * float(np.sqrt(1.0 - WHITE_SHARE))
         self.drift_time_s = max(spec.correlation_time_s, 0.1)
         # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
@@ -59,6 +78,7 @@ class GnssUpdater:
         self.rejected = 0
         self.too_late = 0
         self.last_used_ns: int | None = None
+        self._newest_ns = 0
         self._report = report
         self._seen = 0
 
@@ -81,6 +101,7 @@ class GnssUpdater:
         that of the newest keyframe.
         """
         used = False
+        self.track.step(chain)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
             fix = self.waiting.pop(0)
             k = chain.at_or_after(fix.t_ns)
@@ -89,10 +110,58 @@ class GnssUpdater:
             elif k is None:
                 self.too_late += 1
             else:
-                if k < chain.last:
-                    chain.smooth(chain.last - k + 2)
+                self.track.add(fix)
+                self.scale = self.track.scatter()
+                renewed = self._change_class(chain, k, fix)
+                if renewed or used or k < chain.last:
+                    chain.smooth(max(chain.last - k + 2, 1))
+                    covariance = chain.covariance_at(k)
                 used |= self._add(chain, k, fix, covariance, row)
+                used |= self._set_heading_right(chain, fix, row)
         return used
+
+    def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
+        """Let the drift start anew where the class of fix changes; True when it does.
+
+        A worse class than the data sheet's drifts in proportion to what its first fix claims.
+        """
+        if fix.t_ns < self._newest_ns or (fix.fix == self._class and self._class_scale):
+            return False
+        self._newest_ns, first, self._class = fix.t_ns, not self._class_scale, fix.fix
+        worse = fix.fix is not None and fix.fix < self._best
+        claimed = float(np.max(fix.sigma_m[:2]))
+        self._class_scale[fix.fix] = max(1.0, claimed / self.sheet_sigma_m) if worse else 1.0
+        step = chain.nodes[k - chain.first].markov
+        if first or step is None:
+            return False
+        chain.set_markov(k, step.renewed(slice(1, 3)))
+        return True
+
+    def _set_heading_right(self, chain: Chain, fix: GnssFix, row: SensorNoise) -> bool:
+        """Turn the whole window where motion and fixes agree on another heading than the filter's."""
+        yaw_sigma = float(np.sqrt(chain.covariance()[2, 2]))
+        turn = self.track.wrong_by(yaw_sigma, self.scale)
+        if turn is None:
+            return False
+        k = chain.at_or_after(fix.t_ns)
+        if k is None:
+            return False
+        chain.smooth(len(chain.nodes))
+        pose = chain.state(k).pose
+        antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
+        off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
+        # All that the wrong heading may have bent is in doubt again.
+        doubt = np.zeros(DIM)
+        doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
+        doubt[3:6] = off**2 + float(np.max(fix.sigma_m[:2]) * self.scale) ** 2
+        doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
+        doubt[SLIP], doubt[DRIFT] = row.slip_sigma**2, self.drift_sigma_m**2
+        chain.restart(doubt, chain.first)
+        chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
+        chain.smooth(len(chain.nodes))
+        self.track.restart()
+        self.turned += 1
+        return True
 
     def _add(self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise) -> bool:
         node, state = chain.nodes[k - chain.first], chain.state(k)
@@ -103,21 +172,22 @@ class GnssUpdater:
         antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
         lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
         velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
-        share = self._drift_share(fix, row)
-        sigma = self._white_sigma(fix, row, share)
+        inflation = row.gnss_inflation * self.scale
+        share = self._drift_share(fix, inflation)
+        sigma = self._white_sigma(fix, inflation, share)
         position = GnssPosition(fix.enu_m, lever, sigma, share, velocity)
         innovation = -residual(position, state.pose, state.linear)
         J = np.zeros((3, DIM))
         J[:, POSE], J[:, MARKOV] = jacobians(position, state.pose, state.linear)
         P = J @ covariance @ J.T
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
-        P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * row.gnss_inflation) ** 2
+        P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
         if verdict is Verdict.REJECT:
             self.rejected += 1
             return False
-        cut = k == chain.last and self._prepare(chain, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
+        cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
         if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
             height = (np.asarray(state.pose.translation()) + R @ lever)[2]
@@ -129,31 +199,38 @@ class GnssUpdater:
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
-            chain.smooth(1)
-            chain.restart(np.zeros(DIM))
-        self.last_used_ns = fix.t_ns
+            chain.smooth(chain.last - k + 1)
+            chain.restart(np.zeros(DIM), k)
+        self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
 
-    def _drift_share(self, fix: GnssFix, row: SensorNoise) -> float:
-        """How much of the receiver's drift is in this fix, 0 to 1."""
-        claimed = float(np.max(fix.sigma_m[:2])) * row.gnss_inflation
-        return min(1.0, OPTIMISM * claimed / self.sheet_sigma_m)
+    def _drift_share(self, fix: GnssFix, inflation: float) -> float:
+        """How much of the drift state is in this fix: 0 to 1, above 1 for classes worse than the sheet's."""
+        claimed = float(np.max(fix.sigma_m[:2])) * inflation
+        scale = self._class_scale.get(fix.fix, 1.0)
+        return min(scale, OPTIMISM * claimed / self.sheet_sigma_m)
 
-    def _white_sigma(self, fix: GnssFix, row: SensorNoise, share: float) -> Array:
+    def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
         """1 sigma (3,) of what is new in a fix, beyond the drift that is a state."""
-        reported = fix.sigma_m * row.gnss_inflation
+        reported = fix.sigma_m * inflation
         drift_m = share * self.drift_sigma_m
         level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, WHITE_SHARE * reported[:2] ** 2))
         return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
 
     @staticmethod
     def _prepare(
-        chain: Chain, covariance: Array, innovation_m: Array, S: Array, jacobian: Array, verdict: Verdict
+        chain: Chain,
+        k: int,
+        covariance: Array,
+        innovation_m: Array,
+        S: Array,
+        jacobian: Array,
+        verdict: Verdict,
     ) -> bool:
         """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
 
         A fix after a long outage can turn the heading by more than the window's
-        linearisation bears; applied to the newest keyframe alone it is a Kalman
+        linearisation bears; applied to its keyframe alone it is a Kalman
         update, which cannot diverge.
         """
         gain = covariance @ jacobian.T @ np.linalg.inv(S)
@@ -162,5 +239,52 @@ class GnssUpdater:
             doubt[3:6] = float(innovation_m @ innovation_m)
         elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
             return False
-        chain.restart(doubt)
+        chain.restart(doubt, k)
         return True
+
+
+def checked_fix(
+    t_ns: int,
+    enu_m: ArrayLike,
+    sigma_m: ArrayLike | None,
+    velocity_mps: ArrayLike | None,
+    sigma_v_mps: float,
+    fix: Fix | int | str | None,
+) -> GnssFix | None:
+    """A fix as the graph takes it; None where the receiver itself says that it has none.
+
+    Where the receiver claims no sensible sigma (none, not a number, below 1 mm or above 1 km), that of
+    its class of fix is taken (`ASSUMED_SIGMA_M`; up twice as much).
+
+    Raises:
+        DataError: no east or north, an unknown class of fix, or neither sigma nor class.
+    """
+    position = np.asarray(enu_m, dtype=float)
+    known = _class_of(fix)
+    if known is Fix.NONE:
+        return None
+    if position.shape != (3,) or not np.isfinite(position[:2]).all():
+        raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
+    sigma = np.full(3, np.nan) if sigma_m is None else np.asarray(sigma_m, dtype=float)
+    sensible = sigma.shape == (3,) and ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
+    if not sensible and known is not None:
+        sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
+    elif sigma.shape != (3,) or not (sigma[:2] > 0).all():
+        raise DataError(
+            f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
+        )
+    velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
+    return GnssFix(t_ns, position, sigma, velocity, sigma_v_mps, known)
+
+
+def _class_of(fix: Fix | int | str | None) -> Fix | None:
+    if fix is None or isinstance(fix, Fix):
+        return fix
+    try:
+        return Fix[fix.upper()] if isinstance(fix, str) else Fix(fix)
+    except (KeyError, ValueError):
+        raise DataError(
+            f"unknown class of fix {fix!r}",
+            channel="gnss",
+            remedy=f"give one of {', '.join(known.name.lower() for known in Fix)}",
+        ) from None

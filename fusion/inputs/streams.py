@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.recording import Fix
 
 Array = NDArray[np.float64]
 
@@ -25,47 +27,99 @@ class ImuSegment:
 
 @dataclass(frozen=True, eq=False)
 class GnssFix:
-    """One fix: antenna position (3,) and sigma (3,), ENU m; velocity (3,) m/s and its sigma where known."""
+    """One fix: antenna position (3,) and sigma (3,), ENU m; velocity (3,) m/s and its sigma where known.
+
+    `fix` is the receiver's class of fix, None where it does not say.
+    """
 
     t_ns: int
     enu_m: Array
     sigma_m: Array
     velocity_mps: Array | None = None
     sigma_v_mps: float = float("nan")
+    fix: Fix | None = None
 
 
-def _in_order(channel: str, t_ns: int, times: list[int]) -> None:
-    if times and t_ns < times[-1]:
-        raise DataError(
-            f"sample at {t_ns} ns comes {(times[-1] - t_ns) * 1e-9:.3f} s after a newer one",
-            channel=channel,
-            remedy="feed each sensor in time order",
-        )
+LATEST_S = 5.0
+"""A sample so much older than its stream's newest is no late message: the clock has jumped."""
+LONGEST_WAIT_S = 0.5
+
+
+class Lateness:
+    """How out of order a stream is, and what of it came too late to be used.
+
+    A keyframe waits for as long as the stream has been seen to be late (a stream in
+    order costs no waiting), and takes what came. A sample before it is then too late.
+
+    Attributes:
+        wait_ns: longest lateness seen so far, at most `LONGEST_WAIT_S`.
+        used_ns: end of what the keyframes have taken.
+        too_late: samples left out because their keyframe had been made.
+    """
+
+    def __init__(self, channel: str) -> None:
+        self.channel = channel
+        self.wait_ns = 0
+        self.used_ns: int | None = None
+        self.too_late = 0
+
+    def place(self, t_ns: int, times: list[int]) -> int | None:
+        """Where in `times` a sample belongs, or None when it is too late.
+
+        Raises:
+            DataError: the sample is so old that the clock must have jumped.
+        """
+        if not times or t_ns >= times[-1]:
+            return len(times)
+        late_ns = times[-1] - t_ns
+        if late_ns > LATEST_S * 1e9:
+            raise DataError(
+                f"sample at {t_ns} ns comes {late_ns * 1e-9:.3f} s after a newer one",
+                channel=self.channel,
+                remedy=f"more than {LATEST_S:g} s is no late message: start anew where a clock jumps",
+            )
+        self.wait_ns = max(self.wait_ns, min(late_ns, round(LONGEST_WAIT_S * 1e9)))
+        if self.used_ns is not None and t_ns <= self.used_ns:
+            self.too_late += 1
+            return None
+        return bisect.bisect_right(times, t_ns)
 
 
 class ImuStream:
-    """IMU samples; the sample at t stands for the time since the one before it."""
+    """IMU samples; the sample at t stands for the time since the one before it.
 
-    def __init__(self) -> None:
+    With `six_axis` False the stream is declared to tell the yaw rate alone: any
+    other axis may be NaN, and `segments` has in their place, present or not,
+    what a robot reads that drives straight on level ground.
+    """
+
+    def __init__(self, six_axis: bool = True) -> None:
+        self.six_axis = six_axis
+        self.late = Lateness("imu")
         self.t_ns: list[int] = []
         self.gyro: list[Array] = []
         self.accel: list[Array] = []
 
     def add(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
         gyro, accel = np.asarray(gyro_radps, dtype=float), np.asarray(accel_mps2, dtype=float)
-        if gyro.shape != (3,) or accel.shape != (3,) or not np.isfinite(gyro.sum() + accel.sum()):
+        known = gyro.shape == accel.shape == (3,) and np.isfinite(
+            gyro.sum() + accel.sum() if self.six_axis else gyro[2]
+        )
+        if not known:
+            wanted = "six finite numbers" if self.six_axis else "six numbers with a finite yaw rate"
             raise DataError(
-                f"sample is not six finite numbers: gyro {gyro.tolist()}, accel {accel.tolist()}",
+                f"sample is not {wanted}: gyro {gyro.tolist()}, accel {accel.tolist()}",
                 channel="imu",
                 remedy="leave out samples with missing axes",
             )
-        _in_order("imu", t_ns, self.t_ns)
-        self.t_ns.append(t_ns)
-        self.gyro.append(gyro)
-        self.accel.append(accel)
+        i = self.late.place(t_ns, self.t_ns)
+        if i is not None:
+            self.t_ns.insert(i, t_ns)
+            self.gyro.insert(i, gyro)
+            self.accel.insert(i, accel)
 
     def covers(self, t_ns: int) -> bool:
-        return bool(self.t_ns) and self.t_ns[-1] >= t_ns
+        return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
 
     def segments(self, start_ns: int, end_ns: int) -> list[ImuSegment]:
         """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
@@ -74,10 +128,21 @@ class ImuStream:
         while t < end_ns:
             until = min(self.t_ns[i], end_ns)
             if until > t:
-                pieces.append(ImuSegment((until - t) * 1e-9, self.gyro[i], self.accel[i]))
+                pieces.append(ImuSegment((until - t) * 1e-9, *self._for_graph(self.gyro[i], self.accel[i])))
             t = until
             i += 1
         return pieces
+
+    def _for_graph(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
+        if self.six_axis:
+            return gyro, accel
+        return np.array([0.0, 0.0, gyro[2]]), np.array([0.0, 0.0, GRAVITY_MPS2])
+
+    def levelled(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
+        """Rates (n, 3) and forces (n, 3) of a window, as `segments` has them."""
+        _, gyro, accel = self.window(start_ns, end_ns)
+        rows = [self._for_graph(g, a) for g, a in zip(gyro, accel, strict=True)]
+        return np.array([g for g, _ in rows]).reshape(-1, 3), np.array([a for _, a in rows]).reshape(-1, 3)
 
     def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
         """Longest time between samples that touch the interval, s."""
@@ -87,7 +152,7 @@ class ImuStream:
         return max((b - a for a, b in itertools.pairwise(times)), default=0) * 1e-9
 
     def window(self, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
-        """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end."""
+        """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end, as measured."""
         i, j = bisect.bisect_left(self.t_ns, start_ns), bisect.bisect_left(self.t_ns, end_ns)
         t = np.array([x - start_ns for x in self.t_ns[i:j]], dtype=float) * 1e-9
         return t, np.array(self.gyro[i:j]).reshape(-1, 3), np.array(self.accel[i:j]).reshape(-1, 3)
@@ -103,10 +168,11 @@ class WheelStream:
     """Travelled distance of the left and right side over time."""
 
     def __init__(self) -> None:
+        self.late = Lateness("wheels")
         self.t_ns: list[int] = []
         self.left_m: list[float] = []
         self.right_m: list[float] = []
-        self._last: tuple[float, float] | None = None
+        self._speeds: list[tuple[float, float]] = []
 
     def add(
         self,
@@ -119,25 +185,27 @@ class WheelStream:
         """Side speeds, and, where encoders count angle, the travelled distances, used instead."""
         if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
             raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
-        _in_order("wheels", t_ns, self.t_ns)
-        if left_m is None or right_m is None:
-            left_m, right_m = self._integrated(t_ns, left_mps, right_mps)
-        self.t_ns.append(t_ns)
-        self.left_m.append(left_m)
-        self.right_m.append(right_m)
-        self._last = (left_mps, right_mps)
+        i = self.late.place(t_ns, self.t_ns)
+        if i is None:
+            return
+        counted = left_m is not None and right_m is not None
+        self.t_ns.insert(i, t_ns)
+        self._speeds.insert(i, (left_mps, right_mps))
+        self.left_m.insert(i, left_m if counted else 0.0)  # type: ignore[arg-type]
+        self.right_m.insert(i, right_m if counted else 0.0)  # type: ignore[arg-type]
+        if not counted:
+            self._integrate_from(max(i, 1))
 
-    def _integrated(self, t_ns: int, left_mps: float, right_mps: float) -> tuple[float, float]:
-        if self._last is None:
-            return 0.0, 0.0
-        dt = (t_ns - self.t_ns[-1]) * 1e-9
-        left, right = self._last
-        return self.left_m[-1] + 0.5 * (left + left_mps) * dt, self.right_m[-1] + 0.5 * (
-            right + right_mps
-        ) * dt
+    def _integrate_from(self, first: int) -> None:
+        """Distances by the trapezoid rule, from sample `first` on."""
+        for j in range(first, len(self.t_ns)):
+            half_s = 0.5e-9 * (self.t_ns[j] - self.t_ns[j - 1])
+            (left, right), (left_now, right_now) = self._speeds[j - 1], self._speeds[j]
+            self.left_m[j] = self.left_m[j - 1] + half_s * (left + left_now)
+            self.right_m[j] = self.right_m[j - 1] + half_s * (right + right_now)
 
     def covers(self, t_ns: int) -> bool:
-        return bool(self.t_ns) and self.t_ns[-1] >= t_ns
+        return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
 
     def travelled(self, start_ns: int, end_ns: int, longest_gap_s: float = 1.0) -> tuple[float, float] | None:
         """Distance of the left and right side between two times, m; None where samples are missing."""
@@ -173,4 +241,4 @@ class WheelStream:
     def forget(self, before_ns: int) -> None:
         i = bisect.bisect_left(self.t_ns, before_ns) - 1
         if i > 256:
-            del self.t_ns[:i], self.left_m[:i], self.right_m[:i]
+            del self.t_ns[:i], self.left_m[:i], self.right_m[:i], self._speeds[:i]

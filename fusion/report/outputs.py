@@ -88,6 +88,9 @@ def build_metrics(
         "nees_mean": finite(scores.nees_mean),
         "held_out": None if scores.held_out is None else finite(dataclasses.asdict(scores.held_out)),
         "outages": [finite(dataclasses.asdict(outage)) for outage in scores.outages],
+        "consistency": [
+            finite(dataclasses.asdict(row)) | {"verdict": row.verdict()} for row in scores.consistency
+        ],
         "status": {"value": status["value"], "message": status["message"]},
         "notes": [*notes, *(note for note in scores.notes if note not in notes)],
     }

@@ -14,8 +14,10 @@ unknown or of another quality):
 - NEES: mean of e' P^-1 e / 2 for the 2-D position error e and its covariance
   P (Bar-Shalom, Li, Kirubarajan 2001, sec. 5.4.2, divided by the dimension):
   1 is consistent, above 1 overconfident. Against fixes, P holds the fix's own
-  covariance too.
-- Outage: errors inside a stretch without GNSS. Segments are never realigned.
+  covariance too. By terrain and over time, with bands: `consistency`.
+- Outage: errors inside a stretch without GNSS. Segments are never realigned:
+  an error that was there before the outage counts in full, and so does the
+  heading error with which it began.
 
 Times in seconds count from the start of the recording.
 """
@@ -31,6 +33,13 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.recording import Gnss, Recording
 from terrafusion.fusion.estimate import Estimate
+from terrafusion.fusion.scores.consistency import (
+    Consistency,
+    by_terrain,
+    ground_at,
+    over_time,
+    whitened_series,
+)
 from terrafusion.fusion.scores.error_series import (
     Errors,
     align_both,
@@ -42,6 +51,7 @@ from terrafusion.fusion.scores.error_series import (
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
+Rows = NDArray[np.int64]
 
 RPE_LENGTHS_M = (10, 50, 100)
 """Path lengths over which the relative pose error is taken."""
@@ -62,7 +72,11 @@ class Outage:
 
 @dataclass(frozen=True)
 class OutageScore:
-    """Drift in one outage; None where there is no reference inside it."""
+    """Drift in one outage; None where there is no reference inside it.
+
+    `max_m` is the largest error, `end_yaw_error_rad` the size of the heading error at the end,
+    `nees_mean` that of the position inside.
+    """
 
     start_s: float
     seconds: float
@@ -70,6 +84,9 @@ class OutageScore:
     end_error_m: float | None
     median_m: float | None
     percent: float | None
+    max_m: float | None = None
+    end_yaw_error_rad: float | None = None
+    nees_mean: float | None = None
 
 
 @dataclass(frozen=True)
@@ -85,7 +102,8 @@ class HeldOut:
 class Scores:
     """All scores of one run; None where there is nothing to score against.
 
-    `errors` are the series behind the numbers, `notes` say how they were made.
+    `errors` are the series behind the numbers, `notes` say how they were made. `consistency` holds
+    NEES and NIS of the whole drive and by terrain, `consistency_over_time` the same in windows.
     """
 
     against: str | None
@@ -98,6 +116,8 @@ class Scores:
     outages: tuple[OutageScore, ...]
     notes: tuple[str, ...] = ()
     errors: Errors | None = field(default=None, repr=False)
+    consistency: tuple[Consistency, ...] = ()
+    consistency_over_time: tuple[Consistency, ...] = field(default=(), repr=False)
 
 
 def parse_outage(text: str) -> Outage:
@@ -151,6 +171,8 @@ def score(
     against = None if main is None else "truth" if main is truth else "gnss_held_out"
     if against == "gnss_held_out":
         notes += ("the errors against GNSS fixes hold the noise of the fixes as well",)
+    series = whitened_series(known, main, attitude)
+    start_ns = recording.start_ns
     return Scores(
         against=against,
         ate_m=None if main is None else _rms(main.distance_m()),
@@ -159,9 +181,13 @@ def score(
         velocity_rmse_mps=None if attitude is None else _rms(_norm(attitude.velocity_error_mps)),
         nees_mean=None if main is None else _mean(main.nees()),
         held_out=_held_out(fixes),
-        outages=tuple(_outage(o, known, main, recording.start_ns) for o in outages),
+        outages=tuple(_outage(o, known, main, start_ns) for o in outages),
         notes=notes,
         errors=main,
+        consistency=tuple(
+            row for one in series for row in by_terrain(one, ground_at(recording, known, one.t_ns), start_ns)
+        ),
+        consistency_over_time=tuple(row for one in series for row in over_time(one, start_ns)),
     )
 
 
@@ -171,18 +197,35 @@ def rpe_percent(errors: Errors, lengths_m: Sequence[float] = RPE_LENGTHS_M) -> d
     One number for each length; None where the drive is shorter.
     """
     path = errors.path_m()
-    known = np.flatnonzero(np.isfinite(errors.distance_m()))
     out: dict[str, float | None] = {}
     for length in lengths_m:
-        last = np.searchsorted(path, path[known] + length, side="left")
-        first, last = known[last < len(path)], last[last < len(path)]
-        estimate = errors.estimate_m[last] - errors.estimate_m[first]
-        reference = errors.reference_m[last] - errors.reference_m[first]
-        if len(first) and np.isfinite(errors.reference_yaw_rad[first]).all():
-            estimate = _rotate(estimate, -errors.estimate_yaw_rad[first])
-            reference = _rotate(reference, -errors.reference_yaw_rad[first])
-        out[f"{length:g}"] = _mean(100.0 * _norm(estimate - reference) / (path[last] - path[first]))
+        first, last = path_pairs(errors, length, path)
+        error = relative_error_m(errors, first, last)
+        out[f"{length:g}"] = _mean(100.0 * error / (path[last] - path[first]))
     return out
+
+
+def path_pairs(errors: Errors, length_m: float, path_m: Array | None = None) -> tuple[Rows, Rows]:
+    """Rows (n,) of all starts and of the first sample at least `length_m` of the reference's path later."""
+    path = errors.path_m() if path_m is None else path_m
+    known = np.flatnonzero(np.isfinite(errors.distance_m()))
+    last = np.searchsorted(path, path[known] + length_m, side="left")
+    inside = last < len(path)
+    return known[inside], last[inside]
+
+
+def relative_error_m(errors: Errors, first: Rows, last: Rows) -> Array:
+    """RPE of chosen pairs, (n,): the translation of Sturm et al. (2012), eq. 2, in the plane.
+
+    Each displacement is seen from its own heading at the pair's start; where the reference has no
+    heading at one of them, all are compared in the world frame instead.
+    """
+    estimate = errors.estimate_m[last] - errors.estimate_m[first]
+    reference = errors.reference_m[last] - errors.reference_m[first]
+    if len(first) and np.isfinite(errors.reference_yaw_rad[first]).all():
+        estimate = _rotate(estimate, -errors.estimate_yaw_rad[first])
+        reference = _rotate(reference, -errors.reference_yaw_rad[first])
+    return _norm(estimate - reference)
 
 
 def _held_out(errors: Errors | None) -> HeldOut | None:
@@ -207,8 +250,18 @@ def _outage(outage: Outage, estimate: Estimate, errors: Errors | None, start_ns:
     if len(error) > 1:
         distance = float(travelled_m(errors.reference_m[rows], errors.min_step_m)[-1])
     end = float(error[-1])
-    percent = 100.0 * end / distance if distance >= 1.0 else None
-    return OutageScore(outage.start_s, outage.seconds, distance, end, float(np.median(error)), percent)
+    yaw = float(np.abs(errors.yaw_error_rad()[rows][-1]))
+    return OutageScore(
+        start_s=outage.start_s,
+        seconds=outage.seconds,
+        distance_m=distance,
+        end_error_m=end,
+        median_m=float(np.median(error)),
+        percent=100.0 * end / distance if distance >= 1.0 else None,
+        max_m=float(error.max()),
+        end_yaw_error_rad=yaw if np.isfinite(yaw) else None,
+        nees_mean=_mean(errors.nees()[rows]),
+    )
 
 
 def _rotate(vectors: Array, angle_rad: Array) -> Array:

@@ -55,6 +55,8 @@ class TerrainWeights:
         self.changes: list[WeightChange] = []
         self._noted: SensorNoise | None = None
         self._rig = config.rig
+        # Only where gyro and wheels both tell yaw does their difference say something of the ground.
+        self._two_yaws = config.inputs.sides and config.inputs.yaw == "gyro"
         self._before = self.detector.probabilities
         self._next_ns = 0
         self._grade = 0.0
@@ -124,7 +126,7 @@ class TerrainWeights:
             wheel_speed_rate_mps2=0.0 if np.isnan(rate) else rate,
             speed_mps=float(np.hypot(*state.velocity_mps[:2])),
             yaw_rate_wheels_radps=None
-            if rolled is None
+            if rolled is None or not self._two_yaws
             else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
             yaw_rate_gyro_radps=float(gyro[:, 2].mean() - state.gyro_bias_radps[2]) if len(gyro) else np.nan,
             slip=state.slip if slip_observed else None,

@@ -26,6 +26,7 @@ from terrafusion.datasets.recording import Imu, Overrides, Recording, Wheels, di
 from terrafusion.datasets.sensors import Rig
 from terrafusion.datasets.trajectory import write_tum
 from terrafusion.datasets.writers import ros_messages, write_mcap
+from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 
 
 def test_round_trip(drive: Recording, tmp_path: Path) -> None:
@@ -109,6 +110,7 @@ def test_the_official_library_reads_it(drive: Recording, tmp_path: Path) -> None
     assert counts == {
         "/cmd_vel": 1200, "/joint_states": 1200, "/imu/data": 6000, "/datum": 1, "/fix": 300,
         "/fix_velocity": 300, "/terrain": 6, "/ground_truth/odom": 1200, "/odometry/filtered": 1200,
+        "/tf": 1200,
         "/terrafusion/meta": 1, "/terrafusion/gnss": 300, "/terrafusion/motor": 1200,
         "/terrafusion/terrain": 6,
     }  # fmt: skip
@@ -191,7 +193,15 @@ def test_a_path_that_cannot_be_written(drive: Recording, tmp_path: Path) -> None
 def test_messages_are_those_of_another_serialiser(drive: Recording, tmp_path: Path, husky_rig: Rig) -> None:
     """Decoded and encoded again by rosbags every message has the same bytes: no field is out of place."""
     sides = Wheels(drive.imu.t_ns[:9], np.ones((9, 2)), ("left", "right"), "mps")
-    write_mcap(drive, tmp_path / "a.mcap", drive.truth, rig=husky_rig)
+    assert drive.truth is not None
+    statuses = [(Status("a/b", Level.WARN, "odd länge", {"k": "v" * n, "": "x"}),) * n for n in range(3)]
+    written = WrittenEstimate(
+        drive.truth,
+        np.random.default_rng(1).normal(size=(len(drive.truth), 6, 6)),
+        diagnostics_ns=drive.truth.t_ns[:3],
+        diagnostics=statuses,
+    )
+    write_mcap(drive, tmp_path / "a.mcap", written, rig=husky_rig)
     write_mcap(dataclasses.replace(drive, wheels=sides), tmp_path / "b.mcap", rig=husky_rig)
     seen = set()
     for name in ("a.mcap", "b.mcap"):
@@ -201,7 +211,7 @@ def test_messages_are_those_of_another_serialiser(drive: Recording, tmp_path: Pa
                 again = bytes(reader.typestore.serialize_cdr(message, connection.msgtype))
                 assert again == raw, connection.topic
                 seen.add(connection.topic)
-    assert len(seen) == 16
+    assert len(seen) == 18
 
 
 def test_container(drive: Recording, tmp_path: Path) -> None:

@@ -10,12 +10,20 @@ from gtsam.symbol_shorthand import B, M, V, X
 from terrafusion.fusion.graph import gnss_factor, markov, wheel_factor
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import DIM, MARKOV, POSE, KeyState
+from terrafusion.fusion.graph.key_state import DIM, LINEAR, MARKOV, POSE, KeyState
 from terrafusion.fusion.graph.markov import markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
-STEP = markov_step(0.1, mean=[0.05, 0.0, 0.0], sigma=[0.1, 0.5, 0.5], time_s=[5.0, 30.0, 30.0])
-SIGMAS = np.array([0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5])
+N = len(LINEAR)
+STEP = markov_step(
+    0.1,
+    mean=[0.05, 0.0, 0.0, -0.3, *[0.0] * (N - 4)],
+    sigma=[0.1, 0.5, 0.5, 0.3, 0.1, 0.05, *[0.02] * (N - 6)],
+    time_s=[5.0, *[30.0] * (N - 1)],
+)
+SIGMAS = np.array(
+    [0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5] + [0.1] * (N - 3)
+)
 
 
 def iso(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
@@ -39,7 +47,7 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
         rotation = gtsam.Rot3.Rz(yaw).compose(gtsam.Rot3.Expmap(rng.normal(0, 0.02, 3)))
         pose = gtsam.Pose3(rotation, along + rng.normal(0, 0.3, 3))
         velocity = speed * np.array([np.cos(yaw), np.sin(yaw), 0.0]) + rng.normal(0, 0.1, 3)
-        points.append(KeyState(pose, velocity, bias, 0.0, np.zeros(2)))
+        points.append(KeyState(pose, velocity, bias, np.zeros(N)))
         fixes.append(along + rng.normal(0, 0.2, 3))
         if k == 0:
             continue
@@ -51,7 +59,9 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
         link.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured))
         links.append(link)
         moved = np.array([speed * dt / 0.95, 0.001, 0.0]) + rng.normal(0, 0.002, 3)
-        wheels.append(WheelIncrement(moved, np.array([0.003, 0.005, 0.005]), moved[0], 0.0))
+        wheels.append(
+            WheelIncrement(moved, np.array([0.003, 0.005, 0.005, 0.01]), moved[0], 0.03, 0.02, 0.01)
+        )
     return points, links, wheels, fixes
 
 
@@ -74,7 +84,9 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
             graph.add(wheel_factor.as_gtsam_factor(wheels[k - 1], X(k - 1), X(k), M(k)))
             graph.add(markov.as_gtsam_factor(STEP, M(k - 1), M(k)))
         if k % 4 == 0:
-            fix = GnssPosition(fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3))
+            fix = GnssPosition(
+                fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3), 1.0, np.array([0.9, 0.3, 0.0])
+            )
             chain.add_fix(k, fix)
             graph.add(gnss_factor.as_gtsam_factor(fix, X(k), M(k)))
     return graph
@@ -85,7 +97,7 @@ def add_priors(graph: gtsam.NonlinearFactorGraph, start: KeyState) -> None:
     graph.add(gtsam.PriorFactorPose3(X(0), start.pose, diagonal(SIGMAS[POSE])))
     graph.add(gtsam.PriorFactorVector(V(0), start.velocity, diagonal(SIGMAS[6:9])))
     graph.add(gtsam.PriorFactorConstantBias(B(0), start.bias, diagonal(SIGMAS[9:15])))
-    graph.add(gtsam.PriorFactorVector(M(0), start.markov(), diagonal(SIGMAS[MARKOV])))
+    graph.add(gtsam.PriorFactorVector(M(0), start.linear, diagonal(SIGMAS[MARKOV])))
 
 
 def test_batch_solution_is_that_of_gtsam() -> None:
@@ -94,7 +106,7 @@ def test_batch_solution_is_that_of_gtsam() -> None:
     start = chain.nodes[0].point
     values = gtsam.Values(chain.values)
     for k, node in enumerate(chain.nodes):
-        values.insert(M(k), node.point.markov())
+        values.insert(M(k), node.point.linear)
     add_priors(graph, start)
     params = gtsam.GaussNewtonParams()
     params.setRelativeErrorTol(1e-14)
@@ -106,7 +118,7 @@ def test_batch_solution_is_that_of_gtsam() -> None:
         state = chain.state(k)
         assert np.abs(state.pose.localCoordinates(solution.atPose3(X(k)))).max() < 1e-7
         assert np.abs(state.velocity - solution.atVector(V(k))).max() < 1e-7
-        np.testing.assert_allclose(state.markov(), solution.atVector(M(k)), atol=1e-7)
+        np.testing.assert_allclose(state.linear, solution.atVector(M(k)), atol=1e-7)
     # GTSAM's Marginals uses Cholesky, which gives up here: a dense QR of its own linear system instead.
     ordering = gtsam.Ordering()
     for k in range(40):
@@ -155,7 +167,12 @@ def test_forgetting_keeps_the_information() -> None:
         if k == 0:
             short.set_prior(SIGMAS)
         if k % 4 == 0:
-            short.add_fix(k, GnssPosition(fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3)))
+            short.add_fix(
+                k,
+                GnssPosition(
+                    fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3), 1.0, np.array([0.9, 0.3, 0.0])
+                ),
+            )
         short._eliminate_all()
         short.forget(8)
     whole._eliminate_all()

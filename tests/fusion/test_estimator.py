@@ -230,11 +230,11 @@ def test_bad_samples_are_refused_in_words(call, match: str) -> None:  # type: ig
         call(Estimator.for_vehicle("husky"))
 
 
-def test_time_running_backwards_is_refused() -> None:
+def test_a_clock_that_jumps_back_is_refused() -> None:
     estimator = Estimator.for_vehicle("elevate")
-    estimator.add_imu(1_000_000_000, [0, 0, 0], [0, 0, 9.8])
+    estimator.add_imu(10_000_000_000, [0, 0, 0], [0, 0, 9.8])
     with pytest.raises(DataError, match="after a newer one"):
-        estimator.add_imu(900_000_000, [0, 0, 0], [0, 0, 9.8])
+        estimator.add_imu(4_000_000_000, [0, 0, 0], [0, 0, 9.8])
 
 
 def test_an_unknown_mode_is_refused() -> None:

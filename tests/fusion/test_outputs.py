@@ -69,6 +69,14 @@ def test_metrics_keep_to_the_schema(drive, mode):
     assert metrics["held_out"]["fixes"] == 121
     assert metrics["rejected"] == {"gnss": 7, "wheels": 0}
     assert metrics["update_latency_ms"]["p50"] == pytest.approx(0.6)
+    tested = {(row["quantity"], row["terrain"]) for row in metrics["consistency"]}
+    assert {
+        ("position", "all"),
+        ("position", "loose_sand"),
+        ("heading", "all"),
+        ("nis gnss", "all"),
+    } <= tested
+    assert {row["verdict"] for row in metrics["consistency"]} <= {"consistent", "overconfident", "cautious"}
 
 
 def test_metrics_of_a_run_that_broke_are_still_valid(drive):

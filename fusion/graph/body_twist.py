@@ -1,0 +1,64 @@
+"""Covariance of the body twist, from that of a keyframe."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.graph.key_state import DIM, VELOCITY
+from terrafusion.fusion.weights.policy import SensorNoise
+
+Array = NDArray[np.float64]
+
+_ROTATION, _GYRO_BIAS = slice(0, 3), slice(12, 15)
+
+
+def twist_jacobian(R: Array, velocity_mps: Array) -> Array:
+    """Derivative (6, DIM) of the body twist by the tangent of a keyframe.
+
+    With R <- R exp(theta), v <- v + dv and b <- b + db, the linear velocity R' v becomes
+    u + [u]x theta + R' dv to first order, where u = R' v, and the angular rate w - b loses db
+    (Forster et al. 2017, "On-manifold preintegration", eq. 22 and 23, for the retraction).
+
+    Args:
+        R: (3, 3) body to world.
+        velocity_mps: (3,) of the body origin, world axes.
+    """
+    x, y, z = R.T @ velocity_mps
+    J = np.zeros((6, DIM))
+    J[:3, _ROTATION] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    J[:3, VELOCITY] = R.T
+    J[3:, _GYRO_BIAS] = -np.eye(3)
+    return J
+
+
+def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: float) -> Array:
+    """Covariance (6, 6) of the body twist in ROS order: linear (m/s), then angular (rad/s), body axes.
+
+    The velocity of the body is known better than its world components: an error of heading turns
+    both the pose and the world velocity. That is why the whole of `P` enters, not a block of it.
+
+    Args:
+        P: (DIM, DIM) of the keyframe's tangent.
+        R: (3, 3) body to world.
+        velocity_mps: (3,) world.
+        gyro_sigma_radps: white noise of the rate, as averaged over a keyframe's interval.
+    """
+    J = twist_jacobian(R, velocity_mps)
+    Q = J @ P @ J.T
+    Q[range(3, 6), range(3, 6)] += gyro_sigma_radps**2
+    return np.asarray(0.5 * (Q + Q.T))
+
+
+def gyro_sigma_radps(config: EstimatorConfig, row: SensorNoise) -> float:
+    """White noise of the gyro's mean over a keyframe's interval: density / sqrt(interval), inflated."""
+    density = config.rig.sensors.imu.gyro_noise_radps_sqrthz
+    return row.gyro_inflation * density / math.sqrt(config.keyframe_s)
+
+
+def bias_sigma(P: Array) -> Array:
+    """1 sigma (6,) of the gyro biases, rad/s, then of the accelerometer biases, m/s2."""
+    return np.sqrt(np.maximum(np.diagonal(P)[[12, 13, 14, 9, 10, 11]], 0.0))

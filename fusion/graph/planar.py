@@ -1,0 +1,139 @@
+"""The planar link: what joins two keyframes of a log that has no six-axis IMU.
+
+It is the preintegrated factor of the full graph, fed with what a robot reads
+that drives on level ground: yaw rate from the gyro's z axis or from the
+wheels, no roll or pitch rate, the centripetal specific force v omega to its left,
+gravity upwards. The noise says what that is worth: the yaw rate has the noise
+of its source, speed is a random walk (white acceleration; Bar-Shalom, Li and
+Kirubarajan 2001, sec. 6.2.2), roll and pitch are held level by an attitude
+factor at every keyframe. Nothing is estimated of them, nor of the
+accelerometer's bias. Height follows GNSS where it has heights, and stays at
+its start where it has none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import X
+from numpy.typing import NDArray
+
+from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.sensors import ImuSpec
+from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.preintegration import INTEGRATION_SIGMA_M, Preintegrator
+from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
+
+Array = NDArray[np.float64]
+
+ACCEL_DENSITY_MPS2 = 2.0
+"""White acceleration, m/s2/sqrt(Hz) (assumed): speed may change by 0.6 m/s (1 sigma) in a keyframe of 0.1 s,
+twice what a skid-steer robot brakes. The wheels, not this, set the speed."""
+TILT_SIGMA_RAD = 0.1
+"""Roll and pitch of the ground that is taken to be level, 1 sigma (assumed)."""
+TILT_DENSITY_RADPS = 0.1
+"""Rate at which the ground's tilt changes, rad/s/sqrt(Hz) (assumed): 0.03 rad (1 sigma) a keyframe."""
+TURN_SHARE = 0.4
+"""Error of the yaw rate from the wheels, as a share of it (1 sigma, assumed)."""
+TURN_TIME_S = 2.0
+"""How long that error lasts, s (assumed): about one turn."""
+WHEEL_YAW_DENSITY_RADPS = 0.02
+"""Yaw the wheels do not show on a straight, rad/s/sqrt(Hz) (assumed)."""
+UNKNOWN_YAW_DENSITY_RADPS = 0.5
+"""Yaw of a robot whose log does not tell it, rad/s/sqrt(Hz) (assumed): half a rad/s for a second."""
+
+_LEVEL = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
+_TILT_NOISE = gtsam.noiseModel.Isotropic.Sigma(2, TILT_SIGMA_RAD)
+_BIAS_WALK = 1e-6
+
+
+def held_level(k: int) -> gtsam.NonlinearFactor:
+    """Body z of keyframe k points up, but for the tilt of the ground."""
+    return gtsam.AttitudeFactorPose3(X(k), _LEVEL, _TILT_NOISE, _LEVEL)
+
+
+def in_a_turn(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
+    """The segments of a level robot that keeps its forward speed: centripetal force v omega is added."""
+    speed = float(before.pose.rotation().matrix()[:, 0] @ before.velocity)
+    bias = float(before.bias.gyroscope()[2])
+    return [
+        dataclasses.replace(
+            piece,
+            accel_mps2=np.array([0.0, speed * (float(piece.gyro_radps[2]) - bias), GRAVITY_MPS2]),
+        )
+        for piece in segments
+    ]
+
+
+def yaw_of_wheels(wheels: WheelStream, track_m: float) -> Array:
+    """Angular rate (3,) since the wheels' last sample but one, rad/s; x and y are NaN."""
+    rate = 0.0
+    if len(wheels.t_ns) > 1 and wheels.t_ns[-1] > wheels.t_ns[-2]:
+        dt = (wheels.t_ns[-1] - wheels.t_ns[-2]) * 1e-9
+        left, right = wheels.left_m[-1] - wheels.left_m[-2], wheels.right_m[-1] - wheels.right_m[-2]
+        rate = (right - left) / track_m / dt
+    return np.array([np.nan, np.nan, rate])
+
+
+class PlanarPreintegrator(Preintegrator):
+    """Makes the planar link; takes the place of `Preintegrator`.
+
+    Args:
+        spec: noise of the gyro, where yaw is the gyro's.
+        yaw: who tells the yaw rate: "gyro", "wheels" or "nobody".
+    """
+
+    def __init__(self, spec: ImuSpec, yaw: str) -> None:
+        super().__init__(spec)
+        self.yaw = yaw
+
+    def integrate(
+        self,
+        segments: list[ImuSegment],
+        bias: gtsam.imuBias.ConstantBias,
+        gyro_inflation: float,
+        accel_inflation: float,
+    ) -> gtsam.PreintegratedCombinedMeasurements:
+        """Preintegrate the segments about `bias`; `accel_inflation` has nothing to act on."""
+        turned = sum(float(piece.gyro_radps[2]) * piece.dt_s for piece in segments)
+        total = sum(piece.dt_s for piece in segments)
+        density = self.yaw_density(turned / total if total > 0.0 else 0.0, gyro_inflation)
+        measured = gtsam.PreintegratedCombinedMeasurements(self._planar(density), bias)
+        for piece in segments:
+            measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
+        return measured
+
+    def yaw_density(self, rate_radps: float, gyro_inflation: float) -> float:
+        """Noise density of the yaw rate, rad/s/sqrt(Hz), while turning at `rate_radps`."""
+        if self.yaw == "gyro":
+            return self.spec.gyro_noise_radps_sqrthz * gyro_inflation
+        if self.yaw == "nobody":
+            return UNKNOWN_YAW_DENSITY_RADPS
+        return float(np.hypot(TURN_SHARE * rate_radps * np.sqrt(TURN_TIME_S), WHEEL_YAW_DENSITY_RADPS))
+
+    def _planar(self, yaw_density: float) -> gtsam.PreintegrationCombinedParams:
+        eye = np.eye(3)
+        params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
+        params.setGyroscopeCovariance(np.diag([TILT_DENSITY_RADPS**2, TILT_DENSITY_RADPS**2, yaw_density**2]))
+        params.setAccelerometerCovariance(eye * ACCEL_DENSITY_MPS2**2)
+        walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw == "gyro" else _BIAS_WALK
+        params.setBiasOmegaCovariance(np.diag([_BIAS_WALK**2, _BIAS_WALK**2, walk**2]))
+        params.setBiasAccCovariance(eye * _BIAS_WALK**2)
+        params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
+        return params
+
+
+def planar_spec(spec: ImuSpec, yaw: str) -> ImuSpec:
+    """The IMU's specification as the planar graph uses it: biases it cannot see are zero.
+
+    The yaw rate is the same everywhere on a rigid body, so the IMU sits at the origin.
+    """
+    seen = yaw == "gyro"
+    return dataclasses.replace(
+        spec,
+        accel_bias_sigma_mps2=0.0,
+        gyro_bias_sigma_radps=spec.gyro_bias_sigma_radps if seen else 0.0,
+        position_m=(0.0, 0.0, 0.0),
+    )

@@ -1,0 +1,151 @@
+"""Dead reckoning beside the fixes: a second opinion on the heading, and on what a receiver claims.
+
+The filter believes its own past, so it is slow to see that its heading was wrong, or that a receiver
+lies. Wheels and gyro alone, from any start, trace the shape of the path; held against the fixes of
+the last half minute it tells how far the shape is turned, and how much the fixes scatter about it.
+Neither depends on what the filter made of those fixes.
+"""
+
+from __future__ import annotations
+
+import bisect
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.inputs.alignment import turn_between
+from terrafusion.fusion.inputs.streams import GnssFix
+
+Array = NDArray[np.float64]
+
+KEPT_S = 30.0
+SCATTER_FIXES = 21
+"""Fixes over which a receiver's scatter is judged; the median bears ten wild ones."""
+RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
+"""Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
+LIE = 2.0
+"""Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
+SLIP_CHANGE = 0.1
+"""How far slip may change from fix to fix and so bend the dead-reckoned path (assumed)."""
+LEAST_RATIO, MOST_RATIO = 0.3, 1.7
+"""Driven over dead-reckoned distance between which a path says something about heading."""
+TURN_SIGMA_RAD = 0.15
+LEAST_TURN_RAD = 0.35
+CONFIRMED = 3
+"""Fixes in a row that must show the same wrong heading."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A fix (east + i north, m) with its claimed sigma, and the dead-reckoned antenna `z` (m) at its time."""
+
+    t_ns: int
+    z: complex
+    fix: complex
+    sigma_m: float
+
+
+class MotionTrack:
+    """The dead-reckoned path of the antenna and the fixes along it, for the last `KEPT_S`."""
+
+    def __init__(self, antenna_m: Array) -> None:
+        self._lever = complex(antenna_m[0], antenna_m[1])
+        self._t_ns: list[int] = []
+        self._z: list[complex] = []
+        self._yaw: list[float] = []
+        self.pairs: list[Pair] = []
+        self._yaw_chain = 0.0
+        self._turned = 0
+
+    def step(self, chain: Chain) -> None:
+        """Carry the path to the newest keyframe, by its wheels (or its speed, where they are refused)."""
+        node, state = chain.nodes[-1], chain.state(chain.last)
+        R = state.pose.rotation().matrix()
+        self._yaw_chain = float(np.arctan2(R[1, 0], R[0, 0]))
+        if not self._t_ns or len(chain.nodes) < 2:
+            self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0)
+            return
+        dt = (node.t_ns - self._t_ns[-1]) * 1e-9
+        moved = node.wheels.displacement_m if node.wheels is not None else R.T @ state.velocity * dt
+        east, north, _ = R @ moved
+        turn = float((R @ (node.gyro_radps - state.bias.gyroscope()))[2]) * dt
+        level = complex(east, north) * np.exp(-1j * self._yaw_chain)
+        self._append(node.t_ns, self._z[-1] + level * np.exp(1j * self._yaw[-1]), self._yaw[-1] + turn)
+
+    def _append(self, t_ns: int, z: complex, yaw: float) -> None:
+        self._t_ns.append(t_ns)
+        self._z.append(z)
+        self._yaw.append(yaw)
+        old = bisect.bisect_left(self._t_ns, t_ns - round(KEPT_S * 1e9))
+        if old > 50:
+            del self._t_ns[:old], self._z[:old], self._yaw[:old]
+            self.pairs = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
+
+    def add(self, fix: GnssFix) -> None:
+        """Set a fix beside the path, in its place in time."""
+        if not self._t_ns or fix.t_ns < self._t_ns[0]:
+            return
+        t = np.array(self._t_ns[-100:]) - fix.t_ns
+        z = complex(np.interp(0.0, t, np.array(self._z[-100:])))
+        yaw = float(np.interp(0.0, t, self._yaw[-100:]))
+        at = z + self._lever * complex(np.cos(yaw), np.sin(yaw))
+        pair = Pair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
+        bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
+
+    def scatter(self) -> float:
+        """How many times more than they claim the last fixes scatter about the path; 1 if honest.
+
+        From second differences of fix minus path: neither an offset, a heading error nor steady slip of
+        the estimate shows in them, white noise of variance s^2 does with 6 s^2.
+        """
+        recent = self.pairs[-SCATTER_FIXES:]
+        if len(recent) < 8:
+            return 1.0
+        z, fix = np.array([p.z for p in recent]), np.array([p.fix for p in recent])
+        t = np.array([p.t_ns - recent[0].t_ns for p in recent]) * 1e-9
+        gap = np.diff(t)
+        even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
+        if even.sum() < 6:
+            return 1.0
+        rest = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
+        seen = np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2 / RAYLEIGH_MEDIAN
+        bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
+        claimed = 6.0 * np.array([p.sigma_m for p in recent])[1:-1] ** 2
+        scatter = float(np.sqrt(np.median(np.maximum(seen - bend, 0.0)[even] / claimed[even])))
+        return scatter if scatter > LIE else 1.0
+
+    def wrong_by(self, yaw_sigma_rad: float, scale: float) -> float | None:
+        """Angle by which the filter's heading must turn to agree with the motion, once that is sure."""
+        turn = self._heading_error(yaw_sigma_rad, scale)
+        self._turned = self._turned + 1 if turn is not None else 0
+        return turn if self._turned >= CONFIRMED else None
+
+    def restart(self) -> None:
+        """Forget the fixes seen so far: the filter has been set right."""
+        self.pairs.clear()
+        self._turned = 0
+
+    def _heading_error(self, yaw_sigma_rad: float, scale: float) -> float | None:
+        if len(self.pairs) < 5:
+            return None
+        z, fix = np.array([p.z for p in self.pairs]), np.array([p.fix for p in self.pairs])
+        weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in self.pairs])
+        keep = np.ones(len(z), dtype=bool)
+        for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
+            turn, information = turn_between(z[keep], fix[keep], weight[keep])
+            if information <= 0.0:
+                return None
+            ratio = abs(turn) / information
+            rest = np.abs((fix - fix[keep].mean()) - turn / information * (z - z[keep].mean()))
+            keep = rest <= 5.0 * np.median(rest) + 1e-6
+            if keep.sum() < 5:
+                return None
+        extent = float(np.sqrt(np.mean(np.abs(z[keep] - z[keep].mean()) ** 2)))
+        sigma = 1.0 / (max(ratio, 1e-6) * np.sqrt(information)) + 0.5 * float(np.median(rest)) / extent
+        if sigma > TURN_SIGMA_RAD or not LEAST_RATIO < ratio < MOST_RATIO:
+            return None
+        error = float(np.angle(turn * np.exp(-1j * (self._yaw_chain - self._yaw[-1]))))
+        limit = max(LEAST_TURN_RAD, 4.0 * float(np.hypot(sigma, min(yaw_sigma_rad, 0.3))))
+        return error if abs(error) > limit else None

@@ -1,0 +1,152 @@
+"""The field table as files: CSV of runs and of lines, markdown, and one figure."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from terrafusion.datasets.atomic import write_atomically
+from terrafusion.fusion.report import style
+from terrafusion.fusion.scores.field_summary import OWN, Line, condense, verdicts
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from terrafusion.fusion.scores.field_table import Refusal, Run
+
+LEAST_SHOWN_M = 0.01
+
+
+def write(out: Path, runs: Sequence[Run], refusals: Sequence[Refusal]) -> str:
+    """Write `runs.csv`, `lines.csv`, `refused.csv`, `field_table.md` and, with errors, `field_table.png`.
+
+    Returns the markdown.
+
+    Raises:
+        TerrafusionError: the folder cannot be written.
+    """
+    lines = condense(runs)
+    text = markdown(lines, refusals)
+    for name, rows in (("runs", runs), ("lines", lines), ("refused", refusals)):
+        write_atomically(out / f"{name}.csv", lambda path, rows=rows: _csv(path, rows))  # type: ignore[misc]
+    write_atomically(out / "field_table.md", lambda path: path.write_text(text, encoding="utf-8"))
+    if any(line.error_m is not None for line in lines):
+        figure = plot_lines(lines)
+        write_atomically(out / "field_table.png", lambda path: figure.savefig(path, format="png", dpi=110))
+    return text
+
+
+def markdown(lines: Sequence[Line], refusals: Sequence[Refusal]) -> str:
+    """Three tables (verdicts, scored logs, logs without reference) and the refused logs."""
+    scored = [line for line in lines if line.error_m is not None]
+    others = [line for line in lines if line.error_m is None]
+    parts = []
+    if any(line.mode == OWN and line.ratio is not None for line in lines):
+        parts.append(f"## {OWN.capitalize()} beside the best baseline\n\n{_verdict_table(lines)}")
+    if scored:
+        parts.append(f"## Scored logs\n\n{_scored_table(scored)}")
+    if others:
+        parts.append(f"## Logs without a reference\n\n{_health_table(others)}")
+    if refusals:
+        parts.append("## Not run\n\n" + "".join(f"- {r.log}: {r.why}\n" for r in refusals))
+    return "\n".join(parts)
+
+
+def plot_lines(lines: Sequence[Line]) -> Figure:
+    """Error of each mode in each log: a panel a test, a row a log, logarithmic."""
+    from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    scored = [line for line in lines if line.error_m is not None]
+    tests = list(dict.fromkeys(line.test for line in scored))
+    logs = list(dict.fromkeys(line.log for line in scored))
+    modes = list(dict.fromkeys(line.mode for line in scored))
+    figure = Figure(figsize=(3.2 + 2.0 * len(tests), 1.4 + 0.42 * len(logs)), layout="constrained")
+    panels = figure.subplots(1, len(tests), sharex=True, sharey=True, squeeze=False)[0]
+    for ax, test in zip(panels, tests, strict=True):
+        for number, mode in enumerate(modes):
+            found = [line for line in scored if line.test == test and line.mode == mode]
+            height = [logs.index(line.log) + 0.16 * (number - 0.5 * (len(modes) - 1)) for line in found]
+            error = [max(line.error_m or 0.0, LEAST_SHOWN_M) for line in found]
+            colour = style.colour_of(mode, style.MODE_COLOURS)
+            ax.plot(error, height, "o", color=colour, markersize=5, label=mode)
+        ax.set_xscale("log")
+        ax.xaxis.set_major_locator(LogLocator())
+        ax.xaxis.set_major_formatter(FuncFormatter(lambda metres, _: f"{metres:g}"))
+        ax.xaxis.set_minor_formatter(NullFormatter())
+        for row in np.arange(len(logs) - 1) + 0.5:
+            ax.axhline(row, color="#eeeeee", linewidth=0.6)
+        style.dress(ax, x="error, m", title=test)
+    panels[0].set_yticks(range(len(logs)), [f"{log} ({_ground(scored, log)})" for log in logs], fontsize=7)
+    panels[0].set_ylim(len(logs) - 0.5, -0.5)
+    errors = [max(line.error_m or 0.0, LEAST_SHOWN_M) for line in scored]
+    panels[0].set_xlim(10.0 ** np.floor(np.log10(min(errors))), 10.0 ** np.ceil(np.log10(1.01 * max(errors))))
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=len(modes), frameon=False, fontsize=9)
+    return figure
+
+
+def _ground(lines: Sequence[Line], log: str) -> str:
+    return next(line.ground for line in lines if line.log == log) or "no label"
+
+
+def _verdict_table(lines: Sequence[Line]) -> str:
+    head = (
+        "ground",
+        "test",
+        "logs",
+        "better",
+        "worse",
+        "mean of error over best baseline's",
+        "% of distance",
+    )
+    keys = ("ground", "test", "logs", "better", "worse", "mean_ratio", "percent")
+    return _table(head, [[row[key] for key in keys] for row in verdicts(lines)])
+
+
+def _scored_table(lines: Sequence[Line]) -> str:
+    head = ("log", "ground", "test", "reference", "runs", "way, m", "mode", "error, m", "%", "NEES",
+            "over best baseline", "diverged")  # fmt: skip
+    rows = [
+        [x.log, x.ground or "-", x.test, x.reference, x.runs, x.distance_m, x.mode, x.error_m, x.percent,
+         x.nees, x.ratio if x.mode != x.baseline else "best baseline", x.diverged]
+        for x in lines
+    ]  # fmt: skip
+    return _table(head, rows)
+
+
+def _health_table(lines: Sequence[Line]) -> str:
+    head = ("log", "ground", "mode", "path, m", "path over wheels'", "top speed, m/s", "diverged",
+            "x real time", "p99 of a keyframe, ms")  # fmt: skip
+    rows = [
+        [x.log, x.ground or "-", x.mode, x.distance_m, x.path_ratio, x.top_speed_mps, x.diverged, x.realtime,
+         x.latency_p99_ms]
+        for x in lines
+    ]  # fmt: skip
+    return _table(head, rows)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:
+    ruled = ["| " + " | ".join(head) + " |", "|" + " --- |" * len(head)]
+    return "\n".join(ruled + ["| " + " | ".join(map(_cell, row)) + " |" for row in rows]) + "\n"
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return "-"
+    if isinstance(value, float):
+        return f"{value:.0f}" if abs(value) >= 100.0 else f"{value:.2f}"
+    return str(value)
+
+
+def _csv(path: Path, rows: Sequence[Any]) -> None:
+    with path.open("w", encoding="utf-8", newline="") as file:
+        if rows:
+            writer = csv.DictWriter(file, fieldnames=[f.name for f in dataclasses.fields(rows[0])])
+            writer.writeheader()
+            writer.writerows(dataclasses.asdict(row) for row in rows)

@@ -1,0 +1,319 @@
+"""`python -m terrafusion.fusion.scores.field_table --out DIR`: every field log in every mode.
+
+Each log with wheels and IMU is replayed whole, and once for each simulated
+outage (`outage_plan`), scored on its truth or on fixes kept back and never
+realigned after the start. A log with truth but no receiver is dead reckoning
+when replayed whole; for outages it gets fixes made from its truth. A log
+without any reference is only checked for divergence (`health`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from terrafusion.datasets.catalog import CatalogFile, at_hand, data_folders, load_catalog
+from terrafusion.datasets.doctor import examine
+from terrafusion.datasets.errors import DataError, TerrafusionError, errors_of
+from terrafusion.datasets.readers import open_recordings
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.config import MODES
+from terrafusion.fusion.replay import Replay, choose_vehicle, replay
+from terrafusion.fusion.scores.health import examine_estimate, rolled_until_m
+from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.fusion.scores.outage_plan import aided_by_truth, lead_s, plan_outages, until
+
+OUTAGES_S = (30.0, 60.0, 120.0)
+LEAST_DRIVE_S = 10.0
+"""Shorter recordings, such as windows cut from a drive, are listed and not run."""
+LEAD_ROLLED_M = 5.0
+"""The wheels must have rolled so far before an outage: fixes show no heading of a robot that stands."""
+LEAST_ROLLED_M = 3.0
+"""Outages in which the wheels roll less test nothing and are left out."""
+SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
+SET_GROUND = {"husky_parkinglot": "firm"}
+"""Ground of sets whose logs carry no label but whose title names it."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One replay: of the whole log (`test` "whole"), or with one outage ("outage 60 s" from `start_s`).
+
+    `error_m` is, whole: the root mean square against truth, or the median
+    distance from fixes kept back; in an outage: the error at its end.
+    """
+
+    log: str
+    ground: str
+    vehicle: str
+    reference: str
+    mode: str
+    test: str
+    start_s: float | None
+    distance_m: float
+    error_m: float | None
+    within_m: float | None
+    percent: float | None
+    nees: float | None
+    top_speed_mps: float
+    path_ratio: float | None
+    diverged: str
+    wheels_rejected: int
+    gnss_rejected: int
+    seconds: float
+    realtime: float
+    latency_p99_ms: float
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A log that was not run, and the line that says why."""
+
+    log: str
+    why: str
+
+
+@dataclass(frozen=True)
+class Task:
+    """One log in one mode, so that tasks can run beside each other."""
+
+    log: str
+    mode: str
+    most_starts: int
+    seed: int
+
+
+def field_table(
+    logs: Sequence[str],
+    modes: Sequence[str] = MODES,
+    *,
+    most_starts: int = 4,
+    seed: int = 1,
+    jobs: int = 1,
+    progress: Callable[[str], None] = lambda _: None,
+) -> tuple[list[Run], list[Refusal]]:
+    """All runs of the logs in the modes, and the logs that were refused.
+
+    Args:
+        logs: as `open_recordings` takes them: catalogue names or paths.
+        most_starts: outages of each length in one log.
+        seed: of the noise on fixes made from truth.
+        jobs: processes beside each other; the times measured are those of loaded processors then.
+    """
+    import joblib
+
+    tasks = [Task(log, mode, most_starts, seed) for log in logs for mode in modes]
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator")
+    runs: list[Run] = []
+    refusals: dict[Refusal, None] = {}
+    for task, done in zip(tasks, parallel(joblib.delayed(_run_task)(t) for t in tasks), strict=True):
+        runs += [r for r in done if isinstance(r, Run)]
+        refusals |= {r: None for r in done if isinstance(r, Refusal)}
+        progress(f"{task.log}, {task.mode}")
+    return runs, list(refusals)
+
+
+def catalogued() -> list[str]:
+    """Names of the catalogue's recordings whose files are all at hand."""
+    folders = data_folders()
+
+    def complete(files: list[CatalogFile]) -> bool:
+        return all(at_hand(entry, folders) is not None for entry in files)
+
+    return [name for name, files in load_catalog().recordings().items() if complete(files)]
+
+
+def _run_task(task: Task) -> list[Run | Refusal]:
+    try:
+        recordings = open_recordings(task.log)
+    except TerrafusionError as error:
+        return [Refusal(task.log, str(error))]
+    longest = max(r.duration_s() for r in recordings)
+    if len(recordings) > 1 and longest < LEAST_DRIVE_S:
+        return [Refusal(task.log, f"holds {len(recordings)} pieces of at most {longest:.1f} s, no drive")]
+    out: list[Run | Refusal] = []
+    for i, recording in enumerate(recordings):
+        log = task.log if len(recordings) == 1 else f"{task.log}#{i}"
+        try:
+            with errors_of(log):
+                out += list(_runs(dataclasses.replace(task, log=log), recording))
+        except TerrafusionError as error:
+            out.append(Refusal(log, str(error)))
+    return out
+
+
+def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
+    _check(recording)
+    reference = reference_of(recording)
+    yield _run(task, replay(recording, mode=task.mode), reference, "whole", None)
+    if reference == "none":
+        return
+    if reference == "truth" and recording.gnss is None:
+        recording, reference = aided_by_truth(recording, task.seed), "truth, fixes made from it"
+    for outage in outages_of(recording, task.most_starts):
+        part, test = until(recording, outage.start_s + outage.seconds + 0.5), f"outage {outage.seconds:g} s"
+        try:
+            result = replay(part, mode=task.mode, outages=[outage])
+        except TerrafusionError as error:
+            yield Refusal(f"{task.log}, {test} from {outage.start_s:.1f} s", str(error))
+        else:
+            yield _run(task, result, reference, test, outage)
+
+
+def _check(recording: Recording) -> None:
+    """Refuse what `terrafusion replay` refuses."""
+    if recording.wheels is None or recording.imu is None:
+        raise DataError("has no wheels or no IMU", remedy="nothing to estimate from: the table leaves it out")
+    params, _ = choose_vehicle(recording, None)
+    errors = [found for found in examine(recording, params.rig()) if found.severity == "error"]
+    if errors:
+        raise DataError(
+            f"{errors[0].what} ({errors[0].evidence})", channel=errors[0].channel, remedy=errors[0].fix
+        )
+
+
+def reference_of(recording: Recording) -> str:
+    """ "truth", "fixes kept back", or "none"."""
+    listed = recording.truth_channels
+    if recording.truth is not None and len(recording.truth) and (not listed or "position" in listed):
+        return "truth"
+    return "fixes kept back" if recording.gnss is not None and len(recording.gnss) else "none"
+
+
+def ground_of(log: str, recording: Recording) -> str:
+    """ "firm" or "slipping" by the log's label, else by its set; "" where neither tells."""
+    labels = {recording.terrain_name} - {""}
+    if recording.terrain is not None:
+        labels |= set(recording.terrain.label.astype(str).tolist())
+    if labels - {"unknown", "mixed"}:
+        return "slipping" if labels & set(SLIPPING) else "firm"
+    return SET_GROUND.get(log.partition("/")[0], "")
+
+
+def outages_of(recording: Recording, most_starts: int) -> list[Outage]:
+    """Outages of all lengths where wheels, IMU and fixes are there and the wheels roll."""
+    wheels, imu, gnss = recording.wheels, recording.imu, recording.gnss
+    assert wheels is not None
+    assert imu is not None
+    assert gnss is not None
+    start_ns = recording.start_ns
+    first_s = (max(int(c.t_ns[0]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
+    last_s = (min(int(c.t_ns[-1]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
+    radius_m = choose_vehicle(recording, None)[0].rig().wheel_radius_m
+    rolled = rolled_until_m(wheels, radius_m)
+    if rolled[-1] < LEAD_ROLLED_M:
+        return []
+    moved_s = (int(wheels.t_ns[np.searchsorted(rolled, LEAD_ROLLED_M)]) - start_ns) * 1e-9
+    earliest = max(first_s + lead_s(first_s, last_s), moved_s)
+    planned = [o for s in OUTAGES_S for o in plan_outages(earliest, last_s, s, most_starts)]
+    return [o for o in planned if np.ptp(rolled[o.covers(wheels.t_ns, start_ns)]) >= LEAST_ROLLED_M]
+
+
+def _run(task: Task, result: Replay, reference: str, test: str, outage: Outage | None) -> Run:
+    recording, scores = result.recording, result.scores
+    assert recording.wheels is not None
+    health = examine_estimate(result.estimate, recording.wheels, result.vehicle.rig().wheel_radius_m)
+    percent: float | None = None
+    distance, nees, within = health.path_m, scores.nees_mean, None
+    if outage is not None:
+        part = scores.outages[0]
+        distance, error, within, percent = part.distance_m, part.end_error_m, part.median_m, part.percent
+        nees = _nees_in(result, outage)
+    elif scores.against == "truth":
+        error = scores.ate_m
+    else:
+        error = None if scores.held_out is None else scores.held_out.median_m
+    latencies = result.latencies_ms
+    return Run(
+        log=task.log,
+        ground=ground_of(task.log, recording),
+        vehicle=result.vehicle.name,
+        reference="truth, no fixes"
+        if test == "whole" and recording.gnss is None and error is not None
+        else reference,
+        mode=task.mode,
+        test=test,
+        start_s=None if outage is None else outage.start_s,
+        distance_m=distance,
+        error_m=error,
+        within_m=within,
+        percent=percent,
+        nees=nees,
+        top_speed_mps=health.top_speed_mps,
+        path_ratio=health.path_ratio(),
+        diverged=health.why,
+        wheels_rejected=result.rejected_wheels,
+        gnss_rejected=result.rejected_gnss,
+        seconds=result.seconds,
+        realtime=result.realtime_factor(),
+        latency_p99_ms=float(np.percentile(latencies, 99.0)) if len(latencies) else float("nan"),
+    )
+
+
+def _nees_in(result: Replay, outage: Outage) -> float | None:
+    errors = result.scores.errors
+    if errors is None:
+        return None
+    nees = errors.nees()[outage.covers(errors.t_ns, result.recording.start_ns)]
+    nees = nees[np.isfinite(nees)]
+    return float(nees.mean()) if len(nees) else None
+
+
+def main() -> int:
+    """Run, write the tables and the figure; 0, or 1 after a known error."""
+    parser = argparse.ArgumentParser(
+        prog="python -m terrafusion.fusion.scores.field_table", description=__doc__.partition("\n")[0]
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for tables and figure")
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES, help="by default all")
+    parser.add_argument(
+        "--logs", nargs="+", metavar="LOG", help="by default all of the catalogue that are at hand"
+    )
+    parser.add_argument("--starts", type=int, default=4, help="outages of each length in a log, at most")
+    parser.add_argument("--seed", type=int, default=1, help="of the noise on fixes made from truth")
+    parser.add_argument("--jobs", type=int, default=1, help="processes beside each other")
+    words = parser.parse_args()
+    try:
+        run(words.out, words.modes, words.logs, words.starts, words.seed, words.jobs)
+    except TerrafusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def run(
+    out: Path, modes: Sequence[str], logs: Sequence[str] | None, starts: int, seed: int, jobs: int
+) -> None:
+    """The whole table of the logs, written to `out`.
+
+    Raises:
+        TerrafusionError: no log is at hand, or the folder cannot be written.
+    """
+    from terrafusion.fusion.scores.field_page import write
+
+    chosen = list(logs) if logs else catalogued()
+    if not chosen:
+        raise DataError(
+            "no field log is at hand", remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`"
+        )
+    begun = time.monotonic()
+
+    def progress(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{time.monotonic() - begun:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
+
+    runs, refusals = field_table(chosen, modes, most_starts=starts, seed=seed, jobs=jobs, progress=progress)
+    progress("")
+    print(write(out, runs, refusals))
+    print(f"{time.monotonic() - begun:.0f} s; written to {out}")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
