@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -19,11 +20,13 @@ class History:
         self.states: list[State] = []
         self.rows: list[SensorNoise] = []
         self.innovations: list[Innovation] = []
+        self.changes: list[WeightChange] = []
 
-    def add(self, state: State, row: SensorNoise) -> None:
-        """One more keyframe and the noise row it was made with."""
+    def add(self, state: State, row: SensorNoise, changes: Iterable[WeightChange] = ()) -> None:
+        """One more keyframe, the noise row it was made with, and the changes of weights before it."""
         self.states.append(state)
         self.rows.append(row)
+        self.changes.extend(changes)
 
     def estimate(
         self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]

@@ -145,7 +145,7 @@ def replay(
     history = History()
     estimator = Estimator(
         config,
-        on_state=lambda state: history.add(state, estimator.weights.row),
+        on_state=lambda state: history.add(state, estimator.weights.row, estimator.weights.take_changes()),
         on_innovation=history.innovations.append,
         archive=archive,
     )
@@ -159,7 +159,8 @@ def replay(
     if not history.states:
         raise _never_started(recording, used)
     notes = (*recording.notes, *notes, *inputs.notes(recording), *_said(estimator))
-    estimate = history.estimate(estimator.weights.detector.classes, estimator.weights.changes, notes)
+    changes = [*history.changes, *estimator.weights.take_changes()]
+    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
     antenna = config.rig.sensors.gnss.antenna_m
     scores = score(
         estimate,

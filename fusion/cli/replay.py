@@ -54,6 +54,10 @@ def replay(
             "--mcap", help="Also write the log with the estimate (odometry, diagnostics) to estimate.mcap."
         ),
     ] = False,
+    rerun: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.rrd", help="Also write the replay for the Rerun viewer (extra: rerun)."),
+    ] = None,
     gnss_outage: OutageOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
@@ -71,11 +75,14 @@ def replay(
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config import MODES
     from terrafusion.fusion.replay import replay as run
+    from terrafusion.fusion.report.rerun_log import require_rerun, write_rerun
     from terrafusion.fusion.report.results import write_replay
     from terrafusion.fusion.scores.metrics import parse_outage
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
+    if rerun is not None:
+        require_rerun()
     outages = [parse_outage(text) for text in gnss_outage or []]
     rig = load_rig(vehicle)
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
@@ -95,6 +102,8 @@ def replay(
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     if mcap:
         _write_bag(result, out / "estimate.mcap")
+    if rerun is not None:
+        write_rerun(result, rerun)
     for line in summary(result):
         print(line)
     print(f"written to {out}")

@@ -1,8 +1,9 @@
-"""Plots of one estimate over time: errors, slip, terrain, weights, speeds, biases, innovations.
+"""Plots of one estimate over time: errors, slip, terrain, weights, speeds.
 
 Every function draws into the axes it is given, or into new ones, and returns
 the figure and the axes. Times are seconds from `start_ns`, the start of the
-recording. Maps and comparisons of runs are in `plots_map`.
+recording. Maps and comparisons of runs are in `plots_map`, what the filter
+says of itself is in `plots_filter`.
 """
 
 from __future__ import annotations
@@ -116,7 +117,7 @@ def plot_weights(
     marked: Sequence[WeightChange] = (),
     axes: Sequence[Axes] | None = None,
 ) -> tuple[Figure, NDArray[Any]]:
-    """The noise in force for each sensor (log scale); the changes in `marked` are numbered from 1."""
+    """The noise in force for each sensor (log scale); the moments of `marked` are numbered from 1."""
     fig, panels = style.canvases(axes, 2, (9.0, 4.2))
     t = style.seconds(estimate.trajectory.t_ns, start_ns)
     keep = style.thin(len(t))
@@ -131,9 +132,9 @@ def plot_weights(
         style.dress(ax, y=label)
         style.legend_above(ax)
         ax.margins(x=0.01)
-        for change in marked:
-            ax.axvline((change.t_ns - start_ns) * 1e-9, color="#888888", linewidth=0.6, linestyle=":")
-    _number_marks(panels[1], [(c.t_ns - start_ns) * 1e-9 for c in marked])
+        for t_ns in moments(marked):
+            ax.axvline((t_ns - start_ns) * 1e-9, color="#888888", linewidth=0.6, linestyle=":")
+    _number_marks(panels[1], [(t_ns - start_ns) * 1e-9 for t_ns in moments(marked)])
     panels[-1].set_xlabel(TIME, fontsize=9)
     return fig, panels
 
@@ -180,69 +181,10 @@ def plot_speeds(
     return fig, ax
 
 
-def plot_biases(
-    estimate: Estimate, start_ns: int, *, axes: Sequence[Axes] | None = None
-) -> tuple[Figure, NDArray[Any]]:
-    """Gyro biases in degrees a second and accelerometer biases, body axes."""
-    fig, panels = style.canvases(axes, 2, (9.0, 3.4))
-    series = (np.degrees(estimate.gyro_bias_radps), estimate.accel_bias_mps2)
-    for ax, values, label in zip(panels, series, ("gyro, deg/s", "accelerometer, m/s²"), strict=True):
-        for i, (axis, colour) in enumerate(zip("xyz", ("#0072b2", "#d55e00", "#009e73"), strict=True)):
-            if np.isfinite(values[:, i]).any():
-                _line(ax, estimate.trajectory.t_ns, values[:, i], start_ns, colour, axis, 1.1)
-        style.dress(ax, y=label)
-    style.legend_above(panels[0])
-    panels[-1].set_xlabel(TIME, fontsize=9)
-    return fig, panels
-
-
-def plot_innovations(estimate: Estimate, start_ns: int, *, ax: Axes | None = None) -> tuple[Figure, Axes]:
-    """Normalised innovation squared over its dimension: 1 is expected; crosses were turned away by a gate."""
-    from scipy.stats import chi2
-
-    fig, ax = style.canvas(ax, (9.0, 2.9))
-    found = [i for i in estimate.innovations if np.isfinite(i.nis) and i.dof > 0]
-    sensors = sorted({i.sensor for i in found})
-    for sensor in sensors:
-        of = [i for i in found if i.sensor == sensor]
-        colour = style.colour_of(sensor, style.SENSOR_COLOURS)
-        for accepted, marker in ((True, "."), (False, "x")):
-            points = [((i.t_ns - start_ns) * 1e-9, i.nis / i.dof) for i in of if i.accepted is accepted]
-            if points:
-                t, nis = np.array(points)[style.thin(len(points))].T
-                label = (
-                    style.plain(sensor) if accepted else f"{style.plain(sensor)}, rejected ({len(points)})"
-                )
-                ax.plot(
-                    t,
-                    np.maximum(nis, 0.01),
-                    marker,
-                    color=colour,
-                    alpha=0.55 if accepted else 1.0,
-                    markersize=3 if accepted else 5,
-                    label=label,
-                    linestyle="none",
-                )
-    ax.axhline(1.0, color="#555555", linewidth=0.9)
-    dofs = [i.dof for i in found]
-    if dofs:
-        dof = max(set(dofs), key=dofs.count)
-        limit = float(chi2.ppf(0.99, dof)) / dof
-        ax.axhline(
-            limit, color="#555555", linewidth=0.9, linestyle="--", label=f"99 % of them are below ({dof} dof)"
-        )
-        ax.set_yscale("log")
-        ax.set_ylim(bottom=0.008)
-        _plain_log_ticks(ax)
-    style.dress(ax, x=TIME, y="NIS / degree of freedom")
-    style.legend_above(ax)
-    return fig, ax
-
-
 def important_changes(
     changes: Sequence[WeightChange], most: int = 12, apart_s: float = 2.0
 ) -> list[WeightChange]:
-    """The `most` largest changes by ratio, in order of time; one of each sensor within `apart_s`."""
+    """The `most` largest changes by ratio, in order of time, their moments `apart_s` from each other."""
 
     def size(change: WeightChange) -> float:
         low, high = sorted((abs(change.before), abs(change.after)))
@@ -253,10 +195,15 @@ def important_changes(
     for change in sorted(changes, key=lambda c: (-size(c), c.t_ns, c.sensor)):
         if len(chosen) == most:
             break
-        near = (c for c in chosen if c.sensor == change.sensor)
-        if all(abs(c.t_ns - change.t_ns) > apart_s * 1e9 for c in near):
+        gaps = [abs(c.t_ns - change.t_ns) for c in chosen]
+        if all(gap == 0 or gap > apart_s * 1e9 for gap in gaps):
             chosen.append(change)
     return sorted(chosen, key=lambda c: c.t_ns)
+
+
+def moments(changes: Sequence[WeightChange]) -> dict[int, int]:
+    """The times of changes that are in order, each with its number from 1."""
+    return {t_ns: number for number, t_ns in enumerate(dict.fromkeys(c.t_ns for c in changes), 1)}
 
 
 def shade_outages(ax: Axes, outages: Sequence[Outage]) -> None:

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Fix, Gnss, Recording
 from terrafusion.fusion.estimate import Estimate
@@ -18,8 +19,12 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-ELLIPSE = float(np.sqrt(5.991464547))
-"""Half axes of the 95 % ellipse of two dimensions, in sigmas (chi-square, 2 degrees of freedom)."""
+TimesNs = NDArray[np.int64]
+
+ELLIPSE_SIGMAS = 2.0
+"""Half axes of the ellipses; two dimensions have 1 - exp(-2) = 86 % of their probability inside."""
+ELLIPSE_S, MOST_ELLIPSES = 10.0, 60
+"""Seconds between ellipses; longer drives get at most so many, outside and inside outages."""
 
 
 def plot_map(
@@ -30,12 +35,12 @@ def plot_map(
     outages: Sequence[Outage] = (),
     ax: Axes | None = None,
 ) -> tuple[Figure, Axes]:
-    """The path coloured by terrain with 95 % ellipses, over truth and GNSS fixes; outages are edged."""
+    """The path coloured by terrain with ellipses of two sigma, over truth and fixes; outages are edged."""
     from matplotlib.collections import LineCollection
     from matplotlib.lines import Line2D
 
     fig, ax = style.canvas(ax, _map_size([estimate]))
-    handles = draw_references(ax, recording, held_out)
+    handles = draw_references(ax, recording, held_out, refused_fixes(estimate))
     path = estimate.trajectory
     keep = style.thin(len(path), 2 * style.MAX_POINTS)
     xy = path.position_m[keep, :2]
@@ -52,7 +57,7 @@ def plot_map(
             handles.append(Line2D([], [], color=colour, linewidth=3, label=f"on {style.plain(name)}"))
     elif len(xy):
         handles += ax.plot(xy[:, 0], xy[:, 1], color="#0072b2", linewidth=2.0, label="estimate")
-    handles += _ellipses(ax, estimate)
+    handles += _draw_ellipses(ax, ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages)))
     if len(xy):
         handles += ax.plot(
             *xy[0], "^", color="#111111", markersize=8, zorder=6, label="start", linestyle="none"
@@ -123,8 +128,37 @@ def plot_error_runs(
     return fig, ax
 
 
-def draw_references(ax: Axes, recording: Recording, held_out: Gnss | None) -> list[Any]:
-    """Truth, the fixes used and the fixes kept back; returns the legend's handles."""
+def refused_fixes(estimate: Estimate) -> TimesNs:
+    """Times (N,) of the fixes whose position a gate turned away."""
+    return np.array(
+        [i.t_ns for i in estimate.innovations if i.sensor == "gnss" and not i.accepted], dtype=np.int64
+    )
+
+
+def ellipse_rows(estimate: Estimate, start_ns: int, outages: Sequence[Outage]) -> NDArray[np.int64]:
+    """Keyframes that get an ellipse: one in ten seconds, one in two seconds where there is no GNSS.
+
+    Without GNSS is what the caller left out and what the estimate's status says. The last of each
+    such stretch is among them: there the position is the least sure.
+    """
+    t_ns = estimate.trajectory.t_ns
+    alone = np.asarray(estimate.status == "outage")
+    for outage in outages:
+        alone |= outage.covers(t_ns, start_ns)
+    rows: list[int] = []
+    for inside, every_s in ((False, ELLIPSE_S), (True, ELLIPSE_S / 5.0)):
+        chosen = np.flatnonzero(alone == inside)
+        slot = ((t_ns[chosen] - start_ns) // round(every_s * 1e9)).astype(np.int64)
+        first = chosen[np.flatnonzero(np.diff(slot, prepend=-1))]
+        rows += first[style.thin(len(first), MOST_ELLIPSES)].tolist()
+    ends = np.flatnonzero(alone & ~np.append(alone[1:], False))
+    return np.unique(np.array([*rows, *ends.tolist()], dtype=np.int64))
+
+
+def draw_references(
+    ax: Axes, recording: Recording, held_out: Gnss | None, refused_ns: TimesNs | None = None
+) -> list[Any]:
+    """Truth, the fixes used, turned away and kept back; returns the legend's handles."""
     handles: list[Any] = []
     truth, gnss = recording.truth, recording.gnss
     if truth is not None and len(truth) and ("position" in (recording.truth_channels or ("position",))):
@@ -140,7 +174,20 @@ def draw_references(ax: Axes, recording: Recording, held_out: Gnss | None) -> li
         )
     kept_ns = held_out.t_ns if held_out is not None else np.zeros(0, dtype=np.int64)
     if gnss is not None and len(gnss):
-        used = gnss.select((gnss.fix != Fix.NONE) & ~np.isin(gnss.t_ns, kept_ns))
+        given = gnss.select((gnss.fix != Fix.NONE) & ~np.isin(gnss.t_ns, kept_ns))
+        refused = np.isin(given.t_ns, refused_ns if refused_ns is not None else [])
+        used, away = given.select(~refused), given.select(refused).enu_m
+        if len(away):
+            handles += ax.plot(
+                away[:, 0],
+                away[:, 1],
+                "x",
+                color="#111111",
+                markersize=5,
+                zorder=6,
+                label="GNSS rejected",
+                linestyle="none",
+            )
         xy = used.enu_m[style.thin(len(used), 800), :2]
         handles += ax.plot(
             xy[:, 0],
@@ -189,33 +236,27 @@ def _edge_outages(ax: Axes, estimate: Estimate, start_ns: int, outages: Sequence
     return handles
 
 
-def _ellipses(ax: Axes, estimate: Estimate, count: int = 30) -> list[Any]:
-    """Draw the 95 % ellipses of the position at evenly spaced keyframes."""
+def ellipses(estimate: Estimate, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Ellipses (K, 41, 2) of the position, m, at those of the keyframes `rows` whose covariance is known."""
     path = estimate.trajectory
-    if path.covariance is None or len(path) < 2:
-        return []
-    rows = style.thin(len(path), count)
+    if path.covariance is None:
+        return np.zeros((0, 41, 2))
     P = path.covariance[rows, :2, :2]
     sound = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(path.position_m[rows, :2]).all(axis=1)
-    if not sound.any():
-        return []
     size, axes = np.linalg.eigh(P[sound])
     angle = np.linspace(0.0, 2.0 * np.pi, 41)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    points = ring * ELLIPSE * np.sqrt(np.maximum(size, 0.0))[:, None, :]
-    rings = np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[sound], None, :2]
-    label = "95 % of position"
-    for i, loop in enumerate(rings):
-        ax.plot(
-            loop[:, 0],
-            loop[:, 1],
-            color="#0072b2",
-            linewidth=0.7,
-            alpha=0.8,
-            zorder=5,
-            label=label if i == 0 else None,
-        )
-    return [ax.lines[-len(rings)]]
+    points = ring * ELLIPSE_SIGMAS * np.sqrt(np.maximum(size, 0.0))[:, None, :]
+    return np.asarray(np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[sound], None, :2])
+
+
+def _draw_ellipses(ax: Axes, rings: NDArray[np.float64]) -> list[Any]:
+    label = f"{ELLIPSE_SIGMAS:g} sigma of position"
+    lines = [
+        ax.plot(*ring.T, color="#0072b2", linewidth=0.7, alpha=0.8, zorder=5, label=label)[0]
+        for ring in rings
+    ]
+    return lines[:1]
 
 
 def _map_size(estimates: Sequence[Estimate]) -> tuple[float, float]:

@@ -14,13 +14,15 @@ from typing import Any
 
 from terrafusion.datasets.recording import Gnss, Recording
 from terrafusion.fusion.estimate import Estimate, WeightChange
-from terrafusion.fusion.report import plots, plots_map, style
+from terrafusion.fusion.report import plots, plots_filter, plots_map, style
 from terrafusion.fusion.report import text as words
 from terrafusion.fusion.report.page import bullets, figure, where_from, write_page
 from terrafusion.fusion.scores.metrics import Outage, Scores
 
 MOST_REASONS = 20
 """How many of the changes of weight the report lists; `weights.jsonl` has them all."""
+MOST_MARKS = 45
+"""So many numbers fit side by side above a plot."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,7 +63,9 @@ def write_report(
         raise ValueError("a report needs at least one run")
     ours, theirs = words.pick_pair([run.metrics for run in runs])
     shown = runs[ours]
-    marked = plots.important_changes(shown.estimate.changes, MOST_REASONS)
+    marked = plots.important_changes(
+        shown.estimate.changes, MOST_REASONS, max(2.0, recording.duration_s() / MOST_MARKS)
+    )
     body = [
         _head(title, runs, ours, theirs),
         _numbers(runs, ours, theirs),
@@ -134,7 +138,8 @@ def _maps(
         figure(
             fig,
             f"The path as estimated ({shown.name}), coloured by the most probable ground. The rings hold "
-            "the true position with 95 % probability, if the claimed uncertainty is right.",
+            "the true position with 86 % probability (two sigma in two dimensions), if the claimed "
+            "uncertainty is right: one each ten seconds, one each two seconds without GNSS.",
         )
     )
     return "<h2>Map</h2>\n" + "\n".join(parts)
@@ -192,18 +197,25 @@ def _reasons(shown: ReportRun, recording: Recording, marked: Sequence[WeightChan
     if not marked:
         return f"<p>No weight changed ({escape(shown.name)}).</p>"
     rows = []
-    for i, change in enumerate(marked, 1):
+    numbers, told = plots.moments(marked), 0
+    for change in marked:
+        number = numbers[change.t_ns]
         t_s = (change.t_ns - recording.start_ns) * 1e-9
+        when = (f"{number}", f"{t_s:.1f}") if number != told else ("", "")
+        told = number
+        name, _, why = change.reason.partition(": ")
+        if name not in shown.estimate.weights:
+            name, why = change.sensor, change.reason
+        before, after = (words.number(float(value)) for value in (change.before, change.after))
         rows.append(
-            f'<tr><td class="n">{i}</td><td class="n">{t_s:.1f}</td><td>{escape(change.sensor)}</td>'
-            f'<td class="n">{words.number(float(change.before))} → {words.number(float(change.after))}</td>'
-            f"<td>{escape(change.unit)}</td><td>{escape(change.reason)}</td></tr>"
+            f'<tr><td class="n">{when[0]}</td><td class="n">{when[1]}</td><td>{escape(name)}</td>'
+            f'<td class="n">{before} → {after} {escape(change.unit)}</td><td>{escape(why)}</td></tr>'
         )
     some = "" if total == len(marked) else f" The {len(marked)} largest of {total}; weights.jsonl has all."
     return (
         f'<p class="dim">Changes of weight, in order of time.{some}</p>'
         '<div class="scroll"><table><thead><tr><th class="n">no.</th><th class="n">time, s</th>'
-        '<th>weight</th><th class="n">from → to</th><th>unit</th><th>reason</th></tr></thead>'
+        '<th>weight</th><th class="n">from → to</th><th>reason</th></tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 
@@ -213,19 +225,22 @@ def _sensors(
 ) -> str:
     start = recording.start_ns
     speeds, _ = plots.plot_speeds(shown.estimate, recording, wheel_radius_m=wheel_radius_m, outages=outages)
-    biases, _ = plots.plot_biases(shown.estimate, start)
+    biases, _ = plots_filter.plot_biases(shown.estimate, start)
     parts = [
         "<h2>Sensors</h2>",
         figure(speeds, "Forward speed. Where the wheels run ahead of the estimate, they slip."),
-        figure(biases, f"Biases of the IMU as estimated ({shown.name})."),
+        figure(biases, f"Biases of the IMU as estimated ({shown.name}), with two sigma, in body axes."),
     ]
     if shown.estimate.innovations:
-        innovations, _ = plots.plot_innovations(shown.estimate, start)
+        innovations, _ = plots_filter.plot_innovations(shown.estimate, start, outages=outages)
         parts.append(
             figure(
                 innovations,
-                "Normalised innovations: how surprising each measurement was. "
-                "With right weights they scatter around 1; those at the foot are 0.01 or less.",
+                "Innovations: what each measurement differed from its prediction, over the sigma of that "
+                "difference, and the mean of the squares in windows. With right weights 95 % of the dots "
+                "and 95 % of the means lie in the grey bands; the bands of the means allow for the "
+                "correlation of the samples. A mean above its band: too sure; below: too cautious. "
+                "Dots at the edge lie beyond it.",
             )
         )
     return "\n".join(parts)

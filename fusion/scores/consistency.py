@@ -63,7 +63,7 @@ class Whitened:
 
     def known(self) -> Rows:
         """Which rows hold numbers, (N,)."""
-        return np.isfinite(self.values).all(axis=1)
+        return np.asarray(np.isfinite(self.values).all(axis=1))
 
 
 @dataclass(frozen=True)

@@ -152,19 +152,28 @@ def _run_task(task: Task) -> list[Run | Refusal]:
 def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
     _check(recording)
     reference = reference_of(recording)
-    yield _run(task, replay(recording, mode=task.mode), reference, "whole", None)
+    yield _tried(task, recording, reference, "whole", None)
     if reference == "none":
         return
     if reference == "truth" and recording.gnss is None:
         recording, reference = aided_by_truth(recording, task.seed), "truth, fixes made from it"
     for outage in outages_of(recording, task.most_starts):
         part, test = until(recording, outage.start_s + outage.seconds + 0.5), f"outage {outage.seconds:g} s"
-        try:
-            result = replay(part, mode=task.mode, outages=[outage])
-        except TerrafusionError as error:
-            yield Refusal(f"{task.log}, {test} from {outage.start_s:.1f} s", str(error))
-        else:
-            yield _run(task, result, reference, test, outage)
+        yield _tried(task, part, reference, test, outage)
+
+
+def _tried(
+    task: Task, recording: Recording, reference: str, test: str, outage: Outage | None
+) -> Run | Refusal:
+    """One replay; what stops it becomes a line of the table, so that one log does not cost all others."""
+    where = f"{task.log}, {test}" + ("" if outage is None else f" from {outage.start_s:.1f} s")
+    try:
+        result = replay(recording, mode=task.mode, outages=[] if outage is None else [outage])
+    except TerrafusionError as error:
+        return Refusal(where, str(error))
+    except (ArithmeticError, RuntimeError, ValueError) as error:
+        return Refusal(f"{where}, {task.mode}", f"FAILED, {type(error).__name__}: {error}")
+    return _run(task, result, reference, test, outage)
 
 
 def _check(recording: Recording) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
@@ -24,6 +25,9 @@ WINDOW_NS = 1_000_000_000
 NOTEWORTHY = 0.1
 """Relative change of a weight that is worth a record."""
 
+KEPT_CHANGES = 1000
+"""Records kept where nobody takes them: a robot that runs for days must not grow."""
+
 _RECORDED = {
     "slip_mean": ("wheels", ""),
     "slip_sigma": ("wheels", ""),
@@ -43,7 +47,7 @@ class TerrainWeights:
 
     Attributes:
         row: the noise in force.
-        changes: what changed since `take_changes` was last called.
+        changes: what changed since `take_changes` was last called, the newest `KEPT_CHANGES` of it.
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
@@ -52,7 +56,7 @@ class TerrainWeights:
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self.row = self.policy.blend(self.detector.probabilities) if self.adaptive else self.policy.fixed
-        self.changes: list[WeightChange] = []
+        self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
         self._rig = config.rig
         # Only where gyro and wheels both tell yaw does their difference say something of the ground.
@@ -62,6 +66,12 @@ class TerrainWeights:
         self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
+
+    def take_changes(self) -> list[WeightChange]:
+        """The changes since the last call."""
+        taken = list(self.changes)
+        self.changes.clear()
+        return taken
 
     def take_switch(self) -> float:
         """Probability mass that changed class since the last call (total variation); 0 with fixed weights."""

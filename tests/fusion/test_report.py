@@ -13,7 +13,7 @@ import pytest
 
 from terrafusion.datasets.recording import Fix, Gnss, Recording, Terrain
 from terrafusion.fusion.estimate import WeightChange
-from terrafusion.fusion.report import plots, plots_map
+from terrafusion.fusion.report import plots, plots_filter, plots_map
 from terrafusion.fusion.report.outputs import build_metrics, final_status, rejected_counts, terrain_shares
 from terrafusion.fusion.report.report import ReportRun, write_report
 from terrafusion.fusion.report.style import colour_of, plain, thin
@@ -246,8 +246,8 @@ def test_plots_bear_gaps_nan_and_single_keyframes(drive):
             plots.plot_slip(estimate, start, outages=OUTAGES)[0],
             plots.plot_terrain(estimate, start)[0],
             plots.plot_weights(estimate, start)[0],
-            plots.plot_biases(estimate, start)[0],
-            plots.plot_innovations(estimate, start)[0],
+            plots_filter.plot_biases(estimate, start)[0],
+            plots_filter.plot_innovations(estimate, start)[0],
             plots.plot_speeds(estimate, recording)[0],
             plots_map.plot_map(estimate, recording, held_out=none, outages=OUTAGES)[0],
             plots_map.plot_map_runs({"a": estimate}, recording, outages=OUTAGES)[0],

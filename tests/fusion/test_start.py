@@ -1,0 +1,177 @@
+"""Starts without a known heading, from any motion, and starts that were given wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import quaternion_to_matrix, wrap_angle
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimate import State
+from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.inputs.alignment import turn_between
+from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate
+from terrafusion.twin.vehicle import load_vehicle
+
+WAVE = {"yaw_rate_amplitude_radps": 0.3, "period_s": 8.0}
+DRIVES = {
+    "forward": (DriveSegment(3.0), DriveSegment(30.0, v_mps=1.0, **WAVE)),
+    "backward": (DriveSegment(3.0), DriveSegment(30.0, v_mps=-0.8, **WAVE)),
+    "spin": (
+        DriveSegment(1.5),
+        DriveSegment(8.0, yaw_rate_radps=0.6),
+        DriveSegment(30.0, v_mps=1.0, **WAVE),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Started:
+    """When the first state came after the first motion, s, and the states after it."""
+
+    time_s: float
+    states: list[State]
+
+
+def drive(
+    kind: str = "forward",
+    *,
+    seed: int = 1,
+    slope_deg: float = 0.0,
+    seconds: float = 16.0,
+    heading: float = 70.0,
+) -> Recording:
+    scenario = Scenario(
+        kind,
+        seconds,
+        drive=DRIVES[kind],
+        route=(RouteLeg("asphalt"),),
+        slope_deg=slope_deg,
+        heading_deg=heading,
+    )
+    return simulate(scenario, seed=seed)
+
+
+def moving(recording: Recording, after_s: float) -> Recording:
+    """The part after `after_s`: the robot is already under way."""
+    begin, end = recording.start_ns + round(after_s * 1e9), 2**62
+    parts = {name: getattr(recording, name).between(begin, end) for name in ("imu", "wheels", "gnss")}
+    return dataclasses.replace(recording, **parts)
+
+
+def run(recording: Recording, *, velocity: bool = True, **start: object) -> Started:
+    """Feed a drive in time order, with what only the fixes tell of the heading."""
+    states: list[State] = []
+    vehicle = load_vehicle("elevate")
+    estimator = Estimator(EstimatorConfig(vehicle.rig(), "elevate"), on_state=states.append)
+    if start:
+        estimator.set_start(**start)  # type: ignore[arg-type]
+    imu, wheels, gnss = recording.imu, recording.wheels, recording.gnss
+    assert imu is not None
+    assert wheels is not None
+    assert gnss is not None
+    sides = wheels.side_speeds_mps(vehicle.wheel.radius_m)
+    first = None
+    w = g = 0
+    for i, t_ns in enumerate(imu.t_ns.tolist()):
+        while w < len(wheels) and wheels.t_ns[w] <= t_ns:
+            estimator.add_wheels(int(wheels.t_ns[w]), *sides[w].tolist())
+            w += 1
+        while g < len(gnss) and gnss.t_ns[g] <= t_ns:
+            known = gnss.velocity_enu_mps is not None and gnss.sigma_v_mps is not None and velocity
+            more = (gnss.velocity_enu_mps[g], float(gnss.sigma_v_mps[g])) if known else ()  # type: ignore[index]
+            estimator.add_gnss(int(gnss.t_ns[g]), gnss.enu_m[g], gnss.sigma_enu_m[g], *more)
+            g += 1
+        estimator.add_imu(t_ns, imu.gyro_radps[i], imu.accel_mps2[i])
+        if first is None and states:
+            first = t_ns
+    estimator.finish()
+    assert first is not None, "never started"
+    moved = wheels.t_ns[np.argmax(np.abs(sides.mean(axis=1)) > 0.05)]
+    return Started((first - int(moved)) * 1e-9, states)
+
+
+def yaw_errors(recording: Recording, states: list[State]) -> np.ndarray:
+    """Error of the heading (N,), rad."""
+    truth = recording.truth
+    assert truth is not None
+    t = np.array([s.t_ns for s in states])
+    true = np.interp(t, truth.t_ns, np.unwrap(truth.yaw_rad()))
+    R = quaternion_to_matrix(np.array([s.quaternion for s in states]))
+    return np.asarray(wrap_angle(np.arctan2(R[:, 1, 0], R[:, 0, 0]) - true))
+
+
+def tilt_errors(recording: Recording, states: list[State]) -> np.ndarray:
+    """Angle (N,) between the true and the estimated vertical, rad."""
+    truth = recording.truth
+    assert truth is not None
+    i = np.searchsorted(truth.t_ns, [s.t_ns for s in states])
+    up = quaternion_to_matrix(truth.quaternion[np.minimum(i, len(truth.t_ns) - 1)])[:, 2]
+    seen = quaternion_to_matrix(np.array([s.quaternion for s in states]))[:, 2]
+    # In body axes the vertical does not depend on the heading.
+    return np.asarray(np.arccos(np.clip((up * seen).sum(axis=1), -1.0, 1.0)))
+
+
+CASES = {
+    "at rest": lambda seed: drive("forward", seed=seed),
+    "moving": lambda seed: moving(drive("forward", seed=seed), 5.0),
+    "backward": lambda seed: drive("backward", seed=seed),
+    "moving backward": lambda seed: moving(drive("backward", seed=seed), 5.0),
+    "spin": lambda seed: drive("spin", seed=seed, seconds=20.0),
+    "moving spin": lambda seed: moving(drive("spin", seed=seed, seconds=20.0), 5.0),
+    "slope 10": lambda seed: drive("forward", seed=seed, slope_deg=10.0),
+    "slope 20 moving": lambda seed: moving(drive("forward", seed=seed, slope_deg=20.0), 5.0),
+}
+
+
+@pytest.mark.parametrize("velocity", [True, False], ids=["velocity", "position"])
+@pytest.mark.parametrize("case", CASES)
+def test_heading_is_found_from_any_motion(case: str, velocity: bool) -> None:
+    recording = CASES[case](3)
+    started = run(recording, velocity=velocity)
+    errors = np.abs(yaw_errors(recording, started.states))
+    limit_s = 3.0 + (8.0 if "spin" in case else 0.0)  # on the spot there is nothing to see a heading from
+    assert started.time_s < limit_s
+    assert errors[0] < 0.25
+    assert errors[20:].max() < 0.1
+    assert tilt_errors(recording, started.states).max() < 0.05
+
+
+@pytest.mark.parametrize("off_deg", [90.0, -90.0, 180.0])
+def test_a_wrong_given_heading_recovers(off_deg: float) -> None:
+    recording = drive("forward", seed=4, seconds=20.0, heading=30.0)
+    yaw = np.radians(30.0 + off_deg)
+    started = run(recording, position_m=np.zeros(3), yaw_rad=yaw, position_sigma_m=0.1, yaw_sigma_rad=0.3)
+    t = np.array([s.t_ns - recording.start_ns for s in started.states]) * 1e-9
+    assert abs(yaw_errors(recording, started.states)[0]) > 1.5
+    right = np.abs(yaw_errors(recording, started.states)) < 0.1
+    assert right[t > 9.0].all()  # six seconds after the robot set off
+    truth = recording.truth
+    assert truth is not None
+    end = started.states[-1].position_m - truth.positions_at(np.array([started.states[-1].t_ns]))[0]
+    assert np.hypot(*end[:2]) < 0.1
+
+
+def test_a_right_given_heading_starts_at_once_and_stays() -> None:
+    recording = drive("forward", seed=5, heading=30.0)
+    started = run(recording, position_m=np.zeros(3), yaw_rad=np.radians(30.0), yaw_sigma_rad=0.05)
+    assert started.states[0].t_ns - recording.start_ns < 1.5e9
+    assert np.abs(yaw_errors(recording, started.states)).max() < 0.1
+
+
+@pytest.mark.parametrize("bad", [{"yaw_rad": np.nan}, {"yaw_rad": 0.0, "yaw_sigma_rad": 0.0}])
+def test_a_start_that_is_none_is_refused(bad: dict[str, float]) -> None:
+    with pytest.raises(DataError):
+        Estimator.for_vehicle("elevate").set_start(np.zeros(3), **bad)
+
+
+def test_turn_between_is_exact_for_a_turned_and_scaled_path() -> None:
+    z = np.array([0.0, 1.0 + 0.2j, 2.0 - 0.1j, 2.5 + 1.0j])
+    turn, information = turn_between(z, 5.0 - 3.0j + 0.8 * np.exp(2.1j) * z, np.array([1.0, 2.0, 1.0, 3.0]))
+    assert turn / information == pytest.approx(0.8 * np.exp(2.1j))
