@@ -62,7 +62,7 @@ class WheelIncrement:
     speed_change_mps: float = 0.0
 
     def without_turn(self) -> WheelIncrement:
-        """The same, but the turn tells nothing: the sides are not told apart, or the gyro's place is theirs."""
+        """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
         return dataclasses.replace(self, sigma=np.append(self.sigma[:3], np.inf))
 
 
