@@ -227,7 +227,7 @@ class _Reader:
         if node is None or isinstance(node, (bool, int, float, str)):
             return node
         if isinstance(node, list):
-            return [self.read(v, None, where) for v in node]
+            return _filled(present, [self.read(v, None, where) for v in node])
         kind = next(iter(node))
         if kind == "fixed":
             return present
@@ -242,18 +242,19 @@ class _Reader:
         if kind == "enum":
             name, member = node["enum"]
             return _class(name, Enum)[member]
-        return self._collection(kind, node, where)
+        return self._collection(kind, node, present, where)
 
-    def _collection(self, kind: str, node: dict[str, Any], where: str) -> Any:
+    def _collection(self, kind: str, node: dict[str, Any], present: Any, where: str) -> Any:
         inside = node[kind]
         if kind == "tuple":
             return tuple(self.read(v, None, where) for v in inside)
         if kind == "set":
-            return {str(v) for v in inside}
+            return _filled(present, {str(v) for v in inside})
         if kind == "deque":
-            return deque((self.read(v, None, where) for v in inside), maxlen=node["maxlen"])
+            read = deque((self.read(v, None, where) for v in inside), maxlen=node["maxlen"])
+            return _filled(present, read)
         if kind == "dict":
-            return {self.read(k, None, where): self.read(v, None, where) for k, v in inside}
+            return _filled(present, {self.read(k, None, where): self.read(v, None, where) for k, v in inside})
         if kind == "pose":
             rows = self.read(inside, None, where)
             return gtsam.Pose3(gtsam.Rot3(np.ascontiguousarray(rows[:, :3])), rows[:, 3].copy())
@@ -297,6 +298,15 @@ class _Reader:
             raise ConfigError(f"an array of {shape} lies outside the file")
         flat = np.frombuffer(self._arrays[offset:end], dtype=dtype).copy()
         return flat.reshape(shape, order="F" if by_columns else "C")
+
+
+def _filled(present: Any, read: Any) -> Any:
+    """`read`, in the container that a fresh estimator has there: others may hold it, too."""
+    if type(present) is not type(read):
+        return read
+    present.clear()
+    (present.extend if isinstance(read, (list, deque)) else present.update)(read)
+    return present
 
 
 def _parts(value: object) -> dict[str, Any]:
