@@ -7,9 +7,8 @@ from dataclasses import dataclass, field
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.front import Inputs
+from terrafusion.fusion.weights.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.weights.policy import Policy, load_policy
-
-MODES = ("adaptive", "fixed")
 
 
 @dataclass(frozen=True)
@@ -19,8 +18,13 @@ class EstimatorConfig:
     Attributes:
         rig: geometry and sensors of the robot.
         vehicle: its name, for what the terrain model knows of single robots.
-        mode: "adaptive" (noise follows the detected terrain) or "fixed" (one row for all grounds).
+        mode: "adaptive" (noise follows the detected terrain), "fixed" (one row for all grounds), "robust"
+            (that row, single measurements under a robust loss) or "innovation" (that row, the noise of
+            wheels and GNSS followed by their innovations).
         policy: noise rows by terrain.
+        tuning: the few numbers of the modes.
+        robust_loss: mode "robust": "cauchy" or "gnc".
+        innovation_method: mode "innovation": "sage_husa" or "variational".
         keyframe_s: time between keyframes.
         lag_s: length of the smoothing window.
         wheel_wait_s: how long a keyframe waits for a late wheel sample.
@@ -29,12 +33,16 @@ class EstimatorConfig:
         yaw_sigma_start_rad: heading uncertainty at which the graph is started.
         start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
         inputs: what the estimator will be given; without all six IMU axes the graph is planar.
+        calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
     """
 
     rig: Rig
     vehicle: str | None = None
     mode: str = "adaptive"
     policy: Policy = field(default_factory=load_policy)
+    tuning: ModeTuning = field(default_factory=load_modes)
+    robust_loss: str = "cauchy"
+    innovation_method: str = "variational"
     keyframe_s: float = 0.1
     lag_s: float = 5.0
     wheel_wait_s: float = 0.3
@@ -43,6 +51,7 @@ class EstimatorConfig:
     yaw_sigma_start_rad: float = 0.12
     start_without_gnss_s: float = 30.0
     inputs: Inputs = field(default_factory=Inputs)
+    calibrate: bool = False
 
     @property
     def longest_wait_s(self) -> float:
@@ -50,8 +59,13 @@ class EstimatorConfig:
         return self.start_without_gnss_s if self.inputs.gnss else 0.0
 
     def __post_init__(self) -> None:
-        if self.mode not in MODES:
-            raise ConfigError(f"unknown mode '{self.mode}'", remedy=f"this version has {', '.join(MODES)}")
+        for what, value, known in (
+            ("mode", self.mode, MODES),
+            ("robust_loss", self.robust_loss, ROBUST_LOSSES),
+            ("innovation_method", self.innovation_method, INNOVATION_METHODS),
+        ):
+            if value not in known:
+                raise ConfigError(f"unknown {what} '{value}'", remedy=f"this version has {', '.join(known)}")
         if not 0.01 <= self.keyframe_s <= 1.0:
             raise ConfigError(f"keyframe_s is {self.keyframe_s}", remedy="give 0.01 to 1 s")
         if self.lag_s < 5 * self.keyframe_s:

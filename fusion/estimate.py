@@ -53,6 +53,8 @@ class State:
         bias_sigma: (6,) 1 sigma of the gyro biases (rad/s), then of the accelerometer's (m/s2).
         terrain: class name -> probability.
         status: a key of `STATUS`.
+        slipping: wheels and robot travel different distances (see `monitor`).
+        immobilised: the robot is kept from moving, its wheels spinning or stalled.
     """
 
     t_ns: int
@@ -72,6 +74,8 @@ class State:
     bias_sigma: Array
     terrain: dict[str, float]
     status: str
+    slipping: bool = False
+    immobilised: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,6 +112,8 @@ class Estimate:
     innovations: tuple[Innovation, ...]
     status: NDArray[Any]
     notes: tuple[str, ...] = ()
+    slipping: NDArray[np.bool_] | None = None
+    immobilised: NDArray[np.bool_] | None = None
     twist_covariance: Array | None = None
     bias_sigma: Array | None = None
 

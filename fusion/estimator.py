@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -25,15 +26,14 @@ from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import at_rest, bridge, wheel_increment
+from terrafusion.fusion.graph.factors import bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import (
-    DIM,
-    MARKOV,
     POSE,
     RADIUS,
     SLIP,
     VELOCITY,
     KeyState,
+    linear_sigma,
     quaternion_of,
 )
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
@@ -48,7 +48,9 @@ from terrafusion.fusion.inputs.alignment import (
 from terrafusion.fusion.inputs.gates import WheelGate
 from terrafusion.fusion.inputs.gnss import GnssUpdater, checked_fix
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.monitor import MotionMonitor
 from terrafusion.fusion.propagate import Propagator
+from terrafusion.fusion.rest import RestDetector, hold
 from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
@@ -60,8 +62,6 @@ LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 OUTAGE_S = 2.0
 UNKNOWN = np.full(3, np.nan)
-STILL_GYRO_RADPS = 0.03
-STILL_ACCEL_MPS2 = 0.6
 
 
 class Estimator:
@@ -81,11 +81,11 @@ class Estimator:
         archive: Chain | None = None,
     ) -> None:
         self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
-        self.chain = Chain(archive)
+        self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
-        self.gnss = GnssUpdater(config, self._report)
+        self.gnss = GnssUpdater(config, self._report, self.weights.single)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
@@ -96,9 +96,10 @@ class Estimator:
         self._given: GivenStart | None = None
         self._level: Start | None = None
         self._state: State | None = None
-        self._covariance = np.zeros((DIM, DIM))
+        self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._silent = False
-        self._rest = 0
+        self._rest = RestDetector(config.rig)
+        self.monitor = MotionMonitor(config.rig)
         self._propagator = Propagator(self._preintegrator)
 
     @classmethod
@@ -166,6 +167,10 @@ class Estimator:
         """Class probabilities of an external source, such as a camera, fused with the own detector's."""
         self.weights.external(t_ns, probabilities)
 
+    def add_command(self, t_ns: int, v_mps: float) -> None:
+        """Commanded forward speed: it tells a robot that is kept from moving from one that waits."""
+        self.monitor.command(t_ns, v_mps)
+
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
         return self._state
@@ -181,7 +186,7 @@ class Estimator:
         return snapshot.dump(self)
 
     @classmethod
-    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Callable[..., None]) -> Estimator:
+    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Estimator:
         """An estimator that goes on where `dump` was called, with the same bits; see `snapshot.restore`."""
         return snapshot.restore(cls(config, **callbacks), data)
 
@@ -237,7 +242,7 @@ class Estimator:
         spec = self.config.rig.sensors.imu
         gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
         grade = float(rotation.matrix()[2, 0])
-        linear, linear_sigma = slow_states.prior(self.weights.row, grade, self.gnss.drift_sigma_m)
+        linear, sigma = slow_states.prior(self.weights.row, grade, self.gnss.drift_sigma_m)
         point = KeyState(
             gtsam.Pose3(rotation, start.position_m),
             rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
@@ -256,11 +261,11 @@ class Estimator:
             *[start.position_sigma_m] * 3,
             *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
         ]
-        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + linear_sigma.tolist()
+        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + sigma.tolist()
         self.chain.append(start.t_ns, point, gyro_radps=gyro_bias)
-        self.chain.set_prior(np.array(sigmas))
+        self.chain.set_prior(np.array(sigmas[: self.chain.dim]))
         if self.chain.archive is not None:
-            self.chain.archive.set_prior(np.array(sigmas))
+            self.chain.archive.set_prior(np.array(sigmas[: self.chain.dim]))
         self.chain.solve(SMOOTH_WINDOW)
         self._covariance = self.chain.covariance()
         self.weights.begin(start.t_ns)
@@ -280,7 +285,7 @@ class Estimator:
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
             segments = in_a_turn(segments, before)
-        wheels = self._wheel_increment(before_ns, t_ns, segments, before)
+        rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
         gyro, accel = _mean_rates(segments)
         link = gtsam.NonlinearFactorGraph()
@@ -292,7 +297,7 @@ class Estimator:
             measured = self._preintegrator.integrate(
                 segments, before.bias, row.gyro_inflation, row.accel_inflation
             )
-            seen = before.bias_seen(gyro, accel)
+            seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
             link.add(_imu_factor(k, measured))
@@ -311,10 +316,10 @@ class Estimator:
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
             self.chain.add(k, held_level(k), "X")
-        self._zero_velocity(k, wheels, segments, before, link)
-        self._finish_keyframe(t_ns, gyro)
+        self._zero_velocity(k, t_ns, before, link)
+        self._finish_keyframe(t_ns, gyro, rolled.distance_m if rolled else None)
 
-    def _finish_keyframe(self, t_ns: int, gyro: Array) -> None:
+    def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
         chain = self.chain
         chain.solve(SMOOTH_WINDOW)
         self._covariance = chain.covariance()
@@ -327,6 +332,7 @@ class Estimator:
         chain.forget(self._keep)
         self.imu.forget(t_ns - 2_000_000_000)
         self.wheels.forget(t_ns - 2_000_000_000)
+        self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         self._emit(t_ns, gyro)
         state = self._state
         assert state is not None
@@ -374,36 +380,19 @@ class Estimator:
         accepted, nis = self._wheel_gate.test(innovation, float(np.sqrt(variance)))
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
-            return wheels
+            return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
         self.wheels_rejected += not self._silent
         return None
 
-    def _zero_velocity(
-        self,
-        k: int,
-        wheels: WheelIncrement | None,
-        segments: list[ImuSegment],
-        before: KeyState,
-        link: gtsam.NonlinearFactorGraph,
-    ) -> None:
-        """Zero velocity and rate, once wheels and IMU have been still for three keyframes."""
-        rig = self.config.rig
-        quantum = max(1e-4, 1.5 * rig.sensors.wheels.quantum_rad * rig.wheel_radius_m)
-        bias_g, bias_a = before.bias.gyroscope(), before.bias.accelerometer()
-        still = (
-            wheels is not None
-            and abs(wheels.distance_m) < quantum
-            and abs(wheels.turn_rad) * rig.track_m < 2 * quantum
-            and all(np.abs(s.gyro_radps - bias_g).max() < STILL_GYRO_RADPS for s in segments)
-            and all(
-                abs(float(np.linalg.norm(s.accel_mps2 - bias_a)) - GRAVITY_MPS2) < STILL_ACCEL_MPS2
-                for s in segments
-            )
-        )
-        self._rest = self._rest + 1 if still else 0
-        if self._rest >= 3:
-            link.add(at_rest(k))
-            self.chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _REST_NOISE), "V")
+    def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
+        """Zero velocity and rate where the robot has stood for a window."""
+        known = self.gnss.last_used_ns is not None and (t_ns - self.gnss.last_used_ns) * 1e-9 <= OUTAGE_S
+        sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
+        biases = before.bias.gyroscope(), before.bias.accelerometer()
+        if self._rest.stands(
+            t_ns, self.imu, self.wheels, *biases, float(np.linalg.norm(before.velocity)), sigma
+        ):
+            hold(self.chain, k, link)
 
     def _emit(self, t_ns: int, gyro: Array) -> None:
         key = self.chain.state(self.chain.last)
@@ -421,7 +410,7 @@ class Estimator:
             accel_bias_mps2=np.asarray(key.bias.accelerometer()),
             slip=key.slip,
             linear=key.linear,
-            linear_sigma=np.sqrt(np.diag(P)[MARKOV]),
+            linear_sigma=linear_sigma(P),
             slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
@@ -431,6 +420,8 @@ class Estimator:
             bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),
             status=status,
+            slipping=self.monitor.slipping,
+            immobilised=self.monitor.immobilised,
         )
         if self._on_state is not None and not self._silent:
             self._on_state(self._state)
@@ -446,9 +437,6 @@ def _mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
     accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
     return gyro, accel
-
-
-_REST_NOISE = gtsam.noiseModel.Isotropic.Sigma(3, 0.005)
 
 
 def _imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:

@@ -65,6 +65,8 @@ class History:
             innovations=tuple(self.innovations),
             status=np.array([s.status for s in states], dtype=object),
             notes=notes,
+            slipping=np.array([s.slipping for s in states], dtype=bool),
+            immobilised=np.array([s.immobilised for s in states], dtype=bool),
             twist_covariance=stack("twist_covariance", (6, 6)),
             bias_sigma=stack("bias_sigma", (6,)),
         )

@@ -130,7 +130,7 @@ def repeated(recording: Recording) -> Iterator[Recording]:
         DataError: the drive has no truth.
     """
     truth, imu, wheels, gnss = recording.truth, recording.imu, recording.wheels, recording.gnss
-    if truth is None or imu is None or wheels is None or gnss is None:
+    if truth is None or truth.quaternion is None or imu is None or wheels is None or gnss is None:
         raise DataError("only a drive with truth, IMU, wheels and GNSS can be repeated")
     lasts_ns = int(imu.t_ns[-1] - imu.t_ns[0]) + round(float(np.median(np.diff(imu.t_ns))))
     yaw = np.unwrap(np.arctan2(*quaternion_to_matrix(truth.quaternion[[0, -1]])[:, [1, 0], 0].T))

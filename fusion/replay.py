@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -21,7 +22,14 @@ from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import MARKOV, POSE, SLIP, VELOCITY, KeyState, quaternion_of
+from terrafusion.fusion.graph.key_state import (
+    POSE,
+    SLIP,
+    VELOCITY,
+    KeyState,
+    linear_sigma,
+    quaternion_of,
+)
 from terrafusion.fusion.history import History
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.weights.policy import Policy, load_policy
@@ -114,16 +122,18 @@ def replay(
     outages: Sequence[Outage] = (),
     batch: bool = False,
     progress: Callable[[float], None] | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Replay:
     """Estimate and score one drive.
 
     Args:
         vehicle: name or YAML file; by default what the log says.
-        mode: "adaptive" or "fixed".
+        mode: "adaptive", "fixed", "robust" or "innovation".
         policy: weighting policy, or its file; by default the shipped one.
         outages: stretches in which the estimator gets no fix.
         batch: smooth the whole drive at once, instead of a fixed lag as live.
         progress: called with the share done, 0 to 1.
+        settings: further fields of `EstimatorConfig`.
 
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
@@ -140,8 +150,8 @@ def replay(
     rows = policy if isinstance(policy, Policy) else load_policy(policy)
     inputs = inputs_of(recording, used)
     imu, wheels = _usable(recording, inputs)
-    config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs)
-    archive = Chain() if batch else None
+    config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs, **(settings or {}))
+    archive = Chain(calibrate=config.calibrate) if batch else None
     history = History()
     estimator = Estimator(
         config,
@@ -151,8 +161,9 @@ def replay(
     )
     started = time.perf_counter()
     latencies = _feed(
-        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, history, progress
-    )
+        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, _commands(recording), history,
+        progress,
+    )  # fmt: skip
     if archive is not None and history.states:
         _smooth(archive, history, estimator.config)
     seconds = time.perf_counter() - started
@@ -217,6 +228,7 @@ def _feed(
     imu: Imu | None,
     wheels: tuple[list[int], list[list[float]]],
     gnss: Gnss | None,
+    commands: list[tuple[int, float]],
     history: History,
     progress: Callable[[float], None] | None,
 ) -> Array:
@@ -228,7 +240,7 @@ def _feed(
     gnss_times = [] if gnss is None else gnss.t_ns.tolist()
     clock = wheel_times if imu is None else imu.t_ns.tolist()
     latencies: list[float] = []
-    w = g = made = 0
+    w = g = c = made = 0
     for i, t_ns in enumerate(clock):
         while imu is not None and w < len(wheel_times) and wheel_times[w] <= t_ns:
             estimator.add_wheels(wheel_times[w], *wheel_rows[w])
@@ -237,6 +249,9 @@ def _feed(
             assert gnss is not None
             _give_fix(estimator, gnss, g)
             g += 1
+        while c < len(commands) and commands[c][0] <= t_ns:
+            estimator.add_command(*commands[c])
+            c += 1
         begun = time.perf_counter()
         if imu is None:
             estimator.add_wheels(t_ns, *wheel_rows[i])
@@ -251,6 +266,15 @@ def _feed(
     if progress is not None:
         progress(1.0)
     return np.array(latencies)
+
+
+def _commands(recording: Recording) -> list[tuple[int, float]]:
+    """Times and commanded forward speeds, m/s, as far as the log has them."""
+    command = recording.command
+    if command is None:
+        return []
+    known = np.isfinite(command.v_mps)
+    return list(zip(command.t_ns[known].tolist(), command.v_mps[known].tolist(), strict=True))
 
 
 def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
@@ -297,7 +321,7 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array, gyro_sigma: float) ->
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
         slip=key.slip,
         linear=key.linear,
-        linear_sigma=np.sqrt(np.diag(P)[MARKOV]),
+        linear_sigma=linear_sigma(P),
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
         covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
         velocity_covariance=P[VELOCITY, VELOCITY].copy(),
@@ -312,6 +336,11 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
     if estimator.gnss.too_late:
         notes.append(f"{estimator.gnss.too_late} GNSS fixes came before the start or too late for the lag")
+    if estimator.gnss.turned:
+        notes.append(f"the heading was wrong and was set right from the motion {estimator.gnss.turned} times")
+    for stream in (estimator.imu.late, estimator.wheels.late):
+        if stream.too_late:
+            notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
     return tuple(notes)
 
 

@@ -228,7 +228,7 @@ class _Reader:
             return node
         if isinstance(node, list):
             return _filled(present, [self.read(v, None, where) for v in node])
-        kind = next(iter(node))
+        kind = next(iter(node), "")
         if kind == "fixed":
             return present
         if kind == "seen":

@@ -94,7 +94,7 @@ def open_pool(backend: str, jobs: int, address: str | None = None) -> Iterator[P
         yield Pool(None)
     else:
         with _loky(jobs) as executor:
-            # As many as loky hands on at once: it stops cleanly only when none waits inside it.
+            # Less than loky hands on at once (2 jobs + 1): it stops cleanly only when none waits inside it.
             yield Pool(executor, at_once=2 * jobs)
 
 
@@ -131,6 +131,12 @@ def _loky(jobs: int) -> Iterator[Executor]:
     try:
         yield executor
     finally:
+        # loky's thread fails on jobs that it has not yet handed on when the workers are killed. It takes them
+        # in order: once it has seen one more, it has handed on all.
+        with contextlib.suppress(BrokenExecutor):
+            last = executor.submit(int)
+            last.cancel()
+            wait([last], timeout=_POLL_S)
         executor.shutdown(wait=True, kill_workers=True)
 
 

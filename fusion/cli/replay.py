@@ -41,7 +41,10 @@ def replay(
     out: OutOption,
     mode: Annotated[
         str,
-        typer.Option(help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds."),
+        typer.Option(
+            help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds; robust: "
+            "fixed with a robust loss; innovation: noise learned from the innovations."
+        ),
     ] = "adaptive",
     vehicle: VehicleOption = None,
     policy: Annotated[Path | None, typer.Option(help="Weighting policy; by default the one shipped.")] = None,

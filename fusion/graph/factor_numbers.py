@@ -83,19 +83,23 @@ def _no_motion() -> gtsam.PreintegratedCombinedMeasurements:
     return measured
 
 
+_GTSAM: Any = gtsam  # its stubs know no call with a list of keys
+
 _KINDS: dict[str, Callable[[list[int], Any], Any]] = {
-    "CombinedImuFactor": lambda keys, _: gtsam.CombinedImuFactor(*keys, _no_motion()),
-    "BetweenFactorPose3": lambda keys, noise: gtsam.BetweenFactorPose3(*keys, gtsam.Pose3(), noise),
-    "BetweenFactorVector": lambda keys, noise: gtsam.BetweenFactorVector(*keys, np.zeros(noise.dim()), noise),
-    "BetweenFactorConstantBias": lambda keys, noise: gtsam.BetweenFactorConstantBias(
+    "CombinedImuFactor": lambda keys, _: _GTSAM.CombinedImuFactor(*keys, _no_motion()),
+    "BetweenFactorPose3": lambda keys, noise: _GTSAM.BetweenFactorPose3(*keys, gtsam.Pose3(), noise),
+    "BetweenFactorVector": lambda keys, noise: _GTSAM.BetweenFactorVector(
+        *keys, np.zeros(noise.dim()), noise
+    ),
+    "BetweenFactorConstantBias": lambda keys, noise: _GTSAM.BetweenFactorConstantBias(
         *keys, gtsam.imuBias.ConstantBias(), noise
     ),
-    "PriorFactorVector": lambda keys, noise: gtsam.PriorFactorVector(*keys, np.zeros(noise.dim()), noise),
-    "PriorFactorPose3": lambda keys, noise: gtsam.PriorFactorPose3(*keys, gtsam.Pose3(), noise),
-    "PriorFactorConstantBias": lambda keys, noise: gtsam.PriorFactorConstantBias(
+    "PriorFactorVector": lambda keys, noise: _GTSAM.PriorFactorVector(*keys, np.zeros(noise.dim()), noise),
+    "PriorFactorPose3": lambda keys, noise: _GTSAM.PriorFactorPose3(*keys, gtsam.Pose3(), noise),
+    "PriorFactorConstantBias": lambda keys, noise: _GTSAM.PriorFactorConstantBias(
         *keys, gtsam.imuBias.ConstantBias(), noise
     ),
-    "AttitudeFactorPose3": lambda keys, noise: gtsam.AttitudeFactorPose3(
+    "AttitudeFactorPose3": lambda keys, noise: _GTSAM.AttitudeFactorPose3(
         *keys, gtsam.Unit3(0.0, 0.0, 1.0), noise, gtsam.Unit3(0.0, 0.0, 1.0)
     ),
 }

@@ -34,7 +34,8 @@ _DELAY = GNSS_DELAY - NAV.stop
 class GnssPosition:
     """A fix at a keyframe: antenna `enu_m`, `lever_m` in the body frame, white 1 `sigma_m`, each (3,).
 
-    `velocity_mps` (3,) of the antenna in the world, `drift_share` of the receiver's drift in this fix.
+    `velocity_mps` (3,) of the antenna in the world, `drift_share` of the receiver's drift in this fix;
+    `weight` is what a robust loss leaves of its horizontal part; `sigma_m` holds it already.
     """
 
     enu_m: Array
@@ -42,6 +43,7 @@ class GnssPosition:
     sigma_m: Array
     drift_share: float = 1.0
     velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
+    weight: float = 1.0
 
 
 def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:

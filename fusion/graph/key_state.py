@@ -42,6 +42,7 @@ CALIBRATION = LINEAR[LINEAR.index("radius_scale") :]
 """The states that stay as they are: what a calibration of the robot would tell."""
 
 DIM = 15 + len(LINEAR)
+"""Length of the whole tangent; without calibration it ends before `CALIBRATION`."""
 POSE, VELOCITY, BIAS = slice(0, 6), slice(6, 9), slice(9, 15)
 NAV, MARKOV = slice(0, 15), slice(15, DIM)
 """The states that GTSAM holds, and the linear ones."""
@@ -75,7 +76,9 @@ class KeyState:
         return self.of(DRIFT)
 
     def retract(self, delta: Array) -> KeyState:
-        """The state moved by a tangent vector (DIM,)."""
+        """The state moved by a tangent vector (DIM,) or (DIM - len(CALIBRATION),)."""
+        linear = self.linear.copy()
+        linear[: len(delta) - NAV.stop] += delta[NAV.stop :]
         bias = gtsam.imuBias.ConstantBias(
             self.bias.accelerometer() + delta[9:12], self.bias.gyroscope() + delta[12:15]
         )
@@ -83,7 +86,7 @@ class KeyState:
             self.pose.retract(delta[POSE]),
             self.velocity + delta[VELOCITY],
             bias,
-            self.linear + delta[MARKOV],
+            linear,
         )
 
     def local(self, other: KeyState) -> Array:
@@ -104,6 +107,19 @@ class KeyState:
             self.bias.accelerometer() - np.cross(turn, accel_mps2),
             self.bias.gyroscope() - np.cross(turn, gyro_radps),
         )
+
+
+def linear_sigma(P: Array) -> Array:
+    """1 sigma (14,) of the linear states from a covariance (dim, dim); NaN where they are not estimated."""
+    out = np.full(len(LINEAR), np.nan)
+    estimated = np.diag(P)[NAV.stop :]
+    out[: len(estimated)] = np.sqrt(estimated)
+    return out
+
+
+def dim_of(calibrate: bool) -> int:
+    """Length of the tangent, with or without the states of a calibration."""
+    return DIM if calibrate else DIM - len(CALIBRATION)
 
 
 def skew(v: Array) -> Array:

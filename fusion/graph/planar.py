@@ -37,8 +37,8 @@ TILT_DENSITY_RADPS = 0.1
 """Rate at which the ground's tilt changes, rad/s/sqrt(Hz) (assumed): 0.03 rad (1 sigma) a keyframe."""
 TURN_SHARE = 0.4
 """Error of the yaw rate from the wheels, as a share of it (1 sigma, assumed)."""
-TURN_TIME_S = 2.0
-"""How long that error lasts, s (assumed): about one turn."""
+TURN_TIME_S = 10.0
+"""How long that error lasts, s (assumed): a long turn."""
 WHEEL_YAW_DENSITY_RADPS = 0.02
 """Yaw the wheels do not show on a straight, rad/s/sqrt(Hz) (assumed)."""
 UNKNOWN_YAW_DENSITY_RADPS = 0.5

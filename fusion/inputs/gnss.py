@@ -18,11 +18,12 @@ from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
-from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DIM, DRIFT, MARKOV, POSE, SLIP, VELOCITY
+from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, SLIP, VELOCITY
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.inputs.track import MotionTrack
 from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.fusion.weights.weighting import Surprise, Weighting
 from terrafusion.twin.sensing.gnss import best_fix
 
 Array = NDArray[np.float64]
@@ -30,6 +31,8 @@ Array = NDArray[np.float64]
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
 LARGE_TURN_RAD = 0.05
+UNUSED_WEIGHT = 0.01
+"""A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
 """Share of a fix's variance that is new at every fix; the rest drifts slowly."""
 OPTIMISM = 3.0
@@ -54,7 +57,13 @@ class GnssUpdater:
         last_used_ns: time of the newest fix in the graph.
     """
 
-    def __init__(self, config: EstimatorConfig, report: Callable[[Innovation], None]) -> None:
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        report: Callable[[Innovation], None],
+        weighting: Weighting | None = None,
+    ) -> None:
+        self.weighting = weighting or Weighting()
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
@@ -97,7 +106,7 @@ class GnssUpdater:
     def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `covariance` (DIM, DIM) is
+        A fix belongs to the first keyframe after it. `covariance` (dim, dim) is
         that of the newest keyframe.
         """
         used = False
@@ -118,6 +127,8 @@ class GnssUpdater:
                     covariance = chain.covariance_at(k)
                 used |= self._add(chain, k, fix, covariance, row)
                 used |= self._set_heading_right(chain, fix, row)
+        if used:
+            self.weighting.revisit(chain)
         return used
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
@@ -151,7 +162,7 @@ class GnssUpdater:
         antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
         off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
         # All that the wrong heading may have bent is in doubt again.
-        doubt = np.zeros(DIM)
+        doubt = np.zeros(chain.dim)
         doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
         doubt[3:6] = off**2 + float(np.max(fix.sigma_m[:2]) * self.scale) ** 2
         doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
@@ -177,31 +188,50 @@ class GnssUpdater:
         sigma = self._white_sigma(fix, inflation, share)
         position = GnssPosition(fix.enu_m, lever, sigma, share, velocity)
         innovation = -residual(position, state.pose, state.linear)
-        J = np.zeros((3, DIM))
-        J[:, POSE], J[:, MARKOV] = jacobians(position, state.pose, state.linear)
+        H_pose, H_linear = jacobians(position, state.pose, state.linear)
+        J = np.hstack([H_pose, np.zeros((3, 9)), H_linear])[:, : chain.dim]
         P = J @ covariance @ J.T
+        predicted_m2 = P[[0, 1], [0, 1]].copy()
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
         P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
+        if verdict is Verdict.REJECT and nis <= self.weighting.passed_nis:
+            verdict = Verdict.ACCEPT
+        scale, weight = 1.0, 1.0
+        if verdict is not Verdict.REACQUIRE:
+            drift_m2 = (share * self.drift_sigma_m) ** 2
+            scale, weight = self.weighting.gnss(
+                Surprise(
+                    fix.t_ns,
+                    innovation[:2],
+                    predicted_m2,
+                    sigma[:2] ** 2,
+                    fix.sigma_m[:2] * self.scale,
+                    drift_m2,
+                )
+            )
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
         if verdict is Verdict.REJECT:
             self.rejected += 1
             return False
+        P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
+        sigma[:2] *= scale
         cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
         if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
             height = (np.asarray(state.pose.translation()) + R @ lever)[2]
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
-        chain.add_fix(k, position)
+        chain.add_fix(k, dataclasses.replace(position, weight=weight))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
             chain.smooth(chain.last - k + 1)
-            chain.restart(np.zeros(DIM), k)
-        self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
+            chain.restart(np.zeros(chain.dim), k)
+        if weight > UNUSED_WEIGHT:
+            self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
 
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
@@ -234,7 +264,7 @@ class GnssUpdater:
         update, which cannot diverge.
         """
         gain = covariance @ jacobian.T @ np.linalg.inv(S)
-        doubt = np.zeros(DIM)
+        doubt = np.zeros(chain.dim)
         if verdict is Verdict.REACQUIRE:
             doubt[3:6] = float(innovation_m @ innovation_m)
         elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:

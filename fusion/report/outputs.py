@@ -181,6 +181,7 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     gyro_bias_*, accel_bias_*    body axes
     w_<name>                     the weights in force, named and measured as in the policy file
     status                       waiting, aligning, running, outage or no_gnss
+    slipping, immobilised        1 or 0, see docs/monitor.md
     """
     path = estimate.trajectory
     n = len(path)
@@ -203,6 +204,8 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     for name, values in estimate.weights.items():
         table |= _numbers((f"w_{name}",), np.reshape(values, (n, 1)), ".6g")
     table["status"] = [_cell(value) for value in estimate.status]
+    for name, flags in (("slipping", estimate.slipping), ("immobilised", estimate.immobilised)):
+        table[name] = [""] * n if flags is None else [str(int(flag)) for flag in flags]
     return table
 
 

@@ -31,6 +31,7 @@ def plot_map(
     estimate: Estimate,
     recording: Recording,
     *,
+    errors: Errors | None = None,
     held_out: Gnss | None = None,
     outages: Sequence[Outage] = (),
     ax: Axes | None = None,
@@ -40,7 +41,11 @@ def plot_map(
     from matplotlib.lines import Line2D
 
     fig, ax = style.canvas(ax, _map_size([estimate]))
-    handles = draw_references(ax, recording, held_out, refused_fixes(estimate))
+    local = is_local(estimate)
+    if local:
+        handles = _draw_moved(ax, estimate, errors)
+    else:
+        handles = draw_references(ax, recording, held_out, refused_fixes(estimate))
     path = estimate.trajectory
     keep = style.thin(len(path), 2 * style.MAX_POINTS)
     xy = path.position_m[keep, :2]
@@ -66,6 +71,8 @@ def plot_map(
             *xy[-1], "s", color="#111111", markersize=6, zorder=6, label="end", linestyle="none"
         )
     _frame(ax)
+    if local:
+        style.dress(ax, x="x of the local frame, m", y="y of the local frame, m")
     _side_legend(ax, handles)
     return fig, ax
 
@@ -126,6 +133,30 @@ def plot_error_runs(
     style.dress(ax, x=TIME, y="position error, m")
     style.legend_above(ax)
     return fig, ax
+
+
+def is_local(estimate: Estimate) -> bool:
+    """Whether start and heading of the path are arbitrary, because no fix ever came."""
+    return bool(len(estimate.status)) and bool((estimate.status == "no_gnss").all())
+
+
+def _draw_moved(ax: Axes, estimate: Estimate, errors: Errors | None) -> list[Any]:
+    """The reference in the local frame: scoring moved the path onto it, and this moves it back."""
+    if errors is None:
+        return []
+    here = estimate.trajectory.positions_at(errors.t_ns)[:, :2]
+    rows = np.isfinite(here + errors.estimate_m + errors.reference_m).all(axis=1)
+    if rows.sum() < 2:
+        return []
+    here, there = here[rows] @ [1.0, 1j], errors.estimate_m[rows] @ [1.0, 1j]
+    turn = np.vdot(there - there.mean(), here - here.mean())
+    turn = turn / abs(turn) if abs(turn) > 0.0 else 1.0
+    moved = (errors.reference_m[rows] @ [1.0, 1j] - there.mean()) * turn + here.mean()
+    moved = moved[style.thin(len(moved), 2 * style.MAX_POINTS)]
+    dashes, label = (0, (4, 3)), "reference, moved to the start"
+    return ax.plot(
+        moved.real, moved.imag, color=style.TRUTH, linewidth=0.8, linestyle=dashes, zorder=7, label=label
+    )
 
 
 def refused_fixes(estimate: Estimate) -> TimesNs:

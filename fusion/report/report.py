@@ -133,7 +133,9 @@ def _maps(
             outages=outages,
         )
         parts.append(figure(fig, "The paths of all runs, from above."))
-    fig, _ = plots_map.plot_map(shown.estimate, recording, held_out=held_out, outages=outages)
+    fig, _ = plots_map.plot_map(
+        shown.estimate, recording, errors=shown.scores.errors, held_out=held_out, outages=outages
+    )
     parts.append(
         figure(
             fig,

@@ -25,7 +25,7 @@ from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.estimate import STATUS, Estimate
 from terrafusion.fusion.report import style
-from terrafusion.fusion.report.plots_map import ellipse_rows, ellipses, refused_fixes
+from terrafusion.fusion.report.plots_map import ellipse_rows, ellipses, is_local, refused_fixes
 
 if TYPE_CHECKING:
     from terrafusion.fusion.replay import Replay
@@ -117,7 +117,7 @@ def _world(log: _Log, result: Replay) -> None:
     log.fixed("world/base_link/origin", rr.Points3D([[0.0, 0.0, 0.0]], colors=_rgba(BODY_COLOUR), radii=0.25))
     pose = rr.Transform3D.columns(translation=xyz, quaternion=path.quaternion)
     log.over_time("world/base_link", path.t_ns, pose)
-    if recording.truth is not None and len(recording.truth):
+    if recording.truth is not None and len(recording.truth) and not is_local(estimate):
         points = np.nan_to_num(recording.truth.position_m)
         log.fixed("world/truth", rr.LineStrips3D([points], colors=_rgba(style.TRUTH), radii=0.04))
     refused = np.isin(result.used.t_ns, refused_fixes(estimate)) if result.used is not None else None

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 from terrafusion.fusion.estimate import STATUS, Estimate
+from terrafusion.fusion.report.plots_map import is_local
 
 EVERY_S = 1.0
 """Diagnostics come at least this often while there are keyframes, and at each change."""
@@ -31,7 +32,7 @@ def written_estimate(estimate: Estimate) -> WrittenEstimate:
         )
         for j, i in enumerate(rows.tolist())
     ]
-    frame = "odom" if len(estimate.status) and (estimate.status == "no_gnss").all() else "map"
+    frame = "odom" if is_local(estimate) else "map"
     return WrittenEstimate(estimate.trajectory, estimate.twist_covariance, frame, t_ns, diagnostics)
 
 
@@ -44,6 +45,7 @@ def told_rows(estimate: Estimate) -> NDArray[np.int64]:
     states = [second, estimate.status]
     if estimate.classes:
         states.append(estimate.dominant_terrain())
+    states += [flag for flag in (estimate.slipping, estimate.immobilised) if flag is not None]
     changed = np.ones(len(t_ns), dtype=bool)
     changed[1:] = np.any([state[1:] != state[:-1] for state in states], axis=0)
     return np.flatnonzero(changed)
@@ -71,7 +73,13 @@ def _ground(estimate: Estimate, i: int) -> Status:
         message = f"{name} with probability {p:.2f}"
         values = {"terrain": name, "probability": f"{p:.3f}"}
     values |= {"slip": f"{estimate.slip[i]:.4f}", "slip_sigma": f"{estimate.slip_sigma[i]:.4f}"}
-    return Status("terrafusion/ground", Level.OK, message, values)
+    level = Level.OK
+    for name, flag in (("slipping", estimate.slipping), ("immobilised", estimate.immobilised)):
+        if flag is not None:
+            values[name] = _yes(flag[i])
+            if flag[i]:
+                level, message = Level.WARN, f"{message}, {name}"
+    return Status("terrafusion/ground", level, message, values)
 
 
 def _weights(estimate: Estimate, i: int) -> Status:

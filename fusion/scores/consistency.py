@@ -170,7 +170,7 @@ def effective_samples(rows: Rows, correlation: Array) -> float:
     if not len(inside):
         return 0.0
     pairs = pair_counts(rows[inside[0] : inside[-1] + 1])
-    both = pairs[0] * correlation[0] + 2.0 * float(pairs[1:] @ correlation[1 : len(pairs)])
+    both = float(pairs[0] * correlation[0] + 2.0 * pairs[1:] @ correlation[1 : len(pairs)])
     return min(float(len(inside)), max(1.0, len(inside) ** 2 / both))
 
 

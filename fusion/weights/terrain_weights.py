@@ -17,6 +17,7 @@ from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.terrain.classifier import load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.fusion.weights.weighting import weighting_for
 
 Array = NDArray[np.float64]
 
@@ -42,11 +43,12 @@ _RECORDED = {
 class TerrainWeights:
     """Runs the detector along the drive and blends the policy by its posterior.
 
-    In the mode "fixed" the terrain is still detected and reported, but the row
-    stays the policy's fixed one.
+    In the other modes the terrain is still detected and reported, but the row
+    stays the policy's fixed one, as tuned ("innovation" moves it from there).
 
     Attributes:
         row: the noise in force.
+        single: what the mode makes of single measurements.
         changes: what changed since `take_changes` was last called, the newest `KEPT_CHANGES` of it.
     """
 
@@ -55,12 +57,14 @@ class TerrainWeights:
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
-        self.row = self.policy.blend(self.detector.probabilities) if self.adaptive else self.policy.fixed
+        fixed = config.tuning.fixed.of(self.policy.fixed)
+        self.row = self.policy.blend(self.detector.probabilities) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
         self._rig = config.rig
         # Only where gyro and wheels both tell yaw does their difference say something of the ground.
         self._two_yaws = config.inputs.sides and config.inputs.yaw == "gyro"
+        self.single = weighting_for(config, self)
         self._before = self.detector.probabilities
         self._next_ns = 0
         self._grade = 0.0

@@ -107,7 +107,6 @@ ALL = slice(None)
 BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "no meta": (without("meta.yaml"), ("log", "no meta.yaml", "write meta.yaml")),
     "no wheels": (without("wheels.csv"), ("log", "no wheel speeds", "wheels.csv")),
-    "no imu": (without("imu.csv"), ("log", "no six-axis IMU")),
     "no channel": (
         without(*(f"{c}.csv" for c in ("command", "wheels", "imu", "gnss", "motor", "terrain", "truth"))),
         ("no channel", "add at least one"),
@@ -144,7 +143,6 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         drop_column("wheels.csv", "front_left_radps"),
         ("wheels.csv", "not a layout", "give one of"),
     ),
-    "missing gyro axis": (drop_column("imu.csv", "gyro_x_radps"), ("no six-axis IMU", "three gyro")),
     "axes swapped": (
         swap("imu.csv", "accel_x_mps2", "accel_z_mps2"),
         ("imu", "gravity stands on +x", "turn the accelerometer", "--apply-fixes"),

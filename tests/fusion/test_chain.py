@@ -105,7 +105,7 @@ def add_priors(graph: gtsam.NonlinearFactorGraph, start: KeyState) -> None:
 
 
 def test_batch_solution_is_that_of_gtsam() -> None:
-    chain = Chain()
+    chain = Chain(calibrate=True)
     graph = build(chain, 40)
     start = chain.nodes[0].point
     values = gtsam.Values(chain.values)
@@ -139,7 +139,7 @@ def test_batch_solution_is_that_of_gtsam() -> None:
 
 def test_filter_ends_where_the_batch_ends() -> None:
     """With all keyframes in the window, live updates reach the batch solution of the newest keyframe."""
-    live, batch = Chain(), Chain()
+    live, batch = Chain(calibrate=True), Chain(calibrate=True)
     points, links, wheels, fixes = drive(40, 3)
     for chain in (live, batch):
         for k in range(40):
@@ -163,7 +163,7 @@ def test_filter_ends_where_the_batch_ends() -> None:
 
 def test_forgetting_keeps_the_information() -> None:
     """Dropping old keyframes changes nothing in a graph whose linearisation stands still."""
-    whole, short = Chain(), Chain()
+    whole, short = Chain(calibrate=True), Chain(calibrate=True)
     build(whole, 30)
     _, links, wheels, fixes = drive(30, 1)
     for k in range(30):
@@ -189,7 +189,7 @@ def test_forgetting_keeps_the_information() -> None:
 def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:
     """A prior carried to another tangent space still has its mean where it was."""
     rng = np.random.default_rng(5)
-    chain = Chain()
+    chain = Chain(calibrate=True)
     points, *_ = drive(1, 0)
     chain.append(0, points[0])
     chain.set_prior(SIGMAS)
@@ -203,7 +203,7 @@ def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:
 
 
 def test_restart_keeps_state_and_adds_doubt() -> None:
-    chain = Chain()
+    chain = Chain(calibrate=True)
     build(chain, 20)
     chain.solve(20)
     before, P = chain.state(19), chain.covariance()
@@ -260,7 +260,7 @@ def test_a_turned_imu_acts_as_its_rows_say() -> None:
     at_once = np.cross(turn, gyro), np.cross(turn, accel)
     sides = []
     for extra, linear_turn in (((0.0, 0.0), turn), (at_once, np.zeros(3))):
-        chain = Chain()
+        chain = Chain(calibrate=True)
         linear = np.zeros(N)
         linear[IMU_ROTATION.start - 15 : IMU_ROTATION.stop - 15] = linear_turn
         point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), linear)
@@ -290,7 +290,7 @@ def test_a_markov_step_keeps_the_stationary_variance() -> None:
 
 
 def test_an_undetermined_chain_says_so() -> None:
-    chain = Chain()
+    chain = Chain(calibrate=True)
     points, *_ = drive(1, 0)
     chain.append(0, points[0])
     with pytest.raises(ArithmeticError, match="not determined"):

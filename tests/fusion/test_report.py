@@ -292,3 +292,24 @@ def test_a_report_on_a_long_drive_is_quick(drive, tmp_path):
     path = write_report(tmp_path / "r.html", "Long", runs, d.recording, held_out=d.fixes, outages=OUTAGES)
     assert time.perf_counter() - begun < 10.0
     assert path.stat().st_size < 3_000_000
+
+
+def test_a_local_path_is_shown_with_the_reference_moved_onto_it(drive):
+    """A path turned by 50 deg and moved lies on its reference again; one of GNSS is left where it is."""
+    d = drive(seconds=40.0)
+    turn = np.array([[np.cos(0.9), -np.sin(0.9)], [np.sin(0.9), np.cos(0.9)]])
+    path = d.estimate.trajectory
+    moved = path.position_m.copy()
+    moved[:, :2] = moved[:, :2] @ turn.T + [30.0, -20.0]
+    local = dataclasses.replace(
+        d.estimate,
+        trajectory=dataclasses.replace(path, position_m=moved),
+        status=np.full(len(path), "no_gnss", dtype=object),
+    )
+    errors = score(d.estimate, d.recording, held_out=None, outages=()).errors
+    for estimate, position in ((local, moved), (d.estimate, path.position_m)):
+        _, ax = plots_map.plot_map(estimate, d.recording, errors=errors)
+        (line,) = (x for x in ax.lines if str(x.get_label()) in ("reference, moved to the start", "truth"))
+        xy = np.column_stack([line.get_xdata(), line.get_ydata()])
+        nearest = np.linalg.norm(xy[:, None] - position[None, :, :2], axis=2).min(axis=1)
+        assert nearest.max() < 0.06  # keyframes are 0.1 m apart

@@ -16,6 +16,7 @@ from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.recording import differences
 from terrafusion.datasets.writers import write_mcap
+from terrafusion.datasets.writers.mcap_estimate import Level
 from terrafusion.fusion.report.ros_estimate import told_rows, written_estimate
 
 
@@ -119,6 +120,20 @@ def test_rejections_are_counted_up_to_then(bag: Any) -> None:
         gates = statuses(message)["terrafusion/gates"]
         values = {pair.key: int(pair.value) for pair in gates.values}
         assert values == {"rejected_gnss": int((refused <= t).sum()), "rejected_wheels": 0}
+
+
+def test_slipping_is_warned_of_at_once(drive: Any) -> None:
+    estimate = drive(seconds=10.0).estimate
+    flag = np.zeros(len(estimate.status), dtype=bool)
+    flag[33:37] = True
+    told = dataclasses.replace(estimate, slipping=flag, immobilised=~flag & False)
+    assert {33, 37} <= set(told_rows(told).tolist())
+    ground = {
+        i: found[1] for i, found in zip(told_rows(told), written_estimate(told).diagnostics, strict=True)
+    }
+    assert (ground[33].level, ground[33].values["slipping"]) == (Level.WARN, "true")
+    assert (ground[37].level, ground[37].values["slipping"]) == (Level.OK, "false")
+    assert ground[33].message.endswith(", slipping")
 
 
 def test_a_local_path_is_in_odom(drive: Any) -> None:

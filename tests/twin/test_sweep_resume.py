@@ -99,7 +99,8 @@ def test_a_killed_sweep_continues_without_loss(file: Path, tmp_path: Path, compu
 
 def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Path) -> None:
     file.write_text(SWEEP.replace("[0, 3, 6, 9]", "{from: 0, to: 20, count: 100}"))
-    program = PROGRAM.replace("sys.argv[2]", "sys.argv[2], jobs=2")
+    call = PROGRAM.replace("sys.argv[2]", "sys.argv[2], jobs=2").replace("; run", "\ntry: run")
+    program = f"{call}\nexcept KeyboardInterrupt: print('stopped', file=sys.stderr)"
     words = [sys.executable, "-c", program, str(file), str(tmp_path / "out")]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as child:
         _wait_for_parts(tmp_path / "out", 2, child)
@@ -107,9 +108,7 @@ def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Pat
         begun = time.monotonic()
         _, said = child.communicate(timeout=60.0)
     assert time.monotonic() - begun < 10.0
-    assert said.rstrip().endswith("KeyboardInterrupt")
-    assert said.count("Traceback") == 1
-    assert "loky" not in said
+    assert said == "stopped\n"
 
 
 def test_a_worker_that_dies_is_told() -> None:

@@ -1,0 +1,216 @@
+"""Tuning the modes on drives of the twin that nothing else is scored on.
+
+    python -m terrafusion.fusion.weights.tuning --out modes.yaml
+
+Six drives of about 100 s with an outage of 30 s; their seeds start at 1000, soils and headings are
+drawn for each as for the policy. Three have the receiver's best fixes, one stand-alone fixes, one has a
+tenth of its fixes off by up to 30 m, one a receiver that claims a tenth of its error: a robust or
+adaptive method has to earn its keep there, and must not lose on the others.
+
+The loss is the mean over the drives of the logarithms of two median position errors, in the outage and
+outside it, so that every drive counts by ratios and none by its metres. Coordinate search: each number
+in turn is multiplied and divided by its step, and goes on in a direction for as long as that helps.
+First the row of "fixed", then, from it, the numbers of each method; "adaptive" is not tuned.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import hashlib
+import math
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafusion.datasets.recording import Fix, Recording
+from terrafusion.fusion.replay import replay
+from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.fusion.terrain.drives import Grid, scattered_soil
+from terrafusion.fusion.weights.modes import ModeTuning, bounds, load_modes, write_modes
+from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.simulate import simulate
+
+OUTAGE = Outage(55.0, 30.0)
+FAULTS_FROM_S = 15.0
+"""Heading is found before the faults begin: the start is not what is tuned."""
+OUTLIER_SHARE, OUTLIER_M = 0.1, 30.0
+OPTIMISM = 10.0
+LEAST_ERROR_M = 1e-3
+MOST_STEPS = 3
+HELPS = 1e-3
+"""Decrease of the loss (0.1 % of the errors) below which a number stays as it is."""
+
+STEPS: dict[str, dict[str, float]] = {
+    "fixed": {"wheel_factor": 2.0, "slip_factor": 1.6, "gnss_factor": 1.6},
+    "cauchy": {"wheel_c": 2.0, "gnss_c": 2.0, "gate_sigma": 8.0},
+    "gnc": {"wheel_c": 2.0, "gnss_c": 1.5, "gate_sigma": 8.0},
+    "sage_husa": {"wheel_memory": 3.0, "gnss_memory": 3.0, "wheel_span": 3.0},
+    "variational": {"wheel_memory": 3.0, "gnss_memory": 3.0, "wheel_span": 3.0},
+}
+"""Numbers tuned of each method, in this order, and the factor of a step."""
+MODE_OF: dict[str, tuple[str, dict[str, str]]] = {
+    "fixed": ("fixed", {}),
+    "cauchy": ("robust", {"robust_loss": "cauchy"}),
+    "gnc": ("robust", {"robust_loss": "gnc"}),
+    "sage_husa": ("innovation", {"innovation_method": "sage_husa"}),
+    "variational": ("innovation", {"innovation_method": "variational"}),
+}
+"""Mode and variant of each method."""
+
+
+@dataclass(frozen=True)
+class Training:
+    """One drive: scenario, ground, seed and what is wrong with its fixes."""
+
+    scenario: str
+    ground: str
+    slope_deg: float
+    seed: int
+    fault: str = ""
+
+    def recording(self) -> Recording:
+        """Simulate it."""
+        rng = np.random.default_rng(self.seed)
+        scenario = dataclasses.replace(
+            load_scenario(self.scenario),
+            heading_deg=float(rng.uniform(0.0, 360.0)),
+            gnss_fix=Fix.SINGLE if self.fault == "single" else None,
+        )
+        with tempfile.TemporaryDirectory() as folder:
+            soil = scattered_soil(self.ground, rng, Path(folder))
+            recording = simulate(scenario, terrain=str(soil), slope_deg=self.slope_deg, seed=self.seed)
+        return spoilt(recording, self.fault, self.seed)
+
+
+DRIVES = (
+    Training("figure_eight", "asphalt", 0.0, 1000),
+    Training("staircase", "loose_sand", 3.0, 1001),
+    Training("figure_eight", "mud", 0.0, 1002),
+    Training("figure_eight", "medium_sand", 3.0, 1003, "single"),
+    Training("figure_eight", "loose_sand", 6.0, 1004, "outliers"),
+    Training("staircase", "asphalt", 3.0, 1005, "optimistic"),
+)
+
+
+def spoilt(recording: Recording, fault: str, seed: int) -> Recording:
+    """The drive with `fault` "outliers" (a share of the fixes anywhere within `OUTLIER_M`) or "optimistic"
+    (white errors `OPTIMISM` times the reported sigma); any other word leaves it as it is."""
+    gnss = recording.gnss
+    if gnss is None or fault not in ("outliers", "optimistic"):
+        return recording
+    rng = np.random.default_rng(seed)
+    n = len(gnss)
+    late = (gnss.t_ns - recording.start_ns) * 1e-9 > FAULTS_FROM_S
+    if fault == "outliers":
+        hit = late & (rng.random(n) < OUTLIER_SHARE)
+        error = rng.uniform(-OUTLIER_M, OUTLIER_M, (n, 2))
+    else:
+        hit, error = late, OPTIMISM * gnss.sigma_enu_m[:, :2] * rng.normal(size=(n, 2))
+    enu = gnss.enu_m.copy()
+    enu[hit, :2] += error[hit]
+    return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, enu_m=enu))
+
+
+def loss(recordings: list[Recording], method: str, tuning: ModeTuning) -> float:
+    """Mean logarithm of the median position errors (m) in the outage and outside it, over the drives."""
+    mode, variant = MODE_OF[method]
+    settings: dict[str, Any] = {"tuning": tuning, **variant}
+    logs = []
+    for recording in recordings:
+        errors = replay(recording, mode=mode, outages=[OUTAGE], settings=settings).scores.errors
+        assert errors is not None
+        inside = OUTAGE.covers(errors.t_ns, recording.start_ns)
+        distance = errors.distance_m()
+        for part in (distance[inside], distance[~inside]):
+            logs.append(math.log(max(float(np.nanmedian(part)), LEAST_ERROR_M)))
+    return float(np.mean(logs))
+
+
+def tune(
+    recordings: list[Recording],
+    start: ModeTuning,
+    methods: Sequence[str] = tuple(STEPS),
+    tell: Callable[[str], None] = lambda text: None,
+) -> ModeTuning:
+    """Coordinate search over the numbers of `STEPS`, method by method."""
+    tuning = start
+    for method in methods:
+        steps = STEPS[method]
+        best = loss(recordings, method, tuning)
+        tell(f"{method}: loss {best:.4f} at the start")
+        for name, factor in steps.items():
+            for direction in (factor, 1.0 / factor):
+                moved = False
+                for trial in _line(tuning, method, name, direction):
+                    value = loss(recordings, method, trial)
+                    tell(f"{method}.{name} = {getattr(getattr(trial, method), name):g}: loss {value:.4f}")
+                    if value > best - HELPS:
+                        break
+                    tuning, best, moved = trial, value, True
+                if moved:
+                    break
+    return tuning
+
+
+def _line(tuning: ModeTuning, method: str, name: str, factor: float) -> Iterator[ModeTuning]:
+    """The tuning with one number moved by one step, by two, and so on, while it may have the value."""
+    section = getattr(tuning, method)
+    value = getattr(section, name)
+    low, high = bounds(type(section), name)
+    for _ in range(MOST_STEPS):
+        value = float(f"{value * factor:.4g}")
+        if not low <= value <= high:
+            return
+        yield dataclasses.replace(tuning, **{method: dataclasses.replace(section, **{name: value})})
+
+
+def fingerprint() -> str:
+    """SHA-256 of what the result depends on: policy, drives, their parameter files, steps, first guesses."""
+    drives = [dataclasses.astuple(drive) for drive in DRIVES]
+    columns: Any = (tuple(dict.fromkeys(column)) for column in _columns())
+    grid = Grid(*columns)
+    settings = [drives, STEPS, dataclasses.astuple(ModeTuning()), load_policy().inputs_sha256]
+    faults = [
+        FAULTS_FROM_S,
+        OUTLIER_SHARE,
+        OUTLIER_M,
+        OPTIMISM,
+        OUTAGE.start_s,
+        OUTAGE.seconds,
+        MOST_STEPS,
+        HELPS,
+    ]
+    return hashlib.sha256((grid.fingerprint() + repr(settings) + repr(faults)).encode()).hexdigest()
+
+
+def _columns() -> tuple[list, ...]:
+    """Scenarios, slopes, payloads, seeds and grounds of the drives."""
+    return (
+        [d.scenario for d in DRIVES], [d.slope_deg for d in DRIVES], [0.0],
+        [d.seed for d in DRIVES], [d.ground for d in DRIVES],
+    )  # fmt: skip
+
+
+def main() -> None:
+    """Tune all modes and write the file."""
+    parser = argparse.ArgumentParser(description="Tune the estimator's modes on drives of the twin.")
+    parser.add_argument("--out", type=Path, required=True, help="tuning file to write")
+    parser.add_argument("--start", type=Path, help="tuning file to go on from")
+    parser.add_argument("--only", nargs="+", choices=list(STEPS), default=list(STEPS), help="methods to tune")
+    given = parser.parse_args()
+    out, start = given.out, load_modes(given.start) if given.start else ModeTuning()
+    recordings = [drive.recording() for drive in DRIVES]
+    tuned = tune(recordings, start, given.only, lambda text: print(text, flush=True))
+    made_by = "python -m terrafusion.fusion.weights.tuning"
+    write_modes(dataclasses.replace(tuned, inputs_sha256=fingerprint()), out, made_by)
+    print(f"written to {out}")
+
+
+if __name__ == "__main__":
+    main()

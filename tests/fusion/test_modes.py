@@ -1,0 +1,217 @@
+"""The modes "robust" and "innovation": their mathematics, and what they do on drives of the twin."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.optimize import minimize_scalar
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.fusion.weights.innovation import SageHusa, Variational
+from terrafusion.fusion.weights.modes import ModeTuning, RowTuning, load_modes, write_modes
+from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.fusion.weights.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
+from terrafusion.fusion.weights.tuning import DRIVES, MODE_OF, Training, fingerprint, loss, tune
+from terrafusion.fusion.weights.weighting import Surprise
+from terrafusion.twin.simulate import simulate
+from terrafusion.twin.vehicle import load_vehicle
+
+METHODS = ("cauchy", "gnc", "sage_husa", "variational")
+
+
+@pytest.fixture(scope="module")
+def sand() -> Recording:
+    return simulate("figure_eight", terrain="loose_sand", seed=7)
+
+
+def run(recording: Recording, method: str, **options: object) -> Replay:
+    mode, variant = MODE_OF[method]
+    return replay(recording, mode=mode, settings=variant, **options)  # type: ignore[arg-type]
+
+
+def surprise(innovation: float, predicted: float, noise: float) -> Surprise:
+    return Surprise(0, np.array([innovation]), np.array([predicted]), np.array([noise]), np.array([1.0]))
+
+
+def with_fixes(recording: Recording, error_m: np.ndarray, claimed_m: float | None = None) -> Recording:
+    """Fixes moved by `error_m` (n, 2) from 15 s on, claiming another sigma if told to."""
+    gnss = recording.gnss
+    assert gnss is not None
+    enu, sigma = gnss.enu_m.copy(), gnss.sigma_enu_m.copy()
+    late = (gnss.t_ns - recording.start_ns) * 1e-9 > 15.0
+    enu[late, :2] += error_m[late]
+    if claimed_m is not None:
+        sigma[:] = claimed_m
+    return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma))
+
+
+def errors_m(result: Replay) -> np.ndarray:
+    assert result.scores.errors is not None
+    return result.scores.errors.distance_m()
+
+
+@given(st.floats(-5.0, 5.0), st.floats(1e-3, 4.0), st.floats(0.5, 5.0))
+def test_the_cauchy_weight_is_at_the_minimum_of_its_loss(nu: float, predicted: float, c: float) -> None:
+    """One state seen once: the reweighted update agrees with a search for the least prior + Cauchy cost."""
+    if (
+        8.0 * predicted > c * c
+    ):  # the cost may have two minima where the prior is weaker than the loss is concave
+        predicted = c * c / 8.0
+    w = cauchy_weight(surprise(nu, predicted, 1.0), c)
+
+    def cost(x: float) -> float:
+        return x * x / predicted + c * c * np.log1p((nu - x) ** 2 / c**2)
+
+    best = minimize_scalar(cost, bounds=(-6.0, 6.0), method="bounded", options={"xatol": 1e-9}).x
+    assert nu * predicted / (predicted + 1.0 / w) == pytest.approx(best, abs=2e-3)
+
+
+@given(st.lists(st.floats(0.0, 1e4), min_size=1, max_size=20), st.floats(0.5, 30.0), st.floats(1e-6, 1e6))
+def test_gnc_weights_fall_with_the_residual_and_end_as_all_or_nothing(
+    squares: list[float], c2: float, mu: float
+) -> None:
+    r2 = np.sort(squares)
+    w = truncated_weights(r2, c2, mu)
+    assert ((w >= LEAST_WEIGHT) & (w <= 1.0)).all()
+    assert (np.diff(w) <= 1e-9).all()
+    clear = (r2 < 0.99 * c2) | (r2 > 1.01 * c2)
+    final = truncated_weights(r2, c2, 1e9)
+    assert (final[clear] == np.where(r2 < c2, 1.0, LEAST_WEIGHT)[clear]).all()
+
+
+def test_weights_are_settled_only_where_residuals_agree_and_most_are_believed() -> None:
+    r2 = np.array([1.0, 2.0, 50.0])
+    assert settled(r2, np.array([1.0, 1.0, LEAST_WEIGHT]), 9.0)
+    assert not settled(r2, np.array([1.0, 1.0, 1.0]), 9.0)
+    assert not settled(np.array([1.0, 50.0, 50.0]), np.array([1.0, LEAST_WEIGHT, LEAST_WEIGHT]), 9.0)
+    assert settled(np.zeros(0), np.zeros(0), 9.0)
+
+
+@pytest.mark.parametrize("kind", [SageHusa, Variational])
+@pytest.mark.parametrize("true_sigma", [0.3, 3.0])
+def test_innovations_tell_the_noise_they_were_drawn_with(kind: type, true_sigma: float) -> None:
+    rng = np.random.default_rng(3)
+    noise = kind(1.0, 300.0, 1e-4, 1e4)
+    for _ in range(4000):
+        nu = rng.normal() * np.sqrt(true_sigma**2 + 0.05)
+        noise.update(surprise(nu, 0.05, noise.value))
+    assert np.sqrt(noise.value) == pytest.approx(true_sigma, rel=0.2)
+
+
+@pytest.mark.parametrize("kind", [SageHusa, Variational])
+def test_followed_noise_stays_in_its_bounds(kind: type) -> None:
+    noise = kind(1.0, 10.0, 0.25, 4.0)
+    for nu, bound in ((100.0, 4.0), (0.0, 0.25)):
+        for _ in range(200):
+            noise.update(surprise(nu, 0.0, noise.value))
+        assert noise.value == bound
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_exact_data_give_exact_estimates(method: str) -> None:
+    result = run(simulate("figure_eight", terrain="asphalt", noiseless=True), method)
+    assert np.nanmax(errors_m(result)) < 0.005
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_same_input_gives_the_same_bits(sand: Recording, method: str) -> None:
+    first, again = (run(sand, method, outages=[Outage(50.0, 20.0)]).estimate for _ in range(2))
+    assert first.trajectory.position_m.tobytes() == again.trajectory.position_m.tobytes()
+    assert first.changes == again.changes
+
+
+@pytest.mark.parametrize("method", ["cauchy", "gnc"])
+def test_outliers_hardly_move_the_robust_mode(sand: Recording, method: str) -> None:
+    """A fifth of the fixes 30 m off, any way round: each is refused or doubted, with a reason."""
+    rng = np.random.default_rng(5)
+    assert sand.gnss is not None
+    n = len(sand.gnss)
+    angle = rng.uniform(0.0, 2.0 * np.pi, n)
+    error = 30.0 * np.stack([np.cos(angle), np.sin(angle)], axis=1) * (rng.random(n) < 0.2)[:, None]
+    clean, spoilt = run(sand, method), run(with_fixes(sand, error), method)
+    assert np.nanmedian(errors_m(spoilt)) < np.nanmedian(errors_m(clean)) + 0.02
+    assert np.nanmax(errors_m(spoilt)) < 0.5
+    doubted = [c for c in spoilt.estimate.changes if c.sensor == "gnss" and c.after < 0.5]
+    assert len(doubted) > 0.05 * n  # the gate refuses others
+    assert all("fix doubted" in c.reason and c.after < c.before for c in doubted)
+
+
+@pytest.mark.parametrize("method", ["sage_husa", "variational"])
+def test_innovation_finds_the_noise_of_fixes_that_claim_too_little(sand: Recording, method: str) -> None:
+    """They claim 3 m and are 30 m off: the normalised square comes back into its band.
+
+    The scatter seen against dead reckoning does most of this already, in every mode (`inputs/track.py`).
+    """
+    rng = np.random.default_rng(5)
+    assert sand.gnss is not None
+    liar = with_fixes(sand, 30.0 * rng.normal(size=(len(sand.gnss), 2)), claimed_m=3.0)
+
+    def late_nis(result: Replay) -> float:
+        nis = [i.nis / i.dof for i in result.estimate.innovations if i.sensor == "gnss"]
+        return float(np.median(nis[len(nis) // 2 :]))
+
+    result = run(liar, method)
+    assert 0.3 < late_nis(result) < 1.5  # the median of chi-square over 2 degrees of freedom is 0.69
+
+
+def test_unknown_modes_and_variants_are_refused() -> None:
+    rig = load_vehicle("husky").rig()
+    for settings in ({"mode": "magic"}, {"robust_loss": "huber"}, {"innovation_method": "guess"}):
+        with pytest.raises(ConfigError, match="unknown"):
+            EstimatorConfig(rig, **settings)  # type: ignore[arg-type]
+
+
+def test_untuned_fixed_mode_is_the_policy_row_itself(sand: Recording) -> None:
+    row = load_policy().fixed
+    assert RowTuning().of(row) == row
+    untuned = replay(sand, mode="fixed", settings={"tuning": ModeTuning()}).estimate
+    assert all(series[0] == getattr(row, name) for name, series in untuned.weights.items())
+
+
+def test_tuning_leaves_the_adaptive_mode_alone(sand: Recording) -> None:
+    other = ModeTuning(fixed=RowTuning(3.0, 3.0, 3.0))
+    a, b = (replay(sand, settings={"tuning": t}).estimate for t in (ModeTuning(), other))
+    assert a.trajectory.position_m.tobytes() == b.trajectory.position_m.tobytes()
+
+
+def test_the_tuning_file_is_read_as_it_was_written(tmp_path: Path) -> None:
+    file = tmp_path / "modes.yaml"
+    write_modes(load_modes(), file, "a test")
+    assert load_modes(file) == load_modes()
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("wheel_c:", "wheel_d:", "must have exactly"),
+        ("terrafusion.modes/1", "terrafusion.modes/9", "schema"),
+        ("gnc:", "gmc:", "key"),
+        ("gnss_factor: ", "gnss_factor: -", "gnss_factor"),
+    ],
+)
+def test_a_wrong_tuning_file_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
+    file = tmp_path / "modes.yaml"
+    write_modes(load_modes(), file, "a test")
+    file.write_text(file.read_text().replace(old, new, 1))
+    with pytest.raises(ConfigError, match=said):
+        load_modes(file)
+
+
+def test_the_shipped_tuning_was_made_from_these_drives() -> None:
+    assert load_modes().inputs_sha256 == fingerprint()
+    assert min(drive.seed for drive in DRIVES) >= 1000
+
+
+def test_tuning_never_makes_the_training_loss_worse() -> None:
+    drives = [Training("figure_eight", "mud", 0.0, 1002).recording()]
+    tuned = tune(drives, ModeTuning(), ["fixed"])
+    assert loss(drives, "fixed", tuned) <= loss(drives, "fixed", ModeTuning())
