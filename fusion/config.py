@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.front import Inputs
+from terrafusion.fusion.terrain.labels import GroundLabels
 from terrafusion.fusion.weights.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.weights.policy import Policy, load_policy
 
@@ -34,6 +35,7 @@ class EstimatorConfig:
         start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
         inputs: what the estimator will be given; without all six IMU axes the graph is planar.
         calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
+        labels: the ground over time, told in place of what the detector finds; None: it detects.
     """
 
     rig: Rig
@@ -52,6 +54,7 @@ class EstimatorConfig:
     start_without_gnss_s: float = 30.0
     inputs: Inputs = field(default_factory=Inputs)
     calibrate: bool = False
+    labels: GroundLabels | None = None
 
     @property
     def longest_wait_s(self) -> float:

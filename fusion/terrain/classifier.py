@@ -28,10 +28,14 @@ Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
-FOREIGN_LEVEL_DECADES = 0.3
-"""1 sigma of the vibration level, common to all bands, of a robot not trained on: a factor of two."""
-FOREIGN_BAND_DECADES = 0.2
-"""And of each band by itself: every chassis and mounting has resonances of its own."""
+FOREIGN_SLIP = 0.03
+"""1 sigma of the share by which the rolling radius of a robot not trained on may be wrong: it looks like slip.
+
+Assumed; tyre pressure and load move the rolling radius of a pneumatic wheel by a few per cent.
+"""
+FOREIGN_UNKNOWN = 0.9
+"""Share of `unknown` where a robot not trained on has not been seen to slip."""
+_BROAD_SHARE = 0.1
 
 _KEYS = (
     "schema", "made_by", "inputs_sha256", "vehicles", "features", "temperature", "patch_length_m", "classes",
@@ -47,6 +51,11 @@ class Mixture:
     mean: Array
     covariance: Array
 
+    def mean_of(self, feature: int) -> float:
+        """Mean of one feature over the whole mixture."""
+        weight = np.exp(self.log_weight)
+        return float(weight @ self.mean[:, feature] / weight.sum())
+
 
 @dataclass(frozen=True, eq=False)
 class TerrainModel:
@@ -58,6 +67,7 @@ class TerrainModel:
         temperature: what log-likelihoods are divided by (>= 1).
         patch_length_m: expected distance between two changes of ground.
         vehicles: names of the vehicles whose vibration the model knows.
+        slip_only: judge by the slip alone; see `for_vehicle`.
         scores: held-out figures of the training.
     """
 
@@ -69,22 +79,49 @@ class TerrainModel:
     inputs_sha256: str = ""
     made_by: str = ""
     scores: dict[str, Any] = dataclasses.field(default_factory=dict)
+    slip_only: bool = False
 
     def for_vehicle(self, name: str | None) -> TerrainModel:
         """The model as it holds for a robot.
 
-        A foreign one may vibrate more or less than the trained ones, in all
-        bands and in each: its slip then says more than its vibration.
+        How much a robot trembles, and how it skids in a turn, says more of its
+        tyres, its chassis and where its IMU sits than of the ground. A robot
+        the model was not trained on is therefore judged by its slip alone, and
+        only grounds it is known to slip on can be named: the others look like
+        any firm ground, which for such a robot is `unknown`.
         """
         if name in self.vehicles:
             return self
-        shift = np.zeros((len(FEATURES), len(FEATURES)))
-        shift[:SLIP, :SLIP] = FOREIGN_LEVEL_DECADES**2 + FOREIGN_BAND_DECADES**2 * np.eye(SLIP)
+        doubt = np.zeros((len(FEATURES), len(FEATURES)))
+        doubt[SLIP, SLIP] = FOREIGN_SLIP**2
         widened = {
-            n: dataclasses.replace(m, covariance=m.covariance + shift) for n, m in self.classes.items()
+            n: dataclasses.replace(m, covariance=m.covariance + doubt) for n, m in self.classes.items()
         }
-        unknown = dataclasses.replace(self.unknown, covariance=self.unknown.covariance + shift)
-        return dataclasses.replace(self, classes=widened, unknown=unknown)
+        firm = [n for n, m in widened.items() if abs(m.mean_of(SLIP)) < FOREIGN_SLIP]
+        unknown = self.unknown
+        if firm:
+            known = _pooled([widened[n] for n in firm], [(1.0 - _BROAD_SHARE) / len(firm)] * len(firm))
+            broad = dataclasses.replace(self.unknown, log_weight=np.zeros(1))
+            unknown = _pooled([known, broad], [1.0, _BROAD_SHARE])
+        slippery = {n: m for n, m in widened.items() if n not in firm}
+        return dataclasses.replace(self, classes=slippery, unknown=unknown, slip_only=True)
+
+    def prior(self, classes: tuple[str, ...]) -> Array:
+        """Probabilities (k,) of the named classes before anything was observed."""
+        k = len(classes)
+        if not self.slip_only or k == 1:
+            return np.full(k, 1.0 / k)
+        others = (1.0 - FOREIGN_UNKNOWN) / (k - 1)
+        return np.array([FOREIGN_UNKNOWN if name == UNKNOWN else others for name in classes])
+
+
+def _pooled(mixtures: list[Mixture], weights: list[float]) -> Mixture:
+    """One mixture out of several, `weights` on their own."""
+    return Mixture(
+        np.concatenate([m.log_weight + np.log(w) for m, w in zip(mixtures, weights, strict=True)]),
+        np.concatenate([m.mean for m in mixtures]),
+        np.concatenate([m.covariance for m in mixtures]),
+    )
 
 
 class LikelihoodTable:
@@ -101,13 +138,14 @@ class LikelihoodTable:
         self._covariance = np.concatenate([m.covariance for m in mixtures])
         self._starts = np.cumsum([0] + [len(m.log_weight) for m in mixtures[:-1]])
         self._temperature = model.temperature
+        self._judged = np.arange(len(FEATURES)) == SLIP if model.slip_only else np.ones(len(FEATURES), bool)
 
     def evaluate(self, values: Array, variances: Array) -> Array:
         """Tempered log-likelihoods (k,) of the features (d,); zeros when none was observed.
 
         `variances` (d,) are those of the measurements themselves, added to the classes' own.
         """
-        seen = np.flatnonzero(np.isfinite(values))
+        seen = np.flatnonzero(np.isfinite(values) & self._judged)
         if not seen.size:
             return np.zeros(len(self._starts))
         covariance = self._covariance[:, seen[:, None], seen] + np.diag(variances[seen])

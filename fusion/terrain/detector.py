@@ -42,7 +42,7 @@ class TerrainDetector:
             )
         self.classes = classes
         self._table = LikelihoodTable(model, classes)
-        self._filter = PatchFilter(len(classes), model.patch_length_m)
+        self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
 
     @property
     def probabilities(self) -> Array:

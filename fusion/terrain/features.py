@@ -42,6 +42,8 @@ _MIN_SPAN_S = 0.6
 _ACCEL_FLOOR_MPS2 = 1e-3
 _GYRO_FLOOR_RADPS = 1e-4
 _TIMING_S = 0.05
+_LEAST_INFORMATION = 0.1
+"""Of the measurements, in units of the prior's, for the slip to count as observed."""
 _SLIP_RANGE = (-1.0, 1.2)
 
 
@@ -56,8 +58,8 @@ class Window:
         speed_mps: the estimator's forward speed.
         yaw_rate_wheels_radps: yaw rate the wheels alone imply, or None where sides are not told apart.
         yaw_rate_gyro_radps: mean yaw rate of the gyroscope, bias removed; NaN where unknown.
-        slip, slip_sigma: slip 1 - v / (omega R) and its 1 sigma; None when no measurement
-            independent of the terrain class supports it (the class prior would confirm itself).
+        slip, slip_sigma: slip 1 - v / (omega R) and its 1 sigma, of measurements alone: see
+            `slip_without_prior` (the class prior would confirm itself); None where there are none.
     """
 
     dt_s: float
@@ -100,6 +102,21 @@ def extract(window: Window) -> tuple[Array, Array]:
         variances[YAW_SLIP] = (0.02 / yaw) ** 2
     values[~np.isfinite(values + variances)] = np.nan
     return values, variances
+
+
+def slip_without_prior(
+    slip: float, sigma: float, prior_slip: float, prior_sigma: float
+) -> tuple[float, float] | None:
+    """What the measurements alone say of the slip: its value and 1 sigma, or None where they say little.
+
+    An estimate made under a prior is the product of prior and likelihood; the
+    prior comes from the class the slip is to judge, and is divided out again
+    (the cavity of Minka 2001): 1/s^2 = 1/sigma^2 - 1/prior_sigma^2.
+    """
+    left = 1.0 / max(sigma, 1e-6) ** 2 - 1.0 / prior_sigma**2
+    if not left > _LEAST_INFORMATION / prior_sigma**2:
+        return None
+    return (slip / max(sigma, 1e-6) ** 2 - prior_slip / prior_sigma**2) / left, left**-0.5
 
 
 def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:

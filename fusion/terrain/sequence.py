@@ -1,9 +1,9 @@
 """The ground comes in patches: a hidden Markov model over the terrain classes.
 
 The class changes with the distance driven, not with time: a robot that stands
-still stays where it is. Over a distance d the class is kept with probability
-exp(-d / L), L being the expected length of a patch, else any other class
-follows with equal probability (Rabiner 1989, forward recursion).
+still stays where it is. Patches are L long on average, and what follows is
+drawn from the prior (Rabiner 1989, forward recursion, of a chain continuous
+in distance). Driven far without looking, the filter is back at the prior.
 """
 
 from __future__ import annotations
@@ -20,17 +20,19 @@ FLOOR = 1e-5
 class PatchFilter:
     """Forward filter; `probabilities` (k,) always are at least `FLOOR` and sum to one."""
 
-    def __init__(self, n_classes: int, patch_length_m: float) -> None:
+    def __init__(self, n_classes: int, patch_length_m: float, prior: Array | None = None) -> None:
         self.patch_length_m = patch_length_m
-        self.probabilities: Array = np.full(n_classes, 1.0 / n_classes)
+        self.prior: Array = np.full(n_classes, 1.0 / n_classes) if prior is None else prior
+        self.probabilities: Array = self.prior.copy()
 
     def predict(self, distance_m: float) -> Array:
         """Drive on by `distance_m` (>= 0) without looking."""
         k = len(self.probabilities)
-        leave = -np.expm1(-max(float(distance_m), 0.0) / self.patch_length_m)
-        if k > 1 and np.isfinite(leave):
-            p = self.probabilities
-            self._set(p * (1.0 - leave) + (1.0 - p) * leave / (k - 1))
+        # The ground is drawn anew from the prior, which may give the same one again: k / (k - 1)
+        # makes a patch `patch_length_m` long where all are equally likely.
+        drawn = -np.expm1(-max(float(distance_m), 0.0) / self.patch_length_m * k / max(k - 1, 1))
+        if k > 1 and np.isfinite(drawn):
+            self._set(self.probabilities * (1.0 - drawn) + self.prior * drawn)
         return self.probabilities
 
     def update(self, log_likelihood: ArrayLike) -> Array:

@@ -14,8 +14,9 @@ from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State, WeightChange
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
-from terrafusion.fusion.terrain.classifier import load_terrain_model
+from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
+from terrafusion.fusion.terrain.features import slip_without_prior
 from terrafusion.fusion.weights.policy import SensorNoise
 from terrafusion.fusion.weights.weighting import weighting_for
 
@@ -57,15 +58,19 @@ class TerrainWeights:
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
+        self._labels = config.labels
+        self._told: Array | None = None
         fixed = config.tuning.fixed.of(self.policy.fixed)
-        self.row = self.policy.blend(self.detector.probabilities) if self.adaptive else fixed
+        # Where the ground is not known, adaptive weights must not do worse than fixed ones.
+        self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: fixed})
+        self.row = self.policy.blend(self._probabilities) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
         self._rig = config.rig
         # Only where gyro and wheels both tell yaw does their difference say something of the ground.
         self._two_yaws = config.inputs.sides and config.inputs.yaw == "gyro"
         self.single = weighting_for(config, self)
-        self._before = self.detector.probabilities
+        self._before = self._probabilities
         self._next_ns = 0
         self._grade = 0.0
         self._last_speed = 0.0
@@ -81,7 +86,7 @@ class TerrainWeights:
         """Probability mass that changed class since the last call (total variation); 0 with fixed weights."""
         if not self.adaptive:
             return 0.0
-        p = self.detector.probabilities
+        p = self._probabilities
         moved = 0.5 * float(np.abs(p - self._before).sum())
         self._before = p
         return moved
@@ -90,11 +95,16 @@ class TerrainWeights:
         """Start the clock; the first row is a change from the policy's fixed one."""
         self._next_ns = t_ns + WINDOW_NS
         self._noted = self.policy.fixed
+        self._listen(t_ns)
         self._reweight(t_ns)
 
     def posterior(self) -> dict[str, float]:
         """Class name -> probability now."""
-        return dict(zip(self.detector.classes, self.detector.probabilities.tolist(), strict=True))
+        return dict(zip(self.detector.classes, self._probabilities.tolist(), strict=True))
+
+    @property
+    def _probabilities(self) -> Array:
+        return self.detector.probabilities if self._told is None else self._told
 
     def external(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Fuse the class probabilities of another source.
@@ -120,8 +130,15 @@ class TerrainWeights:
         self._next_ns = state.t_ns + UPDATE_NS
         self.detector.update(self._window(state, imu, wheels, slip_observed))
         self._source = "detector"
+        self._listen(state.t_ns)
         self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
         self._reweight(state.t_ns)
+
+    def _listen(self, t_ns: int) -> None:
+        """Take the ground from the labels, where some are told; the detector runs on, unheard."""
+        if self._labels is not None:
+            self._told = self._labels.probabilities(t_ns, self.detector.classes)
+            self._source = "label"
 
     def _window(self, state: State, imu: ImuStream, wheels: WheelStream, slip_observed: bool) -> Window:
         start_ns, rig = state.t_ns - WINDOW_NS, self._rig
@@ -131,6 +148,9 @@ class TerrainWeights:
         speed = 0.5 * (left + right) / (WINDOW_NS * 1e-9)
         rate = (speed - self._last_speed) / (UPDATE_NS * 1e-9)
         self._last_speed = 0.0 if np.isnan(speed) else speed
+        prior = self.row.slip_at(self._grade), self.row.slip_sigma
+        measured = slip_without_prior(state.slip, state.slip_sigma, *prior) if slip_observed else None
+        slip, slip_sigma = measured if measured is not None else (None, None)
         return Window(
             dt_s=UPDATE_NS * 1e-9,
             imu_t_s=t,
@@ -143,14 +163,14 @@ class TerrainWeights:
             if rolled is None or not self._two_yaws
             else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
             yaw_rate_gyro_radps=float(gyro[:, 2].mean() - state.gyro_bias_radps[2]) if len(gyro) else np.nan,
-            slip=state.slip if slip_observed else None,
-            slip_sigma=state.slip_sigma if slip_observed else None,
+            slip=slip,
+            slip_sigma=slip_sigma,
         )
 
     def _reweight(self, t_ns: int) -> None:
         if not self.adaptive:
             return
-        p = self.detector.probabilities
+        p = self._probabilities
         self.row = self.policy.blend(p, self._grade)
         assert self._noted is not None
         before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)

@@ -15,8 +15,9 @@ from hypothesis import strategies as st
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.drives import Grid
-from terrafusion.fusion.terrain.features import FEATURES, SLIP
+from terrafusion.fusion.terrain.features import FEATURES, SLIP, YAW_SLIP
 from terrafusion.fusion.terrain.mixture import fit, fit_best, shrink
+from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.terrain.train import Plan, fingerprint_of, write_model
 
 D = len(FEATURES)
@@ -88,13 +89,30 @@ def test_an_uncertain_slip_says_less(extra: float) -> None:
     assert posterior(model, slip_only, np.full(D, 1e4)).max() < 0.3
 
 
-def test_a_foreign_robot_is_judged_less_by_its_vibration(model: TerrainModel) -> None:
+def test_a_foreign_robot_is_judged_by_its_slip_alone(model: TerrainModel) -> None:
     assert model.for_vehicle("elevate") is model
     foreign = model.for_vehicle("warthog")
-    louder = model.classes["loose_sand"].mean[0].copy()
-    louder[:SLIP] += 0.5
-    assert CLASSES[int(posterior(model, louder).argmax())] == "unknown"
-    assert posterior(foreign, louder)[CLASSES.index("unknown")] < 0.5
+    values = model.classes["mud"].mean[0].copy()
+    quiet, shaken = values.copy(), values.copy()
+    shaken[:SLIP] += 0.7
+    shaken[YAW_SLIP] = 0.0
+    assert np.array_equal(posterior(foreign, quiet), posterior(foreign, shaken))
+
+
+@pytest.mark.parametrize(("slip", "named"), [(0.0, "unknown"), (-0.06, "unknown"), (0.2, "loose_sand")])
+def test_a_foreign_robot_that_grips_is_on_unknown_ground(
+    model: TerrainModel, slip: float, named: str
+) -> None:
+    foreign = model.for_vehicle(None)
+    table, patches = LikelihoodTable(foreign, CLASSES), PatchFilter(5, 25.0, foreign.prior(CLASSES))
+    values = np.full(D, np.nan)
+    values[SLIP] = slip
+    for _ in range(100):
+        patches.predict(0.5)
+        p = patches.update(table.evaluate(values, np.full(D, 0.02**2)))
+    assert CLASSES[int(p.argmax())] == named
+    assert p.max() > 0.8
+    assert table.evaluate(np.zeros(D) * np.nan, np.zeros(D)).tolist() == [0.0] * 5
 
 
 def test_em_finds_two_grounds_through_gaps() -> None:

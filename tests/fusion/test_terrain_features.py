@@ -10,7 +10,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, YAW_SLIP, Window, extract
+from terrafusion.fusion.terrain.features import (
+    FEATURES,
+    MIN_SPEED_MPS,
+    SLIP,
+    YAW_SLIP,
+    Window,
+    extract,
+    slip_without_prior,
+)
 
 Array = NDArray[np.float64]
 Z_MID, Z_HIGH = FEATURES.index("z_mid"), FEATURES.index("z_high")
@@ -157,3 +165,21 @@ def test_odd_numbers_never_pass(numbers: list[float], n: int) -> None:
     seen = np.isfinite(values)
     assert np.isfinite(variances[seen]).all()
     assert not np.isinf(values).any()
+
+
+@given(st.floats(-0.5, 0.9), st.floats(0.01, 0.3), st.floats(-0.1, 0.2), st.floats(0.01, 0.3))
+def test_the_prior_is_taken_out_of_the_slip(
+    measured: float, sigma: float, prior: float, prior_sigma: float
+) -> None:
+    information = sigma**-2 + prior_sigma**-2
+    estimate = (measured / sigma**2 + prior / prior_sigma**2) / information
+    got = slip_without_prior(estimate, information**-0.5, prior, prior_sigma)
+    if sigma > 3.2 * prior_sigma:
+        assert got is None
+    elif sigma < 3.1 * prior_sigma:
+        assert got == pytest.approx((measured, sigma), rel=1e-6, abs=1e-9)
+
+
+def test_an_estimate_that_is_its_prior_says_nothing() -> None:
+    assert slip_without_prior(0.01, 0.05, 0.01, 0.05) is None
+    assert slip_without_prior(0.2, 0.08, 0.01, 0.05) is None

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.linalg import expm
 
 from terrafusion.fusion.terrain.sequence import FLOOR, PatchFilter
 
@@ -40,17 +41,29 @@ def test_leaves_a_class_it_was_sure_of() -> None:
 def test_prediction_is_that_of_the_markov_chain(first_m: float, second_m: float) -> None:
     length, k = 25.0, 4
     patch = PatchFilter(k, length)
-    patch.probabilities = np.array([0.7, 0.2, 0.06, 0.04])
-    leave = 1.0 - np.exp(-first_m / length)
-    transition = np.full((k, k), leave / (k - 1)) + np.eye(k) * (1.0 - leave - leave / (k - 1))
-    expected = patch.probabilities @ transition
+    start = np.array([0.7, 0.2, 0.06, 0.04])
+    patch.probabilities = start.copy()
+    generator = (np.ones((k, k)) / (k - 1) - np.eye(k) * k / (k - 1)) / length
+    assert np.diag(generator) == pytest.approx(-1.0 / length)
+    expected = start @ expm(generator * first_m)
     assert patch.predict(first_m) == pytest.approx(expected, abs=k * FLOOR)
     before = patch.probabilities.copy()
     assert patch.predict(0.0) == pytest.approx(before, abs=k * FLOOR)
-    # Driving on without looking can only lose certainty about the likeliest class, down to 1 / k.
-    top = float(patch.probabilities.max())
-    if leave < 0.5:
-        assert patch.predict(min(second_m, 5.0)).max() <= top + 1e-12
+    # Two stretches are one of their length together; without looking, certainty can only be lost.
+    assert patch.predict(second_m) == pytest.approx(
+        start @ expm(generator * (first_m + second_m)), abs=2 * k * FLOOR
+    )
+    assert patch.probabilities.max() <= before.max() + k * FLOOR
+
+
+@given(st.floats(0.0, 500.0))
+def test_an_unequal_prior_is_where_it_rests(distance_m: float) -> None:
+    prior = np.array([0.9, 0.06, 0.04])
+    patch = PatchFilter(3, 25.0, prior)
+    assert patch.predict(distance_m) == pytest.approx(prior, abs=3 * FLOOR)
+    patch.update([-10.0, 0.0, -10.0])
+    assert patch.probabilities.argmax() == 1
+    assert patch.predict(1e4) == pytest.approx(prior, abs=3 * FLOOR)
 
 
 def test_no_evidence_changes_nothing() -> None:
