@@ -34,6 +34,7 @@ class EstimatorConfig:
         yaw_sigma_start_rad: heading uncertainty at which the graph is started.
         start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
         inputs: what the estimator will be given; without all six IMU axes the graph is planar.
+        calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
         labels: the ground over time, told in place of what the detector finds; None: it detects.
     """
 
@@ -52,6 +53,7 @@ class EstimatorConfig:
     yaw_sigma_start_rad: float = 0.12
     start_without_gnss_s: float = 30.0
     inputs: Inputs = field(default_factory=Inputs)
+    calibrate: bool = False
     labels: GroundLabels | None = None
 
     @property

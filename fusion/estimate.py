@@ -46,7 +46,7 @@ class State:
         angular_velocity_radps: (3,) in the body frame, bias removed.
         gyro_bias_radps, accel_bias_mps2: (3,) in the body frame.
         slip, slip_sigma: longitudinal slip 1 - v / (omega R) and its 1 sigma.
-        gnss_drift_m: (2,) slow error of the GNSS positions, east and north.
+        linear, linear_sigma: the states of `key_state.LINEAR` and their 1 sigma.
         covariance: (6, 6) of the pose, ROS order (translation then rotation, world axes).
         velocity_covariance: (3, 3), world.
         twist_covariance: (6, 6) of the body twist, linear then angular.
@@ -66,7 +66,8 @@ class State:
     accel_bias_mps2: Array
     slip: float
     slip_sigma: float
-    gnss_drift_m: Array
+    linear: Array
+    linear_sigma: Array
     covariance: Array
     velocity_covariance: Array
     twist_covariance: Array

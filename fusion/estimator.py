@@ -23,11 +23,19 @@ from terrafusion.datasets.recording import Fix
 from terrafusion.fusion import snapshot
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
+from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, wheel_increment
-from terrafusion.fusion.graph.key_state import DIM, POSE, SLIP, VELOCITY, KeyState, quaternion_of
-from terrafusion.fusion.graph.markov import markov_step
+from terrafusion.fusion.graph.key_state import (
+    POSE,
+    RADIUS,
+    SLIP,
+    VELOCITY,
+    KeyState,
+    linear_sigma,
+    quaternion_of,
+)
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.alignment import (
@@ -73,7 +81,7 @@ class Estimator:
         archive: Chain | None = None,
     ) -> None:
         self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
-        self.chain = Chain(archive)
+        self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
@@ -88,7 +96,7 @@ class Estimator:
         self._given: GivenStart | None = None
         self._level: Start | None = None
         self._state: State | None = None
-        self._covariance = np.zeros((DIM, DIM))
+        self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._silent = False
         self._rest = RestDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
@@ -233,13 +241,13 @@ class Estimator:
         rotation = gtsam.Rot3.RzRyRx(start.roll_rad, start.pitch_rad, start.yaw_rad)
         spec = self.config.rig.sensors.imu
         gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
-        row = self.weights.row
+        grade = float(rotation.matrix()[2, 0])
+        linear, sigma = slow_states.prior(self.weights.row, grade, self.gnss.drift_sigma_m)
         point = KeyState(
             gtsam.Pose3(rotation, start.position_m),
             rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
             gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
-            row.slip_at(float(rotation.matrix()[2, 0])),
-            np.zeros(2),
+            linear,
         )
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         from_fixes = not self.gnss.local and self._given is None
@@ -253,12 +261,11 @@ class Estimator:
             *[start.position_sigma_m] * 3,
             *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
         ]
-        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + [row.slip_sigma]
-        sigmas += [self.gnss.drift_sigma_m] * 2
+        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + sigma.tolist()
         self.chain.append(start.t_ns, point, gyro_radps=gyro_bias)
-        self.chain.set_prior(np.array(sigmas))
+        self.chain.set_prior(np.array(sigmas[: self.chain.dim]))
         if self.chain.archive is not None:
-            self.chain.archive.set_prior(np.array(sigmas))
+            self.chain.archive.set_prior(np.array(sigmas[: self.chain.dim]))
         self.chain.solve(SMOOTH_WINDOW)
         self._covariance = self.chain.covariance()
         self.weights.begin(start.t_ns)
@@ -280,7 +287,9 @@ class Estimator:
             segments = in_a_turn(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
+        gyro, accel = _mean_rates(segments)
         link = gtsam.NonlinearFactorGraph()
+        preintegrated = False
         if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
             link = bridge(k, before, wheels, dt)
             point = _carried(before, wheels, dt)
@@ -288,23 +297,23 @@ class Estimator:
             measured = self._preintegrator.integrate(
                 segments, before.bias, row.gyro_inflation, row.accel_inflation
             )
-            nav = measured.predict(gtsam.NavState(before.pose, before.velocity), before.bias)
-            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.slip, before.drift)
+            seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
+            nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
+            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
             link.add(_imu_factor(k, measured))
             if not self.config.inputs.planar:  # the planar link is no witness against the wheels
+                preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, dt, switch)
-        mean = row.slip_at(float(before.pose.rotation().matrix()[2, 0]))
-        drift, drift_s = self.gnss.drift_sigma_m, self.gnss.drift_time_s
-        markov = markov_step(
+        markov = slow_states.step(
             dt,
-            mean=[mean, 0.0, 0.0],
-            sigma=[row.slip_sigma, drift, drift],
-            time_s=[row.slip_time_s, drift_s, drift_s],
-            forget=[switch, 0.0, 0.0],
+            row,
+            float(before.pose.rotation().matrix()[2, 0]),
+            self.gnss.drift_sigma_m,
+            self.gnss.drift_time_s,
+            switch,
         )
-        gyro, accel = _mean_rates(segments)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
-        self.chain.append(t_ns, point, link, markov, wheels, gyro, accel)
+        self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
             self.chain.add(k, held_level(k), "X")
         self._zero_velocity(k, t_ns, before, link)
@@ -338,7 +347,12 @@ class Estimator:
         rig = self.config.rig
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         bias_z = float(before.bias.gyroscope()[2])
-        return wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row)
+        change = self.wheels.speed_change_mps(before_ns, t_ns)
+        increment = wheel_increment(
+            travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row, change
+        )
+        inputs = self.config.inputs
+        return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
         self,
@@ -353,11 +367,12 @@ class Estimator:
             return None
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
-        innovation = float(moved[0] - (1.0 - before.slip) * d[0])
+        scale = (1.0 - before.slip) * (1.0 + before.of(RADIUS))
+        innovation = float(moved[0] - scale * d[0])
         P, row = self._covariance, self.weights.row
         forward = before.pose.rotation().matrix()[:, 0]
         variance = (
-            wheels.sigma_m[0] ** 2
+            wheels.sigma[0] ** 2
             + d[0] ** 2 * (P[SLIP, SLIP] + row.slip_sigma**2 * (2.0 * dt / row.slip_time_s + switch))
             + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
             + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
@@ -394,7 +409,8 @@ class Estimator:
             gyro_bias_radps=np.asarray(key.bias.gyroscope()),
             accel_bias_mps2=np.asarray(key.bias.accelerometer()),
             slip=key.slip,
-            gnss_drift_m=key.drift,
+            linear=key.linear,
+            linear_sigma=linear_sigma(P),
             slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
@@ -434,6 +450,7 @@ def _carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyS
         moved = before.pose.rotation().matrix().T @ before.velocity * dt
         turn = 0.0
     else:
-        moved, turn = (1.0 - before.slip) * wheels.displacement_m, wheels.turn_rad
+        moved = (1.0 - before.slip) * (1.0 + before.of(RADIUS)) * wheels.displacement_m
+        turn = wheels.turn_rad
     pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), moved))
-    return KeyState(pose, before.velocity, before.bias, before.slip, before.drift)
+    return KeyState(pose, before.velocity, before.bias, before.linear)

@@ -47,7 +47,7 @@ class Propagator:
         self._measured: gtsam.PreintegratedCombinedMeasurements
 
     def carry(self, state: State, covariance: Array, imu: ImuStream, row: SensorNoise) -> State:
-        """The state at the newest IMU sample, with `covariance` (DIM, DIM) of the keyframe carried along.
+        """The state at the newest IMU sample, with `covariance` (dim, dim) of the keyframe carried along.
 
         Slip, terrain, status and biases stay those of the keyframe, the
         angular velocity is that of the newest sample. With no sample after the
@@ -87,7 +87,9 @@ class Propagator:
         measured = self._measured
         now = measured.predict(self._from, self._bias)
         R, velocity = now.attitude().matrix(), np.asarray(now.velocity())
-        F, G = transition(self._R, R, measured.deltaPij(), measured.deltaVij(), measured.deltaTij())
+        F, G = transition(
+            self._R, R, measured.deltaPij(), measured.deltaVij(), measured.deltaTij(), len(self._covariance)
+        )
         P = F @ self._covariance @ F.T
         P[NAV, NAV] += G @ measured.preintMeasCov() @ G.T
         return dataclasses.replace(
@@ -104,13 +106,15 @@ class Propagator:
         )
 
 
-def transition(R_i: Array, R_j: Array, dp_m: Array, dv_mps: Array, dt_s: float) -> tuple[Array, Array]:
-    """Derivatives of a keyframe's tangent at j by that at i (DIM, DIM) and by dR, dp, dv, biases (15, 15).
+def transition(
+    R_i: Array, R_j: Array, dp_m: Array, dv_mps: Array, dt_s: float, dim: int = DIM
+) -> tuple[Array, Array]:
+    """Derivatives of a keyframe's tangent at j by that at i (dim, dim) and by dR, dp, dv, biases (15, 15).
 
     `R_i`, `R_j` (3, 3) are body to world; `dp_m`, `dv_mps` (3,) preintegrated, in body axes of i.
     States beyond the biases stay as they are.
     """
-    F, G = np.eye(DIM), np.eye(15)
+    F, G = np.eye(dim), np.eye(15)
     back = R_j.T @ R_i
     F[0:3, 0:3] = F[3:6, 3:6] = G[3:6, 3:6] = back
     F[0:3, 12:15] = -dt_s * _EYE

@@ -22,7 +22,14 @@ from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, quaternion_of
+from terrafusion.fusion.graph.key_state import (
+    POSE,
+    SLIP,
+    VELOCITY,
+    KeyState,
+    linear_sigma,
+    quaternion_of,
+)
 from terrafusion.fusion.history import History
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.weights.policy import Policy, load_policy
@@ -144,7 +151,7 @@ def replay(
     inputs = inputs_of(recording, used)
     imu, wheels = _usable(recording, inputs)
     config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs, **(settings or {}))
-    archive = Chain() if batch else None
+    archive = Chain(calibrate=config.calibrate) if batch else None
     history = History()
     estimator = Estimator(
         config,
@@ -298,7 +305,7 @@ def _key_state(state: State) -> KeyState:
     x, y, z, w = state.quaternion
     pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
     bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
-    return KeyState(pose, state.velocity_mps, bias, state.slip, state.gnss_drift_m)
+    return KeyState(pose, state.velocity_mps, bias, state.linear)
 
 
 def _smoothed(live: State, chain: Chain, k: int, P: Array, gyro_sigma: float) -> State:
@@ -313,7 +320,8 @@ def _smoothed(live: State, chain: Chain, k: int, P: Array, gyro_sigma: float) ->
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
         slip=key.slip,
-        gnss_drift_m=key.drift,
+        linear=key.linear,
+        linear_sigma=linear_sigma(P),
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
         covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
         velocity_covariance=P[VELOCITY, VELOCITY].copy(),

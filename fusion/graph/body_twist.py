@@ -16,8 +16,8 @@ Array = NDArray[np.float64]
 _ROTATION, _GYRO_BIAS = slice(0, 3), slice(12, 15)
 
 
-def twist_jacobian(R: Array, velocity_mps: Array) -> Array:
-    """Derivative (6, 18) of the body twist by the tangent of a keyframe.
+def twist_jacobian(R: Array, velocity_mps: Array, dim: int = DIM) -> Array:
+    """Derivative (6, dim) of the body twist by the tangent of a keyframe.
 
     With R <- R exp(theta), v <- v + dv and b <- b + db, the linear velocity R' v becomes
     u + [u]x theta + R' dv to first order, where u = R' v, and the angular rate w - b loses db
@@ -28,7 +28,7 @@ def twist_jacobian(R: Array, velocity_mps: Array) -> Array:
         velocity_mps: (3,) of the body origin, world axes.
     """
     x, y, z = R.T @ velocity_mps
-    J = np.zeros((6, DIM))
+    J = np.zeros((6, dim))
     J[:3, _ROTATION] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
     J[:3, VELOCITY] = R.T
     J[3:, _GYRO_BIAS] = -np.eye(3)
@@ -42,12 +42,12 @@ def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: 
     both the pose and the world velocity. That is why the whole of `P` enters, not a block of it.
 
     Args:
-        P: (18, 18) of the keyframe's tangent.
+        P: (dim, dim) of the keyframe's tangent.
         R: (3, 3) body to world.
         velocity_mps: (3,) world.
         gyro_sigma_radps: white noise of the rate, as averaged over a keyframe's interval.
     """
-    J = twist_jacobian(R, velocity_mps)
+    J = twist_jacobian(R, velocity_mps, len(P))
     Q = J @ P @ J.T
     Q[range(3, 6), range(3, 6)] += gyro_sigma_radps**2
     return np.asarray(0.5 * (Q + Q.T))

@@ -9,15 +9,16 @@ keyframes are dropped, what they say stays as a prior: exact marginalisation)
 and, with nothing dropped, the batch Gauss-Newton smoother.
 
 Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world
-(m/s), B(k) IMU bias (accelerometer, gyro), then slip and the drift of GNSS
-(east, north; m); a tangent of 18 numbers in this order. Pose, velocity and bias
-are GTSAM variables; slip and drift are linear and live in the chain alone.
+(m/s), B(k) IMU bias (accelerometer, gyro), then the linear states of
+`key_state.LINEAR`; the tangent has this order. Pose, velocity and bias are GTSAM
+variables; the linear states live in the chain alone.
 """
 
 from __future__ import annotations
 
 import bisect
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import gtsam
 import numpy as np
@@ -27,7 +28,16 @@ from scipy.linalg import lapack
 
 from terrafusion.fusion.graph import gnss_factor
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import BIAS, DIM, DRIFT, MARKOV, NAV, POSE, SLIP, VELOCITY, KeyState
+from terrafusion.fusion.graph.key_state import (
+    BIAS,
+    IMU_ROTATION,
+    NAV,
+    POSE,
+    VELOCITY,
+    KeyState,
+    dim_of,
+    skew,
+)
 from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.triangular import back_substitute, triangular
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
@@ -41,7 +51,9 @@ _ZERO = np.zeros(3)
 class Node:
     """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.
 
-    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before.
+    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before; `preintegrated`
+    tells that `link` is one `CombinedImuFactor` made of them. `prior` (m, dim + 1) are whitened rows of all
+    that went before, `delta` (dim,) leads from `point` to the estimate.
     """
 
     point: KeyState
@@ -51,12 +63,13 @@ class Node:
     wheels: WheelIncrement | None
     gyro_radps: Array
     accel_mps2: Array
+    preintegrated: bool
+    prior: Array
+    delta: Array
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     unary_keys: set[str] = field(default_factory=set)
     fixes: list[GnssPosition] = field(default_factory=list)
-    prior: Array = field(default_factory=lambda: np.zeros((0, DIM + 1)))
     conditional: Array | None = None
-    delta: Array = field(default_factory=lambda: np.zeros(DIM))
 
 
 _SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
@@ -69,23 +82,25 @@ class Chain:
     unary factors may be added to any keyframe still held. `solve` brings the
     newest keyframe up to date, `smooth` the newest few, `optimise` all.
     `archive` is a second chain that is given the same factors and keeps them
-    all, for a batch solution afterwards.
+    all, for a batch solution afterwards. Only with `calibrate` are the last linear
+    states, those of a calibration, estimated; without, tangents end before them.
     """
 
-    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3 + [np.inf] * 3)
+    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3)
     """Change of a state (rad, m, m/s, m/s2, rad/s, -) beyond which its factors are linearised again.
 
-    Position, slip and drift enter the factors linearly, so they never ask for it."""
+    Position and the linear states enter the factors linearly (nearly), so they never ask for it."""
 
-    def __init__(self, archive: Chain | None = None) -> None:
+    def __init__(self, archive: Chain | None = None, calibrate: bool = False) -> None:
         self.archive = archive
+        self.dim = dim_of(calibrate)
         self.first = 0
         self.nodes: list[Node] = []
         self.values = gtsam.Values()
         self._dirty = 0
         self._error = 0.0
         self._anchor: tuple[int, KeyState, Array] | None = None
-        self._root = np.zeros((DIM, DIM + 1))
+        self._root = np.zeros((self.dim, self.dim + 1))
 
     @property
     def last(self) -> int:
@@ -101,18 +116,21 @@ class Chain:
         wheels: WheelIncrement | None = None,
         gyro_radps: Array = _ZERO,
         accel_mps2: Array = _ZERO,
+        preintegrated: bool = False,
     ) -> int:
         """Add a keyframe with its initial state and its factors to the one before; gives its index.
 
-        `link` must touch X, V and B of both keyframes; `markov` links slip and drift.
+        `link` must touch X, V and B of both keyframes; `markov` links the linear states.
         """
         link = link if link is not None else gtsam.NonlinearFactorGraph()
-        self.nodes.append(Node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2))
+        self.nodes.append(
+            self._node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
+        )
         self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
         if self.archive is not None:
-            self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2)
+            self.archive.append(t_ns, point, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
         return self.last
 
     def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
@@ -152,22 +170,22 @@ class Chain:
         return node.point.retract(node.delta)
 
     def covariance(self) -> Array:
-        """Marginal covariance (18, 18) of the newest keyframe."""
-        inverse, info = lapack.dtrtri(self._root[:, :DIM])
+        """Marginal covariance (dim, dim) of the newest keyframe."""
+        inverse, info = lapack.dtrtri(self._root[:, : self.dim])
         if info:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
         return np.asarray(inverse @ inverse.T)
 
     def covariances(self) -> Array:
-        """Marginal covariances (n, 18, 18) of all keyframes, by the backward recursion of the chain."""
-        out = np.zeros((len(self.nodes), DIM, DIM))
+        """Marginal covariances (n, dim, dim) of all keyframes, by the backward recursion of the chain."""
+        out = np.zeros((len(self.nodes), self.dim, self.dim))
         out[-1] = self.covariance()
         for i in range(len(self.nodes) - 2, -1, -1):
             out[i] = _covariance_before(self.nodes[i], out[i + 1])
         return out
 
     def covariance_at(self, k: int) -> Array:
-        """Marginal covariance (18, 18) of keyframe k, as of the last `solve` or `smooth`."""
+        """Marginal covariance (dim, dim) of keyframe k, as of the last `solve` or `smooth`."""
         covariance = self.covariance()
         for node in self.nodes[-2 : k - self.last - 2 : -1]:
             covariance = _covariance_before(node, covariance)
@@ -181,7 +199,7 @@ class Chain:
         motion that nobody believes in.
         """
         self._eliminate_all()
-        if (np.abs(self.nodes[-1].delta) > self.RELINEARISE).any():
+        if (np.abs(self.nodes[-1].delta[NAV]) > self.RELINEARISE).any():
             self.smooth(window)
 
     def smooth(self, window: int, iterations: int = 4) -> None:
@@ -194,7 +212,7 @@ class Chain:
         for _ in range(iterations):
             self._eliminate_all()
             self._back_substitute_to(begin)
-            deltas = np.abs([node.delta for node in self.nodes[begin - self.first :]])
+            deltas = np.abs([node.delta[NAV] for node in self.nodes[begin - self.first :]])
             if not (deltas > self.RELINEARISE).any():
                 return
             self._back_substitute_to(self.first)
@@ -211,9 +229,9 @@ class Chain:
         self._dirty = self.last
         node = self.nodes[-1]
         own = np.vstack([node.prior, self._unary_rows(self.last)])
-        self._error += float(own[len(node.prior) :, DIM] @ own[len(node.prior) :, DIM])
+        self._error += float(own[len(node.prior) :, self.dim] @ own[len(node.prior) :, self.dim])
         self._root = triangular(own)
-        node.delta = back_substitute(self._root[:, :DIM], self._root[:, DIM])
+        node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
 
     def optimise(self, iterations: int = 30, tolerance: float = 1e-6) -> int:
         """Gauss-Newton with step halving over all keyframes (batch); gives the iterations taken."""
@@ -261,7 +279,7 @@ class Chain:
 
     def restart(self, extra_variance: Array, k: int | None = None) -> None:
         """Drop all before keyframe k (by default the newest); its marginal stays as prior, less sure by
-        `extra_variance` (18,). The marginal is that of keyframe k and all before it.
+        `extra_variance` (dim,). The marginal is that of keyframe k and all before it.
 
         For an estimate that has proved wrong: what comes next may move it
         freely, and does not bend the past to reach it.
@@ -270,15 +288,13 @@ class Chain:
         k = self.last if k is None else k
         node = self.nodes[k - self.first]
         known = self._root if k == self.last else triangular(np.vstack([node.prior, self._unary_rows(k)]))
-        inverse, _ = lapack.dtrtri(known[:, :DIM])
-        mean = inverse @ known[:, DIM]
+        inverse, _ = lapack.dtrtri(known[:, : self.dim])
+        mean = inverse @ known[:, self.dim]
         root = np.linalg.inv(np.linalg.cholesky(inverse @ inverse.T + np.diag(extra_variance)))
         # Keyframes that follow keep their linearisation, so keyframe k must keep its own, too.
-        shift = mean if k == self.last else np.zeros(DIM)
-        fresh = Node(
-            node.point.retract(shift), node.t_ns, gtsam.NonlinearFactorGraph(), None, None,
-            node.gyro_radps, node.accel_mps2,
-        )  # fmt: skip
+        shift = mean if k == self.last else np.zeros(self.dim)
+        point, empty = node.point.retract(shift), gtsam.NonlinearFactorGraph()
+        fresh = self._node(point, node.t_ns, empty, None, None, node.gyro_radps, node.accel_mps2, False)
         fresh.prior = np.hstack([root, (root @ (mean - shift))[:, None]])
         self.nodes, self.first, self._dirty = [fresh, *self.nodes[k - self.first + 1 :]], k, k
         self._anchor, self.values = None, gtsam.Values()
@@ -318,15 +334,18 @@ class Chain:
     def move_to(self, k: int, point: KeyState) -> None:
         """Linearise keyframe k about another state."""
         node = self.nodes[k - self.first]
-        node.point, node.delta = point, np.zeros(DIM)
+        node.point, node.delta = point, np.zeros(self.dim)
         self._publish(k)
         self._dirty = min(self._dirty, max(k - 1, self.first))
 
     def set_prior(self, sigmas: Array) -> None:
-        """Prior of the first keyframe at its initial state, independent 1 sigmas (18,)."""
+        """Prior of the first keyframe at its initial state, independent 1 sigmas (dim,)."""
         self._anchor = None
-        self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((DIM, 1))])
+        self.nodes[0].prior = np.hstack([np.diag(1.0 / np.asarray(sigmas)), np.zeros((self.dim, 1))])
         self._dirty = self.first
+
+    def _node(self, *parts: Any) -> Node:
+        return Node(*parts, prior=np.zeros((0, self.dim + 1)), delta=np.zeros(self.dim))
 
     def _insert(self, k: int, point: KeyState) -> None:
         self.values.insert(X(k), point.pose)
@@ -346,12 +365,12 @@ class Chain:
             if self._anchor is None or self._anchor[0] != k:
                 self._anchor = (k, node.point, node.prior)
             _, made_at, rows = self._anchor
-            offset = made_at.local(node.point.retract(node.delta))
+            offset = made_at.local(node.point.retract(node.delta))[: self.dim]
             node.prior = rows.copy()
-            node.prior[:, DIM] -= rows[:, :DIM] @ offset
+            node.prior[:, self.dim] -= rows[:, : self.dim] @ offset
             node.prior[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
         node.point = node.point.retract(node.delta)
-        node.delta = np.zeros(DIM)
+        node.delta = np.zeros(self.dim)
         self._publish(k)
 
     def _publish(self, k: int) -> None:
@@ -361,15 +380,16 @@ class Chain:
         self.values.update(B(k), node.point.bias)
 
     def _unary_rows(self, k: int) -> Array:
-        """Whitened rows over keyframe k alone, shape (m, 19)."""
+        """Whitened rows over keyframe k alone, shape (m, dim + 1)."""
         node = self.nodes[k - self.first]
         blocks = [self._gtsam_rows(k)] if node.unary_keys else []
         for fix in node.fixes:
-            rows = np.zeros((3, DIM + 1))
-            rows[:, POSE], rows[:, DRIFT] = gnss_factor.jacobians(fix, node.point.pose)
-            rows[:, DIM] = -gnss_factor.residual(fix, node.point.pose, node.point.drift)
+            rows = np.zeros((3, self.dim + 1))
+            H_pose, H_linear = gnss_factor.jacobians(fix, node.point.pose, node.point.linear)
+            rows[:, POSE], rows[:, 15 : self.dim] = H_pose, H_linear[:, : self.dim - 15]
+            rows[:, self.dim] = -gnss_factor.residual(fix, node.point.pose, node.point.linear)
             blocks.append(rows / fix.sigma_m[:, None])
-        return np.vstack(blocks) if blocks else np.zeros((0, DIM + 1))
+        return np.vstack(blocks) if blocks else np.zeros((0, self.dim + 1))
 
     def _gtsam_rows(self, k: int) -> Array:
         node = self.nodes[k - self.first]
@@ -378,43 +398,52 @@ class Chain:
         for name in present:
             ordering.push_back(_SYMBOLS[name][0](k))
         packed = node.unary.linearize(self.values).augmentedJacobian(ordering)
-        rows = np.zeros((len(packed), DIM + 1))
+        rows = np.zeros((len(packed), self.dim + 1))
         column = 0
         for name in present:
             place = _SYMBOLS[name][1]
             width = place.stop - place.start
             rows[:, place] = packed[:, column : column + width]
             column += width
-        rows[:, DIM] = packed[:, -1]
+        rows[:, self.dim] = packed[:, -1]
         return rows
 
     def _link_rows(self, k: int) -> Array:
-        """Whitened rows over keyframes k - 1 and k, shape (m, 37)."""
+        """Whitened rows over keyframes k - 1 and k, shape (m, 2 dim + 1)."""
         node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
         ordering = gtsam.Ordering()
         for i in (k - 1, k):
             for symbol in (X, V, B):
                 ordering.push_back(symbol(i))
         packed = node.link.linearize(self.values).augmentedJacobian(ordering)
-        n = len(packed)
-        rows = np.zeros((n + 6, 2 * DIM + 1))
+        n, linear = len(packed), self.dim - 15
+        rows = np.zeros((n + linear + 4, 2 * self.dim + 1))
         rows[:n, NAV] = packed[:, :15]
-        rows[:n, DIM : DIM + 15] = packed[:, 15:30]
-        rows[:n, 2 * DIM] = packed[:, 30]
+        rows[:n, self.dim : self.dim + 15] = packed[:, 15:30]
+        rows[:n, 2 * self.dim] = packed[:, 30]
+        if node.preintegrated and self.dim > IMU_ROTATION.start:
+            # The bias walk enters with opposite signs at both ends: their sum is what preintegration does
+            # with a bias, and a small rotation d of the IMU acts as the bias -d x measured.
+            by_bias = packed[:, 9:15] + packed[:, 24:30]
+            turn = by_bias[:, :3] @ skew(node.accel_mps2) + by_bias[:, 3:] @ skew(node.gyro_radps)
+            rows[:n, IMU_ROTATION] = turn
+            rows[:n, 2 * self.dim] -= turn @ before.point.of(IMU_ROTATION)
         if node.markov is not None:
             step = node.markov
-            own = rows[n : n + 3]
-            own[:, MARKOV] = -np.diag(step.decay)
-            own[:, DIM + 15 : DIM + 18] = np.eye(3)
-            own[:, 2 * DIM] = -step.residual(before.point.markov(), node.point.markov())
-            own /= step.sigma[:, None]
+            own = rows[n : n + linear]
+            places = np.arange(linear)
+            own[places, 15 + places] = -step.decay[:linear]
+            own[places, self.dim + 15 + places] = 1.0
+            own[:, 2 * self.dim] = -step.residual(before.point.linear, node.point.linear)[:linear]
+            own /= step.sigma[:linear, None]
         if node.wheels is not None:
-            d, sigma = node.wheels.displacement_m, node.wheels.sigma_m[:, None]
-            H_i, H_j, H_slip = jacobians(before.point.pose, node.point.pose, d)
-            wheel = rows[n + 3 :]
-            wheel[:, 0:6], wheel[:, DIM : DIM + 6], wheel[:, DIM + SLIP] = H_i, H_j, H_slip[:, 0]
-            wheel[:, 2 * DIM] = -residual(before.point.pose, node.point.pose, node.point.slip, d)
-            wheel /= sigma
+            poses = before.point.pose, node.point.pose
+            H_i, H_j, H_linear = jacobians(*poses, node.point.linear, node.wheels)
+            wheel = rows[n + linear :]
+            wheel[:, 0:6], wheel[:, self.dim : self.dim + 6] = H_i, H_j
+            wheel[:, self.dim + 15 : 2 * self.dim] = H_linear[:, :linear]
+            wheel[:, 2 * self.dim] = -residual(*poses, node.point.linear, node.wheels)
+            wheel /= node.wheels.sigma[:, None]
         return rows
 
     def _eliminate(self, k: int) -> None:
@@ -422,26 +451,29 @@ class Chain:
         own = np.vstack([node.prior, self._unary_rows(k)])
         link = self._link_rows(k + 1)
         fresh = 0 if k == self.first else len(node.prior)
-        self._error += float(own[fresh:, DIM] @ own[fresh:, DIM] + link[:, 2 * DIM] @ link[:, 2 * DIM])
-        stacked = np.zeros((len(own) + len(link), 2 * DIM + 1))
-        stacked[: len(own), :DIM] = own[:, :DIM]
-        stacked[: len(own), 2 * DIM] = own[:, DIM]
+        self._error += float(
+            own[fresh:, self.dim] @ own[fresh:, self.dim] + link[:, 2 * self.dim] @ link[:, 2 * self.dim]
+        )
+        stacked = np.zeros((len(own) + len(link), 2 * self.dim + 1))
+        stacked[: len(own), : self.dim] = own[:, : self.dim]
+        stacked[: len(own), 2 * self.dim] = own[:, self.dim]
         stacked[len(own) :] = link
         R = triangular(stacked)
-        node.conditional = R[:DIM]
-        self.nodes[k + 1 - self.first].prior = R[DIM : 2 * DIM, DIM:]
+        node.conditional = R[: self.dim]
+        self.nodes[k + 1 - self.first].prior = R[self.dim : 2 * self.dim, self.dim :]
 
     def _back_substitute_to(self, begin: int) -> None:
         following = self.nodes[-1].delta
         for node in self.nodes[-2 : begin - self.last - 2 : -1]:
             assert node.conditional is not None
-            rhs = node.conditional[:, 2 * DIM] - node.conditional[:, DIM : 2 * DIM] @ following
-            node.delta = following = back_substitute(node.conditional[:, :DIM], rhs)
+            rhs = node.conditional[:, 2 * self.dim] - node.conditional[:, self.dim : 2 * self.dim] @ following
+            node.delta = following = back_substitute(node.conditional[:, : self.dim], rhs)
 
 
 def _covariance_before(node: Node, following: Array) -> Array:
-    """Marginal covariance (18, 18) of a keyframe from that of the one after it."""
+    """Marginal covariance (dim, dim) of a keyframe from that of the one after it."""
     assert node.conditional is not None
-    inverse, _ = lapack.dtrtri(node.conditional[:, :DIM])
-    gain = inverse @ node.conditional[:, DIM : 2 * DIM]
+    dim = len(node.conditional)
+    inverse, _ = lapack.dtrtri(node.conditional[:, :dim])
+    gain = inverse @ node.conditional[:, dim : 2 * dim]
     return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)

@@ -21,6 +21,9 @@ REST_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
 """Motion of a robot at rest between two keyframes: rotation (rad), then translation (m)."""
 UP_SIDE_RATIO = 0.05
 """Vertical over forward displacement in the body frame (1 sigma): wheels follow the ground."""
+YAW_SIGMA_RADPS, YAW_SIGMA_SHARE = 0.05, 0.1
+"""Yaw rate of skid-steered wheels: 1 sigma at standstill, and share of the rate. Wide on purpose: the rows
+tell the yaw scale; they must not correct a gyro's bias, as their error repeats itself for seconds."""
 FLOOR_M = 2e-3
 """Least sigma of a wheel displacement across the rolling direction, m a keyframe."""
 
@@ -32,8 +35,9 @@ def wheel_increment(
     track_m: float,
     quantum_m: float,
     noise: SensorNoise,
+    speed_change_mps: float = 0.0,
 ) -> WheelIncrement:
-    """Displacement of the body origin as the wheels and the gyro tell it.
+    """Displacement of the body origin and turn as the wheels and the gyro tell them.
 
     The travelled distance is spread evenly over the interval and turned by the
     yaw integrated from the gyro (bias removed), exactly for constant rates.
@@ -52,9 +56,10 @@ def wheel_increment(
     forward = math.hypot(noise.wheel_sigma_mps * total, quantum_m)
     across = noise.side_slip_sigma * abs(distance) + FLOOR_M
     up = UP_SIDE_RATIO * abs(distance) + FLOOR_M
-    return WheelIncrement(
-        np.array([x, y, 0.0]), np.array([forward, across, up]), distance, (right - left) / track_m
-    )
+    turn = (right - left) / track_m
+    turn_sigma = YAW_SIGMA_RADPS * total + YAW_SIGMA_SHARE * abs(turn) + quantum_m / track_m
+    sigma = np.array([forward, across, up, turn_sigma])
+    return WheelIncrement(np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps)
 
 
 def at_rest(k: int) -> gtsam.NonlinearFactor:

@@ -2,31 +2,39 @@
 
 Residual (3,), world frame, metres::
 
-    r = p + R lever + share (drift, 0) - fix
+    r = p + R (lever + antenna) - delay v + share (drift, 0) - fix
 
 A receiver repeats its error for tens of seconds (atmosphere, multipath). Were
 its fixes taken for independent, their average would turn the heading and the
 gyro bias after it; as a Gauss-Markov state the drift takes the blame instead
 (Schmidt-Kalman tradition; Groves 2013, Principles of GNSS, ch. 14.2.6). The drift is that of a fix of
 the receiver's data sheet; one of a far better class has a small `share` of it.
+`antenna` is what the vehicle file's lever arm lacks, `delay` how late the stamps of
+the receiver are while the antenna moves with v; both are states.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.graph.key_state import ANTENNA, DRIFT, GNSS_DELAY, MARKOV, NAV, skew
+
 Array = NDArray[np.float64]
+
+_DRIFT, _ANTENNA = (slice(s.start - NAV.stop, s.stop - NAV.stop) for s in (DRIFT, ANTENNA))
+_DELAY = GNSS_DELAY - NAV.stop
 
 
 @dataclass(frozen=True, eq=False)
 class GnssPosition:
     """A fix at a keyframe: antenna `enu_m`, `lever_m` in the body frame, white 1 `sigma_m`, each (3,).
 
+    `velocity_mps` (3,) of the antenna in the world, `drift_share` of the receiver's drift in this fix;
     `weight` is what a robust loss leaves of its horizontal part; `sigma_m` holds it already.
     """
 
@@ -34,35 +42,35 @@ class GnssPosition:
     lever_m: Array
     sigma_m: Array
     drift_share: float = 1.0
+    velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
     weight: float = 1.0
 
 
-def residual(fix: GnssPosition, pose: Any, drift_m: Array) -> Array:
-    """The residual of the module's docstring, unwhitened."""
-    antenna = pose.translation() + pose.rotation().matrix() @ fix.lever_m
-    return np.asarray(antenna + np.append(fix.drift_share * drift_m, 0.0) - fix.enu_m)
+def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:
+    """The residual of the module's docstring, unwhitened; `linear` (14,) of the keyframe."""
+    lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
+    antenna = pose.translation() + pose.rotation().matrix() @ lever - linear[_DELAY] * fix.velocity_mps
+    return np.asarray(antenna + np.append(fix.drift_share * linear[_DRIFT], 0.0) - fix.enu_m)
 
 
-def jacobians(fix: GnssPosition, pose: Any) -> tuple[Array, Array]:
-    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the drift (3, 2)."""
+def jacobians(fix: GnssPosition, pose: Any, linear: Array) -> tuple[Array, Array]:
+    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 14)."""
     R = pose.rotation().matrix()
-    return antenna_jacobian(R, fix.lever_m), fix.drift_share * np.eye(3)[:, :2]
+    lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
+    H = np.zeros((3, MARKOV.stop - MARKOV.start))
+    H[0, _DRIFT.start] = H[1, _DRIFT.start + 1] = fix.drift_share
+    H[:, _ANTENNA] = R[:, :2]
+    H[:, _DELAY] = -fix.velocity_mps
+    return np.hstack([-R @ skew(lever), R]), H
 
 
-def antenna_jacobian(R: Array, lever: Array) -> Array:
-    """Derivative (3, 6) of the antenna position in the world by the pose (GTSAM tangent)."""
-    x, y, z = lever
-    return np.hstack([-R @ np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]), R])
-
-
-def as_gtsam_factor(fix: GnssPosition, pose_key: int, markov_key: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `markov_key` is the vector (slip, drift e, drift n)."""
+def as_gtsam_factor(fix: GnssPosition, pose_key: int, linear_key: int) -> gtsam.CustomFactor:
+    """The same factor for GTSAM's own optimisers; `linear_key` is the vector of the linear states."""
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        pose = values.atPose3(pose_key)
+        pose, linear = values.atPose3(pose_key), values.atVector(linear_key)
         if H is not None:
-            H[0], H_drift = jacobians(fix, pose)
-            H[1] = np.hstack([np.zeros((3, 1)), H_drift])
-        return residual(fix, pose, values.atVector(markov_key)[1:])
+            H[0], H[1] = jacobians(fix, pose, linear)
+        return residual(fix, pose, linear)
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(fix.sigma_m), [pose_key, markov_key], error)
+    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(fix.sigma_m), [pose_key, linear_key], error)

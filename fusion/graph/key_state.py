@@ -10,28 +10,75 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-DIM = 18
-POSE, VELOCITY, BIAS, SLIP, DRIFT = slice(0, 6), slice(6, 9), slice(9, 15), 15, slice(16, 18)
-NAV, MARKOV = slice(0, 15), slice(15, 18)
-"""The states that GTSAM holds, and the Gauss-Markov states."""
+LINEAR = (
+    "slip",
+    "gnss_drift_e_m",
+    "gnss_drift_n_m",
+    "yaw_scale",
+    "icr_x_m",
+    "side_slip",
+    "radius_scale",
+    "antenna_x_m",
+    "antenna_y_m",
+    "imu_roll_rad",
+    "imu_pitch_rad",
+    "imu_yaw_rad",
+    "wheel_delay_s",
+    "gnss_delay_s",
+)
+"""States that live in a vector space, in the order of the tangent:
+
+- slip: 1 - v / (omega R), one for the robot; wanders about the ground's mean.
+- gnss_drift: slow error of the receiver's positions, east and north.
+- yaw_scale: true over wheel yaw rate, less one; negative where skid steering widens the effective track.
+- icr_x: place of the centre of rotation ahead of the body origin; v_lateral = -icr_x yaw_rate.
+- side_slip: lateral over forward speed, what the ground's slope and ruts do.
+- radius_scale: true over nominal wheel radius, less one.
+- antenna: place of the GNSS antenna beyond the vehicle file's.
+- imu: small rotation that brings the IMU's axes onto the body's, beyond the vehicle file's.
+- wheel_delay, gnss_delay: how much later than the IMU's the stamps of a sensor are.
+"""
+CALIBRATION = LINEAR[LINEAR.index("radius_scale") :]
+"""The states that stay as they are: what a calibration of the robot would tell."""
+
+DIM = 15 + len(LINEAR)
+"""Length of the whole tangent; without calibration it ends before `CALIBRATION`."""
+POSE, VELOCITY, BIAS = slice(0, 6), slice(6, 9), slice(9, 15)
+NAV, MARKOV = slice(0, 15), slice(15, DIM)
+"""The states that GTSAM holds, and the linear ones."""
+SLIP, DRIFT, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS = 15, slice(16, 18), 18, 19, 20, 21
+ANTENNA, IMU_ROTATION, WHEEL_DELAY, GNSS_DELAY = slice(22, 24), slice(24, 27), 27, 28
 
 
 @dataclass(frozen=True, eq=False)
 class KeyState:
-    """State of one keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `slip`, `drift` (2,) m."""
+    """State of a keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `linear` (14,) as `LINEAR`."""
 
     pose: gtsam.Pose3
     velocity: Array
     bias: gtsam.imuBias.ConstantBias
-    slip: float
-    drift: Array
+    linear: Array
 
-    def markov(self) -> Array:
-        """Slip and drift (3,)."""
-        return np.array([self.slip, self.drift[0], self.drift[1]])
+    def of(self, place: int | slice) -> Array:
+        """Linear states by their place in the tangent, such as `DRIFT`."""
+        if isinstance(place, slice):
+            return self.linear[place.start - NAV.stop : place.stop - NAV.stop]
+        return self.linear[place - NAV.stop]  # type: ignore[no-any-return]
+
+    @property
+    def slip(self) -> float:
+        """Longitudinal slip."""
+        return float(self.linear[0])
+
+    @property
+    def drift(self) -> Array:
+        """Drift of the GNSS position (2,), m."""
+        return self.of(DRIFT)
 
     def retract(self, delta: Array) -> KeyState:
-        """The state moved by a tangent vector (18,)."""
+        """The state moved by a tangent vector (DIM,) or (DIM - len(CALIBRATION),)."""
+        linear = self.linear.copy()
+        linear[: len(delta) - NAV.stop] += delta[NAV.stop :]
         bias = gtsam.imuBias.ConstantBias(
             self.bias.accelerometer() + delta[9:12], self.bias.gyroscope() + delta[12:15]
         )
@@ -39,20 +86,46 @@ class KeyState:
             self.pose.retract(delta[POSE]),
             self.velocity + delta[VELOCITY],
             bias,
-            self.slip + float(delta[SLIP]),
-            self.drift + delta[DRIFT],
+            linear,
         )
 
     def local(self, other: KeyState) -> Array:
-        """The tangent vector (18,) that leads from this state to `other`."""
+        """The tangent vector (DIM,) that leads from this state to `other`."""
         return np.concatenate(
             [
                 self.pose.localCoordinates(other.pose),
                 other.velocity - self.velocity,
                 other.bias.vector() - self.bias.vector(),
-                other.markov() - self.markov(),
+                other.linear - self.linear,
             ]
         )
+
+    def bias_seen(self, gyro_radps: Array, accel_mps2: Array) -> gtsam.imuBias.ConstantBias:
+        """The bias that stands for bias and mounting: a small rotation d adds d x measured to a reading."""
+        turn = self.of(IMU_ROTATION)
+        return gtsam.imuBias.ConstantBias(
+            self.bias.accelerometer() - np.cross(turn, accel_mps2),
+            self.bias.gyroscope() - np.cross(turn, gyro_radps),
+        )
+
+
+def linear_sigma(P: Array) -> Array:
+    """1 sigma (14,) of the linear states from a covariance (dim, dim); NaN where they are not estimated."""
+    out = np.full(len(LINEAR), np.nan)
+    estimated = np.diag(P)[NAV.stop :]
+    out[: len(estimated)] = np.sqrt(estimated)
+    return out
+
+
+def dim_of(calibrate: bool) -> int:
+    """Length of the tangent, with or without the states of a calibration."""
+    return DIM if calibrate else DIM - len(CALIBRATION)
+
+
+def skew(v: Array) -> Array:
+    """The matrix (3, 3) with skew(v) @ u = v x u."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def quaternion_of(pose: gtsam.Pose3) -> Array:

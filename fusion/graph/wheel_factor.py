@@ -1,18 +1,23 @@
-"""The wheel factor: displacement between two keyframes with a slip scale.
+"""The wheel factor: displacement and turn between two keyframes, as slipping wheels tell them.
 
-Residual (3,), in the body frame of keyframe i, metres::
+Residual (4,): three in the body frame of keyframe i, metres, and the turn, radians::
 
-    r = R_i' (p_j - p_i) - (1 - slip_j) d
+    r[:3] = R_i' (p_j - p_i) - (1 - slip) (1 + radius) (d + delay dv e_x) - lateral e_y
+    r[3]  = yaw(R_i' R_j) - (1 + yaw_scale) turn
+    lateral = side_slip distance - icr_x yaw
 
 `d` is what the wheels say: their travelled distance turned by the gyro while
-it was travelled. Its first row is odometry with slip, its second and third
-are the non-holonomic constraint with a sigma for side-slip (Dissanayake et
-al. 2001, IEEE T-RA 17(5), for the constraint; the slip scale follows the
-usual definition v = (1 - slip) omega R, Wong 2008, Theory of Ground Vehicles).
+it was travelled; `dv` is how much their speed changed meanwhile, which tells a
+delay of their clock. The first row is odometry with slip, the second and third
+are the non-holonomic constraint (Dissanayake et al. 2001, IEEE T-RA 17(5)), freed
+of what a skid-steered robot does in every turn (instantaneous centres of rotation:
+Martinez et al. 2005, IJRR 24(10); Pentzer, Brennan, Reichard 2014, J. Field Robotics
+31(3)). Slip is v = (1 - slip) omega R (Wong 2008, Theory of Ground Vehicles).
 """
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +25,20 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.graph.key_state import (
+    ICR_X,
+    MARKOV,
+    NAV,
+    RADIUS,
+    SIDE_SLIP,
+    SLIP,
+    WHEEL_DELAY,
+    YAW_SCALE,
+)
+
 Array = NDArray[np.float64]
+
+_S, _K, _I, _B, _R, _T = (i - NAV.stop for i in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY))
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,49 +47,77 @@ class WheelIncrement:
 
     Attributes:
         displacement_m: (3,) in the body frame of the first keyframe, slip not removed.
-        sigma_m: (3,) 1 sigma along body x, y, z.
+        sigma: (4,) 1 sigma along body x, y, z (m) and of the turn (rad; infinite where it is not measured).
         distance_m: mean travelled wheel distance, signed.
         turn_rad: right minus left distance over the track, signed.
+        yaw_rad: turn by the gyro, bias removed.
+        speed_change_mps: wheel speed at the end less that at the start.
     """
 
     displacement_m: Array
-    sigma_m: Array
+    sigma: Array
     distance_m: float
     turn_rad: float
+    yaw_rad: float = 0.0
+    speed_change_mps: float = 0.0
+
+    def without_turn(self) -> WheelIncrement:
+        """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
+        return dataclasses.replace(self, sigma=np.append(self.sigma[:3], np.inf))
 
 
-def residual(pose_i: Any, pose_j: Any, slip: float, displacement_m: Array) -> Array:
-    """The residual (3,) of the module's docstring, unwhitened."""
-    moved = pose_i.rotation().matrix().T @ (pose_j.translation() - pose_i.translation())
-    return np.asarray(moved - (1.0 - slip) * displacement_m)
+def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:
+    """The residual (4,) of the module's docstring, unwhitened; `linear` (14,) of keyframe j."""
+    R = pose_i.rotation().matrix()
+    out = np.empty(4)
+    out[:3] = R.T @ (pose_j.translation() - pose_i.translation())
+    rolled = wheels.displacement_m.copy()
+    rolled[0] += linear[_T] * wheels.speed_change_mps
+    out[:3] -= (1.0 - linear[_S]) * (1.0 + linear[_R]) * rolled
+    out[1] -= linear[_B] * wheels.distance_m - linear[_I] * wheels.yaw_rad
+    turned = R.T @ pose_j.rotation().matrix()
+    out[3] = np.arctan2(turned[1, 0], turned[0, 0]) - (1.0 + linear[_K]) * wheels.turn_rad
+    return out
 
 
-def jacobians(pose_i: Any, pose_j: Any, displacement_m: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of `residual` by pose i (3, 6), pose j (3, 6) and slip (3, 1).
+def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> tuple[Array, Array, Array]:
+    """Derivatives of `residual` by pose i (4, 6), pose j (4, 6) and the linear states (4, 14).
 
     Pose tangents are GTSAM's: rotation first, both parts in the body frame.
     """
-    R_body_world = pose_i.rotation().matrix().T
-    x, y, z = R_body_world @ (pose_j.translation() - pose_i.translation())
-    H_i = np.zeros((3, 6))
+    R_i, R_j = pose_i.rotation().matrix(), pose_j.rotation().matrix()
+    x, y, z = R_i.T @ (pose_j.translation() - pose_i.translation())
+    T = R_i.T @ R_j
+    H_i, H_j, H_linear = np.zeros((4, 6)), np.zeros((4, 6)), np.zeros((4, MARKOV.stop - MARKOV.start))
     H_i[0, 1], H_i[0, 2] = -z, y
     H_i[1, 0], H_i[1, 2] = z, -x
     H_i[2, 0], H_i[2, 1] = -y, x
     H_i[0, 3] = H_i[1, 4] = H_i[2, 5] = -1.0
-    H_j = np.zeros((3, 6))
-    H_j[:, 3:] = R_body_world @ pose_j.rotation().matrix()
-    return H_i, H_j, displacement_m.reshape(3, 1)
+    H_j[:3, 3:] = T
+    level = T[0, 0] ** 2 + T[1, 0] ** 2
+    H_i[3, 0] = T[0, 0] * T[2, 0] / level
+    H_i[3, 1] = T[1, 0] * T[2, 0] / level
+    H_i[3, 2] = -1.0
+    H_j[3, 1] = (T[1, 0] * T[0, 2] - T[0, 0] * T[1, 2]) / level
+    H_j[3, 2] = (T[0, 0] * T[1, 1] - T[1, 0] * T[0, 1]) / level
+    rolled = wheels.displacement_m.copy()
+    rolled[0] += linear[_T] * wheels.speed_change_mps
+    slip, radius = 1.0 - linear[_S], 1.0 + linear[_R]
+    H_linear[:3, _S], H_linear[:3, _R] = radius * rolled, -slip * rolled
+    H_linear[0, _T] = -slip * radius * wheels.speed_change_mps
+    H_linear[1, _B], H_linear[1, _I] = -wheels.distance_m, wheels.yaw_rad
+    H_linear[3, _K] = -wheels.turn_rad
+    return H_i, H_j, H_linear
 
 
-def as_gtsam_factor(increment: WheelIncrement, pose_i: int, pose_j: int, markov_j: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `markov_j` is the vector (slip, drift e, drift n)."""
+def as_gtsam_factor(wheels: WheelIncrement, pose_i: int, pose_j: int, linear_j: int) -> gtsam.CustomFactor:
+    """The same factor for GTSAM's own optimisers; `linear_j` is the vector of the linear states."""
 
     def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        a, b = values.atPose3(pose_i), values.atPose3(pose_j)
+        a, b, linear = values.atPose3(pose_i), values.atPose3(pose_j), values.atVector(linear_j)
         if H is not None:
-            H[0], H[1], H_slip = jacobians(a, b, increment.displacement_m)
-            H[2] = np.hstack([H_slip, np.zeros((3, 2))])
-        return residual(a, b, float(values.atVector(markov_j)[0]), increment.displacement_m)
+            H[0], H[1], H[2] = jacobians(a, b, linear, wheels)
+        return residual(a, b, linear, wheels)
 
-    noise = gtsam.noiseModel.Diagonal.Sigmas(increment.sigma_m)
-    return gtsam.CustomFactor(noise, [pose_i, pose_j, markov_j], error)
+    noise = gtsam.noiseModel.Diagonal.Sigmas(wheels.sigma)
+    return gtsam.CustomFactor(noise, [pose_i, pose_j, linear_j], error)

@@ -17,8 +17,8 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
-from terrafusion.fusion.graph.gnss_factor import GnssPosition, antenna_jacobian
-from terrafusion.fusion.graph.key_state import BIAS, DIM, DRIFT, POSE, SLIP, VELOCITY
+from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
+from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, SLIP, VELOCITY
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.inputs.track import MotionTrack
@@ -106,7 +106,7 @@ class GnssUpdater:
     def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `covariance` (18, 18) is
+        A fix belongs to the first keyframe after it. `covariance` (dim, dim) is
         that of the newest keyframe.
         """
         used = False
@@ -162,7 +162,7 @@ class GnssUpdater:
         antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
         off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
         # All that the wrong heading may have bent is in doubt again.
-        doubt = np.zeros(DIM)
+        doubt = np.zeros(chain.dim)
         doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
         doubt[3:6] = off**2 + float(np.max(fix.sigma_m[:2]) * self.scale) ** 2
         doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
@@ -180,14 +180,16 @@ class GnssUpdater:
         R = state.pose.rotation().matrix()
         rate = node.gyro_radps - state.bias.gyroscope()
         accel_world = R @ (node.accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
-        lever = antenna_lever(state, offset_s, rate, accel_world, self.antenna_m)
-        predicted = np.asarray(state.pose.translation()) + R @ lever
+        antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
+        lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
+        velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
         inflation = row.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
         sigma = self._white_sigma(fix, inflation, share)
-        innovation = fix.enu_m - predicted - np.append(share * state.drift, 0.0)
-        J = np.zeros((3, DIM))
-        J[:, POSE], J[:, DRIFT] = antenna_jacobian(R, lever), share * np.eye(3)[:, :2]
+        position = GnssPosition(fix.enu_m, lever, sigma, share, velocity)
+        innovation = -residual(position, state.pose, state.linear)
+        H_pose, H_linear = jacobians(position, state.pose, state.linear)
+        J = np.hstack([H_pose, np.zeros((3, 9)), H_linear])[:, : chain.dim]
         P = J @ covariance @ J.T
         predicted_m2 = P[[0, 1], [0, 1]].copy()
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
@@ -217,16 +219,17 @@ class GnssUpdater:
         cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
         if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
-            fix = dataclasses.replace(fix, enu_m=np.append(fix.enu_m[:2], predicted[2]))
-            sigma[2] = UNKNOWN_HEIGHT_SIGMA_M
-        chain.add_fix(k, GnssPosition(fix.enu_m, lever, sigma, share, weight))
+            height = (np.asarray(state.pose.translation()) + R @ lever)[2]
+            sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
+            position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
+        chain.add_fix(k, dataclasses.replace(position, weight=weight))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
             chain.smooth(chain.last - k + 1)
-            chain.restart(np.zeros(DIM), k)
+            chain.restart(np.zeros(chain.dim), k)
         if weight > UNUSED_WEIGHT:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
@@ -261,7 +264,7 @@ class GnssUpdater:
         update, which cannot diverge.
         """
         gain = covariance @ jacobian.T @ np.linalg.inv(S)
-        doubt = np.zeros(DIM)
+        doubt = np.zeros(chain.dim)
         if verdict is Verdict.REACQUIRE:
             doubt[3:6] = float(innovation_m @ innovation_m)
         elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:

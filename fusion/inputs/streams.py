@@ -228,6 +228,16 @@ class WheelStream:
         right = self.right_m[j - 1] + w * (self.right_m[j] - self.right_m[j - 1])
         return left, right
 
+    def speed_change_mps(self, start_ns: int, end_ns: int, over_ns: int = 100_000_000) -> float:
+        """Speed of both sides about the end less that about the start, m/s; 0 where samples are missing."""
+        half = over_ns // 2
+        at = [self.travelled(t - half, min(t + half, self.t_ns[-1])) for t in (start_ns, end_ns)]
+        if at[0] is None or at[1] is None:
+            return 0.0
+        spans = [min(t + half, self.t_ns[-1]) - t + half for t in (start_ns, end_ns)]
+        first, last = (0.5 * sum(a or ()) / (span * 1e-9) for a, span in zip(at, spans, strict=True))
+        return last - first
+
     def forget(self, before_ns: int) -> None:
         i = bisect.bisect_left(self.t_ns, before_ns) - 1
         if i > 256:

@@ -32,7 +32,7 @@ class SensorNoise:
     robot. It is modelled as an Ornstein-Uhlenbeck process about
     `slip_mean + slip_per_grade * grade`, grade being the sine of the pitch
     (uphill positive), with the standard deviation and the correlation time
-    given here. Side-slip is the lateral over
+    given here. Yaw scale is true over wheel yaw rate, less one. Side-slip is the lateral over
     the forward displacement. The inflations multiply the standard deviations
     of the data sheet (IMU) or of the receiver's own report (GNSS).
     """
@@ -42,6 +42,8 @@ class SensorNoise:
     slip_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
     slip_time_s: Annotated[float, Quantity("s", 0.05, 600.0)]
     wheel_sigma_mps: Annotated[float, Quantity("m/s", 1e-4, 2.0)]
+    yaw_scale_mean: Annotated[float, Quantity("", -0.95, 0.95)]
+    yaw_scale_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
     side_slip_sigma: Annotated[float, Quantity("", 1e-4, 2.0)]
     gyro_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
     accel_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
@@ -54,8 +56,11 @@ class SensorNoise:
 
 _FIELDS = tuple(f.name for f in dataclasses.fields(SensorNoise))
 _SLIP_MEAN, _SLIP_SIGMA = _FIELDS.index("slip_mean"), _FIELDS.index("slip_sigma")
+_YAW_MEAN, _YAW_SIGMA = _FIELDS.index("yaw_scale_mean"), _FIELDS.index("yaw_scale_sigma")
 _SLIP_PER_GRADE = _FIELDS.index("slip_per_grade")
-_AVERAGED = np.array([name in ("slip_mean", "slip_per_grade", "slip_time_s") for name in _FIELDS])
+_AVERAGED = np.array(
+    [name in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean") for name in _FIELDS]
+)
 """Columns that blend as means; the others are standard deviations (or factors on them)."""
 _HINTS = get_type_hints(SensorNoise, include_extras=True)
 _RANGES: dict[str, Quantity] = {name: _HINTS[name].__metadata__[0] for name in _FIELDS}
@@ -88,7 +93,7 @@ class Policy:
     def blend(self, probabilities: ArrayLike, grade: float = 0.0) -> SensorNoise:
         """The moment-matched row for class probabilities (k,) that sum to one, at a grade.
 
-        Slip has the mean and the variance of the mixture (law of total
+        Slip and yaw scale have the mean and the variance of the mixture (law of total
         variance: mean of the variances plus variance of the means); the other
         errors have zero mean in every class, so their variances average.
         """
@@ -97,6 +102,8 @@ class Policy:
         variance = p @ self._table**2
         slips = self._table[:, _SLIP_MEAN] + grade * self._table[:, _SLIP_PER_GRADE]
         variance[_SLIP_SIGMA] += p @ (slips - p @ slips) ** 2
+        scales = self._table[:, _YAW_MEAN]
+        variance[_YAW_SIGMA] += p @ (scales - p @ scales) ** 2
         return SensorNoise(*np.where(_AVERAGED, mean, np.sqrt(variance)).tolist())
 
 

@@ -15,7 +15,10 @@ What counts, ground by ground, and how it is measured against the truth:
 - wheel sigma: speed over 0.1 s that slip, averaged over 1 s, leaves unexplained,
   in quadrature with the vehicle file's `speed_sigma_mps` (position error, backlash,
   uneven ground: the twin's encoders are only quantised).
-- side-slip: lateral over forward speed of the body origin, above 0.2 m/s.
+- yaw scale: true over wheel yaw rate less one, half-second means, while the wheels turn the robot by more
+  than 0.1 rad/s: the median, and the rms about it.
+- side-slip: lateral over forward speed of the body origin, above 0.2 m/s, without the part that follows the
+  yaw rate (a centre of rotation ahead of the origin is a state of its own).
 - IMU: the mean error over tau less its 60 s running mean (the bias), rms over the
   axes, as a multiple of the data sheet's density / sqrt(tau). Vibration has a band:
   its mean falls faster than that of white noise, so the multiple falls with tau, and
@@ -56,6 +59,7 @@ SHORT_S, SLIP_S, LAG_S = 0.1, 0.5, 2.0
 GYRO_S, ACCEL_S = 5.0, 2.0
 TURNING_MPS, SIDE_SLIP_FROM_MPS, STUCK_MPS = 0.15, 0.2, 0.05
 STUCK_COUNTS_S = 1.0
+YAWING_RADPS = 0.1
 BIAS_S = 60.0
 TAIL = 0.005
 GRADE_RIDGE, LAD_STEPS, LAD_FLOOR = 1e-5, 30, 5e-3
@@ -77,6 +81,7 @@ class Evidence:
     slip_pairs: Array
     grade_pairs: Array
     wheel_mps: Array
+    yaw_scale: Array
     side_slip: Array
     gyro: Array
     accel: Array
@@ -115,7 +120,16 @@ def evidence_of(recording: Recording) -> Evidence:
     slip, grade, pairs, grade_pairs, wheel = _slip_evidence(recording)
     gyro, accel = _imu_evidence(recording)
     return Evidence(
-        slip, grade, pairs, grade_pairs, wheel, _side_slips(recording), gyro, accel, _gnss_evidence(recording)
+        slip,
+        grade,
+        pairs,
+        grade_pairs,
+        wheel,
+        _yaw_scales(recording),
+        _side_slips(recording),
+        gyro,
+        accel,
+        _gnss_evidence(recording),
     )
 
 
@@ -133,12 +147,15 @@ def row_of(grounds: list[Evidence]) -> SensorNoise:
     paired = [e.slip_pairs - mean - per_grade * e.grade_pairs for e in grounds]
     power = float(np.mean([np.mean(p**2) for p in paired])) + RADIUS_SIGMA**2
     rho = (float(np.mean([np.mean(p[:, 0] * p[:, 1]) for p in paired])) + RADIUS_SIGMA**2) / power
+    scale = float(np.mean([np.median(e.yaw_scale) for e in grounds]))
     return SensorNoise(
         slip_mean=mean,
         slip_per_grade=per_grade,
         slip_sigma=float(np.sqrt(variance)),
         slip_time_s=float(np.clip(-LAG_S / np.log(np.clip(rho, 1e-3, 0.999)), 0.2, 300.0)),
         wheel_sigma_mps=max(_rms([e.wheel_mps for e in grounds]), 1e-3),
+        yaw_scale_mean=scale,
+        yaw_scale_sigma=max(_rms([e.yaw_scale - scale for e in grounds]), 0.02),
         side_slip_sigma=max(_rms([e.side_slip for e in grounds]), 1e-3),
         gyro_inflation=max(_rms([e.gyro for e in grounds]), 1.0),
         accel_inflation=max(_rms([e.accel for e in grounds]), 1.0),
@@ -226,13 +243,28 @@ def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
     return out
 
 
+def _yaw_scales(recording: Recording) -> Array:
+    """True over wheel yaw rate, less one, of half-second means while the wheels turn the robot."""
+    samples, truth = wheel_samples(recording), recording.truth
+    assert truth is not None
+    assert truth.twist_body is not None
+    count = max(round(SLIP_S / float(np.median(np.diff(samples.t_s)))), 1)
+    left, right = _block_means(samples.sides_mps, count).T
+    wheel = (right - left) / _vehicle(recording).rig().track_m
+    true = _block_means(np.interp(samples.t_s, seconds(truth.t_ns, recording), truth.twist_body[:, 5]), count)
+    turning = np.abs(wheel) > YAWING_RADPS
+    return np.asarray(np.clip(true[turning] / wheel[turning] - 1.0, -1.0, 1.0))
+
+
 def _side_slips(recording: Recording) -> Array:
+    """Lateral over forward speed (n,), without what turning about another point than the body origin does."""
     truth = recording.truth
     assert truth is not None
     assert truth.twist_body is not None
-    forward, lateral = truth.twist_body[:, 0], truth.twist_body[:, 1]
+    forward, lateral, rate = truth.twist_body[:, 0], truth.twist_body[:, 1], truth.twist_body[:, 5]
+    icr = -float(lateral @ rate) / max(float(rate @ rate), 1e-9)
     moving = np.abs(forward) > SIDE_SLIP_FROM_MPS
-    return np.asarray(lateral[moving] / forward[moving])
+    return np.asarray((lateral + icr * rate)[moving] / forward[moving])
 
 
 def _imu_evidence(recording: Recording) -> tuple[Array, Array]:
@@ -316,7 +348,7 @@ def _spread(row: SensorNoise) -> SensorNoise:
     changes = {
         name: value * UNKNOWN_SPREAD
         for name, value in dataclasses.asdict(row).items()
-        if name not in ("slip_mean", "slip_per_grade", "slip_time_s", "gnss_inflation")
+        if name not in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean", "gnss_inflation")
     }
     return dataclasses.replace(row, **{**changes, "slip_sigma": min(changes["slip_sigma"], 1.0)})
 
@@ -331,7 +363,7 @@ def fingerprint_of(grid: Grid) -> str:
     settings = {
         "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
         "side_slip_from_mps": SIDE_SLIP_FROM_MPS, "stuck_mps": STUCK_MPS, "stuck_counts_s": STUCK_COUNTS_S,
-        "bias_s": BIAS_S, "gyro_s": GYRO_S, "accel_s": ACCEL_S,
+        "yawing_radps": YAWING_RADPS, "bias_s": BIAS_S, "gyro_s": GYRO_S, "accel_s": ACCEL_S,
         "tail": TAIL, "line": [GRADE_RIDGE, LAD_STEPS, LAD_FLOOR],
         "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
     }  # fmt: skip

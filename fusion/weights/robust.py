@@ -113,7 +113,7 @@ class RobustWeighting(Weighting):
         out = np.zeros(len(held))
         for i, (k, fix) in enumerate(held):
             state = chain.state(k)
-            r = gnss_factor.residual(fix, state.pose, state.drift)[:2] / fix.sigma_m[:2]
+            r = gnss_factor.residual(fix, state.pose, state.linear)[:2] / fix.sigma_m[:2]
             out[i] = float(r @ r) / fix.weight
         return out
 

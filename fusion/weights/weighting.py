@@ -66,14 +66,14 @@ def tested_wheels(
     t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
 ) -> Surprise:
     """A wheel increment against its prediction, along body x."""
-    own = wheels.sigma_m[0] ** 2
+    own = wheels.sigma[0] ** 2
     rest = max(variance_m2 - own, 0.0)
     return Surprise(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
 
 
 def widened(wheels: WheelIncrement, scale: float) -> WheelIncrement:
     """The increment with `scale` times the sigma along body x."""
-    return dataclasses.replace(wheels, sigma_m=wheels.sigma_m * np.array([scale, 1.0, 1.0]))
+    return dataclasses.replace(wheels, sigma=wheels.sigma * np.array([scale, 1.0, 1.0, 1.0]))
 
 
 def weighting_for(config: EstimatorConfig, weights: TerrainWeights) -> Weighting:

@@ -15,7 +15,7 @@ from terrafusion.fusion.graph.key_state import DIM, KeyState
 def key_state(rng: np.random.Generator) -> KeyState:
     pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3))
     bias = gtsam.imuBias.ConstantBias(rng.normal(size=3) * 0.1, rng.normal(size=3) * 0.1)
-    return KeyState(pose, rng.normal(size=3), bias, 0.1, np.zeros(2))
+    return KeyState(pose, rng.normal(size=3), bias, rng.normal(size=14) * 0.1)
 
 
 def body_twist(key: KeyState, gyro: np.ndarray) -> np.ndarray:

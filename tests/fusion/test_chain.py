@@ -2,20 +2,32 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import gtsam
 import numpy as np
 import pytest
 from gtsam.symbol_shorthand import B, M, V, X
+from numpy.typing import NDArray
 
 from terrafusion.fusion.graph import gnss_factor, markov, wheel_factor
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import DIM, MARKOV, POSE, KeyState
+from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
 from terrafusion.fusion.graph.markov import markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
-STEP = markov_step(0.1, mean=[0.05, 0.0, 0.0], sigma=[0.1, 0.5, 0.5], time_s=[5.0, 30.0, 30.0])
-SIGMAS = np.array([0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5])
+Array = NDArray[np.float64]
+N = len(LINEAR)
+STEP = markov_step(
+    0.1,
+    mean=[0.05, 0.0, 0.0, -0.3, *[0.0] * (N - 4)],
+    sigma=[0.1, 0.5, 0.5, 0.3, 0.1, 0.05, *[0.02] * (N - 6)],
+    time_s=[5.0, *[30.0] * (N - 1)],
+)
+SIGMAS = np.array(
+    [0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5] + [0.1] * (N - 3)
+)
 
 
 def iso(dim: int, sigma: float) -> gtsam.noiseModel.Isotropic:
@@ -39,7 +51,7 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
         rotation = gtsam.Rot3.Rz(yaw).compose(gtsam.Rot3.Expmap(rng.normal(0, 0.02, 3)))
         pose = gtsam.Pose3(rotation, along + rng.normal(0, 0.3, 3))
         velocity = speed * np.array([np.cos(yaw), np.sin(yaw), 0.0]) + rng.normal(0, 0.1, 3)
-        points.append(KeyState(pose, velocity, bias, 0.0, np.zeros(2)))
+        points.append(KeyState(pose, velocity, bias, np.zeros(N)))
         fixes.append(along + rng.normal(0, 0.2, 3))
         if k == 0:
             continue
@@ -51,7 +63,9 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
         link.add(gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured))
         links.append(link)
         moved = np.array([speed * dt / 0.95, 0.001, 0.0]) + rng.normal(0, 0.002, 3)
-        wheels.append(WheelIncrement(moved, np.array([0.003, 0.005, 0.005]), moved[0], 0.0))
+        wheels.append(
+            WheelIncrement(moved, np.array([0.003, 0.005, 0.005, 0.01]), moved[0], 0.03, 0.02, 0.01)
+        )
     return points, links, wheels, fixes
 
 
@@ -74,7 +88,9 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
             graph.add(wheel_factor.as_gtsam_factor(wheels[k - 1], X(k - 1), X(k), M(k)))
             graph.add(markov.as_gtsam_factor(STEP, M(k - 1), M(k)))
         if k % 4 == 0:
-            fix = GnssPosition(fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3))
+            fix = GnssPosition(
+                fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3), 1.0, np.array([0.9, 0.3, 0.0])
+            )
             chain.add_fix(k, fix)
             graph.add(gnss_factor.as_gtsam_factor(fix, X(k), M(k)))
     return graph
@@ -85,16 +101,16 @@ def add_priors(graph: gtsam.NonlinearFactorGraph, start: KeyState) -> None:
     graph.add(gtsam.PriorFactorPose3(X(0), start.pose, diagonal(SIGMAS[POSE])))
     graph.add(gtsam.PriorFactorVector(V(0), start.velocity, diagonal(SIGMAS[6:9])))
     graph.add(gtsam.PriorFactorConstantBias(B(0), start.bias, diagonal(SIGMAS[9:15])))
-    graph.add(gtsam.PriorFactorVector(M(0), start.markov(), diagonal(SIGMAS[MARKOV])))
+    graph.add(gtsam.PriorFactorVector(M(0), start.linear, diagonal(SIGMAS[MARKOV])))
 
 
 def test_batch_solution_is_that_of_gtsam() -> None:
-    chain = Chain()
+    chain = Chain(calibrate=True)
     graph = build(chain, 40)
     start = chain.nodes[0].point
     values = gtsam.Values(chain.values)
     for k, node in enumerate(chain.nodes):
-        values.insert(M(k), node.point.markov())
+        values.insert(M(k), node.point.linear)
     add_priors(graph, start)
     params = gtsam.GaussNewtonParams()
     params.setRelativeErrorTol(1e-14)
@@ -106,7 +122,7 @@ def test_batch_solution_is_that_of_gtsam() -> None:
         state = chain.state(k)
         assert np.abs(state.pose.localCoordinates(solution.atPose3(X(k)))).max() < 1e-7
         assert np.abs(state.velocity - solution.atVector(V(k))).max() < 1e-7
-        np.testing.assert_allclose(state.markov(), solution.atVector(M(k)), atol=1e-7)
+        np.testing.assert_allclose(state.linear, solution.atVector(M(k)), atol=1e-7)
     # GTSAM's Marginals uses Cholesky, which gives up here: a dense QR of its own linear system instead.
     ordering = gtsam.Ordering()
     for k in range(40):
@@ -123,7 +139,7 @@ def test_batch_solution_is_that_of_gtsam() -> None:
 
 def test_filter_ends_where_the_batch_ends() -> None:
     """With all keyframes in the window, live updates reach the batch solution of the newest keyframe."""
-    live, batch = Chain(), Chain()
+    live, batch = Chain(calibrate=True), Chain(calibrate=True)
     points, links, wheels, fixes = drive(40, 3)
     for chain in (live, batch):
         for k in range(40):
@@ -147,7 +163,7 @@ def test_filter_ends_where_the_batch_ends() -> None:
 
 def test_forgetting_keeps_the_information() -> None:
     """Dropping old keyframes changes nothing in a graph whose linearisation stands still."""
-    whole, short = Chain(), Chain()
+    whole, short = Chain(calibrate=True), Chain(calibrate=True)
     build(whole, 30)
     _, links, wheels, fixes = drive(30, 1)
     for k in range(30):
@@ -155,7 +171,12 @@ def test_forgetting_keeps_the_information() -> None:
         if k == 0:
             short.set_prior(SIGMAS)
         if k % 4 == 0:
-            short.add_fix(k, GnssPosition(fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3)))
+            short.add_fix(
+                k,
+                GnssPosition(
+                    fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3), 1.0, np.array([0.9, 0.3, 0.0])
+                ),
+            )
         short._eliminate_all()
         short.forget(8)
     whole._eliminate_all()
@@ -168,11 +189,11 @@ def test_forgetting_keeps_the_information() -> None:
 def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:
     """A prior carried to another tangent space still has its mean where it was."""
     rng = np.random.default_rng(5)
-    chain = Chain()
+    chain = Chain(calibrate=True)
     points, *_ = drive(1, 0)
     chain.append(0, points[0])
     chain.set_prior(SIGMAS)
-    delta = rng.normal(0, 1, DIM) * np.array([0.3] * 3 + [2.0] * 3 + [0.5] * 3 + [0.1] * 6 + [0.1, 0.5, 0.5])
+    delta = rng.normal(0, 1, DIM) * np.array([0.3] * 3 + [2.0] * 3 + [0.5] * 3 + [0.1] * 6 + [0.1] * N)
     chain.nodes[0].delta = delta
     chain._move(0)
     chain.smooth(1, iterations=20)
@@ -182,7 +203,7 @@ def test_moving_the_linearisation_point_of_a_prior_keeps_its_mean() -> None:
 
 
 def test_restart_keeps_state_and_adds_doubt() -> None:
-    chain = Chain()
+    chain = Chain(calibrate=True)
     build(chain, 20)
     chain.solve(20)
     before, P = chain.state(19), chain.covariance()
@@ -194,37 +215,67 @@ def test_restart_keeps_state_and_adds_doubt() -> None:
     np.testing.assert_allclose(chain.covariance(), P + np.diag(doubt), rtol=1e-6, atol=1e-9)
 
 
+def numeric(function: Callable[[Array], Array], n: int, h: float = 1e-6) -> Array:
+    """Central differences (m, n) of a function of a tangent vector, about zero."""
+    return np.stack([(function(s) - function(-s)) / (2 * h) for s in h * np.eye(n)], axis=1)
+
+
 @pytest.mark.parametrize("seed", range(5))
 def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    a, b = (gtsam.Pose3.Expmap(rng.normal(0, 1, 6)) for _ in range(2))
-    d, slip, h = rng.normal(0, 0.2, 3), float(rng.uniform(-0.2, 0.6)), 1e-6
-    H_a, H_b, H_slip = jacobians(a, b, d)
-    for i in range(6):
-        step = np.eye(6)[i] * h
-        numeric = (residual(a.retract(step), b, slip, d) - residual(a.retract(-step), b, slip, d)) / (2 * h)
-        np.testing.assert_allclose(H_a[:, i], numeric, atol=1e-6)
-        numeric = (residual(a, b.retract(step), slip, d) - residual(a, b.retract(-step), slip, d)) / (2 * h)
-        np.testing.assert_allclose(H_b[:, i], numeric, atol=1e-6)
-    numeric = (residual(a, b, slip + h, d) - residual(a, b, slip - h, d)) / (2 * h)
-    np.testing.assert_allclose(H_slip[:, 0], numeric, atol=1e-6)
+    a = gtsam.Pose3.Expmap(rng.normal(0, 1, 6))
+    b = a.compose(gtsam.Pose3.Expmap(rng.normal(0, 0.4, 6)))
+    wheels = WheelIncrement(rng.normal(0, 0.2, 3), np.ones(4), 0.3, 0.2, -0.1, 0.4)
+    linear = rng.uniform(-0.2, 0.4, N)
+    H_a, H_b, H_linear = jacobians(a, b, linear, wheels)
+    for H, function, n in (
+        (H_a, lambda s: residual(a.retract(s), b, linear, wheels), 6),
+        (H_b, lambda s: residual(a, b.retract(s), linear, wheels), 6),
+        (H_linear, lambda s: residual(a, b, linear + s, wheels), N),
+    ):
+        np.testing.assert_allclose(H, numeric(function, n), atol=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    pose, h = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), 1e-6
-    fix = GnssPosition(rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), np.ones(3), drift_share=0.3)
-    drift = rng.normal(0, 1, 2)
-    H_pose, H_drift = gnss_factor.jacobians(fix, pose)
-    for i in range(6):
-        step = np.eye(6)[i] * h
-        up, down = (gnss_factor.residual(fix, pose.retract(s), drift) for s in (step, -step))
-        np.testing.assert_allclose(H_pose[:, i], (up - down) / (2 * h), atol=1e-6)
-    for i in range(2):
-        step = np.eye(2)[i] * h
-        up, down = (gnss_factor.residual(fix, pose, drift + s) for s in (step, -step))
-        np.testing.assert_allclose(H_drift[:, i], (up - down) / (2 * h), atol=1e-6)
+    pose, linear = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), rng.normal(0, 1, N)
+    place, lever, speed = rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), rng.normal(0, 1, 3)
+    fix = GnssPosition(place, lever, np.ones(3), 0.3, speed)
+    H_pose, H_linear = gnss_factor.jacobians(fix, pose, linear)
+    np.testing.assert_allclose(
+        H_pose, numeric(lambda s: gnss_factor.residual(fix, pose.retract(s), linear), 6), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        H_linear, numeric(lambda s: gnss_factor.residual(fix, pose, linear + s), N), atol=1e-6
+    )
+
+
+def test_a_turned_imu_acts_as_its_rows_say() -> None:
+    """The rows' right-hand side with a rotation d is that of a factor made of the readings turned by d."""
+    turn = np.array([0.004, -0.006, 0.005])
+    params = gtsam.PreintegrationCombinedParams.MakeSharedU(9.80665)
+    params.setIntegrationCovariance(np.eye(3) * 1e-8)
+    gyro, accel = np.array([0.05, -0.1, 0.4]), np.array([0.8, 0.3, 9.7])
+    at_once = np.cross(turn, gyro), np.cross(turn, accel)
+    sides = []
+    for extra, linear_turn in (((0.0, 0.0), turn), (at_once, np.zeros(3))):
+        chain = Chain(calibrate=True)
+        linear = np.zeros(N)
+        linear[IMU_ROTATION.start - 15 : IMU_ROTATION.stop - 15] = linear_turn
+        point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), linear)
+        measured = gtsam.PreintegratedCombinedMeasurements(params, point.bias)
+        for _ in range(10):
+            measured.integrateMeasurement(accel + extra[1], gyro + extra[0], 0.01)
+        link = gtsam.NonlinearFactorGraph()
+        link.add(gtsam.CombinedImuFactor(X(0), V(0), X(1), V(1), B(0), B(1), measured))
+        chain.append(0, point)
+        chain.append(100_000_000, point, link, gyro_radps=gyro, accel_mps2=accel, preintegrated=True)
+        sides.append(chain._link_rows(1)[:15, 2 * DIM])
+        untouched = np.abs(sides[0] - sides[-1]).max()
+    assert untouched < 0.02 * np.abs(sides[0]).max()
+    rows = chain._link_rows(1)
+    assert np.abs(rows[:9, IMU_ROTATION]).max() > 0.0
 
 
 def test_a_markov_step_keeps_the_stationary_variance() -> None:
@@ -239,7 +290,7 @@ def test_a_markov_step_keeps_the_stationary_variance() -> None:
 
 
 def test_an_undetermined_chain_says_so() -> None:
-    chain = Chain()
+    chain = Chain(calibrate=True)
     points, *_ = drive(1, 0)
     chain.append(0, points[0])
     with pytest.raises(ArithmeticError, match="not determined"):

@@ -1,0 +1,70 @@
+"""Priors and processes of the linear states: what wanders with the ground, and what a robot keeps."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.graph.markov import MarkovStep, markov_step
+from terrafusion.fusion.weights.policy import SensorNoise
+
+Array = NDArray[np.float64]
+
+ICR_SIGMA_M, ICR_TIME_S = 0.10, 60.0
+"""Centre of rotation along the body: a few tenths of the wheelbase, moving with the load (assumed)."""
+YAW_SCALE_TIME_S = 60.0
+YAW_SCALE_ROBOT = 0.2
+"""Yaw scales of robots on one ground differ by so much from that of the policy's (assumed)."""
+SIDE_SLIP_TIME_S = 5.0
+SIDE_SLIP_SHARE = 0.8
+"""Share of the ground's side-slip that lasts (the rest is new at every keyframe); assumed."""
+CALIBRATION_SIGMA = {
+    "radius_scale": 0.01,
+    "antenna_x_m": 0.02,
+    "antenna_y_m": 0.02,
+    "imu_roll_rad": 0.01,
+    "imu_pitch_rad": 0.01,
+    "imu_yaw_rad": 0.01,
+    "wheel_delay_s": 0.02,
+    "gnss_delay_s": 0.05,
+}
+"""How well a vehicle file is trusted, 1 sigma (assumed: tyre wear and pressure, a tape measure, a mounting
+plate, clocks of drivers)."""
+_WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
+"""Walk of the calibration, per sqrt(s): hardly any, but what is certain for ever cannot be whitened."""
+
+
+def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
+    """Mean and 1 sigma (14,) of the linear states before any data, on the ground of `row`."""
+    mean, sigma = np.zeros(len(LINEAR)), np.empty(len(LINEAR))
+    mean[0], mean[3] = row.slip_at(grade), row.yaw_scale_mean
+    sigma[:6] = _stationary(row, drift_sigma_m)
+    sigma[6:] = list(CALIBRATION_SIGMA.values())
+    return mean, sigma
+
+
+def step(
+    dt_s: float, row: SensorNoise, grade: float, drift_sigma_m: float, drift_time_s: float, switch: float
+) -> MarkovStep:
+    """The step of all linear states over `dt_s`; `switch` is the share of the ground that just changed."""
+    wandering = markov_step(
+        dt_s,
+        mean=[row.slip_at(grade), 0.0, 0.0, row.yaw_scale_mean, 0.0, 0.0],
+        sigma=_stationary(row, drift_sigma_m),
+        time_s=[row.slip_time_s, drift_time_s, drift_time_s, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S],
+        forget=[switch, 0.0, 0.0, switch, 0.0, switch],
+    )
+    walk = np.array(list(_WALK.values())) * np.sqrt(dt_s)
+    return MarkovStep(
+        np.append(wandering.decay, np.ones(len(walk))),
+        np.append(wandering.mean, np.zeros(len(walk))),
+        np.append(wandering.sigma, walk),
+    )
+
+
+def _stationary(row: SensorNoise, drift_sigma_m: float) -> list[float]:
+    slow_side_slip = SIDE_SLIP_SHARE * row.side_slip_sigma
+    drift = [drift_sigma_m, drift_sigma_m]
+    yaw_scale = float(np.hypot(row.yaw_scale_sigma, YAW_SCALE_ROBOT))
+    return [row.slip_sigma, *drift, yaw_scale, ICR_SIGMA_M, slow_side_slip]
