@@ -150,7 +150,7 @@ def _run_task(task: Task) -> list[Run | Refusal]:
 
 
 def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
-    _check(recording)
+    check_log(recording)
     reference = reference_of(recording)
     yield _tried(task, recording, reference, "whole", None)
     if reference == "none":
@@ -176,7 +176,7 @@ def _tried(
     return _run(task, result, reference, test, outage)
 
 
-def _check(recording: Recording) -> None:
+def check_log(recording: Recording) -> None:
     """Refuse what `terrafusion replay` refuses."""
     if recording.wheels is None or recording.imu is None:
         raise DataError("has no wheels or no IMU", remedy="nothing to estimate from: the table leaves it out")

@@ -1,0 +1,210 @@
+"""Drives of the twin on which the arms are compared: what is driven, on which ground, by which laws.
+
+A case is a family of drives, a plant and a seed. Commands, grounds, slope, heading and the time of the
+outage depend on family and seed alone, so that the three plants drive the same; soils and noise are drawn
+for each plant. No seed of training is used: the policy, the terrain model and the tuning have seeds below
+`FIRST_SEED`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.benchmark.arms import true_labels
+from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.fusion.terrain.drives import GROUNDS, SOIL_SCATTER, scattered_soil
+from terrafusion.fusion.terrain.labels import GroundLabels
+from terrafusion.twin.effects.reece import second_terramechanics
+from terrafusion.twin.ground import Variation
+from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate_run
+from terrafusion.twin.soil import SoilParams, load_soil
+
+FIRST_SEED = 100_000
+PERTURBATION = 0.3
+"""Relative error of every soil number of the plant "perturbed"; its sign is drawn."""
+CORRELATED = Variation(strength_sigma=0.3, length_m=4.0)
+"""Ground of the plant "second": 30 % of undrained strength is usual (Phoon and Kulhawy 1999: 10 to 50 %);
+that it changes over a few metres is assumed."""
+LEAD_S = (40.0, 50.0)
+"""An outage begins in this span: heading and slip have been seen by then."""
+TAIL_S = 2.0
+LEG_M, MUD_LEG_M = (12.0, 30.0), (6.0, 12.0)
+"""Length of a ground on the route; mud would hold the robot for good on a longer one."""
+MUD = "mud"
+
+PLANTS = {
+    "twin": "the twin's laws, soils drawn as in training",
+    "perturbed": "the twin's laws, every soil number 30 % too high or too low",
+    "second": "other laws (Reece, Ding, Kondner) on ground whose strength varies from place to place",
+}
+
+
+@dataclass(frozen=True)
+class Family:
+    """Drives of one kind.
+
+    Attributes:
+        grounds: of the route; one after another where `mixed`, else one of them for the whole drive.
+        outages_s: lengths of the outage, taken in turn by the seeds.
+        slope_deg: range of the slope.
+    """
+
+    about: str
+    grounds: tuple[str, ...]
+    mixed: bool
+    outages_s: tuple[float, ...]
+    slope_deg: tuple[float, float] = (0.0, 0.0)
+
+
+FAMILIES = {
+    "mixed": Family("a new ground every few metres, 60 s without GNSS", GROUNDS, True, (60.0,)),
+    "slopes": Family(
+        "the same without mud on a slope of 3 to 8 deg, 60 s without GNSS",
+        ("asphalt", "medium_sand", "loose_sand"), True, (60.0,), (3.0, 8.0),
+    ),
+    "outages": Family("a new ground every few metres, 30, 60 or 120 s without GNSS", GROUNDS, True,
+                      (120.0, 30.0, 60.0)),
+    "firm": Family("asphalt, 120 s without GNSS", ("asphalt",), False, (120.0,)),
+    "unseen": Family(
+        "one ground that policy and detector never saw, 60 s without GNSS",
+        ("gravel", "grass", "ploughed_soil", "snow"), False, (60.0,),
+    ),
+}  # fmt: skip
+FIELD = "field"
+"""The family of field logs, see `field`."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """One drive of the twin."""
+
+    family: str
+    plant: str
+    seed: int
+
+    @property
+    def key(self) -> str:
+        """Its name, also that of its file."""
+        return f"{self.family}-{self.plant}-{self.seed}"
+
+    def stream(self, *words: str) -> np.random.Generator:
+        """Random numbers of the seed for one purpose."""
+        return np.random.default_rng([self.seed, *(zlib.crc32(word.encode()) for word in words)])
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """A recording, the outage in it (None: the whole of it is judged) and its true ground where known.
+
+    `unit` is what is independent of other drives: the seed, or the log that several outages are of.
+    """
+
+    family: str
+    plant: str
+    unit: str
+    name: str
+    recording: Recording
+    outage: Outage | None
+    labels: GroundLabels | None
+    seed: int = 0
+
+
+def checked(names: Sequence[str]) -> tuple[str, ...]:
+    """Families by name, in the order of `FAMILIES`, all of them and the field where none is named.
+
+    Raises:
+        ConfigError: an unknown name.
+    """
+    known = (*FAMILIES, FIELD)
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"unknown family '{name}'", remedy=f"known are {', '.join(known)}")
+    return tuple(name for name in known if not names or name in names)
+
+
+def drive_of(case: Case) -> Drive:
+    """Simulate a case; the same case gives the same bits."""
+    family = FAMILIES[case.family]
+    rng = case.stream(case.family)
+    outage = Outage(
+        round(float(rng.uniform(*LEAD_S)), 1), family.outages_s[case.seed % len(family.outages_s)]
+    )
+    seconds = outage.start_s + outage.seconds + TAIL_S
+    route = _route(family, seconds, rng)
+    scenario = Scenario(
+        name=case.key,
+        description=f"benchmark, {family.about}",
+        duration_s=seconds,
+        drive=_wander(seconds, rng),
+        max_accel_mps2=0.5,
+        route=route,
+        slope_deg=float(rng.uniform(*family.slope_deg)),
+        aspect_deg=float(rng.uniform(-180.0, 180.0)),
+        heading_deg=float(rng.uniform(-180.0, 180.0)),
+        variation=CORRELATED if case.plant == "second" else None,
+    )
+    soils = soils_of(case, {leg.terrain for leg in route})
+    effects = second_terramechanics() if case.plant == "second" else {}
+    seed = int(case.stream(case.family, case.plant, "noise").integers(2**31))
+    recording = simulate_run(scenario, soils=soils, effects=effects, seed=seed).recording
+    unit = f"seed {case.seed}"
+    return Drive(case.family, case.plant, unit, unit, recording, outage, true_labels(recording), case.seed)
+
+
+def soils_of(case: Case, names: set[str]) -> dict[str, SoilParams]:
+    """The case's own soils: scattered as in training, or every number off by `PERTURBATION`."""
+    rng = case.stream(case.family, case.plant, "soil")
+    with tempfile.TemporaryDirectory() as folder:
+        scattered = {n: load_soil(scattered_soil(n, rng, Path(folder))) for n in sorted(names)}
+    return {n: perturbed(load_soil(n), rng) if case.plant == "perturbed" else s for n, s in scattered.items()}
+
+
+def perturbed(soil: SoilParams, rng: np.random.Generator) -> SoilParams:
+    """The soil with each number that training scatters `PERTURBATION` higher or lower."""
+    changed = {}
+    for section, keys in SOIL_SCATTER.items():
+        part = getattr(soil, section)
+        factors = {key: 1.0 + PERTURBATION * float(rng.choice((-1.0, 1.0))) for key in keys}
+        changed[section] = dataclasses.replace(part, **{k: getattr(part, k) * f for k, f in factors.items()})
+    return dataclasses.replace(soil, **changed)
+
+
+def _route(family: Family, seconds: float, rng: np.random.Generator) -> tuple[RouteLeg, ...]:
+    """Grounds in random order, never the same twice running, for longer than the drive can be."""
+    ground = str(rng.choice(family.grounds))
+    if not family.mixed:
+        return (RouteLeg(ground),)
+    legs, length = [], 0.0
+    while length < 1.3 * seconds:
+        legs.append(RouteLeg(ground, float(rng.uniform(*(MUD_LEG_M if ground == MUD else LEG_M)))))
+        length += legs[-1].length or 0.0
+        ground = str(rng.choice([other for other in family.grounds if other != ground]))
+    return (*legs, RouteLeg(ground))
+
+
+def _wander(seconds: float, rng: np.random.Generator) -> tuple[DriveSegment, ...]:
+    """A rest, a straight that shows the heading, then straights, weaving, turns and short stops."""
+    segments = [DriveSegment(3.0), DriveSegment(12.0, 1.0)]
+    while sum(s.duration_s for s in segments) < seconds:
+        speed = float(rng.uniform(0.7, 1.2))
+        straight, turn = float(rng.uniform(6.0, 16.0)), float(rng.uniform(4.0, 8.0))
+        weave, sign = float(rng.uniform(0.0, 0.25)), float(rng.choice((-1.0, 1.0)))
+        segments += [
+            DriveSegment(
+                straight, speed, yaw_rate_amplitude_radps=weave, period_s=float(rng.uniform(6.0, 15.0))
+            ),
+            DriveSegment(turn, 0.9, sign * float(rng.uniform(0.2, 0.35))),
+        ]
+        if rng.random() < 0.15:
+            segments.append(DriveSegment(3.0))
+    return tuple(segments)

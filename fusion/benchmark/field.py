@@ -1,0 +1,94 @@
+"""The field logs as drives: the outages of the field table, with the true ground where a log tells it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from terrafusion.datasets.errors import TerrafusionError, errors_of
+from terrafusion.datasets.readers import open_recordings
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.benchmark.arms import true_labels
+from terrafusion.fusion.benchmark.drives import FIELD, Drive
+from terrafusion.fusion.scores.field_table import (
+    LEAST_DRIVE_S,
+    catalogued,
+    check_log,
+    ground_of,
+    outages_of,
+    reference_of,
+)
+from terrafusion.fusion.scores.outage_plan import aided_by_truth, until
+
+AID_SEED = 1
+"""Of the noise on fixes that are made from truth."""
+NOT_LABELLED = "not labelled"
+
+
+@dataclass(frozen=True)
+class Log:
+    """A field log, and how many outages of each length it is to have at most."""
+
+    name: str
+    starts: int
+
+    @property
+    def key(self) -> str:
+        """Its name as that of a file."""
+        return f"{FIELD}-{self.starts}-{self.name.replace('/', '_').replace('#', '_')}"
+
+
+@dataclass(frozen=True)
+class Refused:
+    """A log, or a recording of it, that is not run, and why."""
+
+    log: str
+    why: str
+
+
+def logs_at_hand(starts: int) -> list[Log]:
+    """Logs of the catalogue whose files are there."""
+    return [Log(name, starts) for name in catalogued()]
+
+
+def drives_of(log: Log) -> Iterator[Drive | Refused]:
+    """All drives of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
+    try:
+        recordings = open_recordings(log.name)
+    except TerrafusionError as error:
+        yield Refused(log.name, str(error))
+        return
+    longest = max(r.duration_s() for r in recordings)
+    if len(recordings) > 1 and longest < LEAST_DRIVE_S:
+        yield Refused(log.name, f"{len(recordings)} pieces of at most {longest:.1f} s, no drive")
+        return
+    for i, recording in enumerate(recordings):
+        name = log.name if len(recordings) == 1 else f"{log.name}#{i}"
+        try:
+            with errors_of(name):
+                yield from _drives(log, name, recording)
+        except TerrafusionError as error:
+            yield Refused(name, str(error))
+
+
+def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:
+    check_log(recording)
+    reference = reference_of(recording)
+    ground = ground_of(log.name, recording) or NOT_LABELLED
+    whole = Drive(FIELD, ground, name, f"{name}, whole", recording, None, true_labels(recording))
+    if reference == "none":
+        yield whole
+        return
+    if reference == "truth" and recording.gnss is None:
+        recording = aided_by_truth(recording, AID_SEED)
+    outages = outages_of(recording, log.starts)
+    if not outages:
+        yield whole
+    for outage in outages:
+        yield dataclasses.replace(
+            whole,
+            name=f"{name}, {outage.seconds:g} s from {outage.start_s:.1f} s",
+            recording=until(recording, outage.start_s + outage.seconds + 0.5),
+            outage=outage,
+        )

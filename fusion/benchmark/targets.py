@@ -1,0 +1,114 @@
+"""The targets of the project that a benchmark can decide, held against what it found."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+from terrafusion.fusion.benchmark.arms import BASE, OWN
+from terrafusion.fusion.benchmark.compare import Contrast, Interval, Share, contrasts, median_interval, shares
+from terrafusion.fusion.benchmark.drives import FIELD
+from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.scores.consistency import Consistency
+from terrafusion.fusion.scores.twin_consistency import Cell, pool
+
+REACHED, OPEN, MISSED = "reached", "open", "missed"
+"""By the whole interval; by neither of its ends; by no part of it."""
+LONG_S = 120.0
+INSIDE, IN_OUTAGE = "whole drive", "in outage"
+
+
+@dataclass(frozen=True)
+class Target:
+    """One statement: `found` is compared with `limit`; `most` tells that it must lie below."""
+
+    name: str
+    what: str
+    limit: float
+    most: bool
+    found: float | None
+    interval: Interval | None
+    unit: str = ""
+
+    def verdict(self) -> str:
+        """`REACHED`, `OPEN` or `MISSED`; "not measured" without a number; by the number where it is alone."""
+        if self.found is None:
+            return "not measured"
+        low, high = self.interval or (self.found, self.found)
+        if self.most:
+            return REACHED if high <= self.limit else MISSED if low > self.limit else OPEN
+        return REACHED if low >= self.limit else MISSED if high < self.limit else OPEN
+
+
+def targets(rows: Sequence[Row]) -> list[Target]:
+    """G1, G2, G5 and G9, as far as there are drives for them."""
+    out: list[Target] = []
+    against_base, against_innovation = contrasts(rows), contrasts(rows, "innovation")
+    for plant in dict.fromkeys(row.plant for row in rows if row.family == "mixed"):
+        at = ("mixed", plant)
+        out += [
+            _ratio("G1", 0.60, against_base, *at, OWN),
+            _ratio("G1", 0.75, against_innovation, *at, OWN),
+            _kept(shares(rows), plant),
+            _ratio("G2", 1.10, against_base, *at, "shuffled"),
+        ]
+    for plant in dict.fromkeys(row.plant for row in rows if row.family == "firm"):
+        out.append(_ratio("G2", 1.03, against_base, "firm", plant, OWN))
+    for family, limit in (("outages", 1.0), ("firm", 0.5)):
+        for plant in dict.fromkeys(row.plant for row in rows if row.family == family):
+            out.append(_drift(rows, family, plant, limit))
+    for ground in dict.fromkeys(row.plant for row in rows if row.family == FIELD):
+        out.append(_ratio("G9", 1.0, against_base, FIELD, ground, OWN))
+    return [target for target in out if target.found is not None]
+
+
+def nees_cells(rows: Sequence[Row], arms: Iterable[str] = (OWN, BASE)) -> list[Cell]:
+    """NEES of the position by arm and ground over all twin drives: whole drives, and their outages alone."""
+    cells = []
+    for arm in arms:
+        own = [row for row in rows if row.arm == arm and row.family != FIELD]
+        for plant in dict.fromkeys(row.plant for row in own):
+            mine = [row for row in own if row.plant == plant]
+            for ground in dict.fromkeys(g.ground for row in mine for g in row.grounds):
+                found = [_consistencies(row, ground) for row in mine]
+                cells += pool(ground, f"{plant}, {arm}", [one for one in found if one])
+    return cells
+
+
+def _consistencies(row: Row, ground: str) -> tuple[Consistency, ...]:
+    out = []
+    for g in row.grounds:
+        pairs = ((INSIDE, g.nees, g.effective), (IN_OUTAGE, g.nees_outage, g.effective_outage))
+        for quantity, mean, effective in pairs:
+            if g.ground == ground and mean is not None and effective is not None:
+                out.append(Consistency(quantity, ground, 0.0, 0.0, 0, effective, mean, 0.0, 0.0))
+    return tuple(out)
+
+
+def _ratio(name: str, limit: float, found: Sequence[Contrast], family: str, plant: str, arm: str) -> Target:
+    what = f"{family}, {plant}: {arm}"
+    for c in found:
+        if (c.family, c.plant, c.arm) == (family, plant, arm):
+            return Target(name, f"{what} over {c.base}", limit, True, c.ratio, c.interval)
+    return Target(name, what, limit, True, None, None)
+
+
+def _kept(found: Sequence[Share], plant: str) -> Target:
+    what = f"mixed, {plant}: share of the oracle's gain"
+    for share in found:
+        if (share.family, share.plant) == ("mixed", plant):
+            return Target("G1", what, 0.70, False, share.share, share.interval)
+    return Target("G1", what, 0.70, False, None, None)
+
+
+def _drift(rows: Sequence[Row], family: str, plant: str, limit: float) -> Target:
+    what = f"{family}, {plant}: drift of {OWN} in {LONG_S:g} s, % of the way"
+    percent = [
+        row.percent
+        for row in rows
+        if (row.family, row.plant, row.arm, row.outage_s) == (family, plant, OWN, LONG_S)
+        and row.percent is not None
+    ]
+    if not percent:
+        return Target("G5", what, limit, True, None, None, "%")
+    return Target("G5", what, limit, True, *median_interval(percent), "%")
