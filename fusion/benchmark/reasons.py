@@ -1,0 +1,106 @@
+"""Why the adaptive weighting loses where it loses: detector or policy, which ground, which error.
+
+Where true labels would have won, the detector is to blame; where they lose as well, the policy's rows are.
+The ground and the kind of error are those that gain most in mean square velocity error (which is what moves
+the position) over the arm that won, weighted by the time spent there.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from terrafusion.fusion.benchmark.arms import ORACLE, OWN
+from terrafusion.fusion.benchmark.compare import EVEN, Contrast, contrasts, groups_of
+from terrafusion.fusion.benchmark.measure import Row
+
+BASELINES = ("data sheet", "fixed", "robust", "innovation")
+KINDS = {
+    "forward_mps": "speed along the robot (slip, wheels)",
+    "side_mps": "speed across the robot (side-slip)",
+    "heading_mps": "heading (gyro)",
+}
+
+
+@dataclass(frozen=True)
+class Reason:
+    """One family on one plant in which a baseline has smaller errors.
+
+    Attributes:
+        ratio: median of the paired ratios, adaptive over `winner`; `sure` where its interval lies above 1.
+        oracle: the same for true labels, None where there are none.
+        ground, kind: where and in which quantity most is lost; "" where the truth does not tell.
+        recognised: share of the outages in which the detector names the ground: on all, and on `ground`.
+    """
+
+    family: str
+    plant: str
+    winner: str
+    ratio: float
+    sure: bool
+    oracle: float | None
+    ground: str
+    kind: str
+    recognised: tuple[float | None, float | None]
+
+    def blame(self) -> str:
+        """ "detector", "policy" or, where no drive has true labels, "not known"."""
+        if self.oracle is None:
+            return "not known"
+        return "detector" if self.oracle < 1.0 else "policy"
+
+
+def reasons(rows: Sequence[Row]) -> list[Reason]:
+    """One for each group in which some baseline beats the adaptive weighting by more than `EVEN`."""
+    out = []
+    for (family, plant), group in groups_of(rows).items():
+        lost = [
+            c for base in BASELINES for c in contrasts(group, base) if c.arm == OWN and c.ratio > 1.0 + EVEN
+        ]
+        if lost:
+            worst = max(lost, key=lambda c: c.ratio)
+            out.append(_reason(family, plant, worst, group))
+    return out
+
+
+def _reason(family: str, plant: str, worst: Contrast, group: Sequence[Row]) -> Reason:
+    told = [c.ratio for c in contrasts(group, worst.base) if c.arm == ORACLE]
+    ground, kind = _where(group, worst.base)
+    return Reason(
+        family,
+        plant,
+        worst.base,
+        worst.ratio,
+        worst.interval is not None and worst.interval[0] > 1.0,
+        told[0] if told else None,
+        ground,
+        kind,
+        (recognised(group), recognised(group, ground) if ground else None),
+    )
+
+
+def recognised(rows: Sequence[Row], ground: str = "") -> float | None:
+    """Share of the time in outages in which the adaptive arm's ground was the true one, on one or all."""
+    total = right = 0.0
+    for row in rows:
+        for g in row.grounds:
+            if row.arm == OWN and g.recognised is not None and ground in ("", g.ground):
+                total, right = total + g.seconds, right + g.seconds * g.recognised
+    return right / total if total > 0.0 else None
+
+
+def _where(rows: Sequence[Row], winner: str) -> tuple[str, str]:
+    """Ground and kind of error in which the adaptive arm loses most to the winner."""
+    excess: dict[tuple[str, str], float] = defaultdict(float)
+    for row in rows:
+        sign = {OWN: 1.0, winner: -1.0}.get(row.arm, 0.0)
+        for g in row.grounds:
+            for kind, words in KINDS.items():
+                error = getattr(g, kind)
+                if sign and error is not None:
+                    excess[g.ground, words] += sign * g.seconds * error**2
+    if not excess:
+        return "", ""
+    place = max(excess, key=lambda key: excess[key])
+    return place if excess[place] > 0.0 else ("", "")
