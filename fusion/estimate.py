@@ -95,7 +95,7 @@ class Estimate:
     """A whole drive as estimated.
 
     `trajectory` has the twist (body) and the covariance of every keyframe; the
-    other arrays run along it. `classes` names the columns of `terrain`.
+    other arrays run along it. `classes` names the columns of `terrain`, `key_state.LINEAR` those of `linear`.
     """
 
     trajectory: Trajectory
@@ -116,6 +116,8 @@ class Estimate:
     immobilised: NDArray[np.bool_] | None = None
     twist_covariance: Array | None = None
     bias_sigma: Array | None = None
+    linear: Array | None = None
+    linear_sigma: Array | None = None
 
     def dominant_terrain(self) -> NDArray[Any]:
         """The most probable class (N,) at each keyframe."""

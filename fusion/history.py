@@ -10,6 +10,7 @@ import numpy as np
 from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.fusion.estimate import Estimate, Innovation, State, WeightChange
+from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.weights.policy import SensorNoise
 
 
@@ -69,4 +70,6 @@ class History:
             immobilised=np.array([s.immobilised for s in states], dtype=bool),
             twist_covariance=stack("twist_covariance", (6, 6)),
             bias_sigma=stack("bias_sigma", (6,)),
+            linear=stack("linear", (len(LINEAR),)),
+            linear_sigma=stack("linear_sigma", (len(LINEAR),)),
         )

@@ -51,6 +51,14 @@ def replay(
     batch: Annotated[
         bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")
     ] = False,
+    calibrate: Annotated[
+        bool,
+        typer.Option(
+            "--calibrate",
+            help="Also estimate what the vehicle file may have wrong: wheel radius, antenna, IMU mounting, "
+            "delays of wheels and GNSS.",
+        ),
+    ] = False,
     mcap: Annotated[
         bool,
         typer.Option(
@@ -73,6 +81,8 @@ def replay(
     scored against. Writes metrics.json, estimate.csv, trajectory.tum, weights.jsonl and report.html.
 
     Example: terrafusion replay drive.bag --vehicle husky --gnss-outage 150:60 --out results
+
+    Example: terrafusion replay drive.bag --vehicle husky --calibrate --batch --out calibrated
     """
     from terrafusion.datasets.errors import errors_of
     from terrafusion.datasets.readers import open_recording
@@ -101,6 +111,7 @@ def replay(
             outages=outages,
             batch=batch,
             progress=progress,
+            settings={"calibrate": calibrate},
         )
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     if mcap:
@@ -124,6 +135,7 @@ def _write_bag(result: Replay, path: Path) -> None:
 
 def summary(result: Replay) -> list[str]:
     """The result in a few lines of text."""
+    from terrafusion.fusion.report.linear_states import calibration, cells
     from terrafusion.fusion.report.outputs import final_status
 
     scores = result.scores
@@ -148,4 +160,6 @@ def summary(result: Replay) -> list[str]:
                 f"outage {outage.start_s:g} to {outage.start_s + outage.seconds:g} s: median error "
                 f"{outage.median_m:.2f} m, {outage.end_error_m:.2f} m after {outage.distance_m:.0f} m"
             )
+    for what, value, sigma, _, verdict in map(cells, calibration(result.estimate)):
+        lines.append(f"{what}: {value} +- {sigma} ({verdict})")
     return lines

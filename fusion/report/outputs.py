@@ -26,6 +26,8 @@ from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import write_tum
 from terrafusion.fusion.estimate import STATUS, Estimate, WeightChange
+from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.report.linear_states import series
 from terrafusion.fusion.scores.metrics import Scores
 
 SCHEMA = "terrafusion.replay/1"
@@ -48,6 +50,7 @@ def build_metrics(
     scores: Scores,
     status: Mapping[str, str],
     notes: Sequence[str] = (),
+    calibration: Sequence[Mapping[str, Any]] = (),
 ) -> dict[str, Any]:
     """The content of `metrics.json`.
 
@@ -61,6 +64,7 @@ def build_metrics(
         rejected: measurements turned away by a gate, by sensor (see `rejected_counts`).
         status: `value` and `message` (see `final_status`).
         notes: what was assumed; notes on the scoring are added.
+        calibration: rows of `linear_states.calibration`; empty where none was asked for.
     """
     if mode not in MODES:
         raise ValueError(f"mode is '{mode}', not one of {', '.join(MODES)}")
@@ -91,6 +95,7 @@ def build_metrics(
         "consistency": [
             finite(dataclasses.asdict(row)) | {"verdict": row.verdict()} for row in scores.consistency
         ],
+        "calibration": [finite(row) for row in calibration],
         "status": {"value": status["value"], "message": status["message"]},
         "notes": [*notes, *(note for note in scores.notes if note not in notes)],
     }
@@ -182,6 +187,9 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     w_<name>                     the weights in force, named and measured as in the policy file
     status                       waiting, aligning, running, outage or no_gnss
     slipping, immobilised        1 or 0, see docs/monitor.md
+    sigma_gyro_bias_*, sigma_accel_bias_*   1 sigma of the biases
+    <state>, sigma_<state>       the linear states but slip, as far as they are estimated; see
+                                 docs/calibration-states.md
     """
     path = estimate.trajectory
     n = len(path)
@@ -206,6 +214,13 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     table["status"] = [_cell(value) for value in estimate.status]
     for name, flags in (("slipping", estimate.slipping), ("immobilised", estimate.immobilised)):
         table[name] = [""] * n if flags is None else [str(int(flag)) for flag in flags]
+    biases = [f"sigma_gyro_bias_{a}_radps" for a in "xyz"] + [f"sigma_accel_bias_{a}_mps2" for a in "xyz"]
+    unknown = np.full((n, 6), np.nan)
+    table |= _numbers(biases, unknown if estimate.bias_sigma is None else estimate.bias_sigma, ".6g")
+    for state in LINEAR[1:]:
+        found = series(estimate, state)
+        if found is not None:
+            table |= _numbers((state, f"sigma_{state}"), np.stack(found, axis=1), ".6g")
     return table
 
 

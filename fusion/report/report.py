@@ -14,9 +14,10 @@ from typing import Any
 
 from terrafusion.datasets.recording import Gnss, Recording
 from terrafusion.fusion.estimate import Estimate, WeightChange
-from terrafusion.fusion.report import plots, plots_filter, plots_map, style
+from terrafusion.fusion.report import plots, plots_filter, plots_map, plots_states, style
 from terrafusion.fusion.report import text as words
-from terrafusion.fusion.report.page import bullets, figure, where_from, write_page
+from terrafusion.fusion.report.linear_states import cells
+from terrafusion.fusion.report.page import bullets, figure, table, where_from, write_page
 from terrafusion.fusion.scores.metrics import Outage, Scores
 
 MOST_REASONS = 20
@@ -72,6 +73,7 @@ def write_report(
         _maps(runs, shown, recording, held_out, outages),
         _errors(runs, shown, recording, outages),
         _ground(shown, recording, outages),
+        _calibration(runs),
         _weights(shown, recording, marked),
         _sensors(shown, recording, outages, wheel_radius_m),
         _notes(runs),
@@ -181,8 +183,38 @@ def _ground(shown: ReportRun, recording: Recording, outages: Sequence[Outage]) -
             "<h2>Ground and slip</h2>",
             figure(terrain, f"Probability of each class of ground ({shown.name}).{strip}"),
             figure(slip, "Slip as estimated, with two sigma; the background is the most probable ground."),
+            *_skid_steering(shown, recording, outages),
         ]
     )
+
+
+def _skid_steering(shown: ReportRun, recording: Recording, outages: Sequence[Outage]) -> list[str]:
+    if not plots_states.drawn(shown.estimate):
+        return []
+    fig, _ = plots_states.plot_skid_steering(shown.estimate, recording.start_ns, outages=outages)
+    caption = (
+        "How the robot turns and drifts sideways, with two sigma. Yaw scale: true over wheel yaw rate, less "
+        "one; the effective track is the track over one plus it. Side-slip: lateral over forward speed. "
+        "Centre of rotation: ahead of the body's origin."
+    )
+    return [figure(fig, caption)]
+
+
+def _calibration(runs: Sequence[ReportRun]) -> str:
+    parts = []
+    heads = ("state", "value", "sigma", "sigma before", "verdict")
+    for run in runs:
+        rows = run.metrics.get("calibration", ())
+        if rows:
+            parts.append(f'<p class="dim">{escape(run.name)}</p>' if len(runs) > 1 else "")
+            parts.append(table(heads, [[escape(c) for c in cells(row)] for row in rows], numbers=(1, 2, 3)))
+    if not parts:
+        return ""
+    about = (
+        "What the drive tells of the vehicle file, at its end: add the value to the file's. Observed: the "
+        "drive has at least halved the sigma the file was trusted with before."
+    )
+    return "\n".join(["<h2>Calibration</h2>", f"<p>{about}</p>", *parts])
 
 
 def _weights(shown: ReportRun, recording: Recording, marked: Sequence[WeightChange]) -> str:

@@ -5,6 +5,7 @@
     world/gnss/{used,rejected,kept_back}           points
     world/two_sigma                                ellipses of the position, as in the report
     slip, speed, sigma, bias, terrain, weights     numbers over time
+    states/<name>, states/sigma_<name>             the other linear states and their 1 sigma
     nis/<sensor>                                   normalised innovation squared over its dimension
     events                                         changes of weight and of status, with their reasons
 
@@ -24,7 +25,9 @@ from numpy.typing import NDArray
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.estimate import STATUS, Estimate
+from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.report import style
+from terrafusion.fusion.report.linear_states import series
 from terrafusion.fusion.report.plots_map import ellipse_rows, ellipses, is_local, refused_fixes
 
 if TYPE_CHECKING:
@@ -147,6 +150,10 @@ def _numbers(log: _Log, estimate: Estimate) -> None:
             f"accel_{axis}_mps2": estimate.accel_bias_mps2[:, i],
         }
         log.scalars("bias", t_ns, biases)
+    for name in LINEAR[1:]:
+        state = series(estimate, name)
+        if state is not None:
+            log.scalars("states", t_ns, {name: state[0], f"sigma_{name}": state[1]})
     log.scalars("terrain", t_ns, dict(zip(estimate.classes, estimate.terrain.T, strict=True)))
     log.scalars("weights", t_ns, estimate.weights)
     for sensor in dict.fromkeys(i.sensor for i in estimate.innovations):

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.fusion.replay import Replay
+from terrafusion.fusion.report.linear_states import calibration
 from terrafusion.fusion.report.outputs import build_metrics, final_status, terrain_shares, write_outputs
 from terrafusion.fusion.report.report import ReportRun, write_report
 
@@ -29,6 +30,7 @@ def metrics_of(result: Replay) -> dict[str, Any]:
         scores=result.scores,
         status=final_status(estimate),
         notes=estimate.notes,
+        calibration=calibration(estimate),
     )
 
 

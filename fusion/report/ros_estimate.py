@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 from terrafusion.fusion.estimate import STATUS, Estimate
+from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.report.linear_states import Array, series
 from terrafusion.fusion.report.plots_map import is_local
 
 EVERY_S = 1.0
@@ -23,12 +25,14 @@ def written_estimate(estimate: Estimate) -> WrittenEstimate:
     t_ns = estimate.trajectory.t_ns[rows]
     rejected = _rejected_by(estimate, t_ns)
     waits = _seconds_in_status(estimate)
+    states = {name: found for name in LINEAR[1:] if (found := series(estimate, name)) is not None}
     diagnostics = [
         (
             _localisation(estimate, i, waits[i]),
             _ground(estimate, i),
             _weights(estimate, i),
             _gates({sensor: int(counts[j]) for sensor, counts in rejected.items()}),
+            *_states(states, i),
         )
         for j, i in enumerate(rows.tolist())
     ]
@@ -85,6 +89,15 @@ def _ground(estimate: Estimate, i: int) -> Status:
 def _weights(estimate: Estimate, i: int) -> Status:
     values = {name: f"{column[i]:.4g}" for name, column in estimate.weights.items()}
     return Status("terrafusion/weights", Level.OK, "noise in force, as the policy file names it", values)
+
+
+def _states(states: dict[str, tuple[Array, Array]], i: int) -> list[Status]:
+    """The linear states but slip with their sigma; no status where the estimate has none."""
+    values: dict[str, str] = {}
+    for name, (value, sigma) in states.items():
+        values |= {name: f"{value[i]:.5g}", f"sigma_{name}": f"{sigma[i]:.3g}"}
+    message = "skid steering, GNSS drift and, where asked for, the robot's calibration"
+    return [Status("terrafusion/states", Level.OK, message, values)] if values else []
 
 
 def _gates(rejected: dict[str, int]) -> Status:
