@@ -13,6 +13,7 @@ import typer
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.cli import (
+    benchmark,
     calibrate,
     convert,
     demo,
@@ -39,6 +40,7 @@ app.command("fetch")(fetch.fetch)
 app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("sweep")(sweep.sweep)
+app.command("benchmark")(benchmark.benchmark)
 app.command("calibrate")(calibrate.calibrate)
 app.command("study")(study.study)
 app.command("replay")(replay.replay)

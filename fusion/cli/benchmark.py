@@ -1,0 +1,60 @@
+"""`terrafusion benchmark`: adaptive weighting against fixed and other baselines, in pairs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafusion.fusion.cli.common import progress_bar
+
+
+def benchmark(
+    out: Annotated[Path, typer.Option("--out", help="Folder for the results; an unfinished run goes on.")],
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few drives: two minutes on two processors.")
+    ] = False,
+    jobs: Annotated[
+        int | None, typer.Option(min=1, help="Processes; by default one a processor.", show_default=False)
+    ] = None,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, help="Drives of each family on each plant (20).", show_default=False),
+    ] = None,
+    only: Annotated[
+        list[str] | None,
+        typer.Option(metavar="FAMILY", help="mixed, slopes, outages, firm, unseen, field; repeat for more."),
+    ] = None,
+    docs: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Put the tables into a document (docs/benchmark.md).")
+    ] = None,
+) -> None:
+    """Compare weightings on the same drives: twin, perturbed soils, another terramechanics, field logs.
+
+    Arms: data sheet, fixed (tuned), robust, innovation, adaptive, and the same with true, shuffled and
+    adversarial labels. Writes benchmark.json, benchmark.md, ratios.png and report.html.
+
+    Example: terrafusion benchmark --out results --quick
+    """
+    import joblib
+
+    from terrafusion.fusion.benchmark.drives import checked
+    from terrafusion.fusion.benchmark.outputs import write_benchmark, write_document
+    from terrafusion.fusion.benchmark.plan import Plan
+    from terrafusion.fusion.benchmark.run import run_benchmark
+    from terrafusion.fusion.benchmark.text import markdown
+
+    plan = Plan(checked(only or []), seeds, quick)
+    with progress_bar("benchmark") as progress:
+        found = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
+    words = [f"--{name}" for name, given in (("quick", quick),) if given]
+    words += [f"--seeds {seeds}"] if seeds else []
+    words += [f"--only {name}" for name in only or []]
+    command = " ".join(["terrafusion benchmark --out DIR", *words])
+    made = write_benchmark(out, plan, found, command)
+    if docs is not None:
+        write_document(docs, made, plan, found, command)
+    for table in made[:3]:
+        print("\n".join([*markdown(table), ""]))
+    print(f"report: {out / 'report.html'}")

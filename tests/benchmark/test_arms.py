@@ -1,0 +1,88 @@
+"""Arms, and the labels that are told to some of them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from terrafusion.fusion.benchmark.arms import (
+    ARMS,
+    SHEET,
+    misleading,
+    most_foreign,
+    replay_options,
+    shuffled,
+    true_labels,
+)
+from terrafusion.fusion.terrain.labels import GroundLabels
+from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.simulate import START_NS, simulate
+
+POLICY = load_policy()
+LABELS = GroundLabels((START_NS, START_NS + 10**10), ("asphalt", "lava"))
+
+
+@pytest.fixture(scope="module")
+def two_grounds():
+    scenario = load_scenario("mixed_terrain")
+    short = dataclasses.replace(scenario, duration_s=60.0)
+    return simulate(short, seed=1)
+
+
+def test_every_arm_is_a_mode_with_its_own_name() -> None:
+    assert len({arm.name for arm in ARMS}) == len(ARMS) == 8
+    for arm in ARMS:
+        options = replay_options(arm, LABELS, seed=3)
+        assert options is not None
+        assert options["mode"] == arm.mode
+
+
+def test_arms_that_need_labels_have_none_without_them() -> None:
+    without = {arm.name for arm in ARMS if replay_options(arm, None, seed=3) is None}
+    assert without == {"oracle", "shuffled", "adversarial"}
+
+
+def test_the_data_sheet_knows_no_slip_and_no_tuning() -> None:
+    options = replay_options(ARMS[0], None, seed=0)
+    assert options is not None
+    row = options["policy"].fixed
+    assert {name: getattr(row, name) for name in SHEET} == SHEET
+    assert options["settings"]["tuning"].fixed.of(row) == row
+
+
+def test_true_labels_follow_the_simulation(two_grounds) -> None:
+    labels = true_labels(two_grounds)
+    assert labels is not None
+    assert labels.names == ("asphalt", "loose_sand")
+    terrain = two_grounds.terrain
+    for t, label in zip(terrain.t_ns.tolist(), terrain.label.astype(str), strict=True):
+        assert labels.at(t) == label
+
+
+def test_a_detectors_word_is_no_truth(two_grounds) -> None:
+    heard = dataclasses.replace(two_grounds.terrain, source="detector")
+    assert true_labels(dataclasses.replace(two_grounds, terrain=heard, terrain_name="")) is None
+
+
+def test_ground_that_the_policy_does_not_know_gives_no_oracle(two_grounds) -> None:
+    assert true_labels(dataclasses.replace(two_grounds, terrain=None, terrain_name="lava")) is None
+    named = true_labels(dataclasses.replace(two_grounds, terrain=None, terrain_name="mud"))
+    assert named is not None
+    assert named.names == ("mud",)
+
+
+def test_shuffled_labels_come_from_the_seed_and_from_all_classes() -> None:
+    one, same, other = (shuffled(LABELS, POLICY, seed) for seed in (1, 1, 2))
+    assert one == same != other
+    assert set(one.names) == set(POLICY.names()) - {"unknown"}
+
+
+def test_the_most_foreign_class_is_never_the_true_one() -> None:
+    for name in POLICY.names():
+        if name != "unknown":
+            assert most_foreign(name, POLICY) not in (name, "unknown")
+    assert most_foreign("loose_sand", POLICY) in ("asphalt", "medium_sand")
+    assert most_foreign("lava", POLICY) == "unknown"
+    assert misleading(LABELS, POLICY).t_ns == LABELS.t_ns

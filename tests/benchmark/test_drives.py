@@ -1,0 +1,82 @@
+"""Drives of the benchmark: paired over plants, untouched by training, the same each time."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.fusion.benchmark.drives import (
+    FAMILIES,
+    FIRST_SEED,
+    LEAD_S,
+    PLANTS,
+    Case,
+    checked,
+    drive_of,
+    perturbed,
+    soils_of,
+)
+from terrafusion.fusion.terrain.drives import SOIL_SCATTER
+from terrafusion.fusion.weights.tuning import DRIVES
+from terrafusion.twin.soil import load_soil
+
+SHORT = Case("outages", "twin", FIRST_SEED + 1)
+
+
+def test_no_seed_of_training_is_used() -> None:
+    assert max(drive.seed for drive in DRIVES) < FIRST_SEED
+
+
+def test_the_same_case_gives_the_same_bits() -> None:
+    one, other = drive_of(SHORT), drive_of(SHORT)
+    assert np.array_equal(one.recording.imu.accel_mps2, other.recording.imu.accel_mps2)
+    assert np.array_equal(one.recording.truth.position_m, other.recording.truth.position_m)
+    assert (one.outage, one.labels) == (other.outage, other.labels)
+
+
+def test_plants_drive_the_same_on_other_ground() -> None:
+    drives = {plant: drive_of(Case("outages", plant, FIRST_SEED + 1)) for plant in PLANTS}
+    commands = [d.recording.command.v_mps for d in drives.values()]
+    assert all(np.array_equal(commands[0], other) for other in commands[1:])
+    assert len({d.outage for d in drives.values()}) == 1
+    ends = [d.recording.truth.position_m[-1, :2] for d in drives.values()]
+    assert min(np.hypot(*(ends[0] - other)) for other in ends[1:]) > 0.1
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_an_outage_follows_the_lead_and_lasts_to_the_end(family: str) -> None:
+    drive = drive_of(Case(family, "twin", FIRST_SEED + 1))
+    assert LEAD_S[0] <= drive.outage.start_s <= LEAD_S[1]
+    assert drive.outage.seconds in FAMILIES[family].outages_s
+    assert drive.recording.duration_s() >= drive.outage.start_s + drive.outage.seconds
+    assert set(drive.recording.terrain.label.astype(str)) <= set(FAMILIES[family].grounds)
+
+
+def test_mixed_drives_change_their_ground_in_the_outage() -> None:
+    drive = drive_of(Case("mixed", "twin", FIRST_SEED))
+    terrain = drive.recording.terrain
+    inside = drive.outage.covers(terrain.t_ns, drive.recording.start_ns)
+    assert len(set(terrain.label[inside].astype(str))) >= 2
+
+
+def test_a_perturbed_soil_is_thirty_percent_off_in_every_number() -> None:
+    soil = load_soil("loose_sand")
+    off = perturbed(soil, np.random.default_rng(0))
+    for section, keys in SOIL_SCATTER.items():
+        for key in keys:
+            own, other = (getattr(getattr(one, section), key) for one in (soil, off))
+            assert abs(other / own - 1.0) == pytest.approx(0.3)
+
+
+def test_soils_of_the_twin_stay_in_the_scatter_of_training() -> None:
+    for name, soil in soils_of(SHORT, {"mud", "loose_sand"}).items():
+        k_phi = load_soil(name).pressure.k_phi_n_per_m_n2
+        assert abs(soil.pressure.k_phi_n_per_m_n2 / k_phi - 1.0) <= 0.2 + 1e-9
+
+
+def test_an_unknown_family_is_refused() -> None:
+    assert checked([]) == (*FAMILIES, "field")
+    assert checked(["field", "mixed"]) == ("mixed", "field")
+    with pytest.raises(ConfigError, match="unknown family 'mixd'"):
+        checked(["mixd"])

@@ -1,0 +1,116 @@
+"""A small benchmark from end to end: files, resumption, the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from terrafusion.datasets.errors import ConfigError, TerrafusionError
+from terrafusion.fusion.benchmark import outputs, plan, run
+from terrafusion.fusion.benchmark.arms import ARMS
+from terrafusion.fusion.benchmark.drives import FIRST_SEED, Case
+from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.benchmark.outputs import MARK, write_benchmark, write_document
+from terrafusion.fusion.benchmark.plan import Job, Plan
+from terrafusion.fusion.benchmark.run import Found, run_benchmark
+
+FEW = ("fixed", "adaptive", "oracle")
+JOB = Job(Case("outages", "twin", FIRST_SEED + 1), FEW)
+PLAN = Plan(("outages",), seeds=1)
+
+
+@pytest.fixture
+def one_job(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every plan is one drive of 75 s with three arms."""
+    monkeypatch.setattr(Plan, "jobs", lambda self: [JOB])
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Found]:
+    out = tmp_path_factory.mktemp("benchmark")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Plan, "jobs", lambda self: [JOB])
+        return out, run_benchmark(PLAN, out)
+
+
+def test_every_arm_gives_a_row_with_its_grounds(found) -> None:
+    rows = found[1].rows
+    assert [row.arm for row in rows] == list(FEW)
+    for row in rows:
+        assert row.failed == row.diverged == ""
+        assert row.error_m is not None
+        assert 0.0 < row.error_m < 20.0
+        assert sum(g.seconds for g in row.grounds) == pytest.approx(row.outage_s, abs=0.5)
+    oracle = rows[2]
+    assert min(g.recognised for g in oracle.grounds if g.seconds > 5.0) > 0.8
+
+
+def test_finished_jobs_are_not_run_again(found, one_job, monkeypatch) -> None:
+    out, before = found
+    monkeypatch.setattr(run, "run_job", lambda job: pytest.fail("it ran again"))
+    assert run_benchmark(PLAN, out) == before
+
+
+def test_results_of_other_sources_are_not_taken(found, one_job, monkeypatch) -> None:
+    monkeypatch.setattr(run, "sources_sha256", lambda: "other")
+    monkeypatch.setattr(run, "run_job", lambda job: (job, Found((Row("a", "b", "c", "d", "e"),), ())))
+    assert run_benchmark(PLAN, found[0]).rows[0].family == "a"
+
+
+def test_the_files_hold_the_same_numbers(found, tmp_path) -> None:
+    made = write_benchmark(tmp_path, PLAN, found[1], "terrafusion benchmark")
+    content = json.loads((tmp_path / "benchmark.json").read_text())
+    assert content["schema"] == outputs.SCHEMA
+    assert [row["arm"] for row in content["rows"]] == list(FEW)
+    assert content["origin"]["command"] == "terrafusion benchmark"
+    text = (tmp_path / "benchmark.md").read_text()
+    for cells in made[0].rows:
+        assert " | ".join(cells) in text
+    page = (tmp_path / "report.html").read_text()
+    assert page.count("<svg") + page.count("data:image/svg+xml") == 1
+    assert (tmp_path / "ratios.png").stat().st_size > 5_000
+    again = tmp_path / "again"
+    write_benchmark(again, PLAN, found[1], "terrafusion benchmark")
+    for name in ("benchmark.json", "benchmark.md", "report.html"):
+        assert (again / name).read_bytes() == (tmp_path / name).read_bytes()
+
+
+def test_a_document_keeps_what_stands_before_the_mark(found, tmp_path) -> None:
+    document = tmp_path / "page.md"
+    document.write_text(f"# Head\n{MARK}\nold\n")
+    made = write_benchmark(tmp_path / "out", PLAN, found[1], "terrafusion benchmark")
+    write_document(document, made, PLAN, found[1], "terrafusion benchmark")
+    text = document.read_text()
+    assert text.startswith(f"# Head\n{MARK}\n\n## Errors\n")
+    assert "old" not in text
+    with pytest.raises(ConfigError, match="no document with a place"):
+        write_document(tmp_path / "absent.md", made, PLAN, found[1], "")
+
+
+def test_plans() -> None:
+    quick = Plan(("mixed", "firm"), quick=True).jobs()
+    assert [(job.item.family, job.item.plant) for job in quick] == [
+        ("mixed", "twin"), ("mixed", "perturbed"), ("mixed", "second"), ("firm", "twin"),
+        ("mixed", "twin"), ("mixed", "perturbed"), ("mixed", "second"),
+    ]  # fmt: skip
+    full = Plan(("mixed", "firm"), seeds=3).jobs()
+    assert len({job.key for job in full}) == len(full) == 2 * 3 * 3
+    assert {job.arms for job in full} == {tuple(arm.name for arm in ARMS)}
+    with pytest.raises(ConfigError, match="0 seeds"):
+        Plan(("mixed",), seeds=0)
+
+
+def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(plan, "logs_at_hand", lambda starts: [])
+    with pytest.raises(TerrafusionError, match="no field log is at hand"):
+        run_benchmark(Plan(("field",)), tmp_path)
+
+
+def test_the_command(terrafusion, one_job, tmp_path) -> None:
+    done = terrafusion("benchmark", "--out", tmp_path / "out", "--only", "outages", "--jobs", 1)
+    assert done.status == 0, done.err
+    assert "## Errors" in done.out
+    assert "outages, twin" in done.out
+    terrafusion("benchmark", "--out", tmp_path, "--only", "nothing").refused("unknown family 'nothing'")
