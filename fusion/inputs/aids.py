@@ -1,0 +1,62 @@
+"""Barometer and magnetometer of one estimator; where no samples of theirs come, nothing is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.sensors import Rig
+from terrafusion.fusion.estimate import Innovation
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.inputs.alignment import WINDOW_NS, GivenStart, Start
+from terrafusion.fusion.inputs.barometer import HeightAid
+from terrafusion.fusion.inputs.magnetometer import HeadingAid
+from terrafusion.fusion.inputs.streams import GnssFix
+
+Array = NDArray[np.float64]
+
+
+class Aids:
+    """Both sensors.
+
+    Args:
+        rig: the robot; its sensor specifications may lack either.
+        declination_rad: magnetic north, east of true north; None where it is not known.
+        report: called with every tested measurement.
+    """
+
+    def __init__(self, rig: Rig, declination_rad: float | None, report: Callable[[Innovation], None]) -> None:
+        self.height = HeightAid(rig.sensors.barometer, report)
+        self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report)
+        self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
+
+    def update(self, chain: Chain, before: Array, after: Array, turned: int) -> bool:
+        """Use what has come up to the newest keyframe; True where factors were added to it.
+
+        `before` and `after` (n, n) are its covariance without and with its fixes; `turned` counts the
+        headings that GNSS has set right.
+        """
+        t_ns = chain.nodes[-1].t_ns
+        height = self.height.active and self.height.update(chain, t_ns, before, after)
+        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, turned)
+        return height or heading
+
+    def start(self, level: Start, fixes: Sequence[GnssFix]) -> GivenStart | None:
+        """Where a robot at rest stands and where it heads, once a fix and the field have told it."""
+        early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
+        told = self.heading.heading_at_rest(level) if early else None
+        if told is None:
+            return None
+        yaw, sigma = told
+        R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, yaw).matrix()
+        best = min(early, key=lambda fix: float(fix.sigma_m[0]))
+        position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
+        return GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
+
+    def notes(self) -> tuple[str, ...]:
+        """What was made of the samples, in sentences."""
+        told = self.height.note()
+        return (*([told] if told else []), *self.heading.notes())
