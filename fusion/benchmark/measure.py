@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,6 +57,8 @@ class Row:
             over all of it); None without a reference.
         end_m, percent: error at the outage's end, and over the way driven in it.
         nees: mean in the outage, per dimension.
+        switch_s: mean time from a change of the true ground in the outage until the ground in force is the
+            new one, or changes again.
         diverged: why the estimate cannot be of the drive, "" where it can.
         failed: why there is no estimate.
     """
@@ -72,6 +75,7 @@ class Row:
     percent: float | None = None
     nees: float | None = None
     heading_rad: float | None = None
+    switch_s: float | None = None
     seconds: float | None = None
     diverged: str = ""
     failed: str = ""
@@ -111,11 +115,28 @@ def _measured(row: Row, drive: Drive, result: Replay) -> Row:
     if drive.outage is not None:
         inside = drive.outage.covers(errors.t_ns, drive.recording.start_ns)
         row = _with_outage(row, result.scores.outages[0])
+    row = dataclasses.replace(row, error_m=_rms(distance[inside]))
+    if drive.labels is None:
+        return row
+    # The labels, not the channel: a log's own name of its terrain counts as one, too.
+    true = np.array([drive.labels.at(t) for t in errors.t_ns.tolist()])
+    used = ground_at(dataclasses.replace(drive.recording, terrain=None), result.estimate, errors.t_ns)
     return dataclasses.replace(
         row,
-        error_m=_rms(distance[inside]),
-        grounds=tuple(_by_ground(drive, result, errors, inside)) if drive.labels else (),
+        switch_s=switch_delay_s(errors.t_ns[inside], true[inside], used[inside]),
+        grounds=tuple(_by_ground(errors, true, used, inside, drive.recording.start_ns)),
     )
+
+
+def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], used: NDArray[Any]) -> float | None:
+    """Mean time from each change of `true` (N,) until `used` agrees, at most to the next; None without one."""
+    changes = np.flatnonzero(true[1:] != true[:-1]) + 1
+    delays = []
+    for first, end in itertools.pairwise([*changes, len(true)]):
+        right = np.flatnonzero(used[first:end] == true[first])
+        last = first + right[0] if len(right) else end - 1
+        delays.append((t_ns[last] - t_ns[first]) * 1e-9)
+    return float(np.mean(delays)) if delays else None
 
 
 def _with_outage(row: Row, outage: OutageScore) -> Row:
@@ -130,12 +151,9 @@ def _with_outage(row: Row, outage: OutageScore) -> Row:
     )
 
 
-def _by_ground(drive: Drive, result: Replay, errors: Errors, inside: Rows) -> list[GroundRow]:
-    recording, estimate = drive.recording, result.estimate
-    assert drive.labels is not None
-    # The labels, not the channel: a log's own name of its terrain counts as one, too.
-    true = np.array([drive.labels.at(t) for t in errors.t_ns.tolist()])
-    detected = ground_at(dataclasses.replace(recording, terrain=None), estimate, errors.t_ns)
+def _by_ground(
+    errors: Errors, true: NDArray[Any], used: NDArray[Any], inside: Rows, start_ns: int
+) -> list[GroundRow]:
     whitened = position(errors)
     speed = np.gradient(errors.path_m(), errors.t_ns * 1e-9) if len(errors.t_ns) > 1 else np.zeros(1)
     step_s = float(np.median(np.diff(errors.t_ns))) * 1e-9 if len(errors.t_ns) > 1 else 0.0
@@ -143,8 +161,8 @@ def _by_ground(drive: Drive, result: Replay, errors: Errors, inside: Rows) -> li
     for ground in dict.fromkeys(true.tolist()):
         here = true == ground
         lost = here & inside
-        whole = summarise(whitened, here, recording.start_ns)
-        outage = summarise(whitened, lost, recording.start_ns)
+        whole = summarise(whitened, here, start_ns)
+        outage = summarise(whitened, lost, start_ns)
         rows.append(
             GroundRow(
                 ground=ground,
@@ -152,7 +170,7 @@ def _by_ground(drive: Drive, result: Replay, errors: Errors, inside: Rows) -> li
                 forward_mps=_rms(errors.velocity_error_mps[lost, 0]),
                 side_mps=_rms(errors.velocity_error_mps[lost, 1]),
                 heading_mps=_rms((speed * errors.yaw_error_rad())[lost]),
-                recognised=float((detected[lost] == ground).mean()) if lost.any() else None,
+                recognised=float((used[lost] == ground).mean()) if lost.any() else None,
                 nees=whole.mean if whole else None,
                 effective=whole.effective if whole else None,
                 nees_outage=outage.mean if outage else None,

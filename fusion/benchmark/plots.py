@@ -12,7 +12,7 @@ from terrafusion.fusion.report import style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-COLOURS = style.MODE_COLOURS | {"data sheet": "#a9a9a9", "shuffled": "#8c510a", "adversarial": "#5e2a84"}
+COLOURS = style.MODE_COLOURS | {"data sheet": "#e69f00", "shuffled": "#8c510a", "adversarial": "#5e2a84"}
 ROW_IN, SPREAD = 0.62, 0.09
 """Height of a group, inches, and of an arm in it, shares of that."""
 RANGE = (0.1, 20.0)

@@ -31,10 +31,12 @@ class Target:
     unit: str = ""
 
     def verdict(self) -> str:
-        """`REACHED`, `OPEN` or `MISSED`; "not measured" without a number; by the number where it is alone."""
+        """`REACHED`, `OPEN` or `MISSED`; "not measured" without a number. One drive alone decides nothing."""
         if self.found is None:
             return "not measured"
-        low, high = self.interval or (self.found, self.found)
+        if self.interval is None:
+            return OPEN
+        low, high = self.interval
         if self.most:
             return REACHED if high <= self.limit else MISSED if low > self.limit else OPEN
         return REACHED if low >= self.limit else MISSED if high < self.limit else OPEN

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.fusion.benchmark.compare import contrasts, median_interval, shares
-from terrafusion.fusion.benchmark.measure import GroundRow, Row
+from terrafusion.fusion.benchmark.measure import GroundRow, Row, switch_delay_s
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, nees_cells, targets
 from terrafusion.fusion.benchmark.text import markdown, tables
@@ -103,7 +103,16 @@ def test_intervals_cover_the_median_as_often_as_they_say() -> None:
 )  # fmt: skip
 def test_verdicts_go_by_the_whole_interval(interval, most, verdict) -> None:
     assert Target("G0", "", 0.6, most, 0.5, interval).verdict() == verdict
+    assert Target("G0", "", 0.6, most, 0.5, None).verdict() == OPEN
     assert Target("G0", "", 0.6, most, None, None).verdict() == "not measured"
+
+
+def test_the_delay_of_a_switch_ends_where_the_grounds_agree_or_change_again() -> None:
+    t = np.arange(8) * 10**9
+    true = np.array([*"aabbbbcc"])
+    assert switch_delay_s(t, true, np.array([*"aaaabbcc"])) == pytest.approx(1.0)  # 2 s, then at once
+    assert switch_delay_s(t, true, np.array([*"aaaaaaaa"])) == pytest.approx(2.0)  # 3 s and 1 s, never seen
+    assert switch_delay_s(t, np.array([*"aaaaaaaa"]), true) is None
 
 
 def test_targets_of_a_benchmark_that_reaches_them() -> None:
