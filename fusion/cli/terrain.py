@@ -22,19 +22,26 @@ app = typer.Typer(help="The terrain detector: train its model, score it.", no_ar
 @app.command("train")
 def train(
     out: Annotated[Path, typer.Option("--out", help="Model file (YAML) to write.")],
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds of the drives it learns from.")] = 3,
+    logs: Annotated[
+        list[str] | None, typer.Argument(help="Labelled logs of one robot; none: drives of the twin.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds of the twin's drives.")] = 3,
 ) -> None:
-    """Drive the twin over soils, slopes, payloads and speeds, and train the terrain model.
+    """Train the terrain model on drives of the twin, or a learner of a robot's own grounds on its logs.
 
-    One further seed calibrates the probabilities and one scores the model; both
-    are kept from the training.
+    Without logs it drives the twin over soils, slopes, payloads and speeds; one
+    further seed calibrates the probabilities and one scores the model.
 
     Example: terrafusion terrain train --out model.yaml
+    Example: terrafusion terrain train --out grounds.yaml borealtc/*/imu_*.csv
     """
+    checked_output(out)
+    if logs:
+        train_on_logs(logs, out)
+        return
     from terrafusion.fusion.terrain.train import Plan, write_model
     from terrafusion.fusion.terrain.train import train as run
 
-    checked_output(out)
     plan = Plan(seeds=seeds)
     with progress("drives", plan.drives()) as tick:
         model, scores = run(plan, tick)
@@ -43,17 +50,49 @@ def train(
     print(f"temperature {model.temperature:g}; inputs {model.inputs_sha256[:16]}; written to {out}")
 
 
+def train_on_logs(logs: list[str], out: Path) -> None:
+    """Fit, calibrate and write a learner of labelled logs."""
+    import dataclasses
+
+    from terrafusion.fusion.terrain.labelled import hashes_of, open_runs, train_on
+
+    runs = open_runs(logs)
+    made_by = f"terrafusion terrain train --out {out.name}, {len(runs)} runs"
+    model = dataclasses.replace(train_on(runs), inputs=hashes_of(logs), made_by=made_by)
+    model.write(out)
+    windows = sum(len(r.x) for r in runs)
+    print(f"{windows} windows of {len(runs)} runs on {', '.join(model.classes)}; written to {out}")
+
+
 @app.command("eval")
 def evaluate(
-    model: Annotated[
-        Path | None, typer.Option("--model", help="Model file; the shipped one if left out.")
+    logs: Annotated[
+        list[str] | None, typer.Argument(help="Labelled logs of one robot; none: fresh drives of the twin.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Fresh seeds to score on.")] = 1,
+    model: Annotated[
+        Path | None, typer.Option("--model", help="Model file for the twin's drives; else the shipped one.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Fresh seeds of the twin to score on.")] = 1,
+    test: Annotated[
+        list[str] | None, typer.Option("--test", help="Labelled logs of another robot (may be given again).")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="JSON file for all figures of the logs.")] = None,
 ) -> None:
-    """Score a terrain model on fresh drives of the twin, with and without slip, and on a ground it never saw.
+    """Score a terrain model on fresh drives of the twin, or a learner on labelled logs, by run.
+
+    With logs: five folds, no run in two of them; changes of ground, each input
+    left out, grounds never seen, and the split that leaks beside it.
 
     Example: terrafusion terrain eval
+    Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
     """
+    if out is not None:
+        checked_output(out)
+    if logs:
+        evaluate_logs(logs, test or [], out)
+        return
+    if test or out is not None:
+        raise TerrafusionError("--test and --out are of labelled logs", remedy="name the logs to train on")
     from terrafusion.fusion.terrain import trials
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
@@ -63,6 +102,23 @@ def evaluate(
     for name, scores in results.items():
         print_scores(name, scores)
         print()
+
+
+def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
+    """Print the figures of labelled logs, and write them."""
+    import json
+
+    from terrafusion.fusion.terrain.labelled import hashes_of, open_runs
+    from terrafusion.fusion.terrain.surface_report import STEPS, lines_of, report_on
+
+    runs, others = open_runs(logs), open_runs(test) if test else []
+    with progress("steps", STEPS) as tick:
+        report = report_on(runs, others, tick)
+    for line in lines_of(report):
+        print(line)
+    if out is not None:
+        text = json.dumps(report | {"inputs": hashes_of([*logs, *test])}, indent=1)
+        out.write_text(text + "\n", encoding="utf-8")
 
 
 def print_scores(name: str, scores: Scores) -> None:

@@ -29,7 +29,7 @@ Array = NDArray[np.float64]
 SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
 FOREIGN_SLIP = 0.03
-"""1 sigma of the share by which the rolling radius of a robot not trained on may be wrong: it looks like slip.
+"""1 sigma of the relative error of the rolling radius of a robot not trained on: it looks like slip.
 
 Assumed; tyre pressure and load move the rolling radius of a pneumatic wheel by a few per cent.
 """

@@ -35,6 +35,10 @@ class PatchFilter:
             self._set(self.probabilities * (1.0 - drawn) + self.prior * drawn)
         return self.probabilities
 
+    def forget(self, share: float) -> None:
+        """Fall back to the prior by a share (0 to 1): something tells that the ground has changed."""
+        self._set(self.probabilities * (1.0 - share) + self.prior * share)
+
     def update(self, log_likelihood: ArrayLike) -> Array:
         """Weigh the classes by log-evidence (k,), known up to a constant; with NaN or +inf there is none."""
         evidence = np.asarray(log_likelihood, dtype=float)
