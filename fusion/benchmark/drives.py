@@ -11,13 +11,11 @@ from __future__ import annotations
 import dataclasses
 import tempfile
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.benchmark.arms import true_labels
 from terrafusion.fusion.scores.metrics import Outage
@@ -106,7 +104,8 @@ class Case:
 class Drive:
     """A recording, the outage in it (None: the whole of it is judged) and its true ground where known.
 
-    `unit` is what is independent of other drives: the seed, or the log that several outages are of.
+    `unit` is what is independent of other drives: the seed, or the log that several outages are of. A drive
+    that is not `judged` has nothing to be judged against: it can only diverge.
     """
 
     family: str
@@ -117,19 +116,7 @@ class Drive:
     outage: Outage | None
     labels: GroundLabels | None
     seed: int = 0
-
-
-def checked(names: Sequence[str]) -> tuple[str, ...]:
-    """Families by name, in the order of `FAMILIES`, all of them and the field where none is named.
-
-    Raises:
-        ConfigError: an unknown name.
-    """
-    known = (*FAMILIES, FIELD)
-    for name in names:
-        if name not in known:
-            raise ConfigError(f"unknown family '{name}'", remedy=f"known are {', '.join(known)}")
-    return tuple(name for name in known if not names or name in names)
+    judged: bool = True
 
 
 def drive_of(case: Case) -> Drive:

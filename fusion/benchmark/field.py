@@ -78,7 +78,7 @@ def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:
     ground = ground_of(log.name, recording) or NOT_LABELLED
     whole = Drive(FIELD, ground, name, f"{name}, whole", recording, None, true_labels(recording))
     if reference == "none":
-        yield whole
+        yield dataclasses.replace(whole, judged=False)
         return
     if reference == "truth" and recording.gnss is None:
         recording = aided_by_truth(recording, AID_SEED)

@@ -129,7 +129,7 @@ def _measured(row: Row, drive: Drive, result: Replay) -> Row:
 
 
 def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], used: NDArray[Any]) -> float | None:
-    """Mean time from each change of `true` (N,) until `used` agrees, at most to the next; None without one."""
+    """Mean time from a change of `true` (N,) until `used` agrees, at most to the next; None without one."""
     changes = np.flatnonzero(true[1:] != true[:-1]) + 1
     delays = []
     for first, end in itertools.pairwise([*changes, len(true)]):

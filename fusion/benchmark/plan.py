@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
 
@@ -17,8 +17,8 @@ SEEDS = 20
 MOST_SEEDS = 10_000
 QUICK_SEEDS = {"mixed": 2}
 """With --quick: seeds of a family, else 1; only "mixed" is driven on other plants than the first."""
-STARTS, QUICK_STARTS = 2, 1
-"""Outages of each length in a field log."""
+STARTS = 1
+"""Outages of each length in a field log, at most."""
 QUICK_LOGS = ("norlab_drive/grass_2024_8_8_16h11s19/raw",)
 ARM_NAMES = tuple(arm.name for arm in ARMS)
 
@@ -42,23 +42,25 @@ class Plan:
     """A benchmark.
 
     Attributes:
-        families: of `FAMILIES`, and `FIELD`.
-        seeds: drives of each family on each plant; None for the usual number.
+        families: of `FAMILIES`, and `FIELD`, each with its own number of seeds, or None.
+        seeds: drives on each plant of a family that has no number of its own; None for the usual one.
         quick: few drives and one log, to see that all works.
     """
 
-    families: tuple[str, ...]
+    families: Mapping[str, int | None]
     seeds: int | None = None
     quick: bool = False
 
     def __post_init__(self) -> None:
-        if self.seeds is not None and not 1 <= self.seeds <= MOST_SEEDS:
-            raise ConfigError(f"{self.seeds} seeds", remedy=f"give 1 to {MOST_SEEDS}")
+        for count in (self.seeds, *self.families.values()):
+            if count is not None and not 1 <= count <= MOST_SEEDS:
+                raise ConfigError(f"{count} seeds", remedy=f"give 1 to {MOST_SEEDS}")
 
     def seed_count(self, family: str) -> int:
         """Drives of a family on a plant."""
-        if self.seeds is not None:
-            return self.seeds
+        given = self.families[family] or self.seeds
+        if given is not None:
+            return given
         return QUICK_SEEDS.get(family, 1) if self.quick else SEEDS
 
     def jobs(self) -> list[Job]:
@@ -77,11 +79,28 @@ class Plan:
     def _field_jobs(self) -> Iterator[Job]:
         if FIELD not in self.families:
             return
-        logs = logs_at_hand(QUICK_STARTS if self.quick else STARTS)
-        for log in logs:
+        for log in logs_at_hand(STARTS):
             if not self.quick or log.name in QUICK_LOGS:
                 for arm in ARM_NAMES:  # logs are long: one arm a job
                     yield Job(log, (arm,))
+
+
+def families_of(words: Sequence[str]) -> dict[str, int | None]:
+    """Families from words `NAME` or `NAME=SEEDS`; all of them and the field where there is no word.
+
+    Raises:
+        ConfigError: an unknown name, or seeds that are no number.
+    """
+    known = (*FAMILIES, FIELD)
+    found: dict[str, int | None] = {}
+    for word in words:
+        name, equals, count = word.partition("=")
+        if name not in known:
+            raise ConfigError(f"unknown family '{name}'", remedy=f"known are {', '.join(known)}")
+        if equals and not count.isdecimal():
+            raise ConfigError(f"'{word}' names no number of seeds", remedy=f"write {name} or {name}=20")
+        found[name] = int(count) if equals else None
+    return {name: found.get(name) for name in known if name in found or not words}
 
 
 @functools.cache

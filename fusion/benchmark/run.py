@@ -14,7 +14,7 @@ from typing import Any
 
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.fusion.benchmark.arms import ARMS
+from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.drives import Case, drive_of
 from terrafusion.fusion.benchmark.field import Refused, drives_of
 from terrafusion.fusion.benchmark.measure import Row, measure
@@ -76,7 +76,8 @@ def run_job(job: Job) -> tuple[Job, Found]:
         if isinstance(drive, Refused):
             refused.append(drive)
         else:
-            rows += [row for arm in arms if (row := measure(drive, arm)) is not None]
+            chosen = arms if drive.judged else [arm for arm in arms if arm.name in (OWN, BASE)]
+            rows += [row for arm in chosen if (row := measure(drive, arm)) is not None]
     return job, Found(tuple(rows), tuple(refused))
 
 

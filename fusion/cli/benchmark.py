@@ -24,7 +24,9 @@ def benchmark(
     ] = None,
     only: Annotated[
         list[str] | None,
-        typer.Option(metavar="FAMILY", help="mixed, slopes, outages, firm, unseen, field; repeat for more."),
+        typer.Option(
+            metavar="FAMILY[=SEEDS]", help="mixed, slopes, outages, firm, unseen, field; repeat for more."
+        ),
     ] = None,
     docs: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Put the tables into a document (docs/benchmark.md).")
@@ -39,13 +41,12 @@ def benchmark(
     """
     import joblib
 
-    from terrafusion.fusion.benchmark.drives import checked
     from terrafusion.fusion.benchmark.outputs import write_benchmark, write_document
-    from terrafusion.fusion.benchmark.plan import Plan
+    from terrafusion.fusion.benchmark.plan import Plan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.benchmark.text import markdown
 
-    plan = Plan(checked(only or []), seeds, quick)
+    plan = Plan(families_of(only or []), seeds, quick)
     with progress_bar("benchmark") as progress:
         found = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]

@@ -5,14 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.benchmark.drives import (
     FAMILIES,
     FIRST_SEED,
     LEAD_S,
     PLANTS,
     Case,
-    checked,
     drive_of,
     perturbed,
     soils_of,
@@ -73,10 +71,3 @@ def test_soils_of_the_twin_stay_in_the_scatter_of_training() -> None:
     for name, soil in soils_of(SHORT, {"mud", "loose_sand"}).items():
         k_phi = load_soil(name).pressure.k_phi_n_per_m_n2
         assert abs(soil.pressure.k_phi_n_per_m_n2 / k_phi - 1.0) <= 0.2 + 1e-9
-
-
-def test_an_unknown_family_is_refused() -> None:
-    assert checked([]) == (*FAMILIES, "field")
-    assert checked(["field", "mixed"]) == ("mixed", "field")
-    with pytest.raises(ConfigError, match="unknown family 'mixd'"):
-        checked(["mixd"])

@@ -13,12 +13,12 @@ from terrafusion.fusion.benchmark.arms import ARMS
 from terrafusion.fusion.benchmark.drives import FIRST_SEED, Case
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.outputs import MARK, write_benchmark, write_document
-from terrafusion.fusion.benchmark.plan import Job, Plan
+from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
 from terrafusion.fusion.benchmark.run import Found, run_benchmark
 
 FEW = ("fixed", "adaptive", "oracle")
 JOB = Job(Case("outages", "twin", FIRST_SEED + 1), FEW)
-PLAN = Plan(("outages",), seeds=1)
+PLAN = Plan({"outages": None}, seeds=1)
 
 
 @pytest.fixture
@@ -90,22 +90,32 @@ def test_a_document_keeps_what_stands_before_the_mark(found, tmp_path) -> None:
 
 
 def test_plans() -> None:
-    quick = Plan(("mixed", "firm"), quick=True).jobs()
+    quick = Plan(families_of(["firm", "mixed"]), quick=True).jobs()
     assert [(job.item.family, job.item.plant) for job in quick] == [
         ("mixed", "twin"), ("mixed", "perturbed"), ("mixed", "second"), ("firm", "twin"),
         ("mixed", "twin"), ("mixed", "perturbed"), ("mixed", "second"),
     ]  # fmt: skip
-    full = Plan(("mixed", "firm"), seeds=3).jobs()
+    full = Plan({"mixed": None, "firm": None}, seeds=3).jobs()
     assert len({job.key for job in full}) == len(full) == 2 * 3 * 3
     assert {job.arms for job in full} == {tuple(arm.name for arm in ARMS)}
     with pytest.raises(ConfigError, match="0 seeds"):
-        Plan(("mixed",), seeds=0)
+        Plan({"mixed": None}, seeds=0)
+
+
+def test_families_by_name_with_seeds_of_their_own() -> None:
+    assert list(families_of([])) == ["mixed", "slopes", "outages", "firm", "unseen", "field"]
+    assert families_of(["field", "mixed=7"]) == {"mixed": 7, "field": None}
+    assert Plan(families_of(["mixed=7", "firm"]), seeds=3).seed_count("mixed") == 7
+    with pytest.raises(ConfigError, match="unknown family 'mixd'"):
+        families_of(["mixd"])
+    with pytest.raises(ConfigError, match="'mixed=all' names no number"):
+        families_of(["mixed=all"])
 
 
 def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(plan, "logs_at_hand", lambda starts: [])
     with pytest.raises(TerrafusionError, match="no field log is at hand"):
-        run_benchmark(Plan(("field",)), tmp_path)
+        run_benchmark(Plan({"field": None}), tmp_path)
 
 
 def test_the_command(terrafusion, one_job, tmp_path) -> None:
