@@ -20,6 +20,7 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Estimate, State
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import (
@@ -288,16 +289,15 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
 
 def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
     """Replace the live states by the batch solution over the whole drive, which starts from them."""
-    offset = len(chain.nodes) - len(history.states)
-    for i, state in enumerate(history.states):
-        chain.move_to(chain.first + offset + i, _key_state(state))
-    chain.optimise()
-    covariances = chain.covariances()
+    batch = Batch(chain, [_key_state(state) for state in history.states])
+    batch.optimise()
+    keys, covariances = batch.states(), batch.covariances()
+    offset = len(keys) - len(history.states)
     history.states[:] = [
-        _smoothed(
-            state, chain, chain.first + offset + i, covariances[offset + i], gyro_sigma_radps(config, row)
+        _smoothed(state, key, P, gyro_sigma_radps(config, row))
+        for state, key, P, row in zip(
+            history.states, keys[offset:], covariances[offset:], history.rows, strict=True
         )
-        for i, (state, row) in enumerate(zip(history.states, history.rows, strict=True))
     ]
 
 
@@ -308,8 +308,7 @@ def _key_state(state: State) -> KeyState:
     return KeyState(pose, state.velocity_mps, bias, state.linear)
 
 
-def _smoothed(live: State, chain: Chain, k: int, P: Array, gyro_sigma: float) -> State:
-    key = chain.state(k)
+def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: float) -> State:
     R = key.pose.rotation().matrix()
     return dataclasses.replace(
         live,

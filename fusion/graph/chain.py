@@ -4,9 +4,9 @@ A localisation graph is a chain: every factor touches one keyframe or two that
 follow each other. Eliminating keyframes in time order by QR therefore costs
 the same at every step, and only keyframes whose factors or linearisation
 changed have to be eliminated again (the idea of iSAM2, Kaess et al. 2012, IJRR
-31(2), on its simplest graph). The same code is the fixed-lag filter (old
-keyframes are dropped, what they say stays as a prior: exact marginalisation)
-and, with nothing dropped, the batch Gauss-Newton smoother.
+31(2), on its simplest graph). This is the fixed-lag filter: old keyframes are
+dropped, what they say stays as a prior (exact marginalisation). With nothing
+dropped the chain is what `batch` solves.
 
 Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world
 (m/s), B(k) IMU bias (accelerometer, gyro), then the linear states of
@@ -80,9 +80,9 @@ class Chain:
 
     A keyframe is appended with the factors that link it to its predecessor;
     unary factors may be added to any keyframe still held. `solve` brings the
-    newest keyframe up to date, `smooth` the newest few, `optimise` all.
+    newest keyframe up to date, `smooth` the newest few.
     `archive` is a second chain that is given the same factors and keeps them
-    all, for a batch solution afterwards. Only with `calibrate` are the last linear
+    all, for a `Batch` solution afterwards. Only with `calibrate` are the last linear
     states, those of a calibration, estimated; without, tangents end before them.
     """
 
@@ -98,7 +98,6 @@ class Chain:
         self.nodes: list[Node] = []
         self.values = gtsam.Values()
         self._dirty = 0
-        self._error = 0.0
         self._anchor: tuple[int, KeyState, Array] | None = None
         self._root = np.zeros((self.dim, self.dim + 1))
 
@@ -176,14 +175,6 @@ class Chain:
             raise ArithmeticError(f"keyframe {self.last} is not determined by its factors")
         return np.asarray(inverse @ inverse.T)
 
-    def covariances(self) -> Array:
-        """Marginal covariances (n, dim, dim) of all keyframes, by the backward recursion of the chain."""
-        out = np.zeros((len(self.nodes), self.dim, self.dim))
-        out[-1] = self.covariance()
-        for i in range(len(self.nodes) - 2, -1, -1):
-            out[i] = _covariance_before(self.nodes[i], out[i + 1])
-        return out
-
     def covariance_at(self, k: int) -> Array:
         """Marginal covariance (dim, dim) of keyframe k, as of the last `solve` or `smooth`."""
         covariance = self.covariance()
@@ -229,45 +220,8 @@ class Chain:
         self._dirty = self.last
         node = self.nodes[-1]
         own = np.vstack([node.prior, self._unary_rows(self.last)])
-        self._error += float(own[len(node.prior) :, self.dim] @ own[len(node.prior) :, self.dim])
         self._root = triangular(own)
         node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
-
-    def optimise(self, iterations: int = 30, tolerance: float = 1e-6) -> int:
-        """Gauss-Newton with step halving over all keyframes (batch); gives the iterations taken."""
-        error = self._linearised_error()
-        taken = 0
-        while taken < iterations:
-            taken += 1
-            self._back_substitute_to(self.first)
-            deltas = [node.delta for node in self.nodes]
-            scale = 1.0
-            while scale > 1e-3:
-                self._step(deltas, scale)
-                trial = self._linearised_error()
-                if trial <= error:
-                    break
-                self._step(deltas, -scale)
-                scale *= 0.5
-            else:
-                self._linearised_error()
-            error = min(trial, error)
-            if scale * max(float(np.abs(delta).max()) for delta in deltas) < tolerance or scale <= 1e-3:
-                break
-        self._back_substitute_to(self.first)
-        return taken
-
-    def _linearised_error(self) -> float:
-        """Linearise and eliminate everything; the sum of squares of all whitened residuals."""
-        self._dirty, self._error = self.first, 0.0
-        self._eliminate_all()
-        return self._error
-
-    def _step(self, deltas: list[Array], scale: float) -> None:
-        """Move every linearisation point by `scale` times its delta."""
-        for k, delta in enumerate(deltas, self.first):
-            self.nodes[k - self.first].delta = scale * delta
-            self._move(k)
 
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
@@ -450,10 +404,6 @@ class Chain:
         node = self.nodes[k - self.first]
         own = np.vstack([node.prior, self._unary_rows(k)])
         link = self._link_rows(k + 1)
-        fresh = 0 if k == self.first else len(node.prior)
-        self._error += float(
-            own[fresh:, self.dim] @ own[fresh:, self.dim] + link[:, 2 * self.dim] @ link[:, 2 * self.dim]
-        )
         stacked = np.zeros((len(own) + len(link), 2 * self.dim + 1))
         stacked[: len(own), : self.dim] = own[:, : self.dim]
         stacked[: len(own), 2 * self.dim] = own[:, self.dim]

@@ -1,0 +1,171 @@
+"""Gauss-Newton over a whole chain at once: what `Chain` does keyframe by keyframe, on arrays.
+
+The factors are those of the chain. All of GTSAM's are linearised in one call, the
+others (wheels, GNSS positions, linear states) by array operations, and the chain
+is eliminated in time order by one QR a keyframe, as in `chain`. QR, since the
+normal equations of a chain with the noise of a data sheet cannot be factored in
+double precision (its links are 1e9 times tighter than what ties it to the world).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import B, V, X
+from numpy.typing import NDArray
+from scipy.linalg import lapack
+
+from terrafusion.fusion.graph.batch_rows import Block
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import POSE, KeyState
+from terrafusion.fusion.graph.triangular import back_substitute, triangular
+
+Array = NDArray[np.float64]
+
+BLOCK = 500
+"""Keyframes whose rows are held at a time."""
+
+
+class Batch:
+    """The keyframes of a chain and their factors, solved together.
+
+    Attributes:
+        values: poses, velocities and biases of all keyframes.
+        linear: (n, 14) their linear states, as `key_state.LINEAR`.
+        iterations: linearisations so far.
+    """
+
+    def __init__(self, chain: Chain, initial: Sequence[KeyState] = ()) -> None:
+        """`initial` states are those of the newest keyframes; the others start at their linearisation."""
+        nodes = chain.nodes
+        points = [*(node.point for node in nodes[: len(nodes) - len(initial)]), *initial]
+        self.dim, self.first, self.size = chain.dim, chain.first, len(nodes)
+        self._keys = [(X(k), V(k), B(k)) for k in range(self.first, self.first + self.size)]
+        self.values = gtsam.Values()
+        for (x, v, b), point in zip(self._keys, points, strict=True):
+            self.values.insert(x, point.pose)
+            self.values.insert(v, point.velocity)
+            self.values.insert(b, point.bias)
+        self.linear = np.array([point.linear for point in points])
+        self.iterations = 0
+        self._blocks = [
+            Block(chain, k, min(k + BLOCK, self.first + self.size))
+            for k in range(self.first, self.first + self.size, BLOCK)
+        ]
+        self._made_at, self._prior = nodes[0].point, nodes[0].prior
+        self._conditionals = np.zeros((self.size - 1, self.dim, 2 * self.dim + 1))
+        self._root = np.zeros((self.dim, self.dim + 1))
+
+    def optimise(self, iterations: int = 30, tolerance: float = 0.1) -> int:
+        """Gauss-Newton with step halving; gives the iterations taken.
+
+        It ends with the first step shorter than `tolerance`, in sigmas of the whole solution (the root of
+        the sum of squares that the step takes off): the next would be shorter by an order of magnitude.
+        """
+        error = self._linearise(self.values, self.linear)
+        for taken in range(1, iterations + 1):
+            step = self._solve()
+            length = self._step_length()
+            scale = 1.0
+            while True:
+                values, linear = self._moved(scale * step)
+                if length < tolerance:
+                    self.values, self.linear = values, linear
+                    return taken
+                trial = self._linearise(values, linear)
+                if trial <= error or scale < 1e-3:
+                    break
+                scale *= 0.5
+            if trial > error:  # no step leads down: this is as far as it goes
+                self._linearise(self.values, self.linear)
+                return taken
+            self.values, self.linear, error = values, linear, trial
+        return iterations
+
+    def states(self) -> list[KeyState]:
+        """The states of all keyframes."""
+        at = self.values
+        return [
+            KeyState(at.atPose3(x), at.atVector(v), at.atConstantBias(b), linear)
+            for (x, v, b), linear in zip(self._keys, self.linear, strict=True)
+        ]
+
+    def covariances(self) -> Array:
+        """Marginal covariances (n, dim, dim) of all keyframes, at the last linearisation."""
+        n, dim = self.size, self.dim
+        out = np.empty((n, dim, dim))
+        inverse = np.linalg.inv(self._root[:, :dim])
+        out[-1] = inverse @ inverse.T
+        for end in range(n - 1, 0, -BLOCK):
+            begin = max(end - BLOCK, 0)
+            inverses = np.linalg.inv(np.triu(self._conditionals[begin:end, :, :dim]))
+            own = inverses @ inverses.transpose(0, 2, 1)
+            gains = inverses @ self._conditionals[begin:end, :, dim : 2 * dim]
+            for k in range(end - 1, begin - 1, -1):
+                gain = gains[k - begin]
+                out[k] = own[k - begin] + gain @ out[k + 1] @ gain.T
+        return out
+
+    def _linearise(self, values: gtsam.Values, linear: Array) -> float:
+        """Linearise and eliminate everything; the sum of squares of all whitened residuals."""
+        self.iterations += 1
+        dim = self.dim
+        poses = gtsam.utilities.extractPose3(values)
+        R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
+        below = np.triu(np.ones((dim, dim + 1)))
+        known = self._first_prior(values, linear[0])
+        error = float(known[:, dim] @ known[:, dim])
+        for block in self._blocks:
+            rows, counts = block.rows(values, R, p, linear)
+            error += float(np.einsum("kr,kr->", rows[:, :, -1], rows[:, :, -1]))
+            for i, count in enumerate(counts, block.begin - self.first):
+                stacked = rows[i + self.first - block.begin, :count]
+                stacked[: len(known), :dim], stacked[: len(known), -1] = known[:, :dim], known[:, dim]
+                if i == self.size - 1:
+                    self._root = triangular(np.delete(stacked, np.s_[dim : 2 * dim], axis=1))
+                    break
+                packed, _, _, _ = lapack.dgeqrf(stacked)
+                self._conditionals[i] = packed[:dim]
+                known = packed[dim : 2 * dim, dim:] * below
+        return error
+
+    def _first_prior(self, values: gtsam.Values, linear: Array) -> Array:
+        """The prior (dim, dim + 1) of the first keyframe, a Gaussian in the tangent space where it was made,
+        carried to where the keyframe is now."""
+        x, v, b = self._keys[0]
+        now = KeyState(values.atPose3(x), values.atVector(v), values.atConstantBias(b), linear)
+        offset = self._made_at.local(now)[: self.dim]
+        rows = self._prior.copy()
+        rows[:, self.dim] -= rows[:, : self.dim] @ offset
+        rows[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
+        return rows
+
+    def _solve(self) -> Array:
+        """The step (n, dim) of all keyframes."""
+        dim = self.dim
+        out = np.empty((self.size, dim))
+        out[-1] = back_substitute(self._root[:, :dim], self._root[:, dim])
+        for k in range(self.size - 2, -1, -1):
+            conditional = self._conditionals[k]
+            rhs = conditional[:, 2 * dim] - conditional[:, dim : 2 * dim] @ out[k + 1]
+            out[k], _ = lapack.dtrtrs(conditional[:, :dim], rhs)
+        if not np.isfinite(out).all():
+            raise ArithmeticError("a keyframe is not determined by its factors")
+        return out
+
+    def _step_length(self) -> float:
+        """What the whole step takes off the sum of squares, as its root."""
+        right = self._conditionals[:, :, -1]
+        return float(np.sqrt(np.einsum("kr,kr->", right, right) + np.sum(self._root[:, -1] ** 2)))
+
+    def _moved(self, step: Array) -> tuple[gtsam.Values, Array]:
+        delta = gtsam.VectorValues()
+        for (x, v, b), row in zip(self._keys, step, strict=True):
+            delta.insert(x, row[0:6])
+            delta.insert(v, row[6:9])
+            delta.insert(b, row[9:15])
+        linear = self.linear.copy()
+        linear[:, : self.dim - 15] += step[:, 15:]
+        return self.values.retract(delta), linear

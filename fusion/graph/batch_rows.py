@@ -1,0 +1,275 @@
+"""Whitened rows of many keyframes at once, for `batch`.
+
+Rows of keyframe k are those of `Chain`: over k and k + 1, shape (m, 2 dim + 1), the last column being the
+right-hand side. They lie in a block (n, m, 2 dim + 1): room for the prior (dim rows, left free), the linear
+states' steps, the wheels (4), then whatever else a keyframe has.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.key_state import (
+    ANTENNA,
+    BIAS,
+    DRIFT,
+    GNSS_DELAY,
+    ICR_X,
+    IMU_ROTATION,
+    NAV,
+    POSE,
+    RADIUS,
+    SIDE_SLIP,
+    SLIP,
+    VELOCITY,
+    WHEEL_DELAY,
+    YAW_SCALE,
+)
+from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+
+Array = NDArray[np.float64]
+Places = NDArray[np.intp]
+
+_PLACES = {ord("x"): POSE, ord("v"): VELOCITY, ord("b"): BIAS}
+
+
+@dataclass(frozen=True, eq=False)
+class _Group:
+    """Factors of GTSAM over the same states: where in the graph, whose rows, from which row on."""
+
+    columns: Places
+    factors: list[int]
+    keyframes: Places
+    first_row: Places
+    height: int
+
+
+class Block:
+    """The factors of the keyframes `begin` to `end - 1` and of their links to the keyframe after each."""
+
+    def __init__(self, chain: Chain, begin: int, end: int) -> None:
+        self.begin, self.end, self.dim = begin, end, chain.dim
+        self._at = slice(begin - chain.first, end - chain.first)
+        own = chain.nodes[self._at]
+        after = chain.nodes[self._at.start + 1 : self._at.stop + 1]
+        self._linked = len(after)
+        self._markov = _Markov([node.markov for node in after], self.dim)
+        self._wheels = _Wheels([node.wheels for node in after])
+        used = np.full(len(own), self.dim + (self.dim - NAV.stop) + 4)
+        self._fixes = _Fixes([node.fixes for node in own], used)
+        self._graph = gtsam.NonlinearFactorGraph()
+        self._groups = self._grouped([node.unary for node in own], [node.link for node in after], used)
+        # A small rotation of the IMU acts on what is preintegrated only.
+        shape = (self._linked, 1)
+        is_imu = np.array([node.preintegrated for node in after], dtype=float).reshape(shape)
+        self._gyro = np.array([node.gyro_radps for node in after]).reshape(-1, 3) * is_imu
+        self._accel = np.array([node.accel_mps2 for node in after]).reshape(-1, 3) * is_imu
+        self._counts = np.maximum(used, 2 * self.dim + 1).tolist()
+
+    def rows(self, values: gtsam.Values, R: Array, p: Array, linear: Array) -> tuple[Array, list[int]]:
+        """All rows, and how many there are of each keyframe.
+
+        Args:
+            values: poses, velocities and biases at which to linearise.
+            R, p, linear: (n, 3, 3), (n, 3), (n, 14) of all keyframes of the chain.
+        """
+        rows = np.zeros((self.end - self.begin, max(self._counts), 2 * self.dim + 1))
+        n, states = self._linked, self.dim - NAV.stop
+        own, after = slice(self._at.start, self._at.start + n), slice(self._at.start + 1, self._at.stop + 1)
+        if n:
+            self._markov.fill(rows[:n, self.dim : self.dim + states], linear[own], linear[after])
+            wheels = rows[:n, self.dim + states : self.dim + states + 4]
+            self._wheels.fill(wheels, R[own], p[own], R[after], p[after], linear[after])
+        self._fixes.fill(rows, R[self._at], p[self._at], linear[self._at])
+        self._fill_graph(rows, values, linear[own])
+        return rows, self._counts
+
+    def _grouped(
+        self,
+        unary: list[gtsam.NonlinearFactorGraph],
+        links: list[gtsam.NonlinearFactorGraph],
+        used: Places,
+    ) -> list[_Group]:
+        found: dict[tuple[tuple[int, ...], int], list[tuple[int, int, int]]] = defaultdict(list)
+        for graphs in (links, unary):
+            for i, graph in enumerate(graphs):
+                for j in range(graph.size()):
+                    factor = graph.at(j)
+                    key = (self._columns(factor, self.begin + i), factor.dim())
+                    found[key].append((self._graph.size(), i, int(used[i])))
+                    self._graph.add(factor)
+                    used[i] += factor.dim()
+        groups = []
+        for (columns, height), members in found.items():
+            index, keyframes, first_row = zip(*members, strict=True)
+            groups.append(
+                _Group(np.array(columns), list(index), np.array(keyframes), np.array(first_row), height)
+            )
+        return groups
+
+    def _columns(self, factor: gtsam.NonlinearFactor, k: int) -> tuple[int, ...]:
+        """The columns of its states in the rows of keyframe k, the right-hand side last."""
+        columns: list[int] = []
+        keys = factor.keys()
+        for symbol in map(gtsam.Symbol, keys):
+            place, shift = _PLACES[symbol.chr()], (symbol.index() - k) * self.dim
+            columns.extend(range(place.start + shift, place.stop + shift))
+        return (*columns, 2 * self.dim)
+
+    def _fill_graph(self, rows: Array, values: gtsam.Values, linear: Array) -> None:
+        linearised = self._graph.linearize(values)
+        for group in self._groups:
+            packed = np.array([linearised.at(i).augmentedJacobian() for i in group.factors])
+            place = group.first_row[:, None] + np.arange(group.height)
+            rows[group.keyframes[:, None, None], place[:, :, None], group.columns] = packed
+            if self.dim > IMU_ROTATION.start and len(group.columns) == 2 * NAV.stop + 1:
+                self._add_rotation(rows, group, place, linear)
+
+    def _add_rotation(self, rows: Array, group: _Group, place: Places, linear: Array) -> None:
+        """Rotation of the IMU, as in `Chain`: a small d acts as the bias -d x measured."""
+        at, dim = group.keyframes, self.dim
+        own = rows[at[:, None], place]
+        by_bias = own[:, :, BIAS] + own[:, :, BIAS.start + dim : BIAS.stop + dim]
+        measured = np.hstack([self._accel[at], self._gyro[at]])[:, None, :]
+        # row @ skew(m) = row x m
+        turn = np.cross(by_bias[:, :, :3], measured[:, :, :3]) + np.cross(
+            by_bias[:, :, 3:], measured[:, :, 3:]
+        )
+        rows[at[:, None, None], place[:, :, None], np.arange(IMU_ROTATION.start, IMU_ROTATION.stop)] = turn
+        d = linear[at][:, IMU_ROTATION.start - NAV.stop : IMU_ROTATION.stop - NAV.stop]
+        rows[at[:, None], place, -1] -= np.einsum("kri,ki->kr", turn, d)
+
+
+class _Markov:
+    """Steps of the linear states."""
+
+    def __init__(self, steps: list[MarkovStep | None], dim: int) -> None:
+        n = dim - NAV.stop
+        known = [step for step in steps if step is not None]
+        self._at = np.array([step is not None for step in steps], dtype=bool)
+        self._decay, self._mean, self._sigma = (
+            np.array([getattr(step, name)[:n] for step in known]).reshape(-1, n)
+            for name in ("decay", "mean", "sigma")
+        )
+        self._n, self._dim = n, dim
+
+    def fill(self, rows: Array, before: Array, now: Array) -> None:
+        """Rows (n, states, 2 dim + 1)."""
+        i, own = np.arange(self._n), np.zeros((len(self._decay), *rows.shape[1:]))
+        own[:, i, NAV.stop + i] = -self._decay / self._sigma
+        own[:, i, self._dim + NAV.stop + i] = 1.0 / self._sigma
+        wandered = self._decay * (before[self._at, : self._n] - self._mean)
+        own[:, :, -1] = -(now[self._at, : self._n] - self._mean - wandered) / self._sigma
+        rows[self._at] = own
+
+
+class _Wheels:
+    """`wheel_factor.residual` and `jacobians` of many increments."""
+
+    def __init__(self, increments: list[WheelIncrement | None]) -> None:
+        known = [w for w in increments if w is not None]
+        self._at = np.array([w is not None for w in increments], dtype=bool)
+        self._moved = np.array([w.displacement_m for w in known]).reshape(-1, 3)
+        self._sigma = np.array([w.sigma for w in known]).reshape(-1, 4)
+        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps")
+        self._distance, self._turn, self._yaw, self._change = (
+            np.array([getattr(w, name) for w in known], dtype=float) for name in names
+        )
+
+    def fill(self, rows: Array, R_i: Array, p_i: Array, R_j: Array, p_j: Array, linear: Array) -> None:
+        """Rows (n, 4, 2 dim + 1)."""
+        at = self._at
+        own = np.zeros((len(self._moved), *rows.shape[1:]))
+        R = R_i[at].transpose(0, 2, 1)
+        moved = np.einsum("kij,kj->ki", R, p_j[at] - p_i[at])
+        T = R @ R_j[at]
+        dim = (rows.shape[2] - 1) // 2
+        self._by_poses(own, moved, T, dim)
+        states = np.zeros((len(own), 4, linear.shape[1]))
+        right = self._by_linear(states, moved, T, linear[at])
+        own[:, :, dim + NAV.stop : 2 * dim] = states[:, :, : dim - NAV.stop]
+        own[:, :, -1] = -right
+        rows[at] = own / self._sigma[:, :, None]
+
+    @staticmethod
+    def _by_poses(own: Array, moved: Array, T: Array, dim: int) -> None:
+        x, y, z = moved.T
+        own[:, 0, 1], own[:, 0, 2] = -z, y
+        own[:, 1, 0], own[:, 1, 2] = z, -x
+        own[:, 2, 0], own[:, 2, 1] = -y, x
+        own[:, [0, 1, 2], [3, 4, 5]] = -1.0
+        own[:, :3, dim + 3 : dim + 6] = T
+        level = T[:, 0, 0] ** 2 + T[:, 1, 0] ** 2
+        own[:, 3, 0] = T[:, 0, 0] * T[:, 2, 0] / level
+        own[:, 3, 1] = T[:, 1, 0] * T[:, 2, 0] / level
+        own[:, 3, 2] = -1.0
+        own[:, 3, dim + 1] = (T[:, 1, 0] * T[:, 0, 2] - T[:, 0, 0] * T[:, 1, 2]) / level
+        own[:, 3, dim + 2] = (T[:, 0, 0] * T[:, 1, 1] - T[:, 1, 0] * T[:, 0, 1]) / level
+
+    def _by_linear(self, H: Array, moved: Array, T: Array, linear: Array) -> Array:
+        """Derivatives (n, 4, 14) into H; the residuals (n, 4)."""
+        s, k, i, b, r, t = (n - NAV.stop for n in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY))
+        rolled = self._moved.copy()
+        rolled[:, 0] += linear[:, t] * self._change
+        slip, radius = 1.0 - linear[:, [s]], 1.0 + linear[:, [r]]
+        H[:, :3, s], H[:, :3, r] = radius * rolled, -slip * rolled
+        H[:, 0, t] = -(slip * radius)[:, 0] * self._change
+        H[:, 1, b], H[:, 1, i] = -self._distance, self._yaw
+        H[:, 3, k] = -self._turn
+        out = np.empty((len(moved), 4))
+        out[:, :3] = moved - slip * radius * rolled
+        out[:, 1] -= linear[:, b] * self._distance - linear[:, i] * self._yaw
+        out[:, 3] = np.arctan2(T[:, 1, 0], T[:, 0, 0]) - (1.0 + linear[:, k]) * self._turn
+        return out
+
+
+class _Fixes:
+    """`gnss_factor.residual` and `jacobians` of many fixes."""
+
+    def __init__(self, fixes: list[list[GnssPosition]], used: Places) -> None:
+        keyframes: list[int] = []
+        first_row: list[int] = []
+        for i, here in enumerate(fixes):
+            for _ in here:
+                keyframes.append(i)
+                first_row.append(int(used[i]))
+                used[i] += 3
+        flat = [fix for here in fixes for fix in here]
+        self._at, self._row = np.array(keyframes, dtype=np.intp), np.array(first_row, dtype=np.intp)
+        self._enu, self._lever, self._sigma, self._velocity = (
+            np.array([getattr(fix, name) for fix in flat]).reshape(-1, 3)
+            for name in ("enu_m", "lever_m", "sigma_m", "velocity_mps")
+        )
+        self._share = np.array([fix.drift_share for fix in flat])
+
+    def fill(self, rows: Array, R: Array, p: Array, linear: Array) -> None:
+        """Into rows (n, m, 2 dim + 1)."""
+        at, dim = self._at, (rows.shape[2] - 1) // 2
+        R, x = R[at], linear[at]
+        drift, antenna = (slice(s.start - NAV.stop, s.stop - NAV.stop) for s in (DRIFT, ANTENNA))
+        delay = GNSS_DELAY - NAV.stop
+        lever = self._lever.copy()
+        lever[:, :2] += x[:, antenna]
+        H = np.zeros((len(at), 3, 6 + x.shape[1] + 1))
+        H[:, :, :3] = np.cross(R, lever[:, None, :]) * -1.0  # -R skew(l), row by row
+        H[:, :, 3:6] = R
+        states = H[:, :, 6:-1]
+        states[:, 0, drift.start] = states[:, 1, drift.start + 1] = self._share
+        states[:, :, antenna] = R[:, :, :2]
+        states[:, :, delay] = -self._velocity
+        right = self._enu - p[at] - np.einsum("kij,kj->ki", R, lever) + x[:, [delay]] * self._velocity
+        right[:, :2] -= self._share[:, None] * x[:, drift]
+        H[:, :, -1] = right
+        H /= self._sigma[:, :, None]
+        place = (self._row[:, None] + np.arange(3))[:, :, None]
+        pick = np.r_[0:6, 6 : 6 + dim - NAV.stop, H.shape[2] - 1]
+        columns = np.r_[0:6, NAV.stop : dim, 2 * dim]
+        rows[at[:, None, None], place, columns] = H[:, :, pick]
