@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from terrafusion.datasets.errors import ConfigError
@@ -35,6 +36,8 @@ class EstimatorConfig:
         start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
         inputs: what the estimator will be given; without all six IMU axes the graph is planar.
         calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
+        declination_rad: magnetic north at the place, east of true north; with it a magnetometer tells the
+            heading, without it holds the one that GNSS or the start has told.
         labels: the ground over time, told in place of what the detector finds; None: it detects.
     """
 
@@ -54,6 +57,7 @@ class EstimatorConfig:
     start_without_gnss_s: float = 30.0
     inputs: Inputs = field(default_factory=Inputs)
     calibrate: bool = False
+    declination_rad: float | None = None
     labels: GroundLabels | None = None
 
     @property
@@ -71,5 +75,7 @@ class EstimatorConfig:
                 raise ConfigError(f"unknown {what} '{value}'", remedy=f"this version has {', '.join(known)}")
         if not 0.01 <= self.keyframe_s <= 1.0:
             raise ConfigError(f"keyframe_s is {self.keyframe_s}", remedy="give 0.01 to 1 s")
+        if self.declination_rad is not None and not abs(self.declination_rad) <= math.pi:
+            raise ConfigError(f"declination_rad is {self.declination_rad}", remedy="give -pi to pi rad")
         if self.lag_s < 5 * self.keyframe_s:
             raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")

@@ -36,8 +36,10 @@ from terrafusion.fusion.graph.key_state import (
     linear_sigma,
     quaternion_of,
 )
+from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.aids import Aids
 from terrafusion.fusion.inputs.alignment import (
     GivenStart,
     Start,
@@ -86,6 +88,7 @@ class Estimator:
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
         self.gnss = GnssUpdater(config, self._report, self.weights.single)
+        self.aids = Aids(config.rig, config.declination_rad, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
@@ -171,6 +174,14 @@ class Estimator:
         """Commanded forward speed: it tells a robot that is kept from moving from one that waits."""
         self.monitor.command(t_ns, v_mps)
 
+    def add_pressure(self, t_ns: int, pressure_pa: float) -> None:
+        """Static pressure of a barometer, Pa: it holds the height that GNSS, or the start, has told."""
+        self.aids.height.add(t_ns, pressure_pa)
+
+    def add_magnetic_field(self, t_ns: int, field_t: ArrayLike) -> None:
+        """Magnetic flux density (3,), body axes, tesla: heading, see `inputs.magnetometer`."""
+        self.aids.heading.add(t_ns, field_t)
+
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
         return self._state
@@ -224,6 +235,8 @@ class Estimator:
             return False
         if self._level is None:
             self._level = level_start(self.imu, self.wheels, begin)
+        if self._given is None:
+            self._given = self.aids.start(self._level, self.gnss.waiting)
         if self._given is not None:
             self._begin(self._given.at(self._level))
         elif self.gnss.waiting and self.gnss.news():
@@ -287,12 +300,12 @@ class Estimator:
             segments = in_a_turn(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
-        gyro, accel = _mean_rates(segments)
+        gyro, accel = mean_rates(segments)
         link = gtsam.NonlinearFactorGraph()
         preintegrated = False
         if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
             link = bridge(k, before, wheels, dt)
-            point = _carried(before, wheels, dt)
+            point = carried(before, wheels, dt)
         else:
             measured = self._preintegrator.integrate(
                 segments, before.bias, row.gyro_inflation, row.accel_inflation
@@ -300,7 +313,7 @@ class Estimator:
             seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
-            link.add(_imu_factor(k, measured))
+            link.add(imu_factor(k, measured))
             if not self.config.inputs.planar:  # the planar link is no witness against the wheels
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, dt, switch)
@@ -322,8 +335,11 @@ class Estimator:
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
         chain = self.chain
         chain.solve(SMOOTH_WINDOW)
-        self._covariance = chain.covariance()
+        before = self._covariance = chain.covariance()
         if self.gnss.update(chain, self._covariance, self.weights.row):
+            chain.solve(SMOOTH_WINDOW)
+            self._covariance = chain.covariance()
+        if self.aids.update(chain, before, self._covariance, self.gnss):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         if chain.last % SMOOTH_EVERY == 0:
@@ -429,28 +445,3 @@ class Estimator:
     def _report(self, innovation: Innovation) -> None:
         if self._on_innovation is not None and not self._silent:
             self._on_innovation(innovation)
-
-
-def _mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
-    """Mean angular rate (3,) and specific force (3,) over the segments."""
-    total = sum(s.dt_s for s in segments)
-    gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
-    accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
-    return gyro, accel
-
-
-def _imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:
-    from gtsam.symbol_shorthand import B, V, X
-
-    return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured)
-
-
-def _carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
-    if wheels is None:
-        moved = before.pose.rotation().matrix().T @ before.velocity * dt
-        turn = 0.0
-    else:
-        moved = (1.0 - before.slip) * (1.0 + before.of(RADIUS)) * wheels.displacement_m
-        turn = wheels.turn_rad
-    pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), moved))
-    return KeyState(pose, before.velocity, before.bias, before.linear)

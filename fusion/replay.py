@@ -123,6 +123,7 @@ def replay(
     outages: Sequence[Outage] = (),
     batch: bool = False,
     progress: Callable[[float], None] | None = None,
+    magnetometer: bool = False,
     settings: Mapping[str, Any] | None = None,
 ) -> Replay:
     """Estimate and score one drive.
@@ -134,6 +135,7 @@ def replay(
         outages: stretches in which the estimator gets no fix.
         batch: smooth the whole drive at once, instead of a fixed lag as live.
         progress: called with the share done, 0 to 1.
+        magnetometer: use the log's magnetometer, too; a barometer is used wherever there is one.
         settings: further fields of `EstimatorConfig`.
 
     Raises:
@@ -162,8 +164,8 @@ def replay(
     )
     started = time.perf_counter()
     latencies = _feed(
-        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used, _commands(recording), history,
-        progress,
+        estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used,
+        _others(recording, magnetometer), history, progress,
     )  # fmt: skip
     if archive is not None and history.states:
         _smooth(archive, history, estimator.config)
@@ -171,6 +173,8 @@ def replay(
     if not history.states:
         raise _never_started(recording, used)
     notes = (*recording.notes, *notes, *inputs.notes(recording), *_said(estimator))
+    if recording.magnetometer is not None and not magnetometer:
+        notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
     changes = [*history.changes, *estimator.weights.take_changes()]
     estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
     antenna = config.rig.sensors.gnss.antenna_m
@@ -229,7 +233,7 @@ def _feed(
     imu: Imu | None,
     wheels: tuple[list[int], list[list[float]]],
     gnss: Gnss | None,
-    commands: list[tuple[int, float]],
+    others: list[tuple[int, str, Any]],
     history: History,
     progress: Callable[[float], None] | None,
 ) -> Array:
@@ -250,8 +254,9 @@ def _feed(
             assert gnss is not None
             _give_fix(estimator, gnss, g)
             g += 1
-        while c < len(commands) and commands[c][0] <= t_ns:
-            estimator.add_command(*commands[c])
+        while c < len(others) and others[c][0] <= t_ns:
+            at_ns, method, value = others[c]
+            getattr(estimator, method)(at_ns, value)
             c += 1
         begun = time.perf_counter()
         if imu is None:
@@ -269,13 +274,21 @@ def _feed(
     return np.array(latencies)
 
 
-def _commands(recording: Recording) -> list[tuple[int, float]]:
-    """Times and commanded forward speeds, m/s, as far as the log has them."""
-    command = recording.command
-    if command is None:
-        return []
-    known = np.isfinite(command.v_mps)
-    return list(zip(command.t_ns[known].tolist(), command.v_mps[known].tolist(), strict=True))
+def _others(recording: Recording, magnetometer: bool) -> list[tuple[int, str, Any]]:
+    """What else the log has, in order of time: time, the estimator's method that takes it, and the value."""
+    command, barometer, field = recording.command, recording.barometer, recording.magnetometer
+    found: list[tuple[int, str, Any]] = []
+    if command is not None:
+        known = np.isfinite(command.v_mps)
+        rows = zip(command.t_ns[known].tolist(), command.v_mps[known].tolist(), strict=True)
+        found += [(t_ns, "add_command", v) for t_ns, v in rows]
+    if barometer is not None:
+        rows = zip(barometer.t_ns.tolist(), barometer.pressure_pa.tolist(), strict=True)
+        found += [(t_ns, "add_pressure", p) for t_ns, p in rows]
+    if field is not None and magnetometer:
+        fields = zip(field.t_ns.tolist(), field.field_t, strict=True)
+        found += [(t_ns, "add_magnetic_field", b) for t_ns, b in fields]
+    return sorted(found, key=lambda one: one[0])
 
 
 def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
@@ -340,7 +353,7 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.too_late:
             notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
-    return tuple(notes)
+    return (*notes, *estimator.aids.notes())
 
 
 def _never_started(recording: Recording, used: Gnss | None) -> DataError:

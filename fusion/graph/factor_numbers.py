@@ -99,6 +99,7 @@ _KINDS: dict[str, Callable[[list[int], Any], Any]] = {
     "PriorFactorConstantBias": lambda keys, noise: _GTSAM.PriorFactorConstantBias(
         *keys, gtsam.imuBias.ConstantBias(), noise
     ),
+    "GPSFactorArm": lambda keys, noise: _GTSAM.GPSFactorArm(*keys, np.zeros(3), np.zeros(3), noise),
     "AttitudeFactorPose3": lambda keys, noise: _GTSAM.AttitudeFactorPose3(
         *keys, gtsam.Unit3(0.0, 0.0, 1.0), noise, gtsam.Unit3(0.0, 0.0, 1.0)
     ),

@@ -13,6 +13,7 @@ from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.alignment import WINDOW_NS, GivenStart, Start
 from terrafusion.fusion.inputs.barometer import HeightAid
+from terrafusion.fusion.inputs.gnss import GnssUpdater
 from terrafusion.fusion.inputs.magnetometer import HeadingAid
 from terrafusion.fusion.inputs.streams import GnssFix
 
@@ -33,15 +34,16 @@ class Aids:
         self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report)
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
-    def update(self, chain: Chain, before: Array, after: Array, turned: int) -> bool:
+    def update(self, chain: Chain, before: Array, after: Array, gnss: GnssUpdater) -> bool:
         """Use what has come up to the newest keyframe; True where factors were added to it.
 
-        `before` and `after` (n, n) are its covariance without and with its fixes; `turned` counts the
-        headings that GNSS has set right.
+        `before` and `after` (n, n) are its covariance without and with its fixes.
         """
         t_ns = chain.nodes[-1].t_ns
+        if gnss.local:
+            self.heading.forget_north()
         height = self.height.active and self.height.update(chain, t_ns, before, after)
-        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, turned)
+        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, gnss.turned)
         return height or heading
 
     def start(self, level: Start, fixes: Sequence[GnssFix]) -> GivenStart | None:

@@ -166,6 +166,12 @@ class HeadingAid:
         """Whether a sample has ever come."""
         return bool(self._samples) or self._last_ns is not None
 
+    def forget_north(self) -> None:
+        """The frame is local: its heading has nothing to do with north, whatever declination was given."""
+        if self.given_rad is not None:
+            self.given_rad = None
+            self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
+
     def heading_at_rest(self, level: Start) -> tuple[float, float] | None:
         """Heading and its 1 sigma, rad, of a robot at rest whose roll and pitch are known.
 
