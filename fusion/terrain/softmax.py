@@ -197,9 +197,8 @@ def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFA
     weights = np.where(seen, weights, 0.0)
     centres = np.stack([z[y == c].mean(axis=0) for c in range(len(classes))])
     scatter = np.cov((z - centres[y]).T) + 0.1 * np.eye(z.shape[1])
-    return SoftmaxModel(
-        tuple(classes.tolist()), mean, scale, weights, offsets, centres, np.asarray(np.linalg.inv(scatter), dtype=float)
-    )  # fmt: skip
+    precision: Array = np.asarray(np.linalg.inv(scatter), dtype=np.float64)
+    return SoftmaxModel(tuple(classes.tolist()), mean, scale, weights, offsets, centres, precision)
 
 
 def _with_gaps(z: Array, y: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:

@@ -113,7 +113,7 @@ def surface_windows(signals: Signals) -> tuple[Array, Array, Array]:
     span = signals.end_s() - begin
     # A log cut into windows of two seconds spans a sample less than that.
     count = max(int((span - WINDOW_S) / HOP_S + 1.0), int(span > _SHORTEST_SPAN * WINDOW_S))
-    ends: Array = begin + WINDOW_S + HOP_S * np.arange(count)
+    ends: Array = begin + WINDOW_S + HOP_S * np.arange(count, dtype=np.float64)
     x: Array = np.full((len(ends), len(SURFACE_FEATURES)), np.nan)
     rolled: Array = np.zeros(len(ends))
     for i, end in enumerate(ends):

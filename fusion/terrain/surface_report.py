@@ -165,8 +165,9 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     leak = reference["split that leaks"]
     lines += [
         "",
-        f"extra trees, window by window, by run {reference['extra trees, by run']:.3f}; windows of one run in "
-        f"training and test: softmax {leak['softmax']:.3f}, extra trees {leak['extra trees']:.3f}",
+        f"extra trees, window by window, by run {reference['extra trees, by run']:.3f}; "
+        "windows of one run in training and test: "
+        f"softmax {leak['softmax']:.3f}, extra trees {leak['extra trees']:.3f}",
         "",
         "called odd, of a ground left out of the training and of known ground:",
         *(

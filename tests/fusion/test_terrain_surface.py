@@ -1,0 +1,264 @@
+"""Features and learner of labelled drives: symmetry, gaps, folds, files, and what they learn."""
+
+from __future__ import annotations
+
+import dataclasses
+import glob
+import itertools
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.fusion.cli.terrain import app
+from terrafusion.fusion.terrain.labelled import (
+    FOLDS,
+    Run,
+    cross_validate,
+    deal,
+    figures_of,
+    open_runs,
+    train_on,
+    window_ms,
+)
+from terrafusion.fusion.terrain.softmax import SoftmaxModel, read_softmax
+from terrafusion.fusion.terrain.spliced import changes_seen, spliced
+from terrafusion.fusion.terrain.surface import (
+    GROUPS,
+    SURFACE_FEATURES,
+    Signals,
+    surface_windows,
+    window_features,
+)
+from terrafusion.fusion.terrain.surface_report import leaking, lines_of, never_seen, report_on, transfer
+
+SHAKES = {"gravel": 1.0, "lawn": 0.35, "pavement": 0.12}
+
+
+def made_drive(label: str, seed: int, seconds: float = 40.0, level: float | None = None) -> Signals:
+    """A drive at a speed and turning rate of its own; each ground shakes and drags as much as it does."""
+    rng = np.random.default_rng(seed)
+    t, w = np.arange(0.0, seconds, 0.01), np.arange(0.0, seconds, 0.1)
+    speed, rate = rng.uniform(0.3, 0.8), rng.uniform(-0.3, 0.3)
+    shake = (SHAKES[label] if level is None else level) * np.sqrt(speed)
+    gyro = 0.2 * shake * rng.normal(size=(len(t), 3)) + [0.0, 0.0, 0.9 * rate]
+    accel = shake * rng.normal(size=(len(t), 3)) + [0.0, 0.0, 9.8]
+    sides = np.column_stack([np.full(len(w), speed - 0.25 * rate), np.full(len(w), speed + 0.25 * rate)])
+    current = 3.0 + 2.0 * shake + 0.3 * rng.normal(size=(len(w), 2))
+    return Signals(t, gyro, accel, w, sides + 0.005 * rng.normal(size=sides.shape), 0.5, w, current)
+
+
+def made_run(label: str, seed: int, **how: float) -> Run:
+    signals = made_drive(label, seed, **how)
+    _, x, rolled = surface_windows(signals)
+    return Run(f"{label}/{seed}", label, signals, x, rolled)
+
+
+@pytest.fixture(autouse=True)
+def short_routes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.fusion.terrain.spliced.PATCHES", 6)
+
+
+@pytest.fixture(scope="module")
+def runs() -> list[Run]:
+    return [made_run(label, 10 * i + n) for i, label in enumerate(SHAKES) for n in range(6)]
+
+
+@pytest.fixture(scope="module")
+def model(runs: Sequence[Run]) -> SoftmaxModel:
+    return train_on([r for r in runs if not r.name.endswith("5")])
+
+
+def test_left_and_right_do_not_matter() -> None:
+    drive = made_drive("lawn", 3).between(0.0, 2.0)
+    mirror = dataclasses.replace(
+        drive,
+        gyro_radps=drive.gyro_radps * [-1.0, 1.0, -1.0],
+        accel_mps2=drive.accel_mps2 * [1.0, -1.0, 1.0],
+        sides_mps=drive.sides_mps[:, ::-1],
+        current_a=drive.current_a[:, ::-1],
+    )
+    assert window_features(mirror) == pytest.approx(window_features(drive), abs=1e-9)
+
+
+@given(st.floats(1.5, 5.0))
+def test_a_louder_ground_shifts_all_levels_alike(gain: float) -> None:
+    drive = made_drive("gravel", 1).between(0.0, 2.0)
+    louder = dataclasses.replace(drive, accel_mps2=gain * drive.accel_mps2)
+    moved = dict(zip(SURFACE_FEATURES, window_features(louder) - window_features(drive), strict=True))
+    for name in GROUPS["accelerometer spectrum"]:
+        assert moved[name] == pytest.approx(np.log10(gain), abs=1e-3)
+    for name in (*GROUPS["gyro spectrum"], *GROUPS["shape of the vibration"], "driving_current", "yaw_lost"):
+        assert moved[name] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_tilt_and_bias_are_not_seen() -> None:
+    drive = made_drive("lawn", 4).between(0.0, 2.0)
+    moved = dataclasses.replace(
+        drive,
+        accel_mps2=drive.accel_mps2 + np.array([0.7, -0.4, -0.1]),
+        gyro_radps=drive.gyro_radps + np.array([0.01, 0.02, 0.0]),
+    )
+    assert window_features(moved) == pytest.approx(window_features(drive), abs=1e-9)
+
+
+def test_what_a_log_lacks_is_not_a_number() -> None:
+    drive = made_drive("lawn", 5).between(0.0, 2.0)
+    bare = dataclasses.replace(
+        drive,
+        gyro_radps=np.full_like(drive.gyro_radps, np.nan),
+        current_s=np.empty(0),
+        current_a=np.empty((0, 2)),
+    )
+    missing = {n for n, v in zip(SURFACE_FEATURES, window_features(bare), strict=True) if np.isnan(v)}
+    assert missing == {*GROUPS["gyro spectrum"], *GROUPS["gyro against wheels"], "driving_current"}
+    slow = dataclasses.replace(
+        drive, imu_s=drive.imu_s[::5], gyro_radps=drive.gyro_radps[::5], accel_mps2=drive.accel_mps2[::5]
+    )
+    missing = {n for n, v in zip(SURFACE_FEATURES, window_features(slow), strict=True) if np.isnan(v)}
+    assert missing == set(GROUPS["spectrum above 10 Hz"]) | {f"{a}_6_hz" for a in _axes()}
+
+
+def _axes() -> list[str]:
+    return [n.split("_")[0] for n in SURFACE_FEATURES if n.endswith("_1.5_hz")]
+
+
+def test_no_run_is_in_two_folds_and_every_ground_is_in_each(runs: Sequence[Run]) -> None:
+    fold_of = deal(runs)
+    assert len(fold_of) == len(runs)
+    assert set(fold_of.tolist()) == set(range(FOLDS))
+    for fold in range(FOLDS):
+        assert {r.label for r, f in zip(runs, fold_of, strict=True) if f != fold} == set(SHAKES)
+    assert np.array_equal(deal(runs), fold_of)
+
+
+def test_grounds_are_learnt_by_run(runs: Sequence[Run]) -> None:
+    folded = cross_validate(runs)
+    single, filtered = folded.figures(filtered=False), folded.figures()
+    assert single.macro_f1 > 0.9
+    assert filtered.macro_f1 > 0.9
+    assert filtered.ece < 0.1
+    assert np.sum(filtered.confusion, axis=1) == pytest.approx(1.0)
+    held = [
+        [(r.signals, r.label) for r, f in zip(runs, folded.fold_of, strict=True) if f == k]
+        for k in range(FOLDS)
+    ]
+    changes = changes_seen(folded.models, held)
+    assert changes.never < 0.1
+    assert changes.median_s < 3.0
+
+
+def test_labels_at_random_are_not_learnt(runs: Sequence[Run]) -> None:
+    names = list(SHAKES)
+    mixed = [dataclasses.replace(r, label=names[i % 3]) for i, r in enumerate(runs)]
+    assert cross_validate(mixed, temperature=4.0).figures().macro_f1 < 0.6
+
+
+def test_every_window_gets_probabilities_whatever_is_missing(
+    model: SoftmaxModel, runs: Sequence[Run]
+) -> None:
+    x = runs[0].x.copy()
+    rng = np.random.default_rng(0)
+    x[rng.random(x.shape) < 0.5] = np.nan
+    x[0] = np.nan
+    p = model.filtered(x, runs[0].rolled_m)
+    assert np.isfinite(p).all()
+    assert p.sum(axis=1) == pytest.approx(1.0)
+    assert (p > 0.0).all()
+
+
+def test_a_ground_unlike_all_others_is_odd(model: SoftmaxModel, runs: Sequence[Run]) -> None:
+    known = np.vstack([r.x for r in runs if r.name.endswith("5")])
+    strange = made_run("gravel", 99, level=8.0)
+    assert np.mean(model.oddness(known) > model.odd_distance) < 0.25
+    assert np.mean(model.oddness(strange.x) > model.odd_distance) > 0.9
+
+
+def test_a_route_is_made_of_the_raw_samples(runs: Sequence[Run]) -> None:
+    route, begins = spliced([(r.signals, r.label) for r in runs], 1)
+    assert (np.diff(route.imu_s) > 0.0).all()
+    assert all(a[1] != b[1] for a, b in itertools.pairwise(begins))
+    again, _ = spliced([(r.signals, r.label) for r in runs], 1)
+    assert np.array_equal(again.accel_mps2, route.accel_mps2)
+
+
+def test_written_and_read_back(model: SoftmaxModel, tmp_path: Path, runs: Sequence[Run]) -> None:
+    model.write(tmp_path / "a.yaml")
+    again = read_softmax(tmp_path / "a.yaml")
+    again.write(tmp_path / "b.yaml")
+    assert (tmp_path / "a.yaml").read_bytes() == (tmp_path / "b.yaml").read_bytes()
+    x = runs[3].x
+    assert again.log_probabilities(x) == pytest.approx(model.log_probabilities(x), abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "words"),
+    [
+        ("terrafusion.surface/1", "terrafusion.surface/7", "no model"),
+        ("temperature:", "heat:", "no model"),
+        ("temperature: ", "temperature: -", "positive"),
+        ("offsets: [", "offsets: [1.0, ", "'offsets'"),
+        ("offsets: [", "offsets: [x, ", "no number"),
+        ("speed_scatter", "speed_scutter", "features"),
+    ],
+)
+def test_a_wrong_file_is_one_line(
+    model: SoftmaxModel, tmp_path: Path, old: str, new: str, words: str
+) -> None:
+    path = tmp_path / "model.yaml"
+    model.write(path)
+    path.write_text(path.read_text().replace(old, new, 1))
+    with pytest.raises(ConfigError) as caught:
+        read_softmax(path)
+    assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_one_ground_is_too_few(runs: Sequence[Run]) -> None:
+    with pytest.raises(ConfigError, match="two grounds"):
+        train_on([r for r in runs if r.label == "lawn"])
+
+
+def test_the_report_of_made_drives(runs: Sequence[Run]) -> None:
+    short = [dataclasses.replace(r, x=r.x[:15], rolled_m=r.rolled_m[:15]) for r in runs]
+    others = [dataclasses.replace(r, x=np.where(np.isnan(r.x), r.x, r.x + 0.01)) for r in short[::2]]
+    ticks: list[None] = []
+    report = report_on(short, others, lambda: ticks.append(None))
+    assert report["filtered"]["macro_f1"] > 0.9
+    alone = {name: row["alone"] for name, row in report["ablation"].items() if "alone" in row}
+    assert alone["accelerometer spectrum"] > alone["gyro against wheels"]
+    assert report["other set"]["there"]["macro_f1"] > 0.8
+    text = "\n".join(lines_of(report))
+    assert "macro-F1" in text
+    assert "gravel" in text
+    assert leaking(short)["softmax"] > 0.9
+    assert set(never_seen(short)) == set(SHAKES)
+    assert transfer(short, short[:6])["common grounds"] == ["gravel"]
+
+
+FIELD = os.environ.get("TERRAFUSION_DATA", "")
+
+
+@pytest.mark.skipif(not FIELD, reason="TERRAFUSION_DATA names no folder of field logs")
+def test_a_real_husky_is_told_ice_from_loam_by_run(tmp_path: Path) -> None:
+    logs = sorted(
+        glob.glob(f"{FIELD}/borealtc/ICE/imu_0*.csv") + glob.glob(f"{FIELD}/borealtc/SANDY_LOAM/imu_*.csv")
+    )
+    if not logs:
+        pytest.skip("no BorealTC among the field logs")
+    runs = open_runs(logs)
+    assert cross_validate(runs, temperature=8.0).figures().macro_f1 > 0.95
+    assert window_ms(train_on(runs, temperature=8.0), runs[0], 50) < 20.0
+    out = tmp_path / "grounds.yaml"
+    result = CliRunner().invoke(app, ["train", "--out", str(out), *logs])
+    assert result.exit_code == 0, result.output
+    model = read_softmax(out)
+    assert model.classes == ("ice", "sandy_loam")
+    assert len(model.inputs) == len(logs)
+    assert figures_of(model.classes, runs, [model.filtered(r.x, r.rolled_m) for r in runs]).macro_f1 > 0.95
