@@ -236,7 +236,7 @@ class Estimator:
         if self._level is None:
             self._level = level_start(self.imu, self.wheels, begin)
         if self._given is None:
-            self._given = self.aids.start(self._level, self.gnss.waiting)
+            self._level, self._given = self.aids.start(self._level, self.imu, self.wheels, self.gnss.waiting)
         if self._given is not None:
             self._begin(self._given.at(self._level))
         elif self.gnss.waiting and self.gnss.news():
@@ -320,10 +320,11 @@ class Estimator:
         markov = slow_states.step(
             dt,
             row,
-            float(before.pose.rotation().matrix()[2, 0]),
+            before.pose.rotation().matrix()[2],
             self.gnss.drift_sigma_m,
             self.gnss.drift_time_s,
             switch,
+            rolled,
         )
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)

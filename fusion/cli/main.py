@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import sys
+from typing import Annotated
 
 import typer
 
@@ -34,6 +35,25 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     add_completion=False,
 )
+
+
+def _told(value: bool) -> None:
+    if value:
+        from importlib.metadata import version
+
+        print(f"terrafusion {version('terrafusion')}")
+        raise typer.Exit
+
+
+@app.callback()
+def options(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and stop.", callback=_told, is_eager=True)
+    ] = False,
+) -> None:
+    """Options of the program itself."""
+
+
 app.command("demo")(demo.demo)
 app.command("inspect")(inspect.inspect)
 app.command("fetch")(fetch.fetch)

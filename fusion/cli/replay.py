@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -70,6 +71,18 @@ def replay(
         typer.Option(metavar="FILE.rrd", help="Also write the replay for the Rerun viewer (extra: rerun)."),
     ] = None,
     gnss_outage: OutageOption = None,
+    magnetometer: Annotated[
+        bool, typer.Option("--magnetometer", help="Use the log's magnetometer; a barometer is always used.")
+    ] = False,
+    declination: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG",
+            min=-180.0,
+            max=180.0,
+            help="Magnetic north, degrees east of north: the magnetometer then tells the heading at rest.",
+        ),
+    ] = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
@@ -96,6 +109,7 @@ def replay(
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
     if rerun is not None:
         require_rerun()
+    turned = None if declination is None else math.radians(declination)
     outages = [parse_outage(text) for text in gnss_outage or []]
     rig = load_rig(vehicle)
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
@@ -111,7 +125,8 @@ def replay(
             outages=outages,
             batch=batch,
             progress=progress,
-            settings={"calibrate": calibrate},
+            magnetometer=magnetometer or declination is not None,
+            settings={"calibrate": calibrate, "declination_rad": turned},
         )
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     if mcap:

@@ -8,14 +8,15 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.inputs.alignment import WINDOW_NS, GivenStart, Start
+from terrafusion.fusion.inputs.alignment import WINDOW_NS, GivenStart, Start, level_start
 from terrafusion.fusion.inputs.barometer import HeightAid
 from terrafusion.fusion.inputs.gnss import GnssUpdater
 from terrafusion.fusion.inputs.magnetometer import HeadingAid
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
 
@@ -32,6 +33,7 @@ class Aids:
     def __init__(self, rig: Rig, declination_rad: float | None, report: Callable[[Innovation], None]) -> None:
         self.height = HeightAid(rig.sensors.barometer, report)
         self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report)
+        self._accel_tilt_rad = rig.sensors.imu.accel_bias_sigma_mps2 / GRAVITY_MPS2
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
     def update(self, chain: Chain, before: Array, after: Array, gnss: GnssUpdater) -> bool:
@@ -46,17 +48,28 @@ class Aids:
         heading = self.heading.active and self.heading.update(chain, t_ns, before, after, gnss.turned)
         return height or heading
 
-    def start(self, level: Start, fixes: Sequence[GnssFix]) -> GivenStart | None:
-        """Where a robot at rest stands and where it heads, once a fix and the field have told it."""
+    def start(
+        self, level: Start, imu: ImuStream, wheels: WheelStream, fixes: Sequence[GnssFix]
+    ) -> tuple[Start, GivenStart | None]:
+        """Where a robot at rest stands and where it heads, once a fix and the field have told it.
+
+        Slow wheels may not have covered the first second when `level` was made; the level given back
+        knows that the robot stood.
+        """
         early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
-        told = self.heading.heading_at_rest(level) if early else None
+        if not early or not self.heading.ready:
+            return level, None
+        if level.gyro_bias_radps is None and level.t_ns >= imu.t_ns[0]:
+            level = level_start(imu, wheels, level.t_ns)
+        tilt = float(np.hypot(level.level_sigma_rad, self._accel_tilt_rad))
+        told = self.heading.heading_at_rest(level, tilt)
         if told is None:
-            return None
+            return level, None
         yaw, sigma = told
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, yaw).matrix()
         best = min(early, key=lambda fix: float(fix.sigma_m[0]))
         position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
-        return GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
+        return level, GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
 
     def notes(self) -> tuple[str, ...]:
         """What was made of the samples, in sentences."""

@@ -53,6 +53,7 @@ CHANCES = 3
 LEAST_START = 5
 FREE = 1e3
 ASTRAY_SIGMA = 4.0
+ODD_SHARE = 0.1
 _NORTH_EAST = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0])
 
 
@@ -162,6 +163,11 @@ class HeadingAid:
             self._samples.append((int(t_ns), field))
 
     @property
+    def ready(self) -> bool:
+        """Whether a declination is known, and samples have come to start from."""
+        return self.given_rad is not None and len(self._samples) >= LEAST_START
+
+    @property
     def active(self) -> bool:
         """Whether a sample has ever come."""
         return bool(self._samples) or self._last_ns is not None
@@ -172,13 +178,13 @@ class HeadingAid:
             self.given_rad = None
             self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
 
-    def heading_at_rest(self, level: Start) -> tuple[float, float] | None:
-        """Heading and its 1 sigma, rad, of a robot at rest whose roll and pitch are known.
+    def heading_at_rest(self, level: Start, tilt_rad: float) -> tuple[float, float] | None:
+        """Heading and its 1 sigma, rad, of a robot at rest whose roll and pitch are known to `tilt_rad`.
 
         None without a declination, with few samples, or with a field that is not Earth's. From here on the
         biases are tied to that heading: later samples are no further opinion on it.
         """
-        if self.given_rad is None or level.gyro_bias_radps is None or len(self._samples) < LEAST_START:
+        if not self.ready or level.gyro_bias_radps is None:
             return None
         mean = np.mean([field for _, field in self._samples], axis=0)
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, 0.0).matrix()
@@ -186,7 +192,7 @@ class HeadingAid:
         if not self.reference.fits(self._samples[-1][0], flat):
             return None
         yaw, H = self._told(R, mean)
-        noise = self._noise(flat, len(self._samples), level.level_sigma_rad)
+        noise = self._noise(flat, len(self._samples), tilt_rad)
         own = self.bias.covariance @ H
         sigma = math.sqrt(float(H @ own) + noise)
         self.bias.cross = -own  # heading = told - H b: its error is the biases', turned round
@@ -280,6 +286,10 @@ class HeadingAid:
         if not self.used and not self.refused:
             return []
         found = [f"magnetometer: {self.used} headings, one a second, were used, {self.refused} refused"]
+        if self.refused > ODD_SHARE * (self.used + self.refused):
+            why = "a wrong declination, " if self.given_rad is not None else ""
+            why += "iron of the robot or of the ground"
+            found.append(f"magnetometer: many headings disagree with the drive: {why}")
         sigma = math.sqrt(float(self.bias.covariance[0, 0]))
         astray = wrapped(float(self.bias.mean[0]) - (self.given_rad or 0.0))
         if self.given_rad is not None and abs(astray) > ASTRAY_SIGMA * max(sigma, GIVEN_SIGMA_RAD):

@@ -178,19 +178,19 @@ def test_a_start_at_rest_and_its_sigma() -> None:
     R = rotation(0.05, -0.1, 2.0)
     field = R.T @ np.array([19e-6 * math.sin(0.1), 19e-6 * math.cos(0.1), -45e-6])
     aid = HeadingAid(None, 0.1, lambda _: None)
-    assert aid.heading_at_rest(level) is None, "no sample yet"
+    assert aid.heading_at_rest(level, 0.01) is None, "no sample yet"
     for i in range(20):
         aid.add(i * 50_000_000, field)
-    told = aid.heading_at_rest(level)
+    told = aid.heading_at_rest(level, 0.01)
     assert told is not None
     assert told[0] == pytest.approx(2.0, abs=1e-6)
     assert told[1] == pytest.approx(math.hypot(0.03, 3e-6 / 19e-6, 0.05, 0.01 * 45 / 19), rel=0.02)
     moving = dataclasses.replace(level, gyro_bias_radps=None)
-    assert aid.heading_at_rest(moving) is None
+    assert aid.heading_at_rest(moving, 0.01) is None
     unknown = HeadingAid(None, None, lambda _: None)
     for i in range(20):
         unknown.add(i * 50_000_000, field)
-    assert unknown.heading_at_rest(level) is None, "magnetic north is not north"
+    assert unknown.heading_at_rest(level, 0.01) is None, "magnetic north is not north"
 
 
 def test_a_disturbed_field_is_not_like_the_drives() -> None:
