@@ -18,9 +18,9 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from terrafusion.fusion.graph.batch_rows import Block
-from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.key_state import POSE, KeyState
-from terrafusion.fusion.graph.triangular import back_substitute, triangular
+from terrafusion.fusion.graph.chain import Chain, carried_prior
+from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class Batch:
         self.linear = np.array([point.linear for point in points])
         self.iterations = 0
         self._blocks = [
-            Block(chain, k, min(k + BLOCK, self.first + self.size))
+            Block(nodes, self.first, k, min(k + BLOCK, self.first + self.size))
             for k in range(self.first, self.first + self.size, BLOCK)
         ]
         self._made_at, self._prior = nodes[0].point, nodes[0].prior
@@ -113,34 +113,25 @@ class Batch:
         self.iterations += 1
         dim = self.dim
         poses = gtsam.utilities.extractPose3(values)
-        R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
-        below = np.triu(np.ones((dim, dim + 1)))
         known = self._first_prior(values, linear[0])
         error = float(known[:, dim] @ known[:, dim])
         for block in self._blocks:
-            rows, counts = block.rows(values, R, p, linear)
+            rows, counts = block.rows(values, linear, poses)
             error += float(np.einsum("kr,kr->", rows[:, :, -1], rows[:, :, -1]))
             for i, count in enumerate(counts, block.begin - self.first):
                 stacked = rows[i + self.first - block.begin, :count]
-                stacked[: len(known), :dim], stacked[: len(known), -1] = known[:, :dim], known[:, dim]
                 if i == self.size - 1:
-                    self._root = triangular(np.delete(stacked, np.s_[dim : 2 * dim], axis=1))
-                    break
-                packed, _, _, _ = lapack.dgeqrf(stacked)
-                self._conditionals[i] = packed[:dim]
-                known = packed[dim : 2 * dim, dim:] * below
+                    own = np.delete(stacked, np.s_[dim : 2 * dim], axis=1)
+                    self._root = triangular(np.vstack([known, own]))
+                else:
+                    self._conditionals[i], known = eliminated(stacked, known)
         return error
 
     def _first_prior(self, values: gtsam.Values, linear: Array) -> Array:
-        """The prior (dim, dim + 1) of the first keyframe, a Gaussian in the tangent space where it was made,
-        carried to where the keyframe is now."""
+        """The prior (m, dim + 1) of the first keyframe, carried to where the keyframe is now."""
         x, v, b = self._keys[0]
         now = KeyState(values.atPose3(x), values.atVector(v), values.atConstantBias(b), linear)
-        offset = self._made_at.local(now)[: self.dim]
-        rows = self._prior.copy()
-        rows[:, self.dim] -= rows[:, : self.dim] @ offset
-        rows[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
-        return rows
+        return carried_prior(self._prior, self._made_at.local(now))
 
     def _solve(self) -> Array:
         """The step (n, dim) of all keyframes."""

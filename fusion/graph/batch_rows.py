@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
     ANTENNA,
@@ -34,6 +34,9 @@ from terrafusion.fusion.graph.key_state import (
 )
 from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+
+if TYPE_CHECKING:
+    from terrafusion.fusion.graph.chain import Node
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
@@ -55,11 +58,12 @@ class _Group:
 class Block:
     """The factors of the keyframes `begin` to `end - 1` and of their links to the keyframe after each."""
 
-    def __init__(self, chain: Chain, begin: int, end: int) -> None:
-        self.begin, self.end, self.dim = begin, end, chain.dim
-        self._at = slice(begin - chain.first, end - chain.first)
-        own = chain.nodes[self._at]
-        after = chain.nodes[self._at.start + 1 : self._at.stop + 1]
+    def __init__(self, nodes: list[Node], first: int, begin: int, end: int) -> None:
+        """`nodes` are all keyframes of the chain, from `first` on."""
+        self.begin, self.end, self.dim = begin, end, len(nodes[0].delta)
+        self._at = slice(begin - first, end - first)
+        own = nodes[self._at]
+        after = nodes[self._at.start + 1 : self._at.stop + 1]
         self._linked = len(after)
         self._markov = _Markov([node.markov for node in after], self.dim)
         self._wheels = _Wheels([node.wheels for node in after])
@@ -74,13 +78,18 @@ class Block:
         self._accel = np.array([node.accel_mps2 for node in after]).reshape(-1, 3) * is_imu
         self._counts = np.maximum(used, 2 * self.dim + 1).tolist()
 
-    def rows(self, values: gtsam.Values, R: Array, p: Array, linear: Array) -> tuple[Array, list[int]]:
+    def rows(
+        self, values: gtsam.Values, linear: Array, poses: Array | None = None
+    ) -> tuple[Array, list[int]]:
         """All rows, and how many there are of each keyframe.
 
         Args:
-            values: poses, velocities and biases at which to linearise.
-            R, p, linear: (n, 3, 3), (n, 3), (n, 14) of all keyframes of the chain.
+            values: poses, velocities and biases at which to linearise, of all keyframes of the chain.
+            linear: (n, 14) their linear states.
+            poses: `extractPose3` of `values`, where the caller has it.
         """
+        poses = gtsam.utilities.extractPose3(values) if poses is None else poses
+        R, p = poses[:, :9].reshape(-1, 3, 3), poses[:, 9:]
         rows = np.zeros((self.end - self.begin, max(self._counts), 2 * self.dim + 1))
         n, states = self._linked, self.dim - NAV.stop
         own, after = slice(self._at.start, self._at.start + n), slice(self._at.start + 1, self._at.stop + 1)

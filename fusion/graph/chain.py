@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from terrafusion.fusion.graph import gnss_factor
+from terrafusion.fusion.graph.batch_rows import Block
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
     BIAS,
@@ -39,7 +40,7 @@ from terrafusion.fusion.graph.key_state import (
     skew,
 )
 from terrafusion.fusion.graph.markov import MarkovStep
-from terrafusion.fusion.graph.triangular import back_substitute, triangular
+from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
@@ -207,9 +208,7 @@ class Chain:
             if not (deltas > self.RELINEARISE).any():
                 return
             self._back_substitute_to(self.first)
-            for k in range(self.first, self.last + 1):
-                self._move(k)
-            self._dirty = self.first
+            self._relinearise()
         self._eliminate_all()
         self._back_substitute_to(begin)
 
@@ -306,26 +305,47 @@ class Chain:
         self.values.insert(V(k), point.velocity)
         self.values.insert(B(k), point.bias)
 
-    def _move(self, k: int) -> None:
-        """Make the current estimate of keyframe k its linearisation point.
+    def _carry_prior(self) -> None:
+        """Carry the prior of the first keyframe to its estimate.
 
-        The prior of the first keyframe is no factor that could be linearised
-        again: it stays a Gaussian in the tangent space where it was made, and
-        is carried to the new one (GTSAM's LinearContainerFactor, with the
-        derivative of the logarithm).
+        It is no factor that could be linearised again: it stays a Gaussian in the tangent
+        space where it was made (GTSAM's LinearContainerFactor, with the derivative of the
+        logarithm).
         """
+        node = self.nodes[0]
+        if self._anchor is None or self._anchor[0] != self.first:
+            self._anchor = (self.first, node.point, node.prior)
+        _, made_at, rows = self._anchor
+        node.prior = carried_prior(rows, made_at.local(node.point.retract(node.delta)))
+
+    def _move(self, k: int) -> None:
+        """Make the current estimate of keyframe k its linearisation point."""
         node = self.nodes[k - self.first]
         if k == self.first:
-            if self._anchor is None or self._anchor[0] != k:
-                self._anchor = (k, node.point, node.prior)
-            _, made_at, rows = self._anchor
-            offset = made_at.local(node.point.retract(node.delta))[: self.dim]
-            node.prior = rows.copy()
-            node.prior[:, self.dim] -= rows[:, : self.dim] @ offset
-            node.prior[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
+            self._carry_prior()
         node.point = node.point.retract(node.delta)
         node.delta = np.zeros(self.dim)
         self._publish(k)
+
+    def _relinearise(self) -> None:
+        """Make the estimates of all keyframes held their linearisation points, and eliminate anew."""
+        self._carry_prior()
+        delta = gtsam.VectorValues()
+        for k, node in enumerate(self.nodes, self.first):
+            delta.insert(X(k), node.delta[POSE])
+            delta.insert(V(k), node.delta[VELOCITY])
+            delta.insert(B(k), node.delta[BIAS])
+        self.values = now = self.values.retract(delta)
+        for k, node in enumerate(self.nodes, self.first):
+            linear = node.point.linear.copy()
+            linear[: self.dim - NAV.stop] += node.delta[NAV.stop :]
+            node.point = KeyState(now.atPose3(X(k)), now.atVector(V(k)), now.atConstantBias(B(k)), linear)
+            node.delta = np.zeros(self.dim)
+        block = Block(self.nodes, self.first, self.first, self.last + 1)
+        rows, counts = block.rows(now, np.array([node.point.linear for node in self.nodes]))
+        for node, after, own, count in zip(self.nodes, self.nodes[1:], rows, counts, strict=False):
+            node.conditional, after.prior = eliminated(own[:count], node.prior)
+        self._dirty = self.last
 
     def _publish(self, k: int) -> None:
         node = self.nodes[k - self.first]
@@ -418,6 +438,15 @@ class Chain:
             assert node.conditional is not None
             rhs = node.conditional[:, 2 * self.dim] - node.conditional[:, self.dim : 2 * self.dim] @ following
             node.delta = following = back_substitute(node.conditional[:, : self.dim], rhs)
+
+
+def carried_prior(rows: Array, offset: Array) -> Array:
+    """Whitened rows (m, dim + 1) at a state that lies `offset` from where they were made."""
+    dim = rows.shape[1] - 1
+    out = rows.copy()
+    out[:, dim] -= rows[:, :dim] @ offset[:dim]
+    out[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
+    return out
 
 
 def _covariance_before(node: Node, following: Array) -> Array:

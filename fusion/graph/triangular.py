@@ -9,13 +9,34 @@ from scipy.linalg import lapack
 Array = NDArray[np.float64]
 
 
+_UPPER = np.triu(np.ones((64, 65)))
+"""Keeps the upper triangle; for two states of 29 at most."""
+
+
+def eliminated(stacked: Array, known: Array) -> tuple[Array, Array]:
+    """Eliminate the first of two states from rows over both.
+
+    Args:
+        stacked: (m, 2 d + 1) with m > 2 d, its first rows left free for `known`.
+        known: (<= d, d + 1) rows over the first state alone.
+
+    Returns:
+        What the rows say of the first state given the second (d, 2 d + 1; numbers below the diagonal
+        mean nothing), and of the second alone (d, d + 1).
+    """
+    d = known.shape[1] - 1
+    stacked[: len(known), :d], stacked[: len(known), -1] = known[:, :d], known[:, d]
+    packed, _, _, _ = lapack.dgeqrf(stacked, overwrite_a=1)
+    return np.asfortranarray(packed[:d]), packed[d : 2 * d, d:] * _UPPER[:d, : d + 1]
+
+
 def triangular(stacked: Array) -> Array:
     """R (n - 1, n) of the QR decomposition of rows (m, n), the last column being the right-hand side."""
     rows, columns = stacked.shape
     if rows < columns:
         stacked = np.vstack([stacked, np.zeros((columns - rows, columns))])
     packed, _, _, _ = lapack.dgeqrf(stacked, overwrite_a=1)
-    return np.asarray(np.triu(packed[: columns - 1]))
+    return np.asarray(packed[: columns - 1] * _UPPER[: columns - 1, :columns])
 
 
 def back_substitute(R: Array, rhs: Array) -> Array:
