@@ -33,6 +33,7 @@ from terrafusion.fusion.graph.key_state import (
 )
 from terrafusion.fusion.history import History
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
+from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.fusion.weights.policy import Policy, load_policy
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
 
@@ -165,7 +166,7 @@ def replay(
     started = time.perf_counter()
     latencies = _feed(
         estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used,
-        _others(recording, magnetometer), history, progress,
+        _others(recording, magnetometer, rows.names()), history, progress,
     )  # fmt: skip
     if archive is not None and history.states:
         _smooth(archive, history, estimator.config)
@@ -274,10 +275,12 @@ def _feed(
     return np.array(latencies)
 
 
-def _others(recording: Recording, magnetometer: bool) -> list[tuple[int, str, Any]]:
+def _others(recording: Recording, magnetometer: bool, grounds: tuple[str, ...]) -> list[tuple[int, str, Any]]:
     """What else the log has, in order of time: time, the estimator's method that takes it, and the value."""
     command, barometer, field = recording.command, recording.barometer, recording.magnetometer
-    found: list[tuple[int, str, Any]] = []
+    found: list[tuple[int, str, Any]] = [
+        (t_ns, "add_terrain", p) for t_ns, p in external_probabilities(recording.terrain, grounds)
+    ]
     if command is not None:
         known = np.isfinite(command.v_mps)
         rows = zip(command.t_ns[known].tolist(), command.v_mps[known].tolist(), strict=True)

@@ -42,7 +42,7 @@ _MIN_SPAN_S = 0.6
 _ACCEL_FLOOR_MPS2 = 1e-3
 _GYRO_FLOOR_RADPS = 1e-4
 _TIMING_S = 0.05
-_LEAST_INFORMATION = 0.1
+_LEAST_INFORMATION = 1.0
 """Of the measurements, in units of the prior's, for the slip to count as observed."""
 _SLIP_RANGE = (-1.0, 1.2)
 

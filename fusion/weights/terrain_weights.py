@@ -172,7 +172,8 @@ class TerrainWeights:
             return
         p = self._probabilities
         self.row = self.policy.blend(p, self._grade)
-        assert self._noted is not None
+        if self._noted is None:  # not started yet: nothing to change from
+            return
         before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)
         best = int(p.argmax())
         why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"

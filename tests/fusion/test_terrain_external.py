@@ -1,0 +1,47 @@
+"""What a log's own source of terrain probabilities becomes before it reaches the estimator."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.recording import Terrain
+from terrafusion.fusion.replay import replay
+from terrafusion.fusion.terrain.external import external_probabilities
+from terrafusion.twin.simulate import simulate
+
+KNOWN = ("asphalt", "mud", "unknown")
+
+
+def camera(rows: list[list[float]], source: str = "camera") -> Terrain:
+    t_ns = np.arange(len(rows), dtype=np.int64) * 10**9
+    return Terrain(t_ns, np.array(["mud"] * len(rows)), source, ("mud", "lava", "asphalt"), np.array(rows))
+
+
+def test_classes_the_policy_lacks_are_unknown_ground() -> None:
+    rows = external_probabilities(camera([[0.2, 0.5, 0.3], [1.0, 0.0, 0.0]]), KNOWN)
+    assert rows[0] == (0, {"asphalt": 0.3, "mud": 0.2, "unknown": 0.5})
+    assert rows[1] == (10**9, {"asphalt": 0.0, "mud": 1.0, "unknown": 0.0})
+
+
+def test_what_is_no_probability_is_left_out() -> None:
+    odd = [[np.nan, 0.5, 0.5], [-1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
+    assert [t for t, _ in external_probabilities(camera(odd), KNOWN)] == [3 * 10**9]
+
+
+@pytest.mark.parametrize("source", ["annotation", "simulation"])
+def test_the_truth_is_not_shown_to_the_estimator(source: str) -> None:
+    assert external_probabilities(camera([[1.0, 0.0, 0.0]], source), KNOWN) == []
+    assert external_probabilities(None, KNOWN) == []
+
+
+def test_a_camera_in_the_log_reaches_the_weights() -> None:
+    recording = simulate("figure_eight", vehicle="husky", terrain="asphalt", seed=5)
+    t_ns = recording.start_ns + np.arange(10, dtype=np.int64) * 10**9
+    seen = Terrain(t_ns, np.array(["mud"] * 10), "camera", ("mud",), np.ones((10, 1)))
+    estimate = replay(dataclasses.replace(recording, terrain=seen)).estimate
+    names = [c.reason for c in estimate.changes]
+    assert any("external source" in reason and "mud" in reason for reason in names)
+    assert not any("external" in c.reason for c in replay(recording).estimate.changes)
