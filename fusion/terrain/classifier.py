@@ -35,6 +35,9 @@ Assumed; tyre pressure and load move the rolling radius of a pneumatic wheel by 
 """
 FOREIGN_UNKNOWN = 0.9
 """Share of `unknown` where a robot not trained on has not been seen to slip."""
+SLIP_TEMPERATURE = 20.0
+"""Windows that are one observation where slip alone is judged: its estimate stays as it is for about 10 s
+(`slip_time_s` of the policy's fixed row, and receivers wander as slowly), windows come twice a second."""
 _BROAD_SHARE = 0.1
 
 _KEYS = (
@@ -104,7 +107,13 @@ class TerrainModel:
             broad = dataclasses.replace(self.unknown, log_weight=np.zeros(1))
             unknown = _pooled([known, broad], [1.0, _BROAD_SHARE])
         slippery = {n: m for n, m in widened.items() if n not in firm}
-        return dataclasses.replace(self, classes=slippery, unknown=unknown, slip_only=True)
+        return dataclasses.replace(
+            self,
+            classes=slippery,
+            unknown=unknown,
+            temperature=max(self.temperature, SLIP_TEMPERATURE),
+            slip_only=True,
+        )
 
     def prior(self, classes: tuple[str, ...]) -> Array:
         """Probabilities (k,) of the named classes before anything was observed."""

@@ -30,18 +30,20 @@ def run(model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None
     - spliced: patches of fresh drives on single grounds, cut together;
     - no slip: the same in a GNSS outage, where the estimator supplies no slip;
     - slow IMU: the same at 30 Hz, means of the samples between;
-    - foreign: the same as a robot the model does not know, shaking twice as much;
+    - foreign: the same as a robot the model does not know, shaking twice as much; firm ground is unknown;
     - mixed route: the twin's own drive over several grounds;
     - without X: X left out of the model, so that `unknown` is the right answer there.
     """
     fresh = range(FRESH_SEED, FRESH_SEED + seeds)
     routes = [splice(list(drives_of(Plan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
     mixed = [_mixed(MIXED_RUNS * FRESH_SEED + number, tick) for number in range(MIXED_RUNS * seeds)]
+    foreign = model.for_vehicle(None)
+    firm = sorted(set(model.classes) - set(foreign.classes))
     scores = {
         "spliced": evaluate(model, routes),
         "no slip": evaluate(model, [_changed(r, _without_slip) for r in routes]),
         "slow IMU": evaluate(model, [_changed(r, _slow) for r in routes]),
-        "foreign": evaluate(model.for_vehicle(None), [_changed(r, _louder) for r in routes]),
+        "foreign": evaluate(foreign, [_relabelled(_changed(r, _louder), *firm) for r in routes]),
         "mixed route": evaluate(model, mixed),
     }
     for ground in GROUNDS:
@@ -63,8 +65,8 @@ def _changed(route: Route, change: Callable[[Window], Window]) -> Route:
     return dataclasses.replace(route, windows=[change(w) for w in route.windows])
 
 
-def _relabelled(route: Route, ground: str) -> Route:
-    labels = np.where(route.labels == ground, "unknown", route.labels)
+def _relabelled(route: Route, *grounds: str) -> Route:
+    labels = np.where(np.isin(route.labels, grounds), "unknown", route.labels)
     return dataclasses.replace(route, labels=labels)
 
 
