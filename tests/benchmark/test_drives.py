@@ -16,6 +16,8 @@ from terrafusion.fusion.benchmark.drives import (
     soils_of,
 )
 from terrafusion.fusion.terrain.drives import SOIL_SCATTER
+from terrafusion.fusion.terrain.external import external_probabilities
+from terrafusion.fusion.weights.policy import load_policy
 from terrafusion.fusion.weights.tuning import DRIVES
 from terrafusion.twin.soil import load_soil
 
@@ -31,6 +33,11 @@ def test_the_same_case_gives_the_same_bits() -> None:
     assert np.array_equal(one.recording.imu.accel_mps2, other.recording.imu.accel_mps2)
     assert np.array_equal(one.recording.truth.position_m, other.recording.truth.position_m)
     assert (one.outage, one.labels) == (other.outage, other.labels)
+
+
+def test_a_recording_tells_the_estimator_nothing_of_its_ground() -> None:
+    terrain = drive_of(SHORT).recording.terrain
+    assert list(external_probabilities(terrain, load_policy().names())) == []
 
 
 def test_plants_drive_the_same_on_other_ground() -> None:
