@@ -55,7 +55,10 @@ class Latencies:
 
 
 def messages(recording: Recording, wheel_radius_m: float) -> Iterator[Message]:
-    """The samples of a recording in the order of time, wheels and fixes before the IMU of the same time.
+    """The samples of a recording in the order of time, all others before the IMU of the same time.
+
+    What `replay` gives is given here, too, a magnetometer excepted: encoder angles, velocity and class of the
+    fixes, commands, pressures.
 
     Raises:
         DataError: no IMU, or no wheels.
@@ -64,7 +67,10 @@ def messages(recording: Recording, wheel_radius_m: float) -> Iterator[Message]:
         raise DataError(
             "the log lacks IMU or wheels", remedy="live use needs both; see `terrafusion inspect`"
         )
-    streams = [_wheels(recording.wheels, wheel_radius_m), _gnss(recording), _imu(recording)]
+    streams = [
+        _wheels(recording.wheels, wheel_radius_m), _gnss(recording), _commands(recording),
+        _pressures(recording), _imu(recording),
+    ]  # fmt: skip
     return heapq.merge(*streams, key=lambda message: message[0])
 
 
@@ -77,11 +83,13 @@ def _imu(recording: Recording) -> Iterator[Message]:
 
 
 def _wheels(wheels: Wheels, radius_m: float) -> Iterator[Message]:
-    for t_ns, (left, right) in zip(
-        wheels.t_ns.tolist(), wheels.side_speeds_mps(radius_m).tolist(), strict=True
-    ):
-        if np.isfinite(left + right):
-            yield t_ns, "wheels", lambda e, t=t_ns, a=left, b=right: e.add_wheels(t, a, b)  # type: ignore[misc]
+    rows = wheels.side_speeds_mps(radius_m)
+    if wheels.angle_rad is not None and np.isfinite(wheels.angle_rad).all():
+        turned = Wheels(wheels.t_ns, wheels.angle_rad, wheels.names, "radps")
+        rows = np.hstack([rows, turned.side_speeds_mps(radius_m)])
+    for t_ns, row in zip(wheels.t_ns.tolist(), rows.tolist(), strict=True):
+        if np.isfinite(sum(row)):
+            yield t_ns, "wheels", lambda e, t=t_ns, r=row: e.add_wheels(t, *r)  # type: ignore[misc]
 
 
 def _gnss(recording: Recording) -> Iterator[Message]:
@@ -91,7 +99,27 @@ def _gnss(recording: Recording) -> Iterator[Message]:
     for i, t_ns in enumerate(gnss.t_ns.tolist()):
         enu, sigma = gnss.enu_m[i], gnss.sigma_enu_m[i]
         if gnss.fix[i] and np.isfinite(enu[:2].sum() + sigma[:2].sum()):
-            yield t_ns, "gnss", lambda e, t=t_ns, p=enu, s=sigma: e.add_gnss(t, p, s)  # type: ignore[misc]
+            velocity = None if gnss.velocity_enu_mps is None else gnss.velocity_enu_mps[i]
+            sigma_v = float("nan") if gnss.sigma_v_mps is None else float(gnss.sigma_v_mps[i])
+            row = (enu, sigma, velocity, sigma_v, int(gnss.fix[i]))
+            yield t_ns, "gnss", lambda e, t=t_ns, r=row: e.add_gnss(t, *r)  # type: ignore[misc]
+
+
+def _commands(recording: Recording) -> Iterator[Message]:
+    command = recording.command
+    if command is None:
+        return
+    for t_ns, v in zip(command.t_ns.tolist(), command.v_mps.tolist(), strict=True):
+        if np.isfinite(v):
+            yield t_ns, "command", lambda e, t=t_ns, v=v: e.add_command(t, v)  # type: ignore[misc]
+
+
+def _pressures(recording: Recording) -> Iterator[Message]:
+    barometer = recording.barometer
+    if barometer is None:
+        return
+    for t_ns, p in zip(barometer.t_ns.tolist(), barometer.pressure_pa.tolist(), strict=True):
+        yield t_ns, "barometer", lambda e, t=t_ns, p=p: e.add_pressure(t, p)  # type: ignore[misc]
 
 
 def run(
@@ -124,7 +152,7 @@ def run(
 def repeated(recording: Recording) -> Iterator[Recording]:
     """A drive again and again, each beginning where and when the one before ended.
 
-    Time runs on; the fixes are turned and shifted in the plane by the truth.
+    Time runs on and so do the encoders; the fixes are turned and shifted in the plane by the truth.
 
     Raises:
         DataError: the drive has no truth.
@@ -135,14 +163,25 @@ def repeated(recording: Recording) -> Iterator[Recording]:
     lasts_ns = int(imu.t_ns[-1] - imu.t_ns[0]) + round(float(np.median(np.diff(imu.t_ns))))
     yaw = np.unwrap(np.arctan2(*quaternion_to_matrix(truth.quaternion[[0, -1]])[:, [1, 0], 0].T))
     R, shift = np.eye(3), np.zeros(3)
+    angle = wheels.angle_rad
+    rolled = np.zeros(0) if angle is None else angle[-1] - angle[0]
     step = _about_z(yaw[1] - yaw[0])
     for n in itertools.count():
         after = n * lasts_ns
         yield dataclasses.replace(
             recording,
             imu=dataclasses.replace(imu, t_ns=imu.t_ns + after),
-            wheels=dataclasses.replace(wheels, t_ns=wheels.t_ns + after),
-            gnss=dataclasses.replace(gnss, t_ns=gnss.t_ns + after, enu_m=gnss.enu_m @ R.T + shift),
+            wheels=dataclasses.replace(
+                wheels, t_ns=wheels.t_ns + after, angle_rad=None if angle is None else angle + n * rolled
+            ),
+            gnss=dataclasses.replace(
+                gnss,
+                t_ns=gnss.t_ns + after,
+                enu_m=gnss.enu_m @ R.T + shift,
+                velocity_enu_mps=None if gnss.velocity_enu_mps is None else gnss.velocity_enu_mps @ R.T,
+            ),
+            command=None,
+            barometer=None,
         )
         shift = shift + R @ (truth.position_m[-1] - step @ truth.position_m[0])
         R = R @ step
