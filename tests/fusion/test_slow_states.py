@@ -1,0 +1,83 @@
+"""Priors and processes of the linear states: limits and signs."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from terrafusion.fusion.graph import slow_states
+from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.weights.policy import load_policy
+
+ROWS = load_policy().classes
+SAND = ROWS["loose_sand"]
+SLIP, SIDE = LINEAR.index("slip"), LINEAR.index("side_slip")
+LEVEL = np.array([0.0, 0.0, 1.0])
+
+
+def rolling(speed_mps: float, change_mps: float = 0.0) -> WheelIncrement:
+    distance = 0.1 * speed_mps
+    return WheelIncrement(
+        np.array([distance, 0.0, 0.0]), np.ones(4), distance, 0.0, speed_change_mps=change_mps
+    )
+
+
+def step(
+    wheels: WheelIncrement | None, up: np.ndarray = LEVEL, switch: float = 0.0, dt_s: float = 0.1
+) -> MarkovStep:
+    return slow_states.step(dt_s, SAND, up, 0.02, 100.0, switch, wheels)
+
+
+def test_slip_lasts_while_the_wheels_keep_their_speed() -> None:
+    steady = step(rolling(1.0))
+    time_s = -0.1 / np.log(steady.decay[SLIP])
+    assert time_s == pytest.approx(slow_states.SLIP_STEADY * SAND.slip_time_s)
+    assert step(None).decay[SLIP] == steady.decay[SLIP]
+    assert step(rolling(1.0, 0.01)).sigma[SLIP] < 1.3 * steady.sigma[SLIP]
+
+
+def test_a_start_and_a_new_ground_renew_slip() -> None:
+    for renewed in (step(rolling(0.05, 0.1)), step(rolling(1.0), switch=1.0)):
+        assert renewed.decay[SLIP] == pytest.approx(0.0)
+        assert renewed.sigma[SLIP] == pytest.approx(SAND.slip_sigma)
+    assert step(rolling(0.05, 0.1)).decay[SIDE] == step(rolling(1.0)).decay[SIDE]
+
+
+@given(speed=st.floats(-3, 3), change=st.floats(-3, 3), switch=st.floats(0, 1))
+def test_a_step_keeps_the_stationary_spread(speed: float, change: float, switch: float) -> None:
+    taken = step(rolling(speed, change), switch=switch)
+    assert 0.0 <= taken.decay[SLIP] <= 1.0
+    variance = taken.decay[SLIP] ** 2 * SAND.slip_sigma**2 + taken.sigma[SLIP] ** 2
+    assert variance == pytest.approx(SAND.slip_sigma**2, rel=1e-6)
+    assert taken.sigma[SLIP] == pytest.approx(step(rolling(-speed, -change), switch=switch).sigma[SLIP])
+
+
+@given(roll=st.floats(-0.4, 0.4))
+def test_on_a_cross_slope_the_robot_slips_downhill_whichever_way_it_drives(roll: float) -> None:
+    up = np.array([0.0, np.sin(roll), np.cos(roll)])  # the left side is up where roll is positive
+    forwards, backwards = (step(rolling(v), up) for v in (1.0, -1.0))
+    assert forwards.mean[SIDE] == -backwards.mean[SIDE]
+    assert forwards.mean[SIDE] * roll <= 0.0
+    mirrored = step(rolling(1.0), up * [1.0, -1.0, 1.0])
+    assert forwards.mean[SIDE] == -mirrored.mean[SIDE]
+    assert forwards.sigma[SIDE] == mirrored.sigma[SIDE] >= step(rolling(1.0)).sigma[SIDE]
+
+
+def test_slip_is_expected_uphill_and_side_slip_is_not() -> None:
+    pitch = 0.1
+    uphill = step(rolling(1.0), np.array([np.sin(pitch), 0.0, np.cos(pitch)]))
+    assert uphill.mean[SLIP] == pytest.approx(SAND.slip_at(np.sin(pitch)))
+    assert uphill.mean[SIDE] == 0.0
+
+
+@pytest.mark.parametrize("row", ROWS.values(), ids=ROWS)
+def test_what_a_robot_keeps_hardly_moves_in_an_hour(row) -> None:
+    _, prior = slow_states.prior(row, 0.0, 0.02)
+    hour = slow_states.step(3600.0, row, LEVEL, 0.02, 100.0, 0.0)
+    kept = slice(LINEAR.index("radius_scale"), None)
+    assert hour.decay[kept] == pytest.approx(1.0)
+    assert np.all(hour.sigma[kept] < 0.02 * prior[kept])
