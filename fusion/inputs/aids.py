@@ -12,7 +12,13 @@ from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.inputs.alignment import WINDOW_NS, GivenStart, Start, level_start
+from terrafusion.fusion.inputs.alignment import (
+    LEVEL_SIGMA_STILL_RAD,
+    WINDOW_NS,
+    GivenStart,
+    Start,
+    level_start,
+)
 from terrafusion.fusion.inputs.barometer import HeightAid
 from terrafusion.fusion.inputs.gnss import GnssUpdater
 from terrafusion.fusion.inputs.magnetometer import HeadingAid
@@ -32,8 +38,9 @@ class Aids:
 
     def __init__(self, rig: Rig, declination_rad: float | None, report: Callable[[Innovation], None]) -> None:
         self.height = HeightAid(rig.sensors.barometer, report)
-        self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report)
         self._accel_tilt_rad = rig.sensors.imu.accel_bias_sigma_mps2 / GRAVITY_MPS2
+        tilt = float(np.hypot(LEVEL_SIGMA_STILL_RAD, self._accel_tilt_rad))
+        self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report, tilt)
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
     def update(self, chain: Chain, before: Array, after: Array, gnss: GnssUpdater) -> bool:

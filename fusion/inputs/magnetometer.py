@@ -34,6 +34,8 @@ Array = NDArray[np.float64]
 GENERIC = MagnetometerSpec(rate_hz=10.0, noise_t=3e-7, hard_iron_sigma_t=3e-6)
 """For a vehicle whose file tells nothing of the magnetometer that its log has (assumed: calibrated once)."""
 EARTH_T = (15e-6, 80e-6)
+VERTICAL_T = 50e-6
+"""About the largest vertical field outside the polar regions (World Magnetic Model 2020)."""
 EVERY_NS = 1_000_000_000
 NEAR_NS = 200_000_000
 """A keyframe takes the mean of the samples so shortly before it."""
@@ -130,6 +132,8 @@ class HeadingAid:
         spec: noise and hard iron of the sensor; None for a generic one.
         declination_rad: magnetic north, east of true north; None where it is not known.
         report: called with every tested heading.
+        tilt_rad: how well roll and pitch are known (1 sigma): an accelerometer's bias tilts the vertical
+            field into the horizontal, which looks like hard iron.
     """
 
     def __init__(
@@ -137,10 +141,11 @@ class HeadingAid:
         spec: MagnetometerSpec | None,
         declination_rad: float | None,
         report: Callable[[Innovation], None],
+        tilt_rad: float = 0.0,
     ) -> None:
         self.spec = spec or GENERIC
         self.given_rad = declination_rad
-        iron = [self.spec.hard_iron_sigma_t] * 2
+        iron = [math.hypot(self.spec.hard_iron_sigma_t, tilt_rad * VERTICAL_T)] * 2
         sigma = UNKNOWN_RAD if declination_rad is None else GIVEN_SIGMA_RAD
         self.bias = SlowBias.of(np.array([declination_rad or 0.0, 0.0, 0.0]), np.array([sigma, *iron]))
         self.reference = Reference()

@@ -60,9 +60,17 @@ class SlowBias:
         self.cross = np.zeros(len(self.mean))
 
     def told(self, before: float, after: float) -> None:
-        """Others have told of s: its variance was `before` and is `after`."""
+        """Others have told of s: its variance was `before` and is `after`.
+
+        New linearisations move the variance, too, by parts in a thousand: what would then be no joint
+        covariance any more is brought back to one.
+        """
         if after < before:
             self.cross = self.cross * (after / before)
+        P = self.covariance + np.diag(1e-12 * np.diag(self.covariance) + 1e-40)
+        needed = float(self.cross @ np.linalg.solve(P, self.cross))
+        if needed > after:
+            self.cross = self.cross * float(np.sqrt(after / needed))
 
     def variance(self, H: Array, state: float, noise: float) -> float:
         """Variance S of an innovation, for the variances of s and of the noise."""

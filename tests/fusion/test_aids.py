@@ -85,6 +85,19 @@ def test_a_bias_that_is_all_unknown_tells_nothing_of_the_state() -> None:
     assert again is None or again.sigma > 1.0
 
 
+def test_a_variance_that_shrinks_unseen_leaves_a_possible_covariance() -> None:
+    """Late fixes: the height's variance falls between two looks; the joint covariance must stay one."""
+    bias, state = SlowBias.of(np.zeros(1), np.array([1e4])), 30.0
+    bias.measure(3.0, np.ones(1), state, 0.07)
+    for _ in range(10):
+        state *= 0.9
+        bias.told(state, 0.95 * state)
+        state *= 0.95
+        assert bias.cross[0] ** 2 <= state * bias.covariance[0, 0] * (1.0 + 1e-9)
+        assert bias.variance(np.ones(1), state, 0.07) > 0.07
+        bias.measure(0.1, np.ones(1), state, 0.07)
+
+
 @given(st.integers(0, 10_000))
 @settings(max_examples=50, deadline=None)
 def test_what_the_graph_gets_never_has_negative_variance(seed: int) -> None:
