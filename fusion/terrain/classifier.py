@@ -33,7 +33,7 @@ FOREIGN_SLIP = 0.03
 
 Assumed; tyre pressure and load move the rolling radius of a pneumatic wheel by a few per cent.
 """
-FOREIGN_UNKNOWN = 0.9
+FOREIGN_UNKNOWN = 0.96
 """Share of `unknown` where a robot not trained on has not been seen to slip."""
 SLIP_TEMPERATURE = 20.0
 """Windows that are one observation where slip alone is judged: its estimate stays as it is for about 10 s
