@@ -52,13 +52,13 @@ from terrafusion.fusion.inputs.gnss import GnssUpdater, checked_fix
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.monitor import MotionMonitor
 from terrafusion.fusion.propagate import Propagator
-from terrafusion.fusion.rest import RestDetector, hold
+from terrafusion.fusion.rest import RestDetector, forget_waiting, hold
 from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
 
 LONGEST_IMU_GAP_S = 0.5
-SMOOTH_EVERY = 5
+SMOOTH_EVERY, SMOOTH_AT = 5, 2  # keyframes 2, 7, ...: the detector has its turn at 0, 5, ...
 SMOOTH_WINDOW = 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
@@ -244,6 +244,8 @@ class Estimator:
             start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
             if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
                 self._begin(start)
+            elif forget_waiting(self.imu, self.wheels, self.gnss.waiting):
+                self._level = None
         elif not self.gnss.waiting and (last or elapsed > self.config.longest_wait_s):
             self.gnss.local = True
             self._begin(self._level)
@@ -343,16 +345,14 @@ class Estimator:
         if self.aids.update(chain, before, self._covariance, self.gnss):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
-        if chain.last % SMOOTH_EVERY == 0:
+        if chain.last % SMOOTH_EVERY == SMOOTH_AT:
             chain.smooth(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         chain.forget(self._keep)
         self.imu.forget(t_ns - 2_000_000_000)
         self.wheels.forget(t_ns - 2_000_000_000)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
-        self._emit(t_ns, gyro)
-        state = self._state
-        assert state is not None
+        state = self._emitted(t_ns, gyro)
         self.weights.update(state, self.imu, self.wheels, slip_observed=state.status == "running")
 
     def _wheel_increment(
@@ -411,13 +411,13 @@ class Estimator:
         ):
             hold(self.chain, k, link)
 
-    def _emit(self, t_ns: int, gyro: Array) -> None:
+    def _emitted(self, t_ns: int, gyro: Array) -> State:
         key = self.chain.state(self.chain.last)
         P = self._covariance
         R = key.pose.rotation().matrix()
         silent = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
         status = "no_gnss" if self.gnss.local else ("outage" if silent else "running")
-        self._state = State(
+        state = self._state = State(
             t_ns=t_ns,
             position_m=np.asarray(key.pose.translation()),
             quaternion=quaternion_of(key.pose),
@@ -441,7 +441,8 @@ class Estimator:
             immobilised=self.monitor.immobilised,
         )
         if self._on_state is not None and not self._silent:
-            self._on_state(self._state)
+            self._on_state(state)
+        return state
 
     def _report(self, innovation: Innovation) -> None:
         if self._on_innovation is not None and not self._silent:

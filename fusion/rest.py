@@ -25,7 +25,7 @@ from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import at_rest
-from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
 
@@ -43,6 +43,10 @@ CEILING_RADPS, CEILING_MPS2 = 0.01, 0.2
 """Largest noise a resting IMU is granted (assumed)."""
 MOVING_MPS = 0.05
 """A speed so far above four sigma is motion, whatever wheels and IMU show."""
+KEPT_AT_REST_S, AT_REST_M = 10.0, 0.02
+"""What is kept of a rest before the start, and how far its wheels may turn meanwhile."""
+LONGEST_WAIT_S = 300.0
+"""A start that takes longer looks at the newer half only."""
 
 _STOPPED = gtsam.noiseModel.Isotropic.Sigma(3, 0.005)
 
@@ -119,6 +123,29 @@ class RestDetector:
         sigma_gyro, sigma_accel = noise_at_rest(self._imu_spec, rate_hz, gyro, accel)
         statistic = likelihood_ratio(gyro - gyro_bias_radps, accel - accel_bias_mps2, sigma_gyro, sigma_accel)
         return statistic < LIMIT
+
+
+def forget_waiting(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) -> bool:
+    """Before the start: drop samples and fixes that no start can use; True when some were dropped.
+
+    A robot that stands learns no heading from it, and needs only the last seconds to level itself. One
+    that moves for minutes and finds none is helped by the newest of them alone.
+    """
+    newest = imu.t_ns[-1]
+    waited_s = (newest - imu.t_ns[0]) * 1e-9
+    if waited_s > LONGEST_WAIT_S:
+        cut = newest - round(0.5e9 * LONGEST_WAIT_S)
+    elif waited_s > 2.0 * KEPT_AT_REST_S:
+        cut = newest - round(1e9 * KEPT_AT_REST_S)
+        turned = wheels_turned(wheels, imu.t_ns[0], newest)
+        if turned is None or turned > AT_REST_M:
+            return False
+    else:
+        return False
+    imu.forget(cut)
+    wheels.forget(cut)
+    fixes[:] = [fix for fix in fixes if fix.t_ns >= cut]
+    return True
 
 
 def hold(chain: Chain, k: int, link: gtsam.NonlinearFactorGraph) -> None:

@@ -123,9 +123,8 @@ class Chain:
         `link` must touch X, V and B of both keyframes; `markov` links the linear states.
         """
         link = link if link is not None else gtsam.NonlinearFactorGraph()
-        self.nodes.append(
-            self._node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
-        )
+        node = self._node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
+        self.nodes.append(node)
         self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
@@ -284,13 +283,6 @@ class Chain:
         for k, node in enumerate(self.nodes, self.first):
             self._insert(k, node.point)
 
-    def move_to(self, k: int, point: KeyState) -> None:
-        """Linearise keyframe k about another state."""
-        node = self.nodes[k - self.first]
-        node.point, node.delta = point, np.zeros(self.dim)
-        self._publish(k)
-        self._dirty = min(self._dirty, max(k - 1, self.first))
-
     def set_prior(self, sigmas: Array) -> None:
         """Prior of the first keyframe at its initial state, independent 1 sigmas (dim,)."""
         self._anchor = None
@@ -298,7 +290,7 @@ class Chain:
         self._dirty = self.first
 
     def _node(self, *parts: Any) -> Node:
-        return Node(*parts, prior=np.zeros((0, self.dim + 1)), delta=np.zeros(self.dim))
+        return Node(*parts, np.zeros((0, self.dim + 1)), np.zeros(self.dim))
 
     def _insert(self, k: int, point: KeyState) -> None:
         self.values.insert(X(k), point.pose)
@@ -308,9 +300,8 @@ class Chain:
     def _carry_prior(self) -> None:
         """Carry the prior of the first keyframe to its estimate.
 
-        It is no factor that could be linearised again: it stays a Gaussian in the tangent
-        space where it was made (GTSAM's LinearContainerFactor, with the derivative of the
-        logarithm).
+        It is no factor that could be linearised again: it stays a Gaussian in the tangent space
+        where it was made (GTSAM's LinearContainerFactor, with the derivative of the logarithm).
         """
         node = self.nodes[0]
         if self._anchor is None or self._anchor[0] != self.first:

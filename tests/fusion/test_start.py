@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,7 +66,13 @@ def moving(recording: Recording, after_s: float) -> Recording:
     return dataclasses.replace(recording, **parts)
 
 
-def run(recording: Recording, *, velocity: bool = True, **start: object) -> Started:
+def run(
+    recording: Recording,
+    *,
+    velocity: bool = True,
+    watch: Callable[[Estimator], None] = lambda _: None,
+    **start: object,
+) -> Started:
     """Feed a drive in time order, with what only the fixes tell of the heading."""
     states: list[State] = []
     vehicle = load_vehicle("elevate")
@@ -89,12 +96,29 @@ def run(recording: Recording, *, velocity: bool = True, **start: object) -> Star
             estimator.add_gnss(int(gnss.t_ns[g]), gnss.enu_m[g], gnss.sigma_enu_m[g], *more)
             g += 1
         estimator.add_imu(t_ns, imu.gyro_radps[i], imu.accel_mps2[i])
+        watch(estimator)
         if first is None and states:
             first = t_ns
     estimator.finish()
     assert first is not None, "never started"
     moved = wheels.t_ns[np.argmax(np.abs(sides.mean(axis=1)) > 0.05)]
     return Started((first - int(moved)) * 1e-9, states)
+
+
+def test_a_long_rest_before_the_start_costs_neither_memory_nor_time() -> None:
+    """Two minutes at rest: buffers stay short, the first motion starts the graph as after three seconds."""
+    segments = (DriveSegment(120.0), DriveSegment(30.0, v_mps=1.0, **WAVE))
+    scenario = Scenario("rest", 140.0, drive=segments, route=(RouteLeg("asphalt"),), heading_deg=70.0)
+    recording = simulate(scenario, seed=1)
+    longest: list[tuple[int, int]] = []
+    started = run(
+        recording, velocity=False, watch=lambda e: longest.append((len(e.imu.t_ns), len(e.gnss.waiting)))
+    )
+    samples, fixes = np.array(longest).max(axis=0)
+    assert samples < 25.0 * 100
+    assert fixes < 25.0 * 5
+    assert started.time_s < run(drive(), velocity=False).time_s + 1.0
+    assert np.abs(yaw_errors(recording, started.states)[-20:]).max() < np.radians(8.0)
 
 
 def yaw_errors(recording: Recording, states: list[State]) -> np.ndarray:
