@@ -34,14 +34,14 @@ SIDE_SLIP_PER_GRADE, SIDE_SLIP_DOUBT = 0.7, 0.3
 it has on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69 on medium sand across 15 deg), give
 or take a share of it (assumed)."""
 CALIBRATION_SIGMA = {
-    "radius_scale": 0.01,
-    "antenna_x_m": 0.02,
-    "antenna_y_m": 0.02,
-    "imu_roll_rad": 0.01,
-    "imu_pitch_rad": 0.01,
-    "imu_yaw_rad": 0.01,
-    "wheel_delay_s": 0.02,
-    "gnss_delay_s": 0.05,
+    "radius_scale": 0.02,
+    "antenna_x_m": 0.05,
+    "antenna_y_m": 0.05,
+    "imu_roll_rad": 0.02,
+    "imu_pitch_rad": 0.02,
+    "imu_yaw_rad": 0.02,
+    "wheel_delay_s": 0.03,
+    "gnss_delay_s": 0.1,
 }
 """How well a vehicle file is trusted, 1 sigma (assumed: tyre wear and pressure, a tape measure, a mounting
 plate, clocks of drivers)."""

@@ -18,7 +18,7 @@ from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
-from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, SLIP, VELOCITY
+from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.inputs.track import MotionTrack
@@ -224,8 +224,10 @@ class GnssUpdater:
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
-            body_velocity = fix.velocity_mps - R @ np.cross(rate, self.antenna_m) - accel_world * offset_s
-            sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
+            late_s = offset_s - float(state.of(GNSS_DELAY))
+            body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * late_s
+            doubt = _calibration_doubt_mps(covariance, rate, accel_world)
+            sigma_v = round(float(np.hypot(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), doubt)), 4)
             chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
             chain.smooth(chain.last - k + 1)
@@ -271,6 +273,15 @@ class GnssUpdater:
             return False
         chain.restart(doubt, k)
         return True
+
+
+def _calibration_doubt_mps(covariance: Array, rate_radps: Array, accel_mps2: Array) -> float:
+    """What doubt about the antenna's place and the receiver's delay does to its velocity, 1 sigma."""
+    if len(covariance) <= GNSS_DELAY:  # not calibrated: the file's numbers stand
+        return 0.0
+    antenna_m = float(np.sqrt(covariance[ANTENNA, ANTENNA].trace()))
+    delay_s = float(np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
+    return float(np.hypot(np.linalg.norm(rate_radps) * antenna_m, np.linalg.norm(accel_mps2) * delay_s))
 
 
 def checked_fix(
