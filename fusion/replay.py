@@ -305,7 +305,7 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
 
 def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
     """Replace the live states by the batch solution over the whole drive, which starts from them."""
-    batch = Batch(chain, [_key_state(state) for state in history.states])
+    batch = Batch(chain, [key_state_of(state) for state in history.states])
     batch.optimise()
     keys, covariances = batch.states(), batch.covariances()
     offset = len(keys) - len(history.states)
@@ -317,7 +317,8 @@ def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
     ]
 
 
-def _key_state(state: State) -> KeyState:
+def key_state_of(state: State) -> KeyState:
+    """The state of a keyframe behind what the estimator told of it."""
     x, y, z, w = state.quaternion
     pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
     bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)

@@ -64,7 +64,7 @@ class Batch:
         It ends with the first step shorter than `tolerance`, in sigmas of the whole solution (the root of
         the sum of squares that the step takes off): the next would be shorter by an order of magnitude.
         """
-        error = self._linearise(self.values, self.linear)
+        error = self.linearise()
         for taken in range(1, iterations + 1):
             step = self._solve()
             length = self._step_length()
@@ -79,7 +79,7 @@ class Batch:
                     break
                 scale *= 0.5
             if trial > error:  # no step leads down: this is as far as it goes
-                self._linearise(self.values, self.linear)
+                self.linearise()
                 return taken
             self.values, self.linear, error = values, linear, trial
         return iterations
@@ -107,6 +107,10 @@ class Batch:
                 gain = gains[k - begin]
                 out[k] = own[k - begin] + gain @ out[k + 1] @ gain.T
         return out
+
+    def linearise(self) -> float:
+        """Linearise and eliminate everything where it is; the sum of squares of all whitened residuals."""
+        return self._linearise(self.values, self.linear)
 
     def _linearise(self, values: gtsam.Values, linear: Array) -> float:
         """Linearise and eliminate everything; the sum of squares of all whitened residuals."""

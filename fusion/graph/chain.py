@@ -290,7 +290,7 @@ class Chain:
         self._dirty = self.first
 
     def _node(self, *parts: Any) -> Node:
-        return Node(*parts, np.zeros((0, self.dim + 1)), np.zeros(self.dim))
+        return Node(*(*parts, np.zeros((0, self.dim + 1)), np.zeros(self.dim)))
 
     def _insert(self, k: int, point: KeyState) -> None:
         self.values.insert(X(k), point.pose)
