@@ -95,17 +95,21 @@ def replay_options(arm: Arm, labels: GroundLabels | None, seed: int) -> dict[str
 def true_labels(recording: Recording) -> GroundLabels | None:
     """The ground as the recording knows it for sure, or None.
 
-    From its terrain channel if a person or the simulation wrote it, else from its own name of the
-    terrain; only where the policy knows one of the names.
+    From its terrain channel if a person or the simulation wrote it, else from its own name of the terrain.
     """
-    terrain, known = recording.terrain, set(load_policy().names()) - {UNKNOWN}
+    terrain = recording.terrain
     if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
         label = terrain.label.astype(str)
         first = np.flatnonzero(np.concatenate([[True], label[1:] != label[:-1]]))
         times, names = tuple(terrain.t_ns[first].tolist()), tuple(label[first].tolist())
-    else:
-        times, names = (recording.start_ns,), (recording.terrain_name,)
-    return GroundLabels(times, names) if known & set(names) else None
+        return GroundLabels(times, names)
+    return GroundLabels((recording.start_ns,), (recording.terrain_name,)) if recording.terrain_name else None
+
+
+def known_labels(labels: GroundLabels | None) -> GroundLabels | None:
+    """The labels where the policy knows one of them, else None: a log's own words are of all kinds."""
+    known = set(load_policy().names()) - {UNKNOWN}
+    return labels if labels is not None and known & set(labels.names) else None
 
 
 def shuffled(labels: GroundLabels, policy: Policy, seed: int, seconds: float = 3600.0) -> GroundLabels:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from terrafusion.datasets.errors import TerrafusionError, errors_of
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.benchmark.arms import true_labels
+from terrafusion.fusion.benchmark.arms import known_labels, true_labels
 from terrafusion.fusion.benchmark.drives import FIELD, Drive
 from terrafusion.fusion.scores.field_table import (
     LEAST_DRIVE_S,
@@ -76,7 +76,8 @@ def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:
     check_log(recording)
     reference = reference_of(recording)
     ground = ground_of(log.name, recording) or NOT_LABELLED
-    whole = Drive(FIELD, ground, name, f"{name}, whole", recording, None, true_labels(recording))
+    labels = known_labels(true_labels(recording))
+    whole = Drive(FIELD, ground, name, f"{name}, whole", recording, None, labels)
     if reference == "none":
         yield dataclasses.replace(whole, judged=False)
         return

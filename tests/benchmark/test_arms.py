@@ -9,6 +9,7 @@ import pytest
 from terrafusion.fusion.benchmark.arms import (
     ARMS,
     SHEET,
+    known_labels,
     misleading,
     most_foreign,
     replay_options,
@@ -66,11 +67,14 @@ def test_a_detectors_word_is_no_truth(two_grounds) -> None:
     assert true_labels(dataclasses.replace(two_grounds, terrain=heard, terrain_name="")) is None
 
 
-def test_ground_that_the_policy_does_not_know_gives_no_oracle(two_grounds) -> None:
-    assert true_labels(dataclasses.replace(two_grounds, terrain=None, terrain_name="lava")) is None
-    named = true_labels(dataclasses.replace(two_grounds, terrain=None, terrain_name="mud"))
-    assert named is not None
-    assert named.names == ("mud",)
+def test_a_log_whose_words_the_policy_does_not_know_has_no_oracle(two_grounds) -> None:
+    lava, mud = (
+        true_labels(dataclasses.replace(two_grounds, terrain=None, terrain_name=word))
+        for word in ("lava", "mud")
+    )
+    assert lava is not None
+    assert known_labels(lava) is None
+    assert known_labels(mud) == mud == GroundLabels((START_NS,), ("mud",))
 
 
 def test_shuffled_labels_come_from_the_seed_and_from_all_classes() -> None:
