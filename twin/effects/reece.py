@@ -66,7 +66,7 @@ def _wheel(q: Quantities, share: Any) -> dict[str, Any]:
     shear_square = q["shear_x_m"] * q["shear_x_m"] + q["shear_y_m"] * q["shear_y_m"]
     ratio = ca.sqrt(shear_square / (q["shear_modulus_m"] * q["shear_modulus_m"]) + 1e-4)
     less = share * (hyperbolic_share(ratio) - 1.0)
-    out = {}
+    out: dict[str, Any] = {}
     for axis in ("x", "y"):
         traction, force = f"traction_{axis}_n", f"force_{axis}_n"
         out |= {traction: q[traction] * (1.0 + less), force: q[force] + less * q[traction]}
