@@ -16,7 +16,10 @@ from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise, load_
 
 FIELDS = [f.name for f in dataclasses.fields(SensorNoise)]
 ZERO_MEAN = [
-    name for name in FIELDS if name not in ("slip_mean", "slip_per_grade", "slip_sigma", "slip_time_s")
+    name
+    for name in FIELDS
+    if name
+    not in ("slip_mean", "slip_per_grade", "slip_sigma", "slip_time_s", "yaw_scale_mean", "yaw_scale_sigma")
 ]
 
 ROWS = st.builds(
@@ -30,6 +33,8 @@ ROWS = st.builds(
     gyro_inflation=st.floats(1.0, 1e3),
     accel_inflation=st.floats(1.0, 1e3),
     gnss_inflation=st.floats(1.0, 100.0),
+    yaw_scale_mean=st.floats(-0.5, 0.5),
+    yaw_scale_sigma=st.floats(1e-3, 1.0),
 )
 
 
@@ -58,6 +63,11 @@ def test_blend_has_the_moments_of_the_mixture(case: tuple[Policy, NDArray[np.flo
     mean = w @ slip
     assert row.slip_mean + grade * row.slip_per_grade == pytest.approx(mean, rel=1e-12, abs=1e-12)
     assert row.slip_sigma**2 == pytest.approx(w @ (slip - mean) ** 2, rel=1e-12)
+    scale = (
+        column(policy, "yaw_scale_mean")[:, None] + column(policy, "yaw_scale_sigma")[:, None] * nodes
+    ).ravel()
+    assert row.yaw_scale_mean == pytest.approx(w @ scale, rel=1e-12, abs=1e-12)
+    assert row.yaw_scale_sigma**2 == pytest.approx(w @ (scale - w @ scale) ** 2, rel=1e-12)
     for name in ZERO_MEAN:
         error = (column(policy, name)[:, None] * nodes).ravel()
         assert getattr(row, name) ** 2 == pytest.approx(w @ error**2, rel=1e-12)
