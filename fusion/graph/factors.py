@@ -22,8 +22,8 @@ REST_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
 UP_SIDE_RATIO = 0.05
 """Vertical over forward displacement in the body frame (1 sigma): wheels follow the ground."""
 YAW_SIGMA_RADPS, YAW_SIGMA_SHARE = 1.0, 0.3
-"""Yaw rate of skid-steered wheels: 1 sigma a keyframe of 0.1 s, and share of the rate. Unequal wheels and camber
-turn a robot by 0.03 rad/s for a minute (assumed), which weighs like white noise of 0.03 sqrt(2 60 / 0.1). The rows
+"""Yaw rate of skid-steered wheels: 1 sigma a keyframe of 0.1 s, and share of the rate. Unequal wheels turn a
+robot by 0.03 rad/s for a minute (assumed), which weighs like white noise of 0.03 sqrt(2 60 / 0.1). The rows
 tell the yaw scale; with 0.05 they also bent the gyro's bias, and a drive without GNSS by 0.45 rad."""
 FLOOR_M = 2e-3
 """Least sigma of a wheel displacement across the rolling direction, m a keyframe."""

@@ -63,7 +63,7 @@ class KeyState:
         """Linear states by their place in the tangent, such as `DRIFT`."""
         if isinstance(place, slice):
             return self.linear[place.start - NAV.stop : place.stop - NAV.stop]
-        return self.linear[place - NAV.stop]  # type: ignore[no-any-return]
+        return self.linear[place - NAV.stop]
 
     @property
     def slip(self) -> float:

@@ -14,8 +14,8 @@ Array = NDArray[np.float64]
 
 SLIP_STEADY = 15.0
 """Slip lasts so many correlation times of the policy's while the wheels keep their speed: those are of whole
-drives, with starts, stops and hills. A compromise: on one soil the longer the better, where grounds change without
-GNSS the shorter; see docs/monitor.md."""
+drives, with starts, stops and hills. A compromise: on one soil the longer the better, where grounds change
+without GNSS the shorter; see docs/monitor.md."""
 SLIP_RENEWAL = 2.0
 """Slip is what traction asks for, and traction changes with speed: where the wheels change theirs by a
 share x, `SLIP_RENEWAL x^2` of the slip is new. Tuned likewise."""

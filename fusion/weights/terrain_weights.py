@@ -14,7 +14,7 @@ from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State, WeightChange
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
-from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
+from terrafusion.fusion.terrain.classifier import load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.terrain.features import slip_without_prior
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -61,8 +61,6 @@ class TerrainWeights:
         self._labels = config.labels
         self._told: Array | None = None
         fixed = config.tuning.fixed.of(self.policy.fixed)
-        # Where the ground is not known, adaptive weights must not do worse than fixed ones.
-        self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: fixed})
         self.row = self.policy.blend(self._probabilities) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None

@@ -236,7 +236,7 @@ def test_folder_without_channels(tmp_path: Path) -> None:
 
 def test_both_packed_and_plain(tmp_path: Path) -> None:
     folder = folder_with(tmp_path, imu="t_s,gyro_z_radps\n0,0\n")
-    (folder / "imu.csv.gz").write_bytes(gzip.compress(b"t_s,gyro_z_radps\n0,0\n"))
+    (folder / "imu.csv.gz").write_bytes(gzip.compress(b"t_s,gyro_z_radps\n0,0\n", mtime=0))
     with pytest.raises(TerrafusionError, match="both"):
         open_recording(folder)
 
@@ -274,7 +274,9 @@ def test_a_packed_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     one_line(caught.value, "imu.csv.gz", "more than 1 MiB", "split")
 
 
-@pytest.mark.parametrize("content", [b"not gzip", gzip.compress(b"t_s,gyro_z_radps\n0,0\n" * 50)[:-20]])
+@pytest.mark.parametrize(
+    "content", [b"not gzip", gzip.compress(b"t_s,gyro_z_radps\n0,0\n" * 50, mtime=0)[:-20]]
+)
 def test_broken_gzip(tmp_path: Path, content: bytes) -> None:
     folder = folder_with(tmp_path)
     (folder / "imu.csv.gz").write_bytes(content)
