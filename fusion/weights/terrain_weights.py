@@ -14,7 +14,7 @@ from terrafusion.datasets.frames import quaternion_to_matrix
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State, WeightChange
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
-from terrafusion.fusion.terrain.classifier import load_terrain_model
+from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.terrain.features import slip_without_prior
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -61,6 +61,10 @@ class TerrainWeights:
         self._labels = config.labels
         self._told: Array | None = None
         fixed = config.tuning.fixed.of(self.policy.fixed)
+        if model.slip_only:
+            # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
+            classes = {**self.policy.classes, UNKNOWN: self.policy.fixed}
+            self.policy = dataclasses.replace(self.policy, classes=classes)
         self.row = self.policy.blend(self._probabilities) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
