@@ -60,6 +60,8 @@ GYRO_S, ACCEL_S = 5.0, 2.0
 TURNING_MPS, SIDE_SLIP_FROM_MPS, STUCK_MPS = 0.15, 0.2, 0.05
 STUCK_COUNTS_S = 1.0
 YAWING_RADPS = 0.1
+UNSEEN_YAW_SCALE, LEAST_YAW_SCALE_SIGMA = (-0.4, 0.2), 0.02
+"""For drives without turns: robots turn at 0.44 to 0.71 of what their track says (`docs/planar.md`)."""
 BIAS_S = 60.0
 TAIL = 0.005
 GRADE_RIDGE, LAD_STEPS, LAD_FLOOR = 1e-5, 30, 5e-3
@@ -147,7 +149,7 @@ def row_of(grounds: list[Evidence]) -> SensorNoise:
     paired = [e.slip_pairs - mean - per_grade * e.grade_pairs for e in grounds]
     power = float(np.mean([np.mean(p**2) for p in paired])) + RADIUS_SIGMA**2
     rho = (float(np.mean([np.mean(p[:, 0] * p[:, 1]) for p in paired])) + RADIUS_SIGMA**2) / power
-    scale = float(np.mean([np.median(e.yaw_scale) for e in grounds]))
+    scale, scatter = _yaw_scale_of([e.yaw_scale for e in grounds if len(e.yaw_scale)])
     return SensorNoise(
         slip_mean=mean,
         slip_per_grade=per_grade,
@@ -155,12 +157,20 @@ def row_of(grounds: list[Evidence]) -> SensorNoise:
         slip_time_s=float(np.clip(-LAG_S / np.log(np.clip(rho, 1e-3, 0.999)), 0.2, 300.0)),
         wheel_sigma_mps=max(_rms([e.wheel_mps for e in grounds]), 1e-3),
         yaw_scale_mean=scale,
-        yaw_scale_sigma=max(_rms([e.yaw_scale - scale for e in grounds]), 0.02),
+        yaw_scale_sigma=scatter,
         side_slip_sigma=max(_rms([e.side_slip for e in grounds]), 1e-3),
         gyro_inflation=max(_rms([e.gyro for e in grounds]), 1.0),
         accel_inflation=max(_rms([e.accel for e in grounds]), 1.0),
         gnss_inflation=max(_rms([e.gnss for e in grounds]), 1.0),
     )
+
+
+def _yaw_scale_of(found: list[Array]) -> tuple[float, float]:
+    """Mean and 1 sigma of the yaw scale; `UNSEEN_YAW_SCALE` where no drive turned."""
+    if not found:
+        return UNSEEN_YAW_SCALE
+    mean = float(np.mean([np.median(scales) for scales in found]))
+    return mean, max(_rms([scales - mean for scales in found]), LEAST_YAW_SCALE_SIGMA)
 
 
 def _slip_line(grounds: list[Evidence]) -> tuple[float, float]:

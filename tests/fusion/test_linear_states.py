@@ -64,8 +64,8 @@ def test_every_state_of_a_calibration_is_told_with_unit_and_prior(drive: Any) ->
     rows = calibration(with_states(drive().estimate, calibrated=True))
     assert tuple(row["state"] for row in rows) == CALIBRATION == tuple(QUANTITIES) == tuple(CALIBRATION_SIGMA)
     assert [row["state"] for row in rows if row["observed"]] == ["antenna_x_m", "antenna_y_m"]
-    told = {row["state"]: cells(row) for row in rows}
-    assert told["antenna_x_m"][1:] == ["0.080", "0.008", "0.020", "observed"]
+    told, prior = {row["state"]: cells(row) for row in rows}, CALIBRATION_SIGMA["antenna_x_m"]
+    assert told["antenna_x_m"][1:] == ["0.080", f"{0.4 * prior:.3f}", f"{prior:.3f}", "observed"]
     yaw_deg = np.degrees(0.01 * (LINEAR.index("imu_yaw_rad") + 1))
     assert told["imu_yaw_rad"][0].endswith(", deg")
     assert float(told["imu_yaw_rad"][1]) == pytest.approx(yaw_deg, abs=5e-4)

@@ -18,7 +18,7 @@ from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
-from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.replay import Replay, replay
@@ -249,7 +249,7 @@ def test_a_turn_adds_the_centripetal_force() -> None:
     heading = gtsam.Rot3.Rz(1.0)
     velocity = heading.matrix() @ np.array([2.0, 0.0, 0.0])
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, 0.1]))
-    before = KeyState(gtsam.Pose3(heading, np.zeros(3)), velocity, bias, 0.0, np.zeros(2))
+    before = KeyState(gtsam.Pose3(heading, np.zeros(3)), velocity, bias, np.zeros(len(LINEAR)))
     segment = ImuSegment(0.1, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, GRAVITY_MPS2]))
     force = in_a_turn([segment], before)[0].accel_mps2
     np.testing.assert_allclose(force, [0.0, 2.0 * 0.3, GRAVITY_MPS2])

@@ -51,7 +51,18 @@ def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: in
 
     pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
     flat, level = np.zeros(n), np.zeros_like(pairs)
-    return Evidence(slip, flat, pairs, level, noise(0.03), noise(0.05), noise(7.0), noise(12.0), noise(1.4))
+    return Evidence(
+        slip,
+        flat,
+        pairs,
+        level,
+        noise(0.03),
+        noise(0.1) - 0.5,
+        noise(0.05),
+        noise(7.0),
+        noise(12.0),
+        noise(1.4),
+    )
 
 
 def test_a_known_process_is_found_again() -> None:
@@ -60,6 +71,8 @@ def test_a_known_process_is_found_again() -> None:
     assert row.slip_sigma == pytest.approx(np.hypot(0.1, RADIUS_SIGMA), rel=0.03)
     assert row.slip_time_s == pytest.approx(6.0, rel=0.1)
     assert row.wheel_sigma_mps == pytest.approx(0.03, rel=0.03)
+    assert row.yaw_scale_mean == pytest.approx(-0.5, abs=0.01)
+    assert row.yaw_scale_sigma == pytest.approx(0.1, rel=0.05)
     assert row.side_slip_sigma == pytest.approx(0.05, rel=0.03)
     assert row.gyro_inflation == pytest.approx(7.0, rel=0.03)
     assert row.accel_inflation == pytest.approx(12.0, rel=0.03)
@@ -101,7 +114,7 @@ def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
 
 def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
     nothing = Evidence(
-        *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(5)))
+        *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(6)))
     )
     with pytest.raises(ValueError, match="never turned"):
         row_of([nothing])
