@@ -27,15 +27,7 @@ from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, wheel_increment
-from terrafusion.fusion.graph.key_state import (
-    POSE,
-    RADIUS,
-    SLIP,
-    VELOCITY,
-    KeyState,
-    linear_sigma,
-    quaternion_of,
-)
+from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
@@ -63,6 +55,8 @@ SMOOTH_WINDOW = 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 OUTAGE_S = 2.0
+SEEN_LATE_NS, SWITCHED = 1_000_000_000, 0.1
+"""A change of ground is seen a second after it (`docs/terrain.md`); less of a shift is none."""
 UNKNOWN = np.full(3, np.nan)
 
 
@@ -296,7 +290,9 @@ class Estimator:
         switch = self.weights.take_switch()
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
-        row = self.weights.row
+        row, drift = self.weights.row, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
+        if switch > SWITCHED:
+            slow_states.open_slip(self.chain, t_ns - SEEN_LATE_NS, dt, row, *drift, switch)
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
             segments = in_a_turn(segments, before)
@@ -319,15 +315,8 @@ class Estimator:
             if not self.config.inputs.planar:  # the planar link is no witness against the wheels
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, dt, switch)
-        markov = slow_states.step(
-            dt,
-            row,
-            before.pose.rotation().matrix()[2],
-            self.gnss.drift_sigma_m,
-            self.gnss.drift_time_s,
-            switch,
-            rolled,
-        )
+        up = before.pose.rotation().matrix()[2]
+        markov = slow_states.step(dt, row, up, *drift, switch, rolled)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
@@ -384,8 +373,7 @@ class Estimator:
             return None
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
-        scale = (1.0 - before.slip) * (1.0 + before.of(RADIUS))
-        innovation = float(moved[0] - scale * d[0])
+        innovation = float(moved[0] - before.rolling * d[0])
         P, row = self._covariance, self.weights.row
         forward = before.pose.rotation().matrix()[:, 0]
         variance = (

@@ -71,6 +71,11 @@ class KeyState:
         return float(self.linear[0])
 
     @property
+    def rolling(self) -> float:
+        """Distance over what the wheels say, longitudinally: of slip and radius."""
+        return float((1.0 - self.linear[0]) * (1.0 + self.linear[RADIUS - NAV.stop]))
+
+    @property
     def drift(self) -> Array:
         """Drift of the GNSS position (2,), m."""
         return self.of(DRIFT)

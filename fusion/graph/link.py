@@ -7,7 +7,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph.key_state import RADIUS, KeyState
+from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import ImuSegment
 
@@ -33,7 +33,7 @@ def carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeySt
         moved = before.pose.rotation().matrix().T @ before.velocity * dt
         turn = 0.0
     else:
-        moved = (1.0 - before.slip) * (1.0 + before.of(RADIUS)) * wheels.displacement_m
+        moved = before.rolling * wheels.displacement_m
         turn = wheels.turn_rad
     pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), moved))
     return KeyState(pose, before.velocity, before.bias, before.linear)

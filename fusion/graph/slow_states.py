@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,9 +12,12 @@ from terrafusion.fusion.graph.markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.weights.policy import SensorNoise
 
+if TYPE_CHECKING:
+    from terrafusion.fusion.graph.chain import Chain
+
 Array = NDArray[np.float64]
 
-SLIP_STEADY = 15.0
+SLIP_STEADY = 30.0
 """Slip lasts so many correlation times of the policy's while the wheels keep their speed: those are of whole
 drives, with starts, stops and hills. A compromise: on one soil the longer the better, where grounds change
 without GNSS the shorter; see docs/monitor.md."""
@@ -97,6 +102,28 @@ def step(
         np.append(wandering.mean, np.zeros(len(walk))),
         np.append(wandering.sigma, walk),
     )
+
+
+def open_slip(
+    chain: Chain,
+    t_ns: int,
+    dt_s: float,
+    row: SensorNoise,
+    drift_sigma_m: float,
+    drift_time_s: float,
+    switch: float,
+) -> None:
+    """Let the share `switch` of the slip start anew at the keyframe of `t_ns`, or the oldest that still can.
+
+    The ground changed there, and is seen only now. What wheels and IMU told since then was explained by
+    a speed that fits the old slip; with the slip free from there on, they tell the new one.
+    """
+    k = chain.at_or_after(t_ns)
+    k = chain.first + 1 if k is None else max(k, chain.first + 1)
+    if k <= chain.last:
+        node = chain.nodes[k - chain.first]
+        up = node.point.pose.rotation().matrix()[2]
+        chain.set_markov(k, step(dt_s, row, up, drift_sigma_m, drift_time_s, switch, node.wheels))
 
 
 def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:
