@@ -35,54 +35,62 @@ OutageOption = Annotated[
         help="Keep all fixes of a stretch from the estimator and score there; repeat for more.",
     ),
 ]
+ModeOption = Annotated[
+    str,
+    typer.Option(
+        help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds; robust: "
+        "fixed with a robust loss; innovation: noise learned from the innovations."
+    ),
+]
+PolicyOption = Annotated[Path | None, typer.Option(help="Weighting policy; by default the one shipped.")]
+BatchOption = Annotated[
+    bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")
+]
+CalibrateOption = Annotated[
+    bool,
+    typer.Option(
+        "--calibrate",
+        help="Also estimate what the vehicle file may have wrong: wheel radius, antenna, IMU mounting, "
+        "delays of wheels and GNSS.",
+    ),
+]
+McapOption = Annotated[
+    bool,
+    typer.Option(
+        "--mcap", help="Also write the log with the estimate (odometry, diagnostics) to estimate.mcap."
+    ),
+]
+RerunOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.rrd", help="Also write the replay for the Rerun viewer (extra: rerun)."),
+]
+MagnetometerOption = Annotated[
+    bool, typer.Option("--magnetometer", help="Use the log's magnetometer; a barometer is always used.")
+]
+DeclinationOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="DEG",
+        min=-180.0,
+        max=180.0,
+        help="Magnetic north, degrees east of north: the magnetometer then tells the heading at rest.",
+    ),
+]
 
 
 def replay(
     log: LogArgument,
     out: OutOption,
-    mode: Annotated[
-        str,
-        typer.Option(
-            help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds; robust: "
-            "fixed with a robust loss; innovation: noise learned from the innovations."
-        ),
-    ] = "adaptive",
+    mode: ModeOption = "adaptive",
     vehicle: VehicleOption = None,
-    policy: Annotated[Path | None, typer.Option(help="Weighting policy; by default the one shipped.")] = None,
-    batch: Annotated[
-        bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")
-    ] = False,
-    calibrate: Annotated[
-        bool,
-        typer.Option(
-            "--calibrate",
-            help="Also estimate what the vehicle file may have wrong: wheel radius, antenna, IMU mounting, "
-            "delays of wheels and GNSS.",
-        ),
-    ] = False,
-    mcap: Annotated[
-        bool,
-        typer.Option(
-            "--mcap", help="Also write the log with the estimate (odometry, diagnostics) to estimate.mcap."
-        ),
-    ] = False,
-    rerun: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.rrd", help="Also write the replay for the Rerun viewer (extra: rerun)."),
-    ] = None,
+    policy: PolicyOption = None,
+    batch: BatchOption = False,
+    calibrate: CalibrateOption = False,
+    mcap: McapOption = False,
+    rerun: RerunOption = None,
     gnss_outage: OutageOption = None,
-    magnetometer: Annotated[
-        bool, typer.Option("--magnetometer", help="Use the log's magnetometer; a barometer is always used.")
-    ] = False,
-    declination: Annotated[
-        float | None,
-        typer.Option(
-            metavar="DEG",
-            min=-180.0,
-            max=180.0,
-            help="Magnetic north, degrees east of north: the magnetometer then tells the heading at rest.",
-        ),
-    ] = None,
+    magnetometer: MagnetometerOption = False,
+    declination: DeclinationOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
