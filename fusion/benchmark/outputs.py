@@ -19,7 +19,7 @@ from typing import Any
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.benchmark.compare import contrasts, shares
-from terrafusion.fusion.benchmark.plan import Plan, sources_sha256
+from terrafusion.fusion.benchmark.plan import Plan
 from terrafusion.fusion.benchmark.plots import plot_ratios
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run import Found
@@ -27,6 +27,7 @@ from terrafusion.fusion.benchmark.targets import nees_cells, targets
 from terrafusion.fusion.benchmark.text import Table, markdown, tables
 from terrafusion.fusion.report import page
 from terrafusion.fusion.report.outputs import to_json
+from terrafusion.fusion.scores.parts import sources_sha256
 from terrafusion.fusion.weights.modes import load_modes
 from terrafusion.fusion.weights.policy import load_policy
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import functools
-import hashlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib import resources
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.benchmark.arms import ARMS
@@ -101,16 +98,3 @@ def families_of(words: Sequence[str]) -> dict[str, int | None]:
             raise ConfigError(f"'{word}' names no number of seeds", remedy=f"write {name} or {name}=20")
         found[name] = int(count) if equals else None
     return {name: found.get(name) for name in known if name in found or not words}
-
-
-@functools.cache
-def sources_sha256() -> str:
-    """Hash of everything that makes the numbers: rows of two versions are not mixed."""
-    digest = hashlib.sha256()
-    for package in ("datasets", "twin", "fusion"):
-        with resources.as_file(resources.files(f"terrafusion.{package}")) as folder:
-            for file in sorted(folder.rglob("*")):
-                if file.suffix in (".py", ".c", ".h", ".yaml", ".csv"):
-                    digest.update(f"{package}/{file.relative_to(folder).as_posix()}\0".encode())
-                    digest.update(file.read_bytes().replace(b"\r\n", b"\n") + b"\0")
-    return digest.hexdigest()

@@ -1,28 +1,20 @@
-"""`run_benchmark`: all jobs of a plan on all processors; a run that was stopped goes on.
-
-parts/<job>.json     the rows of one job, written when it is whole
-"""
+"""`run_benchmark`: all jobs of a plan on all processors; a run that was stopped goes on (`scores.parts`)."""
 
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.drives import Case, drive_of
 from terrafusion.fusion.benchmark.field import Refused, drives_of
 from terrafusion.fusion.benchmark.measure import Row, measure
-from terrafusion.fusion.benchmark.plan import Job, Plan, sources_sha256
-from terrafusion.fusion.report.outputs import to_json
+from terrafusion.fusion.benchmark.plan import Job, Plan
+from terrafusion.fusion.scores.parts import read_part, write_part
 from terrafusion.twin.pools import open_pool
-
-PARTS = "parts"
 
 
 @dataclass(frozen=True)
@@ -53,15 +45,15 @@ def run_benchmark(
             "there is nothing to run: no field log is at hand",
             remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`, or leave out --only field",
         )
-    missing = [job for job in wanted if _read(out, job) is None]
+    missing = [job for job in wanted if read_part(out, job.key) is None]
     done = len(wanted) - len(missing)
     with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
         for job, found in pool.results(run_job, [(job,) for job in missing]):
-            _write(out, job, found)
+            write_part(out, job.key, dataclasses.asdict(found))
             done += 1
             if progress is not None:
                 progress(done / len(wanted))
-    parts = [part for job in wanted if (part := _read(out, job)) is not None]
+    parts = [part for job in wanted if (part := read_part(out, job.key)) is not None]
     rows = tuple(Row.read(raw) for part in parts for raw in part["rows"])
     refused = dict.fromkeys(Refused(**raw) for part in parts for raw in part["refused"])
     return Found(rows, tuple(refused))
@@ -79,22 +71,3 @@ def run_job(job: Job) -> tuple[Job, Found]:
             chosen = arms if drive.judged else [arm for arm in arms if arm.name in (OWN, BASE)]
             rows += [row for arm in chosen if (row := measure(drive, arm)) is not None]
     return job, Found(tuple(rows), tuple(refused))
-
-
-def _file(out: Path, job: Job) -> Path:
-    return out / PARTS / f"{job.key}.json"
-
-
-def _write(out: Path, job: Job, found: Found) -> None:
-    content = {"sources_sha256": sources_sha256(), **dataclasses.asdict(found)}
-    write_atomically(_file(out, job), lambda part: part.write_text(to_json(content), encoding="utf-8"))
-
-
-def _read(out: Path, job: Job) -> dict[str, Any] | None:
-    """What a job has left, None where it is missing, cut short, or of other sources."""
-    try:
-        part = json.loads(_file(out, job).read_text(encoding="utf-8"))
-        fresh = part["sources_sha256"] == sources_sha256()
-    except (OSError, ValueError, KeyError, TypeError):
-        return None
-    return part if fresh and isinstance(part.get("rows"), list) else None

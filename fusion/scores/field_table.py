@@ -5,17 +5,24 @@ outage (`outage_plan`), scored on its truth or on fixes kept back and never
 realigned after the start. A log with truth but no receiver is dead reckoning
 when replayed whole; for outages it gets fixes made from its truth. A log
 without any reference is only checked for divergence (`health`).
+
+What one log gives in one mode is kept in `DIR/parts` as soon as it is known: a
+table that was stopped goes on with the same command, and `--collect` writes
+the tables of what is there.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 
@@ -29,6 +36,8 @@ from terrafusion.fusion.replay import Replay, choose_vehicle, replay
 from terrafusion.fusion.scores.health import examine_estimate, rolled_until_m
 from terrafusion.fusion.scores.metrics import Outage
 from terrafusion.fusion.scores.outage_plan import aided_by_truth, lead_s, plan_outages, until
+from terrafusion.fusion.scores.parts import read_part, write_part
+from terrafusion.twin.pools import open_pool
 
 OUTAGES_S = (30.0, 60.0, 120.0)
 LEAST_DRIVE_S = 10.0
@@ -37,6 +46,8 @@ LEAD_ROLLED_M = 5.0
 """The wheels must have rolled so far before an outage: fixes show no heading of a robot that stands."""
 LEAST_ROLLED_M = 3.0
 """Outages in which the wheels roll less test nothing and are left out."""
+FIRST_MODES = ("adaptive", "fixed")
+"""Run on every log before the other modes: a table that was stopped compares these two everywhere."""
 SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
 SET_GROUND = {"husky_parkinglot": "firm"}
 """Ground of sets whose logs carry no label but whose title names it."""
@@ -71,6 +82,12 @@ class Run:
     realtime: float
     latency_p99_ms: float
 
+    @classmethod
+    def read(cls, raw: dict[str, Any]) -> Run:
+        """A run from its JSON object, which has null for numbers that are not finite."""
+        floats = [f.name for f in dataclasses.fields(cls) if f.type == "float"]
+        return cls(**{**raw, **{name: float("nan") for name in floats if raw[name] is None}})
+
 
 @dataclass(frozen=True)
 class Refusal:
@@ -89,35 +106,59 @@ class Task:
     most_starts: int
     seed: int
 
+    @property
+    def key(self) -> str:
+        """Its name as that of a file."""
+        return f"{quote(self.log, safe='')}-{self.mode}-{self.most_starts}-{self.seed}"
 
-def field_table(
-    logs: Sequence[str],
-    modes: Sequence[str] = MODES,
-    *,
-    most_starts: int = 4,
-    seed: int = 1,
-    jobs: int = 1,
-    progress: Callable[[str], None] = lambda _: None,
-) -> tuple[list[Run], list[Refusal]]:
-    """All runs of the logs in the modes, and the logs that were refused.
+
+def tasks_of(logs: Sequence[str], modes: Sequence[str], most_starts: int, seed: int) -> list[Task]:
+    """The tasks in the order in which they are run: `FIRST_MODES` on all logs, then the others."""
+    late = [mode not in FIRST_MODES for mode in modes]
+    return [
+        Task(log, mode, most_starts, seed)
+        for turn in (False, True)
+        for log in logs
+        for mode, is_late in zip(modes, late, strict=True)
+        if is_late == turn
+    ]
+
+
+def run_tasks(
+    tasks: Sequence[Task], out: Path, *, jobs: int = 1, progress: Callable[[str], None] = lambda _: None
+) -> None:
+    """Run the tasks of which `out` does not hold the results yet, and keep them there.
 
     Args:
-        logs: as `open_recordings` takes them: catalogue names or paths.
-        most_starts: outages of each length in one log.
-        seed: of the noise on fixes made from truth.
         jobs: processes beside each other; the times measured are those of loaded processors then.
-    """
-    import joblib
 
-    tasks = [Task(log, mode, most_starts, seed) for log in logs for mode in modes]
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator")
+    Raises:
+        TerrafusionError: workers died, or the folder cannot be written.
+    """
+    missing = [task for task in tasks if read_part(out, task.key) is None]
+    with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
+        for task, found in pool.results(run_task, [(task,) for task in missing]):
+            runs = [dataclasses.asdict(r) for r in found if isinstance(r, Run)]
+            refused = [dataclasses.asdict(r) for r in found if isinstance(r, Refusal)]
+            write_part(out, task.key, {"runs": runs, "refused": refused})
+            progress(f"{task.log}, {task.mode}")
+
+
+def collect(
+    logs: Sequence[str], modes: Sequence[str], most_starts: int, seed: int, out: Path
+) -> tuple[list[Run], list[Refusal], list[Task]]:
+    """The runs that `out` holds, log by log, the logs that were refused, and the tasks still missing."""
     runs: list[Run] = []
     refusals: dict[Refusal, None] = {}
-    for task, done in zip(tasks, parallel(joblib.delayed(_run_task)(t) for t in tasks), strict=True):
-        runs += [r for r in done if isinstance(r, Run)]
-        refusals |= {r: None for r in done if isinstance(r, Refusal)}
-        progress(f"{task.log}, {task.mode}")
-    return runs, list(refusals)
+    missing: list[Task] = []
+    for task in (Task(log, mode, most_starts, seed) for log in logs for mode in modes):
+        part = read_part(out, task.key)
+        if part is None:
+            missing.append(task)
+            continue
+        runs += [Run.read(raw) for raw in part["runs"]]
+        refusals |= {Refusal(**raw): None for raw in part["refused"]}
+    return runs, list(refusals), missing
 
 
 def catalogued() -> list[str]:
@@ -130,14 +171,16 @@ def catalogued() -> list[str]:
     return [name for name, files in load_catalog().recordings().items() if complete(files)]
 
 
-def _run_task(task: Task) -> list[Run | Refusal]:
+def run_task(task: Task) -> tuple[Task, list[Run | Refusal]]:
+    """The task, and all runs of its log in its mode; what stops one becomes a line that says so."""
     try:
-        recordings = open_recordings(task.log)
+        recordings = _recordings(task.log)
     except TerrafusionError as error:
-        return [Refusal(task.log, str(error))]
+        return task, [Refusal(task.log, str(error))]
     longest = max(r.duration_s() for r in recordings)
     if len(recordings) > 1 and longest < LEAST_DRIVE_S:
-        return [Refusal(task.log, f"holds {len(recordings)} pieces of at most {longest:.1f} s, no drive")]
+        why = f"holds {len(recordings)} pieces of at most {longest:.1f} s, no drive"
+        return task, [Refusal(task.log, why)]
     out: list[Run | Refusal] = []
     for i, recording in enumerate(recordings):
         log = task.log if len(recordings) == 1 else f"{task.log}#{i}"
@@ -146,7 +189,13 @@ def _run_task(task: Task) -> list[Run | Refusal]:
                 out += list(_runs(dataclasses.replace(task, log=log), recording))
         except TerrafusionError as error:
             out.append(Refusal(log, str(error)))
-    return out
+    return task, out
+
+
+@functools.lru_cache(maxsize=1)
+def _recordings(log: str) -> list[Recording]:
+    """The log, read once for modes that follow each other."""
+    return open_recordings(log)
 
 
 def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
@@ -288,27 +337,24 @@ def main() -> int:
     parser.add_argument("--starts", type=int, default=4, help="outages of each length in a log, at most")
     parser.add_argument("--seed", type=int, default=1, help="of the noise on fixes made from truth")
     parser.add_argument("--jobs", type=int, default=1, help="processes beside each other")
+    parser.add_argument("--collect", action="store_true", help="run nothing, write what has been run")
     words = parser.parse_args()
+    logs = list(words.logs) if words.logs else catalogued()
     try:
-        run(words.out, words.modes, words.logs, words.starts, words.seed, words.jobs)
+        _table(words.out, words.modes, logs, words.starts, words.seed, None if words.collect else words.jobs)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def run(
-    out: Path, modes: Sequence[str], logs: Sequence[str] | None, starts: int, seed: int, jobs: int
+def _table(
+    out: Path, modes: Sequence[str], logs: Sequence[str], most_starts: int, seed: int, jobs: int | None
 ) -> None:
-    """The whole table of the logs, written to `out`.
-
-    Raises:
-        TerrafusionError: no log is at hand, or the folder cannot be written.
-    """
+    """Run what is missing, unless `jobs` is None, and write the tables of what is there."""
     from terrafusion.fusion.scores.field_page import write
 
-    chosen = list(logs) if logs else catalogued()
-    if not chosen:
+    if not logs:
         raise DataError(
             "no field log is at hand", remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`"
         )
@@ -318,10 +364,13 @@ def run(
         if sys.stderr.isatty():
             print(f"\r\x1b[K{time.monotonic() - begun:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
 
-    runs, refusals = field_table(chosen, modes, most_starts=starts, seed=seed, jobs=jobs, progress=progress)
+    if jobs is not None:
+        run_tasks(tasks_of(logs, modes, most_starts, seed), out, jobs=jobs, progress=progress)
     progress("")
+    runs, refusals, missing = collect(logs, modes, most_starts, seed, out)
     print(write(out, runs, refusals))
-    print(f"{time.monotonic() - begun:.0f} s; written to {out}")
+    rest = f"; {len(missing)} of {len(logs) * len(modes)} logs and modes not run yet" if missing else ""
+    print(f"{time.monotonic() - begun:.0f} s; written to {out}{rest}")
 
 
 if __name__ == "__main__":

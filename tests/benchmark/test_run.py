@@ -15,6 +15,7 @@ from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.outputs import MARK, write_benchmark, write_document
 from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
 from terrafusion.fusion.benchmark.run import Found, run_benchmark
+from terrafusion.fusion.scores import parts
 
 FEW = ("fixed", "adaptive", "oracle")
 JOB = Job(Case("outages", "twin", FIRST_SEED + 1), FEW)
@@ -54,7 +55,7 @@ def test_finished_jobs_are_not_run_again(found, one_job, monkeypatch) -> None:
 
 
 def test_results_of_other_sources_are_not_taken(found, one_job, monkeypatch) -> None:
-    monkeypatch.setattr(run, "sources_sha256", lambda: "other")
+    monkeypatch.setattr(parts, "sources_sha256", lambda: "other")
     monkeypatch.setattr(run, "run_job", lambda job: (job, Found((Row("a", "b", "c", "d", "e"),), ())))
     assert run_benchmark(PLAN, found[0]).rows[0].family == "a"
 

@@ -18,9 +18,21 @@ from hypothesis import strategies as st
 
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import Imu, Recording, Terrain, Wheels
+from terrafusion.fusion.scores import field_table, parts
 from terrafusion.fusion.scores.field_page import plot_lines, write
 from terrafusion.fusion.scores.field_summary import condense, verdicts
-from terrafusion.fusion.scores.field_table import Refusal, Run, ground_of, outages_of, reference_of
+from terrafusion.fusion.scores.field_table import (
+    Refusal,
+    Run,
+    Task,
+    collect,
+    ground_of,
+    outages_of,
+    reference_of,
+    run_task,
+    run_tasks,
+    tasks_of,
+)
 from terrafusion.fusion.scores.health import examine_estimate, rolled_m
 from terrafusion.fusion.scores.outage_plan import (
     AID_HZ,
@@ -197,6 +209,66 @@ def test_files_hold_all_runs_and_the_refusals(tmp_path: Path) -> None:
     assert len(plot_lines(condense(runs)).axes) == 1
 
 
+def test_first_modes_are_run_on_all_logs_before_the_others_and_each_log_in_one_piece() -> None:
+    tasks = tasks_of(["a", "b"], ["adaptive", "robust", "fixed", "innovation"], 2, 1)
+    assert [(t.log, t.mode) for t in tasks] == [
+        ("a", "adaptive"), ("a", "fixed"), ("b", "adaptive"), ("b", "fixed"),
+        ("a", "robust"), ("a", "innovation"), ("b", "robust"), ("b", "innovation"),
+    ]  # fmt: skip
+    assert len({t.key for t in [*tasks, Task("a/b", "fixed", 2, 1), Task("a_b", "fixed", 2, 1)]}) == 10
+    assert not any("/" in Task(log, "fixed", 1, 1).key for log in ("a/b", "/c", "../d"))
+
+
+def test_a_stopped_table_goes_on_and_what_it_has_can_be_collected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    logs, modes = ["a", "b"], ["adaptive", "fixed"]
+    tasks = tasks_of(logs, modes, 1, 1)
+    begun: list[Task] = []
+
+    def fake(task: Task) -> tuple[Task, list[Run | Refusal]]:
+        begun.append(task)
+        if task.mode == "fixed" and len(begun) == 2:
+            raise KeyboardInterrupt
+        if task.log == "b":
+            return task, [Refusal("b", "has no wheels")]
+        # a diverged run: numbers that JSON does not have
+        return task, [made_run(task.log, task.mode, 0.1 + 0.2, top_speed_mps=float("nan"))]
+
+    monkeypatch.setattr(field_table, "run_task", fake)
+    with pytest.raises(KeyboardInterrupt):
+        run_tasks(tasks, tmp_path)
+    runs, refusals, missing = collect(logs, modes, 1, 1, tmp_path)
+    assert [(r.log, r.mode) for r in runs] == [("a", "adaptive")]
+    assert missing == tasks[1:]
+    run_tasks(tasks, tmp_path)
+    assert begun == [tasks[0], tasks[1], *tasks[1:]]
+    runs, refusals, missing = collect(logs, modes, 1, 1, tmp_path)
+    assert [(r.log, r.mode, r.error_m) for r in runs] == [("a", mode, 0.1 + 0.2) for mode in modes]
+    assert np.isnan(runs[0].top_speed_mps)
+    assert (refusals, missing) == ([Refusal("b", "has no wheels")], [])
+    monkeypatch.setattr(parts, "sources_sha256", lambda: "other")
+    assert collect(logs, modes, 1, 1, tmp_path)[2] == tasks
+
+
+def test_a_log_is_read_once_for_modes_that_follow_each_other(
+    drive: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read: list[str] = []
+    bare = dataclasses.replace(drive(seconds=20.0).recording, wheels=None)
+
+    def opened(log: str) -> list[Recording]:
+        read.append(log)
+        return [bare]
+
+    monkeypatch.setattr(field_table, "open_recordings", opened)
+    for log, mode in (("one", "fixed"), ("one", "robust"), ("two", "fixed")):
+        task, (refusal,) = run_task(Task(log, mode, 1, 1))
+        assert (task.mode, refusal.log) == (mode, log)
+        assert "no wheels" in refusal.why
+    assert read == ["one", "two"]
+
+
 def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) -> None:
     root = os.environ.get("TERRAFUSION_DATA")
     if not root or not (Path(root) / "umich_husky").is_dir():
@@ -215,3 +287,10 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
         (refused,) = csv.DictReader(file)
     assert refused["log"] == logs[1]
     assert "no wheels" in refused["why"]
+    before = (tmp_path / "runs.csv").read_bytes()
+    again = subprocess.run([*command, "--collect"], capture_output=True, text=True, check=False)
+    assert (again.returncode, (tmp_path / "runs.csv").read_bytes()) == (0, before)
+    more = subprocess.run(
+        [*command, "--collect", "--modes", "fixed", "robust"], capture_output=True, text=True, check=False
+    )
+    assert "2 of 4 logs and modes not run yet" in more.stdout
