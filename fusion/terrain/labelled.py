@@ -19,7 +19,7 @@ from terrafusion.fusion.terrain.softmax import (
     SoftmaxModel,
     fit_softmax,
 )
-from terrafusion.fusion.terrain.surface import SURFACE_FEATURES, Signals, signals_of, surface_windows
+from terrafusion.fusion.terrain.surface import SURFACE_FEATURES, Signals, Windows, signals_of, surface_windows
 
 Array = NDArray[np.float64]
 
@@ -31,13 +31,17 @@ TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """One drive on one ground: its signals, windows' features (n, d) and rolled distances (n,) m."""
+    """One drive on one ground: its signals, and what its n windows show."""
 
     name: str
     label: str
     signals: Signals
-    x: Array
-    rolled_m: Array
+    windows: Windows
+
+    @property
+    def x(self) -> Array:
+        """Features (n, d) of the windows."""
+        return self.windows.x
 
 
 @dataclass(frozen=True)
@@ -83,9 +87,9 @@ def open_runs(logs: Sequence[str]) -> list[Run]:
             if not recording.terrain_name:
                 raise DataError(f"{recording.name}: no ground label for the whole drive", channel="terrain")
             signals = signals_of(recording)
-            _, x, rolled = surface_windows(signals)
-            if len(x):
-                runs.append(Run(recording.name, recording.terrain_name, signals, x, rolled))
+            windows = surface_windows(signals)
+            if len(windows):
+                runs.append(Run(recording.name, recording.terrain_name, signals, windows))
     if not runs:
         raise DataError("no labelled windows in the logs given", channel="terrain")
     return runs
@@ -142,9 +146,7 @@ def train_on(
 
     def loss(t: float) -> float:
         scores = [
-            -np.log(
-                dataclasses.replace(m, temperature=t).filtered(r.x, r.rolled_m)[:, m.classes.index(r.label)]
-            )
+            -np.log(dataclasses.replace(m, temperature=t).filtered(r.windows)[:, m.classes.index(r.label)])
             for m, r in held
         ]
         return float(np.concatenate(scores).mean())
@@ -174,7 +176,7 @@ def cross_validate(
         fold_of=fold_of,
         models=models,
         single=tuple(np.exp(m.log_probabilities(r.x)) for m, r in zip(chosen, runs, strict=True)),
-        filtered=tuple(m.filtered(r.x, r.rolled_m) for m, r in zip(chosen, runs, strict=True)),
+        filtered=tuple(m.filtered(r.windows) for m, r in zip(chosen, runs, strict=True)),
     )
 
 
@@ -199,13 +201,14 @@ def figures_of(classes: tuple[str, ...], runs: Sequence[Run], answers: Sequence[
 
 
 def window_ms(model: SoftmaxModel, run: Run, windows: int = 200) -> float:
-    """Median computing time of one window, features and answer, ms."""
-    from terrafusion.fusion.terrain.surface import HOP_S, WINDOW_S, window_features
+    """Mean computing time of one window, features and answers, ms."""
+    from terrafusion.fusion.terrain.surface import HOP_S, RECENT_S, WINDOW_S, window_features
 
     first, times = float(run.signals.imu_s[0]) + WINDOW_S, []
     for i in range(min(windows, len(run.x))):
         begin = time.process_time()
-        x = window_features(run.signals.between(first + i * HOP_S - WINDOW_S, first + i * HOP_S))
-        model.log_probabilities(x)
+        end = first + i * HOP_S
+        for length in (WINDOW_S, RECENT_S):
+            model.log_probabilities(window_features(run.signals.between(end - length, end), length))
         times.append(time.process_time() - begin)
     return 1e3 * float(np.mean(times))

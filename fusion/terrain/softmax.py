@@ -21,17 +21,19 @@ from numpy.typing import NDArray
 from terrafusion.datasets.config import read_yaml
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.terrain.sequence import PatchFilter
-from terrafusion.fusion.terrain.surface import GROUPS, SURFACE_FEATURES
+from terrafusion.fusion.terrain.surface import GROUPS, HOP_S, SURFACE_FEATURES, WINDOW_S, Windows
 
 Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.surface/1"
 UNKNOWN = "unknown"
 PATCH_LENGTH_M = 10.0
-BREAK_MEMORY = 10
+BREAK_MEMORY = 6
 BREAK_FROM = 0.75
-"""A window that answers otherwise than the ten before (total variation above this) ends the patch: windows
-of one patch err alike, so the filter is slow to give up a ground for evidence of the usual kind."""
+"""A last second that answers otherwise than the six before (total variation above this) ends the patch:
+windows of one patch err alike, so the filter is slow to give up a ground for evidence of the usual kind."""
+STRADDLES = round(WINDOW_S / HOP_S)
+"""Windows from a change on that still show some of the ground before: there the last second is believed."""
 STRENGTH = 0.1
 """Inverse of the L2 penalty on the weights of standardised features."""
 ERROR_SHARE = 1e-3
@@ -90,15 +92,18 @@ class SoftmaxModel:
         seen = np.maximum(np.isfinite(np.atleast_2d(x)).sum(axis=1), 1)
         return np.asarray(distance.min(axis=1) / seen)
 
-    def filtered(self, x: Array, rolled_m: Array) -> Array:
-        """Class probabilities (n, k) along a drive: features (n, d), distance rolled before each (n,), m."""
-        log_p = self.log_probabilities(x)
+    def filtered(self, windows: Windows) -> Array:
+        """Class probabilities (n, k) along the n windows of a drive."""
+        log_p, recent = self.log_probabilities(windows.x), self.log_probabilities(windows.recent)
         patches = PatchFilter(len(self.classes), PATCH_LENGTH_M)
         p = np.empty_like(log_p)
-        for i, rolled in enumerate(rolled_m):
+        age = STRADDLES
+        for i, rolled in enumerate(windows.rolled_m):
             patches.predict(float(rolled))
-            patches.forget(_broken(np.exp(log_p[max(i - BREAK_MEMORY, 0) : i + 1])))
-            p[i] = patches.update(log_p[i] / self.temperature)
+            broken = _broken(np.exp(recent[max(i - BREAK_MEMORY, 0) : i + 1]))
+            patches.forget(broken)
+            age = 0 if broken > 0.5 else age + 1
+            p[i] = patches.update((recent if age < STRADDLES else log_p)[i] / self.temperature)
         return p
 
     def write(self, path: Path) -> None:

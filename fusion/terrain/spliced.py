@@ -76,8 +76,9 @@ def delays(
     model: SoftmaxModel, route: Signals, begins: Sequence[tuple[float, str]]
 ) -> tuple[list[float], float]:
     """Time from each change to its detection, s (inf: never), and the share of windows named right."""
-    ends, x, rolled = surface_windows(route)
-    winner = np.array(model.classes)[model.filtered(x, rolled).argmax(axis=1)]
+    windows = surface_windows(route)
+    ends = windows.end_s
+    winner = np.array(model.classes)[model.filtered(windows).argmax(axis=1)]
     found: list[float] = []
     right = 0
     for k, (begin, label) in enumerate(begins):

@@ -21,6 +21,8 @@ from terrafusion.datasets.recording import Recording
 Array = NDArray[np.float64]
 
 WINDOW_S = 2.0
+RECENT_S = 1.0
+"""What is judged by itself beside the window, as its end: a new ground fills it twice as soon."""
 HOP_S = 0.5
 BANDS_HZ = ((1.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 14.0), (14.0, 20.0), (20.0, 30.0), (30.0, 45.0))
 AXES = ("roll", "pitch", "yaw", "x", "y", "z")
@@ -107,29 +109,56 @@ def signals_of(recording: Recording) -> Signals:
     )  # fmt: skip
 
 
-def surface_windows(signals: Signals) -> tuple[Array, Array, Array]:
-    """End times (n,) s, features (n, d) and distances rolled since the last window (n,) m, every `HOP_S`."""
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """What a drive shows every `HOP_S`.
+
+    Attributes:
+        end_s: (n,) ends of the windows.
+        x: (n, d) features of the windows.
+        recent: (n, d) features of the last `RECENT_S` of each.
+        rolled_m: (n,) distances rolled since the window before.
+    """
+
+    end_s: Array
+    x: Array
+    recent: Array
+    rolled_m: Array
+
+    def __len__(self) -> int:
+        """The number of windows."""
+        return len(self.end_s)
+
+    def first(self, count: int) -> Windows:
+        """The first `count` of them."""
+        return Windows(self.end_s[:count], self.x[:count], self.recent[:count], self.rolled_m[:count])
+
+
+def surface_windows(signals: Signals) -> Windows:
+    """Cut a drive into windows."""
     begin = max(float(signals.imu_s[0]), float(signals.wheels_s[0]))
     span = signals.end_s() - begin
     # A log cut into windows of two seconds spans a sample less than that.
     count = max(int((span - WINDOW_S) / HOP_S + 1.0), int(span > _SHORTEST_SPAN * WINDOW_S))
     ends: Array = begin + WINDOW_S + HOP_S * np.arange(count, dtype=np.float64)
     x: Array = np.full((len(ends), len(SURFACE_FEATURES)), np.nan)
+    recent: Array = x.copy()
     rolled: Array = np.zeros(len(ends))
     for i, end in enumerate(ends):
         window = signals.between(end - WINDOW_S, end)
         x[i] = window_features(window)
+        recent[i] = window_features(window.between(end - RECENT_S, end), RECENT_S)
         if len(window.sides_mps):
             rolled[i] = float(np.abs(window.sides_mps).mean(axis=0).max()) * HOP_S
-    return ends, x, rolled
+    return Windows(ends, x, recent, rolled)
 
 
-def window_features(window: Signals) -> Array:
-    """Features (d,) in the order of `SURFACE_FEATURES`; NaN where not observed."""
+def window_features(window: Signals, length_s: float = WINDOW_S) -> Array:
+    """Features (d,) of a window of `length_s` in the order of `SURFACE_FEATURES`; NaN where not observed."""
     values = dict.fromkeys(SURFACE_FEATURES, np.nan)
     n = len(window.imu_s)
     span = float(window.imu_s[-1] - window.imu_s[0]) if n > 1 else 0.0
-    if n >= 16 and span > _LEAST_SPAN * WINDOW_S:
+    if n >= 16 and span > _LEAST_SPAN * length_s:
         values |= _vibration(window, (n - 1) / span)
     if len(window.sides_mps) >= 3:
         values |= _motion(window)

@@ -33,6 +33,7 @@ from terrafusion.fusion.terrain.surface import (
     GROUPS,
     SURFACE_FEATURES,
     Signals,
+    Windows,
     surface_windows,
     window_features,
 )
@@ -56,8 +57,7 @@ def made_drive(label: str, seed: int, seconds: float = 40.0, level: float | None
 
 def made_run(label: str, seed: int, **how: float) -> Run:
     signals = made_drive(label, seed, **how)
-    _, x, rolled = surface_windows(signals)
-    return Run(f"{label}/{seed}", label, signals, x, rolled)
+    return Run(f"{label}/{seed}", label, signals, surface_windows(signals))
 
 
 @pytest.fixture(autouse=True)
@@ -151,7 +151,7 @@ def test_grounds_are_learnt_by_run(runs: Sequence[Run]) -> None:
     ]
     changes = changes_seen(folded.models, held)
     assert changes.never < 0.1
-    assert changes.median_s < 3.0
+    assert changes.median_s < 2.0
 
 
 def test_labels_at_random_are_not_learnt(runs: Sequence[Run]) -> None:
@@ -163,11 +163,13 @@ def test_labels_at_random_are_not_learnt(runs: Sequence[Run]) -> None:
 def test_every_window_gets_probabilities_whatever_is_missing(
     model: SoftmaxModel, runs: Sequence[Run]
 ) -> None:
-    x = runs[0].x.copy()
+    whole = runs[0].windows
+    x, recent = whole.x.copy(), whole.recent.copy()
     rng = np.random.default_rng(0)
     x[rng.random(x.shape) < 0.5] = np.nan
-    x[0] = np.nan
-    p = model.filtered(x, runs[0].rolled_m)
+    recent[rng.random(x.shape) < 0.5] = np.nan
+    x[0], recent[:3] = np.nan, np.nan
+    p = model.filtered(dataclasses.replace(whole, x=x, recent=recent))
     assert np.isfinite(p).all()
     assert p.sum(axis=1) == pytest.approx(1.0)
     assert (p > 0.0).all()
@@ -178,6 +180,28 @@ def test_a_ground_unlike_all_others_is_odd(model: SoftmaxModel, runs: Sequence[R
     strange = made_run("gravel", 99, level=8.0)
     assert np.mean(model.oddness(known) > model.odd_distance) < 0.25
     assert np.mean(model.oddness(strange.x) > model.odd_distance) > 0.9
+
+
+def test_a_change_is_seen_while_the_window_still_shows_both_grounds(
+    model: SoftmaxModel, runs: Sequence[Run]
+) -> None:
+    lawn, gravel = (next(r for r in runs if r.label == label).windows for label in ("lawn", "gravel"))
+    # After the change the window of two seconds answers as before for as long as we please: 2 s here.
+    kept = np.vstack([lawn.x[:20], lawn.x[20:24], gravel.x[:6]])
+    recent = np.vstack([lawn.recent[:20], gravel.recent[:10]])
+    drive = Windows(0.5 * np.arange(30.0), kept, recent, np.full(30, 0.25))
+    named = np.array(model.classes)[model.filtered(drive).argmax(axis=1)]
+    assert (named[:20] == "lawn").all()
+    assert (named[20:] == "gravel").all()
+
+
+def test_one_odd_second_does_not_lose_the_ground(model: SoftmaxModel, runs: Sequence[Run]) -> None:
+    lawn, gravel = (next(r for r in runs if r.label == label).windows for label in ("lawn", "gravel"))
+    recent = lawn.recent.copy()
+    recent[20] = gravel.recent[0]
+    named = np.array(model.classes)[model.filtered(dataclasses.replace(lawn, recent=recent)).argmax(axis=1)]
+    assert (named[:20] == "lawn").all()
+    assert (named[22:] == "lawn").all()
 
 
 def test_a_route_is_made_of_the_raw_samples(runs: Sequence[Run]) -> None:
@@ -226,8 +250,10 @@ def test_one_ground_is_too_few(runs: Sequence[Run]) -> None:
 
 
 def test_the_report_of_made_drives(runs: Sequence[Run]) -> None:
-    short = [dataclasses.replace(r, x=r.x[:15], rolled_m=r.rolled_m[:15]) for r in runs]
-    others = [dataclasses.replace(r, x=np.where(np.isnan(r.x), r.x, r.x + 0.01)) for r in short[::2]]
+    short = [dataclasses.replace(r, windows=r.windows.first(15)) for r in runs]
+    others = [
+        dataclasses.replace(r, windows=dataclasses.replace(r.windows, x=r.x + 0.01)) for r in short[::2]
+    ]
     ticks: list[None] = []
     report = report_on(short, others, lambda: ticks.append(None))
     assert report["filtered"]["macro_f1"] > 0.9
@@ -261,4 +287,4 @@ def test_a_real_husky_is_told_ice_from_loam_by_run(tmp_path: Path) -> None:
     model = read_softmax(out)
     assert model.classes == ("ice", "sandy_loam")
     assert len(model.inputs) == len(logs)
-    assert figures_of(model.classes, runs, [model.filtered(r.x, r.rolled_m) for r in runs]).macro_f1 > 0.95
+    assert figures_of(model.classes, runs, [model.filtered(r.windows) for r in runs]).macro_f1 > 0.95
