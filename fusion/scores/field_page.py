@@ -103,32 +103,56 @@ def _verdict_table(lines: Sequence[Line]) -> str:
         "better",
         "worse",
         "mean of error over best baseline's",
+        "largest",
         "% of distance",
     )
-    keys = ("ground", "test", "logs", "better", "worse", "mean_ratio", "percent")
+    keys = ("ground", "test", "logs", "better", "worse", "mean_ratio", "worst", "percent")
     return _table(head, [[row[key] for key in keys] for row in verdicts(lines)])
 
 
 def _scored_table(lines: Sequence[Line]) -> str:
-    head = ("log", "ground", "test", "reference", "runs", "way, m", "mode", "error, m", "%", "NEES",
-            "over best baseline", "diverged")  # fmt: skip
-    rows = [
-        [x.log, x.ground or "-", x.test, x.reference, x.runs, x.distance_m, x.mode, x.error_m, x.percent,
-         x.nees, x.ratio if x.mode != x.baseline else "best baseline", x.diverged]
-        for x in lines
-    ]  # fmt: skip
+    """A row a log and test, a column a mode."""
+    modes = list(dict.fromkeys(line.mode for line in lines))
+    head = ["log", "ground", "reference", "test", "runs", "way, m", *(f"{mode}, m" for mode in modes),
+            f"{OWN} over best baseline", f"NEES of {OWN}", "diverged"]  # fmt: skip
+    rows = []
+    for by_mode in _by_test(lines):
+        first, own = next(iter(by_mode.values())), by_mode.get(OWN)
+        ratio = "-" if own is None or own.ratio is None else f"{own.ratio:.2f} ({own.baseline})"
+        errors = [by_mode[mode].error_m if mode in by_mode else None for mode in modes]
+        rows.append(
+            [first.log, first.ground or "-", first.reference, first.test, first.runs, first.distance_m,
+             *errors, ratio, own and own.nees, _diverged(by_mode)]
+        )  # fmt: skip
     return _table(head, rows)
 
 
 def _health_table(lines: Sequence[Line]) -> str:
-    head = ("log", "ground", "mode", "path, m", "path over wheels'", "top speed, m/s", "diverged",
-            "x real time", "p99 of a keyframe, ms")  # fmt: skip
-    rows = [
-        [x.log, x.ground or "-", x.mode, x.distance_m, x.path_ratio, x.top_speed_mps, x.diverged, x.realtime,
-         x.latency_p99_ms]
-        for x in lines
-    ]  # fmt: skip
+    """A row a log, a column a mode: the path over that of the wheels."""
+    modes = list(dict.fromkeys(line.mode for line in lines))
+    head = ["log", "ground", "path, m", *(f"{mode}: path over wheels'" for mode in modes),
+            "top speed, m/s", "diverged"]  # fmt: skip
+    rows = []
+    for by_mode in _by_test(lines):
+        first = next(iter(by_mode.values()))
+        ratios = [by_mode[mode].path_ratio if mode in by_mode else None for mode in modes]
+        fastest = max(line.top_speed_mps for line in by_mode.values())
+        rows.append([first.log, first.ground or "-", first.distance_m, *ratios, fastest, _diverged(by_mode)])
     return _table(head, rows)
+
+
+def _by_test(lines: Sequence[Line]) -> list[dict[str, Line]]:
+    """The lines of each log and test by mode."""
+    groups: dict[tuple[str, str], dict[str, Line]] = {}
+    for line in lines:
+        groups.setdefault((line.log, line.test), {})[line.mode] = line
+    return list(groups.values())
+
+
+def _diverged(by_mode: dict[str, Line]) -> str:
+    """The modes that diverged, and how often where it is not once; "none"."""
+    found = [(mode, line.diverged) for mode, line in by_mode.items() if line.diverged]
+    return ", ".join(mode if count == 1 else f"{mode} {count}" for mode, count in found) or "none"
 
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[Any]]) -> str:

@@ -57,7 +57,7 @@ def condense(runs: Sequence[Run]) -> list[Line]:
 
 
 def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]:
-    """By ground and test: in how many logs `OWN` is better or worse, and the geometric mean of its ratios."""
+    """By ground and test: in how many logs `OWN` is better or worse, geometric mean and largest of its ratios."""
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
         if line.mode == OWN and line.ratio is not None:
@@ -68,6 +68,7 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
         row: dict[str, str | int | float | None] = {"ground": ground, "test": test, "logs": len(found)}
         row |= {"better": int((ratios < 1 - EVEN).sum()), "worse": int((ratios > 1 + EVEN).sum())}
         row["mean_ratio"] = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
+        row["worst"] = float(ratios.max())
         row["percent"] = median([line.percent for line in found])
         out.append(row)
     return out

@@ -168,6 +168,7 @@ def test_ratio_is_over_the_best_baseline_of_the_same_log() -> None:
     (row,) = verdicts(list(lines.values()))
     assert (row["logs"], row["better"], row["worse"]) == (2, 1, 1)
     assert row["mean_ratio"] == pytest.approx(np.sqrt(0.5 * 1.5))
+    assert row["worst"] == pytest.approx(1.5)
 
 
 def test_lines_are_medians_over_starts() -> None:
@@ -207,6 +208,21 @@ def test_files_hold_all_runs_and_the_refusals(tmp_path: Path) -> None:
     assert (tmp_path / "field_table.md").read_text(encoding="utf-8") == text
     assert (tmp_path / "field_table.png").stat().st_size > 1000
     assert len(plot_lines(condense(runs)).axes) == 1
+
+
+def test_tables_have_a_row_a_test_and_a_column_a_mode(tmp_path: Path) -> None:
+    runs = [
+        made_run("a", "adaptive", 1.0), made_run("a", "fixed", 2.0),
+        made_run("a", "robust", 4.0, diverged="x"),
+        made_run("c", "adaptive", None, path_ratio=0.5), made_run("c", "fixed", None, path_ratio=0.25),
+        made_run("c", "fixed", None, path_ratio=0.25, diverged="y"), made_run("b", "fixed", 3.0),
+    ]  # fmt: skip
+    rows = write(tmp_path, runs, []).splitlines()
+    assert (
+        "| a | firm | truth | whole | 1 | 100 | 1.00 | 2.00 | 4.00 | 0.50 (fixed) | 1.00 | robust |" in rows
+    )
+    assert "| b | firm | truth | whole | 1 | 100 | - | 3.00 | - | - | - | none |" in rows
+    assert "| c | firm | 100 | 0.50 | 0.25 | 1.00 | fixed |" in rows
 
 
 def test_first_modes_are_run_on_all_logs_before_the_others_and_each_log_in_one_piece() -> None:
