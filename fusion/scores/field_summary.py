@@ -57,7 +57,7 @@ def condense(runs: Sequence[Run]) -> list[Line]:
 
 
 def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]:
-    """By ground and test: in how many logs `OWN` is better or worse, geometric mean and largest of its ratios."""
+    """By ground and test: in how many logs `OWN` is better or worse, mean (geometric) and largest ratio."""
     groups: dict[tuple[str, str], list[Line]] = {}
     for line in lines:
         if line.mode == OWN and line.ratio is not None:
