@@ -143,6 +143,8 @@ class MotionTrack:
             if keep.sum() < 5:
                 return None
         extent = float(np.sqrt(np.mean(np.abs(z[keep] - z[keep].mean()) ** 2)))
+        if extent == 0.0:  # all that is left was seen where the robot stood
+            return None
         sigma = 1.0 / (max(ratio, 1e-6) * np.sqrt(information)) + 0.5 * float(np.median(rest)) / extent
         if sigma > TURN_SIGMA_RAD or not LEAST_RATIO < ratio < MOST_RATIO:
             return None

@@ -19,6 +19,7 @@ from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.gnss import checked_fix
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.track import MotionTrack, Pair
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
@@ -343,3 +344,12 @@ def test_a_sensible_claim_stays_and_no_fix_is_none() -> None:
 def test_a_fix_without_a_sigma_or_of_an_unknown_class_is_refused(fix: object, match: str) -> None:
     with pytest.raises(DataError, match=match):
         checked_fix(0, np.zeros(3), None, None, float("nan"), fix)  # type: ignore[arg-type]
+
+
+def test_fixes_of_a_robot_that_stood_show_no_heading_whatever_else_was_seen() -> None:
+    # Three fixes far off take each other's part until only those at rest are left: one place, no direction.
+    rest = [(0j, 0.1 * complex(np.cos(k), np.sin(k))) for k in range(9)]
+    wild = [(1 + 0j, -2 + 31j), (2 + 0j, -18 - 22j), (3 + 0j, -24 - 38j)]
+    track = MotionTrack(np.zeros(3))
+    track.pairs = [Pair(i, z, fix, 1.0) for i, (z, fix) in enumerate([*rest, *wild])]
+    assert track.wrong_by(0.1, 1.0) is None
