@@ -49,12 +49,10 @@ from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 
 Array = NDArray[np.float64]
 
-LONGEST_IMU_GAP_S = 0.5
-SMOOTH_EVERY, SMOOTH_AT = 5, 2  # keyframes 2, 7, ...: the detector has its turn at 0, 5, ...
-SMOOTH_WINDOW = 50
+LONGEST_IMU_GAP_S, OUTAGE_S = 0.5, 2.0
+SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
-OUTAGE_S = 2.0
 SEEN_LATE_NS, SWITCHED = 1_000_000_000, 0.1
 """A change of ground is seen a second after it (`docs/terrain.md`); less of a shift is none."""
 UNKNOWN = np.full(3, np.nan)
@@ -93,6 +91,7 @@ class Estimator:
         self._given: GivenStart | None = None
         self._level: Start | None = None
         self._state: State | None = None
+        self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._silent = False
         self._rest = RestDetector(config.rig)
@@ -210,14 +209,18 @@ class Estimator:
     def _advance(self, last: bool = False) -> None:
         if self._start is None and not self._try_start(last):
             return
-        while True:
-            t = self.chain.nodes[-1].t_ns + self._step_ns
-            if not self.imu.covers(t):
-                return
-            late = self.imu.covers(t + round(self.config.wheel_wait_s * 1e9))
-            if not (self.wheels.covers(t) or late or last):
-                return
+        newest = self.chain.last
+        while self._ready(t := self.chain.nodes[-1].t_ns + self._step_ns, last):
             self._keyframe(t)
+        if self.chain.last == newest or last:
+            self._upkeep()
+
+    def _ready(self, t_ns: int, last: bool) -> bool:
+        """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
+        if not self.imu.covers(t_ns):
+            return False
+        waited = t_ns + round(self.config.wheel_wait_s * 1e9)
+        return last or self.wheels.covers(t_ns) or self.imu.covers(waited)
 
     def _try_start(self, last: bool) -> bool:
         """Start the graph once heading is known, or once it is clear that GNSS will not come."""
@@ -287,6 +290,7 @@ class Estimator:
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _keyframe(self, t_ns: int) -> None:
+        self._upkeep()
         switch = self.weights.take_switch()
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
@@ -299,8 +303,7 @@ class Estimator:
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
-        link = gtsam.NonlinearFactorGraph()
-        preintegrated = False
+        link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
             link = bridge(k, before, wheels, dt)
             point = carried(before, wheels, dt)
@@ -334,15 +337,25 @@ class Estimator:
         if self.aids.update(chain, before, self._covariance, self.gnss):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
-        if chain.last % SMOOTH_EVERY == SMOOTH_AT:
-            chain.smooth(SMOOTH_WINDOW)
-            self._covariance = chain.covariance()
         chain.forget(self._keep)
         self.imu.forget(t_ns - 2_000_000_000)
         self.wheels.forget(t_ns - 2_000_000_000)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
-        state = self._emitted(t_ns, gyro)
-        self.weights.update(state, self.imu, self.wheels, slip_observed=state.status == "running")
+        self._fresh = self._emitted(t_ns, gyro)
+
+    def _upkeep(self) -> None:
+        """What no state waits for: the heading's second opinion, smoothing, the ground.
+
+        Done in the call after a keyframe's, at the latest before the next keyframe: no call takes long.
+        """
+        state, self._fresh = self._fresh, None
+        if state is None:
+            return
+        turned = self.gnss.set_heading_right(self.chain, self.weights.row)
+        if turned or self.chain.last % SMOOTH_EVERY == 0:
+            self.chain.smooth(SMOOTH_WINDOW)
+            self._covariance = self.chain.covariance()
+        self.weights.update(state, self.imu, self.wheels)
 
     def _wheel_increment(
         self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState

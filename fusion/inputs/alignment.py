@@ -132,9 +132,10 @@ def turn_between(
     sum w_i conj(z_i - z) (g_i - g) (the planar case of Horn 1987, JOSA A 4(4)), the best
     scale its size over sum w_i |z_i - z|^2, which is given as information.
     """
-    z_mean, g_mean = np.average(z, weights=weight), np.average(g, weights=weight)
-    information = float(np.sum(weight * np.abs(z - z_mean) ** 2))
-    return complex(np.sum(weight * np.conj(z - z_mean) * (g - g_mean))), information
+    share = weight / weight.sum()
+    from_mean = z - share @ z
+    weighted = weight * from_mean.conj()
+    return complex(weighted @ (g - share @ g)), float((weighted @ from_mean).real)
 
 
 def heading_from_motion(

@@ -88,6 +88,7 @@ class GnssUpdater:
         self.too_late = 0
         self.last_used_ns: int | None = None
         self._newest_ns = 0
+        self._unchecked: GnssFix | None = None
         self._report = report
         self._seen = 0
 
@@ -126,7 +127,7 @@ class GnssUpdater:
                     chain.smooth(max(chain.last - k + 2, 1))
                     covariance = chain.covariance_at(k)
                 used |= self._add(chain, k, fix, covariance, row)
-                used |= self._set_heading_right(chain, fix, row)
+                self._unchecked = fix
         if used:
             self.weighting.revisit(chain)
         return used
@@ -148,8 +149,12 @@ class GnssUpdater:
         chain.set_markov(k, step.renewed(slice(1, 3)))
         return True
 
-    def _set_heading_right(self, chain: Chain, fix: GnssFix, row: SensorNoise) -> bool:
-        """Turn the whole window where motion and fixes agree on another heading than the filter's."""
+    def set_heading_right(self, chain: Chain, row: SensorNoise) -> bool:
+        """Turn the whole window where motion and the fixes, the last ones of them taken since the call
+        before, agree on another heading than the filter's; True when it did."""
+        fix, self._unchecked = self._unchecked, None
+        if fix is None:
+            return False
         yaw_sigma = float(np.sqrt(chain.covariance()[2, 2]))
         turn = self.track.wrong_by(yaw_sigma, self.scale)
         if turn is None:

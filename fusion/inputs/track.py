@@ -9,6 +9,8 @@ Neither depends on what the filter made of those fixes.
 from __future__ import annotations
 
 import bisect
+import cmath
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,11 +87,13 @@ class MotionTrack:
 
     def add(self, fix: GnssFix) -> None:
         """Set a fix beside the path, in its place in time."""
-        if not self._t_ns or fix.t_ns < self._t_ns[0]:
+        if len(self._t_ns) < 2 or fix.t_ns < self._t_ns[0]:
             return
-        t = np.array(self._t_ns[-100:]) - fix.t_ns
-        z = complex(np.interp(0.0, t, np.array(self._z[-100:])))
-        yaw = float(np.interp(0.0, t, self._yaw[-100:]))
+        i = min(bisect.bisect_left(self._t_ns, fix.t_ns, 1), len(self._t_ns) - 1)
+        begin, end = self._t_ns[i - 1], self._t_ns[i]
+        share = min((fix.t_ns - begin) / (end - begin), 1.0)
+        z = self._z[i - 1] + share * (self._z[i] - self._z[i - 1])
+        yaw = self._yaw[i - 1] + share * (self._yaw[i] - self._yaw[i - 1])
         at = z + self._lever * complex(np.cos(yaw), np.sin(yaw))
         pair = Pair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
         bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
@@ -113,7 +117,7 @@ class MotionTrack:
         seen = np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2 / RAYLEIGH_MEDIAN
         bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
         claimed = 6.0 * np.array([p.sigma_m for p in recent])[1:-1] ** 2
-        scatter = float(np.sqrt(np.median(np.maximum(seen - bend, 0.0)[even] / claimed[even])))
+        scatter = math.sqrt(_median(np.maximum(seen - bend, 0.0)[even] / claimed[even]))
         return scatter if scatter > LIE else 1.0
 
     def wrong_by(self, yaw_sigma_rad: float, scale: float) -> float | None:
@@ -139,15 +143,22 @@ class MotionTrack:
                 return None
             ratio = abs(turn) / information
             rest = np.abs((fix - fix[keep].mean()) - turn / information * (z - z[keep].mean()))
-            keep = rest <= 5.0 * np.median(rest) + 1e-6
-            if keep.sum() < 5:
+            middle = _median(rest)
+            keep = rest <= 5.0 * middle + 1e-6
+            if np.count_nonzero(keep) < 5:
                 return None
-        extent = float(np.sqrt(np.mean(np.abs(z[keep] - z[keep].mean()) ** 2)))
+        kept = z[keep]
+        extent = float(np.linalg.norm(kept - kept.mean())) / math.sqrt(len(kept))
         if extent == 0.0:  # all that is left was seen where the robot stood
             return None
-        sigma = 1.0 / (max(ratio, 1e-6) * np.sqrt(information)) + 0.5 * float(np.median(rest)) / extent
+        sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * middle / extent
         if sigma > TURN_SIGMA_RAD or not LEAST_RATIO < ratio < MOST_RATIO:
             return None
-        error = float(np.angle(turn * np.exp(-1j * (self._yaw_chain - self._yaw[-1]))))
-        limit = max(LEAST_TURN_RAD, 4.0 * float(np.hypot(sigma, min(yaw_sigma_rad, 0.3))))
+        error = cmath.phase(turn * cmath.exp(-1j * (self._yaw_chain - self._yaw[-1])))
+        limit = max(LEAST_TURN_RAD, 4.0 * math.hypot(sigma, min(yaw_sigma_rad, 0.3)))
         return error if abs(error) > limit else None
+
+
+def _median(values: Array) -> float:
+    """The median, of an even number the upper of the two in the middle; a tenth of `np.median`'s time."""
+    return float(np.sort(values)[len(values) // 2])

@@ -125,12 +125,12 @@ class TerrainWeights:
         self._source = "external source"
         self._reweight(t_ns)
 
-    def update(self, state: State, imu: ImuStream, wheels: WheelStream, slip_observed: bool) -> None:
+    def update(self, state: State, imu: ImuStream, wheels: WheelStream) -> None:
         """Look at the last second, twice a second."""
         if state.t_ns < self._next_ns:
             return
         self._next_ns = state.t_ns + UPDATE_NS
-        self.detector.update(self._window(state, imu, wheels, slip_observed))
+        self.detector.update(self._window(state, imu, wheels))
         self._source = "detector"
         self._listen(state.t_ns)
         self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
@@ -142,7 +142,7 @@ class TerrainWeights:
             self._told = self._labels.probabilities(t_ns, self.detector.classes)
             self._source = "label"
 
-    def _window(self, state: State, imu: ImuStream, wheels: WheelStream, slip_observed: bool) -> Window:
+    def _window(self, state: State, imu: ImuStream, wheels: WheelStream) -> Window:
         start_ns, rig = state.t_ns - WINDOW_NS, self._rig
         t, gyro, accel = imu.window(start_ns, state.t_ns + 1)
         rolled = wheels.travelled(start_ns, state.t_ns)
@@ -151,7 +151,8 @@ class TerrainWeights:
         rate = (speed - self._last_speed) / (UPDATE_NS * 1e-9)
         self._last_speed = 0.0 if np.isnan(speed) else speed
         prior = self.row.slip_at(self._grade), self.row.slip_sigma
-        measured = slip_without_prior(state.slip, state.slip_sigma, *prior) if slip_observed else None
+        observed = state.status == "running"  # without fixes the slip is what its prior says
+        measured = slip_without_prior(state.slip, state.slip_sigma, *prior) if observed else None
         slip, slip_sigma = measured if measured is not None else (None, None)
         return Window(
             dt_s=UPDATE_NS * 1e-9,
