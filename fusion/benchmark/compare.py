@@ -2,12 +2,17 @@
 
 Two arms are compared on the same drives. The ratio of their errors is taken drive by drive; its median over
 the independent units (seeds, or field logs, whose several outages make one number by their own median) is the
-result. The interval is the percentile bootstrap's over units (Efron 1979, Ann. Statist. 7(1)), all arms
-resampled together, so that shares of two gains keep their pairing.
+result. Its interval is the sign test's, between two of the ordered ratios (Thompson 1936, Ann. Math. Statist.
+7(3)): it holds for any distribution and any number of units from `LEAST_UNITS` on; fewer have none. That of a
+share of two gains is the percentile bootstrap's over units (Efron 1979, Ann. Statist. 7(1)), both arms
+resampled together, so that the gains keep their pairing.
+
+A replay that failed has an infinite error, so that it loses. Where the base failed nothing is compared.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -22,6 +27,9 @@ Interval = tuple[float, float]
 
 RESAMPLES = 4000
 SEED = 0
+CONFIDENCE = 0.95
+LEAST_UNITS = 6
+"""Fewer have no interval: all five on one side of the median are chance once in 16 times, six in 32."""
 LEAST_ERROR_M = 1e-3
 """Errors below a millimetre count as one: no ratio is made of what the truth itself does not hold."""
 EVEN = 0.03
@@ -34,8 +42,8 @@ class Contrast:
 
     Attributes:
         units: independent drives (or logs) in which both have an error.
-        error_m, base_m: median errors.
-        ratio, interval: median of the paired ratios, error over base; None for one unit alone.
+        error_m, base_m: median errors; infinite where half of the replays failed.
+        ratio, interval: median of the paired ratios, error over base; None for less than `LEAST_UNITS`.
         wins, losses: units in which the ratio is below or above 1 by more than `EVEN`.
     """
 
@@ -88,21 +96,26 @@ def shares(rows: Sequence[Row]) -> list[Share]:
 
 
 def errors_by_unit(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
-    """arm -> unit -> drive -> error in m; drives without an error are left out."""
+    """arm -> unit -> drive -> error in m, infinite where the replay failed; without one it is left out."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
-        if row.error_m is not None:
+        error = math.inf if row.failed else row.error_m
+        if error is not None:
             by_unit = out.setdefault(row.arm, {}).setdefault(row.unit, {})
-            by_unit[row.drive] = max(row.error_m, LEAST_ERROR_M)
+            by_unit[row.drive] = max(error, LEAST_ERROR_M)
     return out
 
 
 def log_ratios(errors: dict[str, dict[str, dict[str, float]]], arm: str, base: str) -> dict[str, float]:
-    """Unit -> logarithm of the ratio: the median over the drives that both arms have."""
+    """Unit -> logarithm of the ratio: the median over drives of both arms in which base did not fail."""
     out = {}
     for unit, own in errors.get(arm, {}).items():
         other = errors.get(base, {}).get(unit, {})
-        logs = [np.log(error / other[drive]) for drive, error in own.items() if drive in other]
+        logs = [
+            math.log(error / other[drive])
+            for drive, error in own.items()
+            if other.get(drive, math.inf) < math.inf
+        ]
         if logs:
             out[unit] = float(np.median(logs))
     return out
@@ -115,16 +128,22 @@ def resampled(values: Array) -> Array:
     return np.asarray(np.median(values[rows], axis=1))
 
 
-def interval_of(samples: Array) -> Interval:
-    """Central 95 % of samples (R,)."""
-    low, high = np.percentile(samples, [2.5, 97.5])
-    return float(low), float(high)
-
-
 def median_interval(values: Sequence[float]) -> tuple[float, Interval | None]:
-    """Median of independent values, and its interval where there are two of them or more."""
-    column = np.asarray(values, dtype=float)[:, None]
-    return float(np.median(column)), interval_of(resampled(column)[:, 0]) if len(column) > 1 else None
+    """Median of independent values, and its interval where there are `LEAST_UNITS` of them or more."""
+    ordered = sorted(values)
+    middle = float(np.median(ordered))
+    if len(ordered) < LEAST_UNITS:
+        return middle, None
+    k = _sign_test_rank(len(ordered))
+    return middle, (ordered[k], ordered[-1 - k])
+
+
+def _sign_test_rank(n: int) -> int:
+    """How many of n ordered values may be left out at each end of an interval of the median."""
+    tail, k = 0.5**n, 0
+    while 2.0 * (tail := tail + math.comb(n, k + 1) * 0.5**n) <= 1.0 - CONFIDENCE:
+        k += 1
+    return k
 
 
 def _contrast(
@@ -153,9 +172,12 @@ def _share(errors: dict[str, dict[str, dict[str, float]]]) -> tuple[float | None
     if gain_best <= EVEN:
         return None, None
     share = float(gain_own / gain_best)
-    if len(units) < 2:
+    if len(units) < LEAST_UNITS:
         return share, None
     gains = 1.0 - np.exp(resampled(logs))
-    if (gains[:, 1] <= 0.0).mean() > 0.025:
+    if (gains[:, 1] <= 0.0).mean() > 0.5 * (1.0 - CONFIDENCE):
         return share, None
-    return share, interval_of(gains[:, 0] / np.maximum(gains[:, 1], 1e-9))
+    samples = gains[:, 0] / np.maximum(gains[:, 1], 1e-9)
+    # A sample, not a mean of two: a gain is minus infinite where half of the replays failed.
+    low, high = np.percentile(samples, [2.5, 97.5], method="inverted_cdf")
+    return share, (float(low), float(high))

@@ -18,7 +18,7 @@ from typing import Any
 
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import ConfigError
-from terrafusion.fusion.benchmark.compare import contrasts, shares
+from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
 from terrafusion.fusion.benchmark.plan import Plan
 from terrafusion.fusion.benchmark.plots import plot_ratios
 from terrafusion.fusion.benchmark.reasons import reasons
@@ -28,6 +28,7 @@ from terrafusion.fusion.benchmark.text import Table, markdown, tables
 from terrafusion.fusion.report import page
 from terrafusion.fusion.report.outputs import to_json
 from terrafusion.fusion.scores.parts import sources_sha256
+from terrafusion.fusion.scores.twin_consistency import Cell
 from terrafusion.fusion.weights.modes import load_modes
 from terrafusion.fusion.weights.policy import load_policy
 
@@ -116,10 +117,17 @@ def _content(found: Found, origin: Mapping[str, str]) -> dict[str, Any]:
         "shares": [dataclasses.asdict(s) for s in shares(rows)],
         "targets": [dataclasses.asdict(t) | {"verdict": t.verdict()} for t in targets(rows)],
         "reasons": [dataclasses.asdict(r) | {"blame": r.blame()} for r in reasons(rows)],
-        "consistency": [dataclasses.asdict(c) | {"verdict": c.verdict()} for c in nees_cells(rows)],
+        "consistency": [_cell(c) for c in nees_cells(rows)],
         "refused": [dataclasses.asdict(one) for one in found.refused],
         "rows": [dataclasses.asdict(row) for row in rows],
     }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    """A cell with its verdict, or without verdict and interval where its drives are too few."""
+    few = cell.drives < LEAST_UNITS
+    known = {"interval": None, "verdict": None} if few else {"verdict": cell.verdict()}
+    return dataclasses.asdict(cell) | known
 
 
 def _page(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> None:

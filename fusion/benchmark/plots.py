@@ -16,6 +16,7 @@ COLOURS = style.MODE_COLOURS | {"data sheet": "#e69f00", "shuffled": "#8c510a", 
 ROW_IN, SPREAD = 0.62, 0.09
 """Height of a group, inches, and of an arm in it, shares of that."""
 RANGE = (0.1, 20.0)
+"""Of the ratios; what lies outside, such as those of failed replays, is drawn at its ends."""
 
 
 def plot_ratios(found: Sequence[Contrast]) -> Figure:
@@ -31,8 +32,8 @@ def plot_ratios(found: Sequence[Contrast]) -> Figure:
     for k, arm in enumerate(arms):
         own = [c for c in shown if c.arm == arm]
         height = [groups.index((c.family, c.plant)) + SPREAD * (k - 0.5 * (len(arms) - 1)) for c in own]
-        ratio = [c.ratio for c in own]
-        ends = [c.interval or (c.ratio, c.ratio) for c in own]
+        ratio = [_drawn(c.ratio) for c in own]
+        ends = [tuple(map(_drawn, c.interval or (c.ratio, c.ratio))) for c in own]
         reach = [[r - e[0] for r, e in zip(ratio, ends, strict=True)],
                  [e[1] - r for r, e in zip(ratio, ends, strict=True)]]  # fmt: skip
         ax.errorbar(
@@ -41,7 +42,7 @@ def plot_ratios(found: Sequence[Contrast]) -> Figure:
         )  # fmt: skip
     ax.axvline(1.0, color=style.TRUTH, linewidth=0.8)
     ax.set_xscale("log")
-    low, high = (f([c.ratio for c in shown], default=1.0) for f in (min, max))
+    low, high = (f([_drawn(c.ratio) for c in shown], default=1.0) for f in (min, max))
     ax.set_xlim(max(RANGE[0], 0.7 * low), min(RANGE[1], 1.5 * high))
     ax.xaxis.set_major_formatter(FuncFormatter(lambda x, _: f"{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
@@ -55,3 +56,7 @@ def plot_ratios(found: Sequence[Contrast]) -> Figure:
     )
     style.legend_above(ax)
     return figure
+
+
+def _drawn(ratio: float) -> float:
+    return min(max(ratio, RANGE[0]), RANGE[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -20,7 +21,10 @@ INSIDE, IN_OUTAGE = "whole drive", "in outage"
 
 @dataclass(frozen=True)
 class Target:
-    """One statement: `found` is compared with `limit`; `most` tells that it must lie below."""
+    """One statement: `found` is compared with `limit`; `most` tells that it must lie below.
+
+    `broken` replays failed or diverged where none may.
+    """
 
     name: str
     what: str
@@ -29,9 +33,12 @@ class Target:
     found: float | None
     interval: Interval | None
     unit: str = ""
+    broken: int = 0
 
     def verdict(self) -> str:
-        """`REACHED`, `OPEN` or `MISSED`; "not measured" without a number. One drive alone decides nothing."""
+        """`REACHED`, `OPEN` or `MISSED`; "not measured" without a number. Few drives decide nothing."""
+        if self.broken:
+            return MISSED
         if self.found is None:
             return "not measured"
         if self.interval is None:
@@ -60,8 +67,11 @@ def targets(rows: Sequence[Row]) -> list[Target]:
         for plant in dict.fromkeys(row.plant for row in rows if row.family == family):
             out.append(_drift(rows, family, plant, limit))
     for ground in dict.fromkeys(row.plant for row in rows if row.family == FIELD):
-        out.append(_ratio("G9", 1.0, against_base, FIELD, ground, OWN))
-    return [target for target in out if target.found is not None]
+        own = [r for r in rows if (r.family, r.plant, r.arm) == (FIELD, ground, OWN)]
+        broken = sum(bool(r.failed or r.diverged) for r in own)
+        found = _ratio("G9", 1.0, against_base, FIELD, ground, OWN)
+        out.append(dataclasses.replace(found, broken=broken))
+    return [target for target in out if target.found is not None or target.broken]
 
 
 def nees_cells(rows: Sequence[Row], arms: Iterable[str] = (OWN, BASE)) -> list[Cell]:

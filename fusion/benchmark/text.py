@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
-from terrafusion.fusion.benchmark.compare import Contrast, Interval, contrasts, groups_of, shares
+from terrafusion.fusion.benchmark.compare import LEAST_UNITS, Contrast, Interval, contrasts, groups_of, shares
 from terrafusion.fusion.benchmark.drives import FAMILIES, FIELD, PLANTS
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
@@ -58,11 +58,14 @@ def _main(rows: Sequence[Row]) -> Table:
     for family, plant in groups_of(rows):
         of = {c.arm: c for c in found if (c.family, c.plant) == (family, plant)}
         if BASE in of:
-            head = [group_name(family, plant), str(of[BASE].units), number(of[BASE].error_m)]
-            lines.append([*head, *(_ratio(of.get(arm)) for arm in arms)])
+            units = of[BASE].units
+            head = [group_name(family, plant), str(units), number(of[BASE].error_m)]
+            lines.append([*head, *(_ratio(of.get(arm), units) for arm in arms)])
     about = (
         f"Root mean square position error inside the outage: its median for {BASE} (tuned), and for the "
-        "others the median of the paired ratios to it, with its 95 % interval. Below 1 is better."
+        f"others the median of the paired ratios to it, with its 95 % interval from {LEAST_UNITS} pairs on. "
+        "Below 1 is better. A replay that failed counts as infinitely wrong; in brackets the pairs where not "
+        "every drive has labels."
     )
     return Table("Errors", about, ("drives", "pairs", f"{BASE}, m", *arms), tuple(lines))
 
@@ -71,11 +74,15 @@ def _targets(found: Iterable[Target]) -> Table:
     lines = [
         [
             t.name, t.what, f"{'<=' if t.most else '>='} {t.limit:g}{f' {t.unit}' if t.unit else ''}",
-            f"{number(t.found)}{_ends(t.interval)}", t.verdict(),
+            f"{number(t.found)}{_ends(t.interval)}{f'; {t.broken} failed or diverged' if t.broken else ''}",
+            t.verdict(),
         ]
         for t in found
     ]  # fmt: skip
-    about = "Reached or missed: by the whole interval; open: the interval holds the limit."
+    about = (
+        "Reached or missed: by the whole interval. Open: the interval holds the limit, or there is none "
+        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {OWN} that fails or diverges."
+    )
     return Table("Targets", about, ("target", "what", "limit", "found", "verdict"), tuple(lines))
 
 
@@ -139,7 +146,8 @@ def _nees(cells: Iterable[Cell]) -> Table:
         lines.append([ground, mode, str(max(c.drives for c in of.values())), *texts])
     about = (
         "Mean NEES of the position per dimension on each true ground [95 % interval over drives], inside "
-        "(=), above (+, overconfident) or below (-, cautious) the band of a consistent estimator."
+        "(=), above (+, overconfident) or below (-, cautious) the band of a consistent estimator; with fewer "
+        f"than {LEAST_UNITS} drives the mean alone."
     )
     heads = ("ground", "plant, arm", "drives", INSIDE, IN_OUTAGE)
     return Table("Consistency", about, heads, tuple(lines))
@@ -172,8 +180,10 @@ def _arms() -> Table:
     return Table("Names", "Arms, families of drives, and plants.", ("name", "is"), tuple(lines))
 
 
-def _ratio(c: Contrast | None) -> str:
-    return "-" if c is None else f"{c.ratio:.2f}{_ends(c.interval, 2)}"
+def _ratio(c: Contrast | None, units: int) -> str:
+    if c is None:
+        return "-"
+    return f"{c.ratio:.2f}{_ends(c.interval, 2)}{f' ({c.units})' if c.units != units else ''}"
 
 
 def _ends(interval: Interval | None, decimals: int | None = None) -> str:
@@ -184,6 +194,8 @@ def _ends(interval: Interval | None, decimals: int | None = None) -> str:
 
 
 def _cell(cell: Cell) -> str:
+    if cell.drives < LEAST_UNITS:
+        return f"{cell.mean:.2f}"
     (low, high), band = cell.interval, cell.band
     return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {MARKS[cell.verdict()]} {band[0]:.2f}..{band[1]:.2f}"
 

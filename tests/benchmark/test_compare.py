@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -9,6 +11,7 @@ from hypothesis import strategies as st
 
 from terrafusion.fusion.benchmark.compare import contrasts, median_interval, shares
 from terrafusion.fusion.benchmark.measure import GroundRow, Row, switch_delay_s
+from terrafusion.fusion.benchmark.plots import plot_ratios
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, nees_cells, targets
 from terrafusion.fusion.benchmark.text import markdown, tables
@@ -60,6 +63,59 @@ def test_pairing_takes_the_spread_of_the_drives_out() -> None:
     assert found.interval[1] - found.interval[0] < 0.05
 
 
+@pytest.mark.parametrize("units", range(2, 9))
+def test_few_units_have_no_interval_and_decide_nothing(units: int) -> None:
+    errors = np.linspace(0.4, 0.5, units)
+    all_rows = rows("fixed", np.ones(units)) + rows("adaptive", errors) + rows("oracle", 0.9 * errors)
+    found = next(c for c in contrasts(all_rows) if c.arm == "adaptive")
+    share = shares(all_rows)[0]
+    assert (found.interval is None) == (share.interval is None) == (units < 6)
+    verdict = next(t for t in targets(all_rows) if t.what == "mixed, twin: adaptive over fixed").verdict()
+    assert verdict == (OPEN if units < 6 else REACHED)
+    assert share.share is not None
+    if found.interval is not None:  # of so few units, all of them
+        assert found.interval == pytest.approx((0.4, 0.5))
+
+
+def test_a_failed_replay_loses_and_where_the_base_failed_nothing_is_compared() -> None:
+    def failing(arm: str, unit: str) -> Row:
+        return Row("mixed", "twin", unit, unit, arm, failed="RuntimeError: singular")
+
+    base = [failing("fixed", f"seed {i}") for i in (0, 1)] + rows("fixed", np.ones(12))[2:]
+    own = [failing("adaptive", "seed 0"), *rows("adaptive", np.full(12, 0.5))[1:4]]
+    own += [failing("adaptive", f"seed {i}") for i in range(4, 12)]
+    found = next(c for c in contrasts(base + own) if c.arm == "adaptive")
+    assert (found.units, found.wins, found.losses, found.ratio) == (10, 2, 8, np.inf)
+    assert found.interval == (0.5, np.inf)
+    assert {t.verdict() for t in targets(base + own)} == {OPEN}
+    text = "\n".join(line for table in tables(base + own) for line in markdown(table))
+    assert "inf [0.50, inf]" in text
+    plot_ratios(contrasts(base + own)).canvas.draw()
+    assert shares(base + own + rows("oracle", np.full(12, 0.4)))[0].share == -np.inf
+
+
+@pytest.mark.parametrize("trouble", [{"failed": "singular"}, {"error_m": 0.5, "diverged": "ran away"}])
+def test_one_field_log_that_fails_or_diverges_misses_its_target(trouble) -> None:
+    base, own = (
+        rows(arm, [e] * 8, family="field", plant="firm") for arm, e in (("fixed", 1.0), ("adaptive", 0.5))
+    )
+    (sound,) = targets(base + own)
+    assert (sound.name, sound.verdict()) == ("G9", REACHED)
+    broken = dataclasses.replace(own[0], error_m=None)
+    (target,) = targets([*base, *own[1:], dataclasses.replace(broken, **trouble)])
+    assert (target.broken, target.verdict()) == (1, MISSED)
+    (alone,) = targets([dataclasses.replace(broken, **trouble)])
+    assert alone.verdict() == MISSED
+
+
+def test_an_arm_of_fewer_drives_tells_their_number() -> None:
+    all_rows = rows("fixed", [1.0] * 8) + rows("adaptive", [0.9] * 8) + rows("oracle", [0.2] * 3)
+    cells = tables(all_rows)[0].rows[0]
+    assert cells[1] == "8"
+    assert "0.20 (3)" in cells
+    assert "0.90 [0.90, 0.90]" in cells
+
+
 def test_drives_that_one_arm_lacks_are_left_out() -> None:
     found = contrasts(rows("fixed", [1.0, 1.0, None]) + rows("adaptive", [0.5, None, 0.1]))
     assert [(c.arm, c.units, c.ratio) for c in found] == [("fixed", 2, 1.0), ("adaptive", 1, 0.5)]
@@ -84,14 +140,15 @@ def test_the_share_of_the_oracles_gain() -> None:
     assert shares(none)[0].share is None
 
 
-def test_intervals_cover_the_median_as_often_as_they_say() -> None:
+@pytest.mark.parametrize("units", [6, 7, 8, 9, 20, 25])
+def test_intervals_cover_the_median_at_least_as_often_as_they_say(units: int) -> None:
     rng = np.random.default_rng(5)
     covered = 0
-    for _ in range(200):
-        _, interval = median_interval(rng.normal(size=25).tolist())
+    for _ in range(1000):
+        _, interval = median_interval(rng.exponential(size=units).tolist())
         assert interval is not None
-        covered += interval[0] <= 0.0 <= interval[1]
-    assert 180 <= covered <= 200
+        covered += interval[0] <= np.log(2.0) <= interval[1]
+    assert covered >= 936  # two standard deviations below 950
 
 
 @pytest.mark.parametrize(
@@ -158,6 +215,15 @@ def test_consistency_pools_the_drives_of_a_ground() -> None:
     cells = nees_cells(rows("adaptive", [1.0] * 6, grounds=(ground("mud", 0.1),)))
     assert {(c.terrain, c.mode, c.drives, c.mean) for c in cells} == {("mud", "twin, adaptive", 6, 1.0)}
     assert {c.verdict() for c in cells} == {"consistent"}
+
+
+def test_consistency_of_few_drives_has_no_interval_and_no_verdict() -> None:
+    def cell(drives: int) -> str:
+        made = tables(rows("adaptive", [1.0] * drives, grounds=(ground("mud", 0.1),)))
+        return next(table for table in made if table.title == "Consistency").rows[0][3]
+
+    assert cell(5) == "1.00"
+    assert cell(6).startswith("1.00 [1.00, 1.00] = ")
 
 
 def test_tables_are_rectangular_and_tell_failures() -> None:
