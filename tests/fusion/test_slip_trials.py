@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafusion.fusion.scores.slip_trials import MOVING_MPS, mean_slip, true_slip
+from terrafusion.fusion.scores.slip_trials import (
+    MOVING_MPS,
+    Told,
+    delays_text,
+    mean_slip,
+    poisson_interval,
+    true_slip,
+)
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
@@ -23,3 +30,19 @@ def test_slip_of_a_keyframe_is_the_mean_of_its_span_and_unknown_at_rest() -> Non
     assert np.isfinite(slip[steady]).all()
     assert np.abs(slip - (1.0 - speed / np.maximum(rim, 0.1)))[steady].max() < 1e-3
     assert (slip[steady] > 0.0).all()  # driving wheels outrun the robot
+
+
+def test_delays_are_told_with_their_interval_and_with_what_was_never_told() -> None:
+    assert delays_text([Told(10.0, 11.0), Told(20.0, 21.0)]) == (
+        "1.00 s late [1.00, 1.00], at most 1.00 s; told in 2 of 2"
+    )
+    spread = delays_text([Told(0.0, 1.0), Told(0.0, 3.0), Told(0.0, None)])
+    assert spread.startswith("2.00 s late [1.00, 3.00], at most 3.00 s; told in 2 of 3")
+    assert delays_text([Told(0.0, None)]) == "never told in 1"
+
+
+def test_a_rate_of_no_alarms_has_the_interval_of_three_and_a_half_over_the_time() -> None:
+    low, high = poisson_interval(0, 3600.0)
+    assert (low, round(high, 2)) == (0.0, 3.69)  # -ln 0.025
+    low, high = poisson_interval(1, 4380.0)
+    assert low < 3600.0 / 4380.0 < high
