@@ -1,4 +1,4 @@
-"""`terrafusion policy fit`: the weighting policy from drives of the twin."""
+"""`terrafusion policy fit`: the weighting policy from drives of the twin, and from labelled logs."""
 
 from __future__ import annotations
 
@@ -18,25 +18,44 @@ def policy() -> None:
 @app.command("fit")
 def fit(
     out: Annotated[Path, typer.Option("--out", help="Policy file (YAML) to write.")],
+    logs: Annotated[
+        list[str] | None,
+        typer.Argument(help="Labelled logs with a truth; what they tell of a ground goes before the twin."),
+    ] = None,
     seeds: Annotated[
         int, typer.Option(min=1, max=1000, help="Seeds: soil, heading and noise drawn anew.")
     ] = 3,
+    ground: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="SOIL", help="Soil to drive on; repeat for more. By default the four the detector knows."
+        ),
+    ] = None,
+    vehicle: Annotated[
+        str | None,
+        typer.Option(help="Vehicle of the library that drives (elevate), and of logs that do not name one."),
+    ] = None,
 ) -> None:
     """Drive the twin over soils, slopes, payloads and speeds, and fit each sensor's noise on each ground.
 
     The `fixed` row is fitted to the same drives, all grounds pooled. Made again
-    with the same parameter files, the policy file has the same bytes.
+    with the same parameter files and logs, the policy file has the same bytes.
 
     Example: terrafusion policy fit --out policy.yaml
+    Example: terrafusion policy fit --out warthog.yaml --vehicle warthog norlab/*/raw_dataframe.pkl
     """
     from terrafusion.fusion.cli.terrain import checked_output, progress
-    from terrafusion.fusion.weights.policy_fit import default_grid, fit_policy, write_policy
+    from terrafusion.fusion.terrain.drives import GROUNDS
+    from terrafusion.fusion.weights.policy_fit import Logged, default_grid, fit_policy, write_policy
+    from terrafusion.fusion.weights.policy_logs import read_logs
 
     checked_output(out)
-    grid = default_grid(seeds)
+    grounds = chosen("soils", "soil", tuple(dict.fromkeys(ground or GROUNDS)))
+    grid = default_grid(seeds, grounds, *chosen("vehicles", "vehicle", (vehicle or "elevate",)))
+    logged = read_logs(logs, vehicle) if logs else Logged()
     with progress("drives", len(grid.conditions())) as tick:
-        fitted = fit_policy(grid, tick)
-    write_policy(fitted, out, made_by=f"terrafusion policy fit --seeds {seeds}")
+        fitted = fit_policy(grid, tick, logged)
+    write_policy(fitted, out, made_by=made_by(seeds, ground, vehicle, logs))
     print(f"{'':12s} slip           a grade   time   wheel  side-slip  gyro  accel  GNSS")
     print(f"{'':12s}                             s     m/s             x      x     x")
     for name, row in {**fitted.classes, "fixed": fitted.fixed}.items():
@@ -46,3 +65,26 @@ def fit(
             f"  {row.gyro_inflation:4.1f}  {row.accel_inflation:5.1f}  {row.gnss_inflation:4.2f}"
         )
     print(f"inputs {fitted.inputs_sha256[:16]}; written to {out}")
+
+
+def chosen(folder: str, kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
+    """The names, all of the library: the policy's hash is of its files.
+
+    Raises:
+        ConfigError: another name.
+    """
+    from terrafusion.datasets.errors import ConfigError
+    from terrafusion.twin.library import known_names
+
+    known = known_names(folder)
+    for name in names:
+        if name not in known:
+            raise ConfigError(f"unknown {kind} '{name}'", remedy=f"one of {', '.join(known)}")
+    return names
+
+
+def made_by(seeds: int, ground: list[str] | None, vehicle: str | None, logs: list[str] | None) -> str:
+    """The command, without the paths of logs: those differ from machine to machine."""
+    words = [f"terrafusion policy fit --seeds {seeds}", *(f"--ground {name}" for name in ground or [])]
+    words += [f"--vehicle {vehicle}"] if vehicle else []
+    return " ".join(words) + (f", {len(logs)} logs" if logs else "")

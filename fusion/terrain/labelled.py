@@ -96,12 +96,18 @@ def open_runs(logs: Sequence[str]) -> list[Run]:
 
 
 def hashes_of(logs: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of every file given by path, name by name: what a model was trained on."""
-    return {
-        "/".join(Path(log).parts[-2:]): hashlib.sha256(Path(log).read_bytes()).hexdigest()
-        for log in logs
-        if Path(log).is_file()
-    }
+    """SHA-256 of every file given by path, or in a folder given, name by name: what was learnt from.
+
+    Logs given by their name in the catalogue are pinned there.
+    """
+    hashes: dict[str, str] = {}
+    for log in logs:
+        path = Path(log) if Path(log).exists() else Path(log.rpartition("#")[0])
+        files = sorted(f for f in path.rglob("*") if f.is_file()) if log and path.is_dir() else [path]
+        hashes |= {
+            "/".join(f.parts[-2:]): hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.is_file()
+        }
+    return hashes
 
 
 def deal(runs: Sequence[Run], folds: int = FOLDS) -> NDArray[np.intp]:

@@ -11,15 +11,17 @@ import pytest
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.terrain.drives import Grid
 from terrafusion.fusion.weights.policy import Policy, load_policy
-from terrafusion.fusion.weights.policy_fit import (
+from terrafusion.fusion.weights.policy_evidence import (
     LAG_S,
-    RADIUS_SIGMA,
     SLIP_S,
     STUCK_COUNTS_S,
-    UNKNOWN_SPREAD,
     Evidence,
-    default_grid,
     evidence_of,
+)
+from terrafusion.fusion.weights.policy_fit import (
+    RADIUS_SIGMA,
+    UNKNOWN_SPREAD,
+    default_grid,
     fingerprint_of,
     fit_policy,
     row_of,

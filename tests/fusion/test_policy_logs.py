@@ -1,0 +1,221 @@
+"""Labelled logs as a source of the policy: motion from poses, labels, gaps, and what becomes of the rows."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from typer.testing import CliRunner
+
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.frames import rpy_to_quaternion
+from terrafusion.datasets.recording import Recording, Terrain, Wheels
+from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.fusion.cli.main import app
+from terrafusion.fusion.terrain.drives import Grid
+from terrafusion.fusion.weights import policy_fit
+from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.fusion.weights.policy_evidence import Evidence, evidence_of
+from terrafusion.fusion.weights.policy_fit import Logged, fingerprint_of, fit_policy
+from terrafusion.fusion.weights.policy_logs import MEAN_S, logged_evidence, motion_of, read_logs
+from terrafusion.twin.simulate import simulate
+from terrafusion.twin.vehicle import load_vehicle
+
+START_NS = 1_700_000_000_000_000_000
+TRACK_M = load_vehicle("warthog").rig().track_m
+GRID = Grid(("staircase",), (3.0,), (0.0,), (5,))
+
+
+def nanoseconds(t_s: np.ndarray) -> np.ndarray:
+    return START_NS + np.round(t_s * 1e9).astype(np.int64)
+
+
+def circled(
+    slip: float = 0.1, rate: float = 0.2, seconds: float = 40.0, heading: float = 0.3, noise_m: float = 0.0
+) -> Recording:
+    """Wheels that say 1 m/s and twice the yaw rate, on a robot that slips; poses at 10 Hz, wheels at 7 Hz."""
+    t, w = np.arange(0.0, seconds, 0.1), np.arange(0.0, seconds, 1.0 / 7.0)
+    yaw, v = heading + rate * t, 1.0 - slip
+    fine = np.linspace(0.0, seconds, 40_001)
+    way = np.cumsum(v * np.stack([np.cos(heading + rate * fine), np.sin(heading + rate * fine)]), axis=1)
+    xy = np.stack([np.interp(t, fine, x) for x in way * fine[1]], axis=1)
+    xy = xy + noise_m * np.random.default_rng(7).normal(size=xy.shape)
+    pose = Trajectory(
+        nanoseconds(t),
+        np.column_stack([xy, np.full(len(t), np.nan)]),
+        np.stack([rpy_to_quaternion([0.0, 0.0, y]) for y in yaw]),
+    )
+    spin = rate * TRACK_M  # half of it on each side, times two
+    speeds = np.tile([1.0 - spin, 1.0 + spin], (len(w), 1))
+    return Recording(
+        "made", START_NS, vehicle="warthog", truth=pose, truth_channels=("position", "yaw"),
+        wheels=Wheels(nanoseconds(w), speeds, ("left", "right"), "mps"), terrain_name="grass",
+    )  # fmt: skip
+
+
+@settings(deadline=None)
+@given(st.floats(-0.3, 0.6), st.floats(-0.4, 0.4), st.floats(-3.0, 3.0))
+def test_slip_and_yaw_scale_of_a_circle_are_exact(slip: float, rate: float, heading: float) -> None:
+    evidence = logged_evidence(circled(slip, rate, 12.0, heading))["grass"]
+    assert evidence.slip == pytest.approx(slip, abs=1e-3)
+    assert evidence.side_slip == pytest.approx(0.0, abs=2e-3)
+    if abs(rate) > 0.06:
+        assert evidence.yaw_scale == pytest.approx(-0.5, abs=1e-6)
+
+
+def test_a_pose_good_to_2_cm_tells_slip_to_less_than_2_percent() -> None:
+    slips = logged_evidence(circled(noise_m=0.02, seconds=400.0))["grass"].slip
+    assert np.std(slips) == pytest.approx(np.sqrt(2.0) * 0.02 / MEAN_S, rel=0.3)
+    assert np.mean(slips) == pytest.approx(0.1, abs=0.003)
+
+
+def test_poses_of_the_twin_tell_what_its_true_velocity_tells() -> None:
+    for scenario in ("staircase", "figure_eight"):
+        drive = simulate(scenario, terrain="loose_sand", seed=3)
+        known = evidence_of(drive)
+        assert drive.truth is not None
+        blind = dataclasses.replace(drive, truth=dataclasses.replace(drive.truth, twist_body=None))
+        found = logged_evidence(blind)["loose_sand"]
+        assert np.median(found.slip) == pytest.approx(np.median(known.slip), abs=0.01)
+        assert len(found.wheel_mps) == len(found.gyro) == len(found.accel) == len(found.gnss) == 0
+        if scenario == "figure_eight":
+            assert np.median(found.yaw_scale) == pytest.approx(np.median(known.yaw_scale), abs=0.02)
+            assert np.std(found.side_slip) < 2.0 * np.std(known.side_slip) + 0.01
+
+
+def test_a_mean_over_two_grounds_is_of_neither() -> None:
+    labels = Terrain(nanoseconds(np.array([0.0, 15.0])), np.array(["grass", "gravel"]))
+    found = logged_evidence(dataclasses.replace(circled(), terrain=labels))
+    assert set(found) == {"grass", "gravel"}
+    apart = len(logged_evidence(circled())["grass"].slip) - sum(len(e.slip) for e in found.values())
+    assert apart in (3, 4, 5)  # two seconds of means every half second
+
+
+def test_nothing_is_known_across_a_gap() -> None:
+    whole = circled()
+    assert whole.truth is not None
+    holed = whole.truth.select(np.r_[0:100, 150:400])
+    motion = motion_of(dataclasses.replace(whole, truth=holed))
+    middle = (motion.t_ns - START_NS) * 1e-9
+    silent = np.isnan(motion.forward_mps)
+    assert silent[(middle > 9.0) & (middle < 15.9)].all()
+    assert not silent[(middle < 8.8) | (middle > 16.2)].any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"wheels": None}, "wheels of both sides"),
+        ({"truth": None}, "truth with position and yaw"),
+        ({"truth_channels": ("position",)}, "truth with position and yaw"),
+        ({"truth_frame": "antenna"}, "truth with position and yaw"),
+        ({"terrain_name": ""}, "no ground label"),
+        ({"vehicle": None}, "--vehicle"),
+    ],
+)
+def test_a_log_that_lacks_something_is_refused(changes: dict[str, object], words: str) -> None:
+    recording = dataclasses.replace(circled(), **changes)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=words):
+        logged_evidence(recording)
+
+
+def test_labels_of_the_detector_itself_are_none() -> None:
+    guess = Terrain(nanoseconds(np.array([0.0])), np.array(["mud"]), "detector")
+    with pytest.raises(DataError, match="no ground label"):
+        logged_evidence(dataclasses.replace(circled(), terrain=guess, terrain_name=""))
+
+
+def test_too_little_driving_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.datasets.readers.open_recordings", lambda log: [circled(seconds=8.0)])
+    with pytest.raises(DataError, match="slips with one 2 s later on 'grass'"):
+        read_logs(["made"])
+
+
+def test_a_log_goes_before_the_twin_and_the_rest_stays() -> None:
+    told = logged_evidence(circled(slip=0.25, seconds=120.0))["grass"]
+    plain = fit_policy(GRID)
+    logged = Logged({"asphalt": told, "grass": told}, {"a.csv": "12ab"})
+    fitted = fit_policy(GRID, logged=logged)
+    assert fitted.names() == ("asphalt", "medium_sand", "loose_sand", "mud", "grass", "unknown")
+    for name in ("asphalt", "grass"):
+        assert fitted.classes[name].slip_mean == pytest.approx(0.25, abs=1e-3)
+        assert fitted.classes[name].yaw_scale_mean == pytest.approx(-0.5, abs=1e-3)
+    for name in ("medium_sand", "loose_sand", "mud"):
+        assert fitted.classes[name] == plain.classes[name]
+    sensors = ("wheel_sigma_mps", "gyro_inflation", "accel_inflation", "gnss_inflation")
+    for name in sensors:
+        assert getattr(fitted.classes["asphalt"], name) == getattr(plain.classes["asphalt"], name)
+        seen = [getattr(row, name) for ground, row in plain.classes.items() if ground != "unknown"]
+        assert min(seen) <= getattr(fitted.classes["grass"], name) <= max(seen)
+    assert plain.inputs_sha256 == fingerprint_of(GRID)
+    assert fitted.inputs_sha256 == fingerprint_of(GRID, logged) != plain.inputs_sha256
+
+
+def test_evidence_is_completed_quantity_by_quantity() -> None:
+    none, pairs = np.empty(0), np.empty((0, 2))
+    some = Evidence(np.ones(3), np.zeros(3), pairs, pairs, *([none] * 6))
+    other = Evidence(np.zeros(2), np.ones(2), np.ones((4, 2)), np.ones((4, 2)), *([np.ones(5)] * 6))
+    whole = some.completed_by(other)
+    assert whole.slip.tolist() == [1.0, 1.0, 1.0]
+    assert len(whole.slip_pairs) == 4
+    assert len(whole.gnss) == 5
+
+
+@pytest.fixture
+def few_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(policy_fit, "SCENARIOS", ("staircase",))
+    monkeypatch.setattr(policy_fit, "SLOPES_DEG", (0.0,))
+    monkeypatch.setattr(policy_fit, "PAYLOADS_KG", (0.0,))
+
+
+@pytest.mark.usefixtures("few_drives")
+def test_the_command_takes_soils_and_logs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.datasets.readers.open_recordings", lambda log: [circled()])
+    log = tmp_path / "drive.csv"
+    log.write_text("any\n")
+    out = tmp_path / "policy.yaml"
+    words = ["policy", "fit", "--out", str(out), "--seeds", "1", "--ground", "gravel", str(log)]
+    result = CliRunner().invoke(app, words)
+    assert result.exit_code == 0, result.output
+    policy = load_policy(out)
+    assert policy.names() == ("gravel", "grass", "unknown")
+    assert policy.classes["grass"].slip_mean == pytest.approx(0.1, abs=1e-3)
+    first = out.read_bytes()
+    assert str(tmp_path).encode() not in first
+    CliRunner().invoke(app, words)
+    assert out.read_bytes() == first
+    log.write_text("another\n")
+    CliRunner().invoke(app, words)
+    assert load_policy(out).inputs_sha256 != policy.inputs_sha256
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [(["--ground", "lava"], "unknown soil 'lava'"), (["--vehicle", "boat"], "unknown vehicle 'boat'")],
+)
+def test_an_unknown_soil_or_vehicle_is_refused_at_once(
+    tmp_path: Path, words: list[str], message: str
+) -> None:
+    result = CliRunner().invoke(app, ["policy", "fit", "--out", str(tmp_path / "p.yaml"), *words])
+    assert result.exit_code != 0
+    assert message in str(result.exception) + result.output
+
+
+FIELD = os.environ.get("TERRAFUSION_DATA", "")
+
+
+@pytest.mark.skipif(not FIELD, reason="TERRAFUSION_DATA names no folder of field logs")
+def test_a_real_warthog_on_grass() -> None:
+    log = Path(FIELD) / "norlab_drive/warthog_wheels_grass_2024_8_8_16h11s19/raw_dataframe.pkl"
+    if not log.exists():
+        pytest.skip("no norlab_drive among the field logs")
+    logged = read_logs([str(log)])
+    row = policy_fit.row_of([logged.grounds["grass"]])
+    assert 0.0 < row.slip_mean < 0.1
+    assert -0.6 < row.yaw_scale_mean < -0.3  # docs/planar.md: what its yaw loses on any ground
+    assert list(logged.inputs) == [f"{log.parent.name}/{log.name}"]
