@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.terrain.drives import GROUNDS, Grid, run_all
-from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise
+from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise, within_ranges
 from terrafusion.fusion.weights.policy_evidence import (
     ACCEL_S,
     BIAS_S,
@@ -162,12 +162,16 @@ def _spread(row: SensorNoise) -> SensorNoise:
         for name, value in dataclasses.asdict(row).items()
         if name not in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean", "gnss_inflation")
     }
-    return dataclasses.replace(row, **{**changes, "slip_sigma": min(changes["slip_sigma"], 1.0)})
+    return dataclasses.replace(row, **changes)
 
 
 def _rounded(row: SensorNoise) -> SensorNoise:
-    """Four significant digits: the last bits of a sum differ from machine to machine, the file must not."""
-    return SensorNoise(*(float(f"{value:.{DIGITS}g}") for value in dataclasses.astuple(row)))
+    """Four significant digits: the last bits of a sum differ from machine to machine, the file must not.
+
+    And inside the ranges of the file: a robot that does not turn at all in mud has a yaw scale of -1.
+    """
+    digits = (float(f"{value:.{DIGITS}g}") for value in dataclasses.astuple(row))
+    return within_ranges(SensorNoise(*digits))
 
 
 def fingerprint_of(grid: Grid, logged: Logged = Logged()) -> str:

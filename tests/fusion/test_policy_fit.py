@@ -10,7 +10,7 @@ import pytest
 
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.terrain.drives import Grid
-from terrafusion.fusion.weights.policy import Policy, load_policy
+from terrafusion.fusion.weights.policy import Policy, load_policy, within_ranges
 from terrafusion.fusion.weights.policy_evidence import (
     LAG_S,
     SLIP_S,
@@ -112,6 +112,26 @@ def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
     assert pooled.slip_mean == pytest.approx(matched.slip_mean, rel=1e-9)
     assert pooled.slip_sigma >= matched.slip_sigma * (1 - 1e-9)  # the rms is least about the mean
     assert pooled.accel_inflation == pytest.approx(matched.accel_inflation, rel=1e-9)
+
+
+def test_a_row_beyond_what_a_file_may_hold_is_brought_inside() -> None:
+    row = load_policy().fixed
+    wild = dataclasses.replace(row, yaw_scale_mean=-0.997, slip_sigma=1.3, slip_per_grade=55.0)
+    tame = within_ranges(wild)
+    assert (tame.yaw_scale_mean, tame.slip_sigma, tame.slip_per_grade) == (-0.95, 1.0, 20.0)
+    assert within_ranges(row) == row
+
+
+def test_any_soil_of_the_library_is_covered_by_the_row_of_unknown() -> None:
+    # Soils without a row are *unknown* to the estimator; so its row must hold for them.
+    row = load_policy().classes["unknown"]
+    for soil in ("gravel", "grass", "ploughed_soil", "snow"):
+        for condition in Grid(("staircase",), (0.0, 6.0), (30.0,), (9,), (soil,)).conditions():
+            evidence = evidence_of(condition.run())
+            away = (evidence.slip - row.slip_mean - row.slip_per_grade * evidence.grade) / row.slip_sigma
+            assert np.mean(np.abs(away) < 2.0) > 0.95, (soil, condition.slope_deg)
+            assert row_of([evidence]).side_slip_sigma < row.side_slip_sigma
+            assert row_of([evidence]).gyro_inflation < row.gyro_inflation
 
 
 def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
