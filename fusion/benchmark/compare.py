@@ -99,7 +99,8 @@ def errors_by_unit(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]
     """arm -> unit -> drive -> error in m, infinite where the replay failed; without one it is left out."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
-        error = math.inf if row.failed else row.error_m
+        broken = row.failed or (row.diverged and row.error_m is None)
+        error = math.inf if broken else row.error_m
         if error is not None:
             by_unit = out.setdefault(row.arm, {}).setdefault(row.unit, {})
             by_unit[row.drive] = max(error, LEAST_ERROR_M)

@@ -6,15 +6,14 @@ import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from terrafusion.datasets.errors import TerrafusionError, errors_of
-from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.benchmark.arms import known_labels, true_labels
 from terrafusion.fusion.benchmark.drives import FIELD, Drive
 from terrafusion.fusion.scores.field_table import (
-    LEAST_DRIVE_S,
+    Refusal,
     catalogued,
     check_log,
+    each_drive,
     ground_of,
     outages_of,
     reference_of,
@@ -39,37 +38,14 @@ class Log:
         return f"{FIELD}-{self.starts}-{self.name.replace('/', '_').replace('#', '_')}"
 
 
-@dataclass(frozen=True)
-class Refused:
-    """A log, or a recording of it, that is not run, and why."""
-
-    log: str
-    why: str
-
-
 def logs_at_hand(starts: int) -> list[Log]:
     """Logs of the catalogue whose files are there."""
     return [Log(name, starts) for name in catalogued()]
 
 
-def drives_of(log: Log) -> Iterator[Drive | Refused]:
+def drives_of(log: Log) -> list[Drive | Refusal]:
     """All drives of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
-    try:
-        recordings = open_recordings(log.name)
-    except TerrafusionError as error:
-        yield Refused(log.name, str(error))
-        return
-    longest = max(r.duration_s() for r in recordings)
-    if len(recordings) > 1 and longest < LEAST_DRIVE_S:
-        yield Refused(log.name, f"{len(recordings)} pieces of at most {longest:.1f} s, no drive")
-        return
-    for i, recording in enumerate(recordings):
-        name = log.name if len(recordings) == 1 else f"{log.name}#{i}"
-        try:
-            with errors_of(name):
-                yield from _drives(log, name, recording)
-        except TerrafusionError as error:
-            yield Refused(name, str(error))
+    return each_drive(log.name, lambda name, recording: _drives(log, name, recording))
 
 
 def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:

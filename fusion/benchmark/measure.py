@@ -16,6 +16,7 @@ from terrafusion.fusion.benchmark.drives import Drive
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.fusion.scores.consistency import ground_at, position, summarise
 from terrafusion.fusion.scores.error_series import Errors
+from terrafusion.fusion.scores.field_table import UNFORESEEN
 from terrafusion.fusion.scores.health import examine_estimate
 from terrafusion.fusion.scores.metrics import OutageScore
 
@@ -97,7 +98,7 @@ def measure(drive: Drive, arm: Arm) -> Row | None:
         result = replay(drive.recording, outages=[drive.outage] if drive.outage else [], **options)
     except TerrafusionError as error:
         return dataclasses.replace(empty, failed=str(error))
-    except (ArithmeticError, RuntimeError, ValueError) as error:  # of the solver: counted, not hidden
+    except UNFORESEEN as error:
         return dataclasses.replace(empty, failed=f"{type(error).__name__}: {error}")
     return _measured(empty, drive, result)
 

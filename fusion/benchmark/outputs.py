@@ -27,7 +27,7 @@ from terrafusion.fusion.benchmark.targets import nees_cells, targets
 from terrafusion.fusion.benchmark.text import Table, markdown, tables
 from terrafusion.fusion.report import page
 from terrafusion.fusion.report.outputs import to_json
-from terrafusion.fusion.scores.parts import sources_sha256
+from terrafusion.fusion.scores.parts import LIBRARIES, hash_sources, sources_sha256
 from terrafusion.fusion.scores.twin_consistency import Cell
 from terrafusion.fusion.weights.modes import load_modes
 from terrafusion.fusion.weights.policy import load_policy
@@ -40,13 +40,12 @@ CAPTION = (
 )
 
 
-def write_benchmark(out: Path, plan: Plan, found: Found, command: str) -> list[Table]:
+def write_benchmark(out: Path, found: Found, origin: Mapping[str, str]) -> list[Table]:
     """All files but the parts; returns the tables.
 
     Raises:
         TerrafusionError: a file cannot be written.
     """
-    origin = origin_of(plan, command)
     made = tables(found.rows)
     _text(out / "benchmark.json", to_json(_content(found, origin), indent=1) + "\n")
     _text(out / "benchmark.md", "\n".join(document_lines(made, found, origin)) + "\n")
@@ -56,12 +55,21 @@ def write_benchmark(out: Path, plan: Plan, found: Found, command: str) -> list[T
     return made
 
 
-def write_document(path: Path, made: Sequence[Table], plan: Plan, found: Found, command: str) -> None:
+def write_document(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> None:
     """Put the tables into a document: what follows its line `MARK` is replaced, the rest is kept.
 
     Raises:
         ConfigError: the file is not there, or has no such line.
         TerrafusionError: it cannot be written.
+    """
+    _text(path, document_head(path) + MARK + "\n\n" + "\n".join(document_lines(made, found, origin)) + "\n")
+
+
+def document_head(path: Path) -> str:
+    """What stands before the line `MARK` of a document.
+
+    Raises:
+        ConfigError: the file is not there, or has no such line.
     """
     try:
         head, mark, _ = path.read_text(encoding="utf-8").partition(MARK)
@@ -71,12 +79,11 @@ def write_document(path: Path, made: Sequence[Table], plan: Plan, found: Found, 
         raise ConfigError(
             "is no document with a place for the tables", file=path, remedy=f"add a line {MARK}"
         )
-    lines = document_lines(made, found, origin_of(plan, command))
-    _text(path, head + MARK + "\n\n" + "\n".join(lines) + "\n")
+    return head
 
 
 def origin_of(plan: Plan, command: str) -> dict[str, str]:
-    """What the numbers were made by and of."""
+    """What the numbers are made by and of: to be asked before they are made."""
     return {
         "command": command,
         "commit": commit() or "not from a checkout",
@@ -87,13 +94,28 @@ def origin_of(plan: Plan, command: str) -> dict[str, str]:
     }
 
 
+def at_the_end(origin: Mapping[str, str]) -> dict[str, str]:
+    """The origin, which says so where the sources are no longer those of the beginning."""
+    note = "" if hash_sources()[:16] == origin["sources"] else ", changed while it ran"
+    return {**origin, "sources": origin["sources"] + note}
+
+
 def commit() -> str:
-    """Commit of the checkout that this library runs from, "-dirty" where files differ; "" without one."""
-    words = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=12"]
+    """Commit of the checkout that this library runs from, "-dirty" where files differ; "" without one.
+
+    An installed library lies in nobody's checkout, even where the folder above it is one.
+    """
+    file = Path(__file__)
     try:
-        return subprocess.run(words, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+        _git(file.parent, "ls-files", "--error-unmatch", file.name)
+        return _git(file.parent, "describe", "--always", "--dirty", "--abbrev=12")
     except (OSError, subprocess.SubprocessError):
         return ""
+
+
+def _git(folder: Path, *words: str) -> str:
+    command = ["git", "-C", str(folder), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
 
 def document_lines(made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> list[str]:
@@ -141,7 +163,7 @@ def _page(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, 
     if found.refused:
         refused = (f"{escape(one.log)}: {escape(one.why)}" for one in found.refused)
         body += ["<h2>Logs not run</h2>", page.bullets(refused)]
-    body.append(page.where_from(origin, ("gtsam", "casadi", "numpy", "scipy")))
+    body.append(page.where_from(origin, LIBRARIES))
     page.write_page(path, "Fixed against adaptive weighting", body)
 
 

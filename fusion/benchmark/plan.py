@@ -86,7 +86,7 @@ def families_of(words: Sequence[str]) -> dict[str, int | None]:
     """Families from words `NAME` or `NAME=SEEDS`; all of them and the field where there is no word.
 
     Raises:
-        ConfigError: an unknown name, or seeds that are no number.
+        ConfigError: an unknown name, seeds that are no number, or seeds of the field.
     """
     known = (*FAMILIES, FIELD)
     found: dict[str, int | None] = {}
@@ -96,5 +96,7 @@ def families_of(words: Sequence[str]) -> dict[str, int | None]:
             raise ConfigError(f"unknown family '{name}'", remedy=f"known are {', '.join(known)}")
         if equals and not count.isdecimal():
             raise ConfigError(f"'{word}' names no number of seeds", remedy=f"write {name} or {name}=20")
+        if equals and name == FIELD:
+            raise ConfigError(f"'{word}': field logs have no seeds", remedy=f"write {FIELD}")
         found[name] = int(count) if equals else None
     return {name: found.get(name) for name in known if name in found or not words}

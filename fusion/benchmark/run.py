@@ -6,14 +6,16 @@ import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.drives import Case, drive_of
-from terrafusion.fusion.benchmark.field import Refused, drives_of
+from terrafusion.fusion.benchmark.field import drives_of
 from terrafusion.fusion.benchmark.measure import Row, measure
 from terrafusion.fusion.benchmark.plan import Job, Plan
-from terrafusion.fusion.scores.parts import read_part, write_part
+from terrafusion.fusion.scores.field_table import Refusal
+from terrafusion.fusion.scores.parts import log_state, prepare, read_part, write_part
 from terrafusion.twin.pools import open_pool
 
 
@@ -22,7 +24,12 @@ class Found:
     """All rows of a plan, and what was not run; the same plan and sources find the same but for `seconds`."""
 
     rows: tuple[Row, ...]
-    refused: tuple[Refused, ...]
+    refused: tuple[Refusal, ...]
+
+    @classmethod
+    def read(cls, raw: dict[str, Any]) -> Found:
+        """What a part holds."""
+        return cls(tuple(map(Row.read, raw["rows"])), tuple(Refusal(**one) for one in raw["refused"]))
 
 
 def run_benchmark(
@@ -31,7 +38,7 @@ def run_benchmark(
     """Run the jobs whose results `out` does not hold yet, and return the rows of all, in the plan's order.
 
     Args:
-        out: folder; parts of other sources in it are computed anew.
+        out: folder; parts of other sources or files in it, and refused logs, are computed anew.
         jobs: processes.
         progress: told the share of the jobs that is done, from 0 to 1.
 
@@ -45,27 +52,39 @@ def run_benchmark(
             "there is nothing to run: no field log is at hand",
             remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`, or leave out --only field",
         )
-    missing = [job for job in wanted if read_part(out, job.key) is None]
-    done = len(wanted) - len(missing)
+    prepare(out)
+    found = {job: kept for job in wanted if (kept := _kept(out, job)) is not None}
+    missing = [job for job in wanted if job not in found]
     with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
-        for job, found in pool.results(run_job, [(job,) for job in missing]):
-            write_part(out, job.key, dataclasses.asdict(found))
-            done += 1
+        for job, new in pool.results(run_job, [(job,) for job in missing]):
+            found[job] = Found.read(write_part(out, job.key, dataclasses.asdict(new), _state(job)))
             if progress is not None:
-                progress(done / len(wanted))
-    parts = [part for job in wanted if (part := read_part(out, job.key)) is not None]
-    rows = tuple(Row.read(raw) for part in parts for raw in part["rows"])
-    refused = dict.fromkeys(Refused(**raw) for part in parts for raw in part["refused"])
-    return Found(rows, tuple(refused))
+                progress(len(found) / len(wanted))
+    rows = tuple(row for job in wanted for row in found[job].rows)
+    return Found(rows, tuple(dict.fromkeys(one for job in wanted for one in found[job].refused)))
+
+
+def _kept(out: Path, job: Job) -> Found | None:
+    """What `out` holds of a job; None also where something was refused: it may be mended by now."""
+    try:
+        part = read_part(out, job.key, _state(job))
+        found = None if part is None else Found.read(part)
+    except (KeyError, TypeError):  # JSON, but no part
+        return None
+    return None if found is None or found.refused else found
+
+
+def _state(job: Job) -> str:
+    return "" if isinstance(job.item, Case) else log_state(job.item.name)
 
 
 def run_job(job: Job) -> tuple[Job, Found]:
     """The job, and what every drive of it gives with every arm of it."""
     arms = [arm for arm in ARMS if arm.name in job.arms]
     rows: list[Row] = []
-    refused: list[Refused] = []
+    refused: list[Refusal] = []
     for drive in [drive_of(job.item)] if isinstance(job.item, Case) else drives_of(job.item):
-        if isinstance(drive, Refused):
+        if isinstance(drive, Refusal):
             refused.append(drive)
         else:
             chosen = arms if drive.judged else [arm for arm in arms if arm.name in (OWN, BASE)]

@@ -41,21 +41,31 @@ def benchmark(
     """
     import joblib
 
-    from terrafusion.fusion.benchmark.outputs import write_benchmark, write_document
+    from terrafusion.fusion.benchmark.outputs import (
+        at_the_end,
+        document_head,
+        origin_of,
+        write_benchmark,
+        write_document,
+    )
     from terrafusion.fusion.benchmark.plan import Plan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.benchmark.text import markdown
 
     plan = Plan(families_of(only or []), seeds, quick)
-    with progress_bar("benchmark") as progress:
-        found = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]
     words += [f"--seeds {seeds}"] if seeds else []
     words += [f"--only {name}" for name in only or []]
     command = " ".join(["terrafusion benchmark --out DIR", *words])
-    made = write_benchmark(out, plan, found, command)
+    origin = origin_of(plan, command)
     if docs is not None:
-        write_document(docs, made, plan, found, command)
+        document_head(docs)  # refused now, not when all is computed
+    with progress_bar("benchmark") as progress:
+        found = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
+    origin = at_the_end(origin)
+    made = write_benchmark(out, found, origin)
+    if docs is not None:
+        write_document(docs, made, found, origin)
     for table in made[:3]:
         print("\n".join([*markdown(table), ""]))
     print(f"report: {out / 'report.html'}")

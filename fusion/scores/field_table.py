@@ -18,10 +18,10 @@ import dataclasses
 import functools
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import quote
 
 import numpy as np
@@ -36,7 +36,7 @@ from terrafusion.fusion.replay import Replay, choose_vehicle, replay
 from terrafusion.fusion.scores.health import examine_estimate, rolled_until_m
 from terrafusion.fusion.scores.metrics import Outage
 from terrafusion.fusion.scores.outage_plan import aided_by_truth, lead_s, plan_outages, until
-from terrafusion.fusion.scores.parts import read_part, write_part
+from terrafusion.fusion.scores.parts import log_state, prepare, read_part, write_part
 from terrafusion.twin.pools import open_pool
 
 OUTAGES_S = (30.0, 60.0, 120.0)
@@ -49,6 +49,9 @@ LEAST_ROLLED_M = 3.0
 FIRST_MODES = ("adaptive", "fixed")
 """Run on every log before the other modes: a table that was stopped compares these two everywhere."""
 SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
+UNFORESEEN = (ArithmeticError, RuntimeError, ValueError)
+"""Errors of readers and solver that stop one replay, counted and not hidden, but not the whole table."""
+Found = TypeVar("Found")
 SET_GROUND = {"husky_parkinglot": "firm"}
 """Ground of sets whose logs carry no label but whose title names it."""
 
@@ -135,12 +138,13 @@ def run_tasks(
     Raises:
         TerrafusionError: workers died, or the folder cannot be written.
     """
-    missing = [task for task in tasks if read_part(out, task.key) is None]
+    prepare(out)
+    missing = [task for task in tasks if read_part(out, task.key, log_state(task.log)) is None]
     with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
         for task, found in pool.results(run_task, [(task,) for task in missing]):
             runs = [dataclasses.asdict(r) for r in found if isinstance(r, Run)]
             refused = [dataclasses.asdict(r) for r in found if isinstance(r, Refusal)]
-            write_part(out, task.key, {"runs": runs, "refused": refused})
+            write_part(out, task.key, {"runs": runs, "refused": refused}, log_state(task.log))
             progress(f"{task.log}, {task.mode}")
 
 
@@ -152,7 +156,7 @@ def collect(
     refusals: dict[Refusal, None] = {}
     missing: list[Task] = []
     for task in (Task(log, mode, most_starts, seed) for log in logs for mode in modes):
-        part = read_part(out, task.key)
+        part = read_part(out, task.key, log_state(task.log))
         if part is None:
             missing.append(task)
             continue
@@ -173,23 +177,32 @@ def catalogued() -> list[str]:
 
 def run_task(task: Task) -> tuple[Task, list[Run | Refusal]]:
     """The task, and all runs of its log in its mode; what stops one becomes a line that says so."""
+    return task, each_drive(task.log, lambda log, drive: _runs(dataclasses.replace(task, log=log), drive))
+
+
+def each_drive(log: str, run: Callable[[str, Recording], Iterable[Found | Refusal]]) -> list[Found | Refusal]:
+    """What `run` gives for name and recording of every drive of a log; what stops it becomes a refusal."""
+    out: list[Found | Refusal] = []
     try:
-        recordings = _recordings(task.log)
-    except TerrafusionError as error:
-        return task, [Refusal(task.log, str(error))]
-    longest = max(r.duration_s() for r in recordings)
-    if len(recordings) > 1 and longest < LEAST_DRIVE_S:
-        why = f"holds {len(recordings)} pieces of at most {longest:.1f} s, no drive"
-        return task, [Refusal(task.log, why)]
-    out: list[Run | Refusal] = []
+        recordings = _recordings(log)
+        longest = max(r.duration_s() for r in recordings)
+        if len(recordings) > 1 and longest < LEAST_DRIVE_S:
+            raise DataError(f"holds {len(recordings)} pieces of at most {longest:.1f} s, no drive")
+    except (TerrafusionError, *UNFORESEEN) as error:
+        return [_refusal(log, error)]
     for i, recording in enumerate(recordings):
-        log = task.log if len(recordings) == 1 else f"{task.log}#{i}"
+        name = log if len(recordings) == 1 else f"{log}#{i}"
         try:
-            with errors_of(log):
-                out += list(_runs(dataclasses.replace(task, log=log), recording))
-        except TerrafusionError as error:
-            out.append(Refusal(log, str(error)))
-    return task, out
+            with errors_of(name):
+                out += run(name, recording)
+        except (TerrafusionError, *UNFORESEEN) as error:
+            out.append(_refusal(name, error))
+    return out
+
+
+def _refusal(name: str, error: Exception) -> Refusal:
+    known = isinstance(error, TerrafusionError)
+    return Refusal(name, str(error) if known else f"FAILED, {type(error).__name__}: {error}")
 
 
 @functools.lru_cache(maxsize=1)
@@ -220,8 +233,8 @@ def _tried(
         result = replay(recording, mode=task.mode, outages=[] if outage is None else [outage])
     except TerrafusionError as error:
         return Refusal(where, str(error))
-    except (ArithmeticError, RuntimeError, ValueError) as error:
-        return Refusal(f"{where}, {task.mode}", f"FAILED, {type(error).__name__}: {error}")
+    except UNFORESEEN as error:
+        return _refusal(f"{where}, {task.mode}", error)
     return _run(task, result, reference, test, outage)
 
 

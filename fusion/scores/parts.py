@@ -1,6 +1,6 @@
 """Results of a long run, kept piece by piece: a run that was stopped goes on with the same command.
 
-parts/<key>.json     what one piece gave, with the hash of the sources that made it
+parts/<key>.json     what one piece gave, with the hash of the sources and the state of the files that made it
 """
 
 from __future__ import annotations
@@ -8,40 +8,91 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-from importlib import resources
+import tempfile
+from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.atomic import write_atomically
+from terrafusion.datasets.atomic import unwritable, write_atomically
+from terrafusion.datasets.catalog import load_catalog
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.readers.open import find_log
 from terrafusion.fusion.report.outputs import to_json
 
 FOLDER = "parts"
+LIBRARIES = ("casadi", "gtsam", "numpy", "scipy")
+"""Their versions make the numbers, too."""
 
 
-def write_part(out: Path, key: str, content: dict[str, Any]) -> None:
-    """Keep what the piece `key`, the name of its file, gave.
+def prepare(out: Path) -> None:
+    """Make the folder of the parts: to be called before anything is computed.
+
+    Raises:
+        TerrafusionError: it cannot be made or written.
+    """
+    try:
+        (out / FOLDER).mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out / FOLDER).close()
+    except OSError as error:
+        raise unwritable(out, error) from None
+
+
+def write_part(out: Path, key: str, content: dict[str, Any], state: str = "") -> dict[str, Any]:
+    """Keep what the piece `key`, the name of its file, gave; returns it as `read_part` does.
+
+    Args:
+        state: of the files that it was made of, such as `log_state`.
 
     Raises:
         TerrafusionError: the folder cannot be written.
     """
-    text = to_json({"sources_sha256": sources_sha256(), **content})
+    text = to_json({"sources_sha256": sources_sha256(), "state": state, **content})
     write_atomically(_file(out, key), lambda part: part.write_text(text, encoding="utf-8"))
+    part: dict[str, Any] = json.loads(text)
+    return part
 
 
-def read_part(out: Path, key: str) -> dict[str, Any] | None:
-    """What the piece `key` gave, None where it is missing, cut short, or of other sources."""
+def read_part(out: Path, key: str, state: str = "") -> dict[str, Any] | None:
+    """What the piece `key` gave, None where it is missing, cut short, or of other sources or files."""
     try:
         part: dict[str, Any] = json.loads(_file(out, key).read_text(encoding="utf-8"))
-        fresh = part["sources_sha256"] == sources_sha256()
+        fresh = (part["sources_sha256"], part["state"]) == (sources_sha256(), state)
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return part if fresh else None
 
 
+def log_state(log: str) -> str:
+    """Hash of names, sizes and times of the files of a log.
+
+    Empty for a log of the catalogue: it is only read with the bytes that the catalogue, one of the sources,
+    tells. Empty as well where there is no such log.
+    """
+    if log in load_catalog().recordings():
+        return ""
+    try:
+        place, _ = find_log(log)
+    except TerrafusionError:
+        return ""
+    digest = hashlib.sha256()
+    for file in sorted([place, *place.rglob("*")]):
+        if file.is_file():
+            found = file.stat()
+            digest.update(f"{file.relative_to(place)}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
+    return digest.hexdigest()
+
+
 @functools.cache
 def sources_sha256() -> str:
-    """Hash of everything that makes the numbers: pieces of two versions are not mixed."""
+    """`hash_sources` as it was when this process first asked: pieces of two versions are not mixed."""
+    return hash_sources()
+
+
+def hash_sources() -> str:
+    """Hash of everything that makes the numbers: this library and the `LIBRARIES` it computes with."""
     digest = hashlib.sha256()
+    for name in LIBRARIES:
+        digest.update(f"{name} {metadata.version(name)}\0".encode())
     for package in ("datasets", "twin", "fusion"):
         with resources.as_file(resources.files(f"terrafusion.{package}")) as folder:
             for file in sorted(folder.rglob("*")):

@@ -3,23 +3,28 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from terrafusion.datasets.errors import ConfigError, TerrafusionError
-from terrafusion.fusion.benchmark import outputs, plan, run
+from terrafusion.fusion.benchmark import field, outputs, plan, run
 from terrafusion.fusion.benchmark.arms import ARMS
 from terrafusion.fusion.benchmark.drives import FIRST_SEED, Case
+from terrafusion.fusion.benchmark.field import Log
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.outputs import MARK, write_benchmark, write_document
 from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
 from terrafusion.fusion.benchmark.run import Found, run_benchmark
-from terrafusion.fusion.scores import parts
+from terrafusion.fusion.scores import field_table, parts
+from terrafusion.fusion.scores.field_table import Refusal
 
 FEW = ("fixed", "adaptive", "oracle")
 JOB = Job(Case("outages", "twin", FIRST_SEED + 1), FEW)
 PLAN = Plan({"outages": None}, seeds=1)
+ORIGIN = {"command": "terrafusion benchmark"}
 
 
 @pytest.fixture
@@ -60,8 +65,114 @@ def test_results_of_other_sources_are_not_taken(found, one_job, monkeypatch) -> 
     assert run_benchmark(PLAN, found[0]).rows[0].family == "a"
 
 
+def test_jobs_whose_parts_another_process_overwrites_meanwhile_are_not_lost(tmp_path, monkeypatch) -> None:
+    jobs = [Job(Case("mixed", "twin", FIRST_SEED + i), FEW) for i in range(3)]
+
+    def job(one: Job) -> tuple[Job, Found]:
+        for file in (tmp_path / parts.FOLDER).iterdir():
+            file.write_text(json.dumps({"sources_sha256": "of other sources", "state": ""}))
+        return one, Found((Row("mixed", "twin", one.key, one.key, "fixed", error_m=1.0),), ())
+
+    monkeypatch.setattr(Plan, "jobs", lambda self: jobs)
+    monkeypatch.setattr(run, "run_job", job)
+    assert [row.unit for row in run_benchmark(Plan({"mixed": 3}), tmp_path).rows] == [one.key for one in jobs]
+
+
+def test_logs_are_run_again_once_their_files_differ_or_where_they_were_refused(tmp_path, monkeypatch) -> None:
+    log = tmp_path / "log"
+    log.mkdir()
+    wheels = log / "wheels.csv"
+    wheels.write_text("t_ns\n")
+    begun: list[Job] = []
+    given: list[tuple[tuple[Row, ...], tuple[Refusal, ...]]] = []
+
+    def job(one: Job) -> tuple[Job, Found]:
+        begun.append(one)
+        return one, Found(*given[-1])
+
+    monkeypatch.setattr(Plan, "jobs", lambda self: [Job(Log(str(log), 1), ("fixed",))])
+    monkeypatch.setattr(run, "run_job", job)
+    row = Row("field", "firm", "log", "log", "fixed", error_m=1.0)
+    for rows, refused, runs in (
+        ((), (Refusal("log", "no IMU"),), 1), ((row,), (), 2), ((row,), (), 2),
+    ):  # fmt: skip
+        given.append((rows, refused))
+        assert run_benchmark(PLAN, tmp_path / "out") == Found(rows, refused)
+        assert len(begun) == runs
+    wheels.write_text("t_ns\n0\n")
+    run_benchmark(PLAN, tmp_path / "out")
+    assert len(begun) == 3
+    (part,) = (tmp_path / "out" / parts.FOLDER).iterdir()
+    cut = json.loads(part.read_text())
+    del cut["refused"]
+    part.write_text(json.dumps(cut))
+    run_benchmark(PLAN, tmp_path / "out")
+    assert len(begun) == 4
+
+
+@pytest.mark.parametrize("place", [(field_table, "open_recordings"), (field, "check_log")])
+def test_an_unforeseen_error_in_a_log_becomes_a_refusal(place, monkeypatch) -> None:
+    def fail(what: object) -> None:
+        raise ValueError("from a reader or planner")
+
+    field_table._recordings.cache_clear()
+    monkeypatch.setattr(
+        field_table, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)]
+    )
+    monkeypatch.setattr(*place, fail)
+    _, found = run.run_job(Job(Log("one", 1), ("fixed",)))
+    assert found == Found((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
+    field_table._recordings.cache_clear()
+
+
+def test_what_cannot_be_written_is_refused_before_anything_is_computed(
+    terrafusion, one_job, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.setattr(run, "run_job", lambda job: pytest.fail("it ran"))
+    taken = tmp_path / "file"
+    taken.write_text("")
+    terrafusion("benchmark", "--out", taken, "--jobs", 1).refused("cannot be written")
+    words = ("benchmark", "--out", tmp_path / "out", "--jobs", 1)
+    terrafusion(*words, "--docs", taken).refused("no document with a place")
+    terrafusion(*words, "--only", "field=5").refused("field logs have no seeds")
+
+
+def test_the_commit_is_that_of_this_library_and_of_no_folder_above_it(tmp_path, monkeypatch) -> None:
+    def git(*words: str) -> None:
+        who = ("-c", "user.name=a", "-c", "user.email=a@example.org")
+        subprocess.run(["git", "-C", str(tmp_path), *who, *words], check=True, capture_output=True)
+
+    module = tmp_path / "site-packages" / "outputs.py"
+    module.parent.mkdir()
+    module.write_text("")
+    monkeypatch.setattr(outputs, "__file__", str(module))
+    assert outputs.commit() == ""
+    git("init")
+    git("commit", "--allow-empty", "-m", "somebody's project")
+    assert outputs.commit() == ""
+    git("add", "site-packages")
+    git("commit", "-m", "this library")
+    assert len(outputs.commit()) == 12
+    module.write_text("# changed")
+    assert outputs.commit().endswith("-dirty")
+
+
+def test_sources_that_change_while_it_runs_are_told(monkeypatch) -> None:
+    origin = outputs.origin_of(PLAN, "terrafusion benchmark")
+    assert outputs.at_the_end(origin) == origin
+    monkeypatch.setattr(outputs, "hash_sources", lambda: "other")
+    assert outputs.at_the_end(origin)["sources"] == f"{origin['sources']}, changed while it ran"
+
+
+def test_versions_are_among_the_sources(monkeypatch) -> None:
+    before = parts.hash_sources()
+    assert before == parts.hash_sources()
+    monkeypatch.setattr(parts.metadata, "version", lambda name: "0")
+    assert parts.hash_sources() != before
+
+
 def test_the_files_hold_the_same_numbers(found, tmp_path) -> None:
-    made = write_benchmark(tmp_path, PLAN, found[1], "terrafusion benchmark")
+    made = write_benchmark(tmp_path, found[1], ORIGIN)
     content = json.loads((tmp_path / "benchmark.json").read_text())
     assert content["schema"] == outputs.SCHEMA
     assert [row["arm"] for row in content["rows"]] == list(FEW)
@@ -73,7 +184,7 @@ def test_the_files_hold_the_same_numbers(found, tmp_path) -> None:
     assert page.count("<svg") + page.count("data:image/svg+xml") == 1
     assert (tmp_path / "ratios.png").stat().st_size > 5_000
     again = tmp_path / "again"
-    write_benchmark(again, PLAN, found[1], "terrafusion benchmark")
+    write_benchmark(again, found[1], ORIGIN)
     for name in ("benchmark.json", "benchmark.md", "report.html"):
         assert (again / name).read_bytes() == (tmp_path / name).read_bytes()
 
@@ -81,13 +192,13 @@ def test_the_files_hold_the_same_numbers(found, tmp_path) -> None:
 def test_a_document_keeps_what_stands_before_the_mark(found, tmp_path) -> None:
     document = tmp_path / "page.md"
     document.write_text(f"# Head\n{MARK}\nold\n")
-    made = write_benchmark(tmp_path / "out", PLAN, found[1], "terrafusion benchmark")
-    write_document(document, made, PLAN, found[1], "terrafusion benchmark")
+    made = write_benchmark(tmp_path / "out", found[1], ORIGIN)
+    write_document(document, made, found[1], ORIGIN)
     text = document.read_text()
     assert text.startswith(f"# Head\n{MARK}\n\n## Errors\n")
     assert "old" not in text
     with pytest.raises(ConfigError, match="no document with a place"):
-        write_document(tmp_path / "absent.md", made, PLAN, found[1], "")
+        write_document(tmp_path / "absent.md", made, found[1], ORIGIN)
 
 
 def test_plans() -> None:
