@@ -54,6 +54,7 @@ CHECKS: tuple[Check, ...] = (
     gnss_frame.check_degrees,
     gnss.check_classes,
     gnss.check_sigma,
+    gnss.check_velocity_sigma,
     gnss.check_frozen,
     gnss.check_jumps,
     gnss.check_scatter,

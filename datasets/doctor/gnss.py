@@ -72,6 +72,35 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
         )
 
 
+def check_velocity_sigma(patient: Patient) -> Iterator[Finding]:
+    """The sigma of a velocity must not be zero or negative; one that is not told is no fault."""
+    gnss = patient.recording.gnss
+    if gnss is None or gnss.velocity_enu_mps is None or gnss.sigma_v_mps is None:
+        return
+    told = np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)
+    bad = told & (gnss.sigma_v_mps <= 0.0)
+    if bad.any():
+        first = int(np.flatnonzero(bad)[0])
+        at_s = patient.since_start_s(gnss.t_ns[first])
+        yield Finding(
+            "velocity-sigma-impossible",
+            "warning",
+            "gnss",
+            f"{int(bad.sum())} of {int(told.sum())} velocities have a sigma that is zero or negative",
+            f"first at t = {at_s:.2f} s: {gnss.sigma_v_mps[first]:g} m/s",
+            "leave these velocities out, or give the receiver's own sigma in m/s",
+            functools.partial(_without_velocity, rows=bad),
+        )
+
+
+def _without_velocity(recording: Recording, rows: Mask) -> Recording:
+    gnss = recording.gnss
+    assert gnss is not None
+    assert gnss.velocity_enu_mps is not None
+    velocity = np.where(rows[:, None], np.nan, gnss.velocity_enu_mps)
+    return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, velocity_enu_mps=velocity))
+
+
 def _impossible(gnss: Gnss) -> Mask:
     """Mask (N, 3) of sigmas that are no positive number; heights count only where there are any."""
     placed = np.isfinite(gnss.enu_m[:, :2]).all(axis=1)

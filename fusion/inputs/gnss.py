@@ -183,8 +183,8 @@ class GnssUpdater:
         node, state = chain.nodes[k - chain.first], chain.state(k)
         offset_s = (fix.t_ns - node.t_ns) * 1e-9
         R = state.pose.rotation().matrix()
-        rate = node.gyro_radps - state.bias.gyroscope()
-        accel_world = R @ (node.accel_mps2 - state.bias.accelerometer()) - np.array([0.0, 0.0, GRAVITY_MPS2])
+        rate = state.rate(node.gyro_radps)
+        accel_world = R @ state.specific_force(node.accel_mps2) - np.array([0.0, 0.0, GRAVITY_MPS2])
         antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
         lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
         velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
@@ -300,7 +300,8 @@ def checked_fix(
     """A fix as the graph takes it; None where the receiver itself says that it has none.
 
     Where the receiver claims no sensible sigma (none, not a number, below 1 mm or above 1 km), that of
-    its class of fix is taken (`ASSUMED_SIGMA_M`; up twice as much).
+    its class of fix is taken (`ASSUMED_SIGMA_M`; up twice as much). A velocity without a positive sigma
+    is left out, a height without one is free.
 
     Raises:
         DataError: no east or north, an unknown class of fix, or neither sigma nor class.
@@ -311,15 +312,22 @@ def checked_fix(
         return None
     if position.shape != (3,) or not np.isfinite(position[:2]).all():
         raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
-    sigma = np.full(3, np.nan) if sigma_m is None else np.asarray(sigma_m, dtype=float)
+    sigma = np.full(3, np.nan) if sigma_m is None else np.array(sigma_m, dtype=float)
     sensible = sigma.shape == (3,) and ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
     if not sensible and known is not None:
         sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
-    elif sigma.shape != (3,) or not (sigma[:2] > 0).all():
+    elif sigma.shape != (3,) or not ((sigma[:2] > 0) & (sigma[:2] < np.inf)).all():
         raise DataError(
             f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
         )
+    sigma[2] = sigma[2] if sigma[2] > 0.0 else np.nan
     velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
+    if velocity is not None and velocity.shape != (3,):
+        raise DataError(
+            f"a velocity of shape {velocity.shape}", channel="gnss", remedy="give east, north, up"
+        )
+    if not 0.0 < sigma_v_mps < np.inf:  # as drivers tell that they do not know it
+        velocity = None
     return GnssFix(t_ns, position, sigma, velocity, sigma_v_mps, known)
 
 

@@ -353,3 +353,17 @@ def test_fixes_of_a_robot_that_stood_show_no_heading_whatever_else_was_seen() ->
     track = MotionTrack(np.zeros(3))
     track.pairs = [Pair(i, z, fix, 1.0) for i, (z, fix) in enumerate([*rest, *wild])]
     assert track.wrong_by(0.1, 1.0) is None
+
+
+@pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_velocity_of_unknown_sigma_is_left_out(sigma: float) -> None:
+    taken = checked_fix(0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.0], [1.0, 0.0, 0.0], sigma, None)
+    assert taken.velocity_mps is None
+    assert np.isnan(taken.sigma_m[2]), "nor is a height"
+
+
+def test_a_velocity_of_two_axes_and_an_endless_sigma_are_refused() -> None:
+    with pytest.raises(DataError, match="velocity"):
+        checked_fix(0, np.zeros(3), np.full(3, 0.1), np.zeros(2), 0.1, None)
+    with pytest.raises(DataError, match="sigma"):
+        checked_fix(0, np.zeros(3), np.array([np.inf, np.inf, 1.0]), None, np.nan, None)
