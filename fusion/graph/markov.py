@@ -36,6 +36,13 @@ class MarkovStep:
         decay[states] = 0.0
         return MarkovStep(decay, self.mean, sigma)
 
+    def opened(self, other: MarkovStep, states: Array) -> MarkovStep:
+        """The same step, but `states` (indices) go as in `other` where that forgets more of them."""
+        taken = states[other.decay[states] < self.decay[states]]
+        decay, mean, sigma = self.decay.copy(), self.mean.copy(), self.sigma.copy()
+        decay[taken], mean[taken], sigma[taken] = other.decay[taken], other.mean[taken], other.sigma[taken]
+        return MarkovStep(decay, mean, sigma)
+
 
 def markov_step(
     dt_s: float, mean: ArrayLike, sigma: ArrayLike, time_s: ArrayLike, forget: ArrayLike = 0.0

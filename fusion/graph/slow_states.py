@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, YAW_SCALE
 from terrafusion.fusion.graph.markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -21,9 +21,11 @@ SLIP_STEADY = 30.0
 """Slip lasts so many correlation times of the policy's while the wheels keep their speed: those are of whole
 drives, with starts, stops and hills. A compromise: on one soil the longer the better, where grounds change
 without GNSS the shorter; see docs/monitor.md."""
-SLIP_RENEWAL = 2.0
+SLIP_RENEWAL = 1.1
 """Slip is what traction asks for, and traction changes with speed: where the wheels change theirs by a
 share x, `SLIP_RENEWAL x^2` of the slip is new. Tuned likewise."""
+OF_THE_GROUND = np.array([SLIP, YAW_SCALE, SIDE_SLIP]) - NAV.stop
+"""What another ground changes; the receiver's drift and the calibration stay."""
 CRAWL_MPS = 0.1
 """Below this wheel speed any change of it is a start or a stop."""
 ICR_SIGMA_M, ICR_TIME_S = 0.10, 60.0
@@ -123,7 +125,8 @@ def open_slip(
     if k <= chain.last:
         node = chain.nodes[k - chain.first]
         up = node.point.pose.rotation().matrix()[2]
-        chain.set_markov(k, step(dt_s, row, up, drift_sigma_m, drift_time_s, switch, node.wheels))
+        anew = step(dt_s, row, up, drift_sigma_m, drift_time_s, switch, node.wheels)
+        chain.set_markov(k, anew if node.markov is None else node.markov.opened(anew, OF_THE_GROUND))
 
 
 def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:

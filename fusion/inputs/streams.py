@@ -229,14 +229,21 @@ class WheelStream:
         return left, right
 
     def speed_change_mps(self, start_ns: int, end_ns: int, over_ns: int = 100_000_000) -> float:
-        """Speed of both sides about the end less that about the start, m/s; 0 where samples are missing."""
-        half = over_ns // 2
-        at = [self.travelled(t - half, min(t + half, self.t_ns[-1])) for t in (start_ns, end_ns)]
-        if at[0] is None or at[1] is None:
+        """Speed of both sides at the end less that at the start, m/s; 0 where samples are missing.
+
+        Each speed is a mean about its time; where the newest sample cuts the last one short, its middle
+        is earlier, and the change is that of a steady acceleration between the two middles.
+        """
+        half, newest = over_ns // 2, self.t_ns[-1] if self.t_ns else 0
+        if newest <= end_ns - half:
             return 0.0
-        spans = [min(t + half, self.t_ns[-1]) - t + half for t in (start_ns, end_ns)]
-        first, last = (0.5 * sum(a or ()) / (span * 1e-9) for a, span in zip(at, spans, strict=True))
-        return last - first
+        windows = [(t - half, min(t + half, newest)) for t in (start_ns, end_ns)]
+        (a, b), (c, d) = windows
+        first, last = self.travelled(a, b), self.travelled(c, d)
+        if first is None or last is None:
+            return 0.0
+        change = 0.5e9 * (sum(last) / (d - c) - sum(first) / (b - a))
+        return change * (end_ns - start_ns) / (0.5 * (c + d - a - b))
 
     def forget(self, before_ns: int) -> None:
         i = bisect.bisect_left(self.t_ns, before_ns) - 1

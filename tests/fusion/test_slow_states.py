@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.fusion.graph import slow_states
-from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.weights.policy import load_policy
@@ -81,3 +83,32 @@ def test_what_a_robot_keeps_hardly_moves_in_an_hour(row) -> None:
     kept = slice(LINEAR.index("radius_scale"), None)
     assert hour.decay[kept] == pytest.approx(1.0)
     assert np.all(hour.sigma[kept] < 0.02 * prior[kept])
+
+
+def test_a_slip_opened_later_keeps_what_else_began_at_that_keyframe() -> None:
+    chain = Chain()
+    point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
+    for k in range(4):
+        chain.append(k * 10**8, point, markov=step(rolling(1.0)) if k else None)
+    drift = slice(1, 3)
+    chain.set_markov(2, chain.nodes[2].markov.renewed(drift))  # another class of fix
+
+    def open_at_2(switch: float) -> np.ndarray:
+        slow_states.open_slip(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, switch)
+        return chain.nodes[2].markov.decay
+
+    assert open_at_2(0.9)[drift].tolist() == [0.0, 0.0]
+    opened = open_at_2(0.9)[SLIP]
+    assert opened == pytest.approx(0.1 * step(rolling(1.0)).decay[SLIP])
+    assert open_at_2(0.1)[SLIP] == opened, "a smaller change later closes nothing"
+    assert chain.nodes[1].markov.decay[SLIP] == chain.nodes[3].markov.decay[SLIP] > 0.9
+
+
+def test_what_was_seen_late_is_opened_at_the_oldest_keyframe_that_still_can() -> None:
+    chain = Chain()
+    point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
+    for k in range(3):
+        chain.append((5 + k) * 10**8, point, markov=step(rolling(1.0)) if k else None)
+    slow_states.open_slip(chain, 0, 0.1, SAND, 0.02, 100.0, 1.0)
+    assert chain.nodes[1].markov.decay[SLIP] == 0.0
+    assert chain.nodes[2].markov.decay[SLIP] > 0.9
