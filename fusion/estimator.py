@@ -423,7 +423,7 @@ class Estimator:
             position_m=np.asarray(key.pose.translation()),
             quaternion=quaternion_of(key.pose),
             velocity_mps=key.velocity,
-            angular_velocity_radps=gyro - key.bias.gyroscope(),
+            angular_velocity_radps=key.rate(gyro),
             gyro_bias_radps=np.asarray(key.bias.gyroscope()),
             accel_bias_mps2=np.asarray(key.bias.accelerometer()),
             slip=key.slip,

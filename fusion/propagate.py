@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.frames import gtsam_to_ros_covariance
 from terrafusion.fusion.estimate import State
 from terrafusion.fusion.graph.body_twist import bias_sigma, twist_covariance
-from terrafusion.fusion.graph.key_state import DIM, NAV, POSE, VELOCITY, quaternion_of
+from terrafusion.fusion.graph.key_state import DIM, NAV, POSE, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -60,11 +60,13 @@ class Propagator:
             self._begin(state, covariance, row)
         for piece in imu.segments(self._until_ns, newest_ns):
             self._measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
+            self._readings += piece.dt_s * np.array([piece.gyro_radps, piece.accel_mps2])
         self._until_ns = newest_ns
         self._count = self._taken(imu)
         density = row.gyro_inflation * self._preintegrator.spec.gyro_noise_radps_sqrthz
         interval_s = max(newest_ns - imu.t_ns[-2], 1) * 1e-9 if len(imu.t_ns) > 1 else 1.0
-        return self._carried(state, imu.gyro[-1], density / math.sqrt(interval_s))
+        gyro = np.where(np.isfinite(imu.gyro[-1]), imu.gyro[-1], state.gyro_bias_radps)  # none: no rate
+        return self._carried(state, gyro, density / math.sqrt(interval_s))
 
     def _taken(self, imu: ImuStream) -> int:
         """How many samples lie between keyframe and `_until_ns`: it changes when a late one comes."""
@@ -78,14 +80,16 @@ class Propagator:
         self._from = gtsam.NavState(pose, state.velocity_mps)
         self._R = pose.rotation().matrix()
         self._bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
-        self._covariance, self._count = covariance, 0
+        self._key = KeyState(pose, state.velocity_mps, self._bias, state.linear)
+        self._covariance, self._count, self._readings = covariance, 0, np.zeros((2, 3))
         self._measured = self._preintegrator.integrate(
             [], self._bias, row.gyro_inflation, row.accel_inflation
         )
 
     def _carried(self, state: State, gyro_radps: Array, gyro_sigma_radps: float) -> State:
         measured = self._measured
-        now = measured.predict(self._from, self._bias)
+        seconds = max(measured.deltaTij(), 1e-9)
+        now = measured.predict(self._from, self._key.bias_seen(*(self._readings / seconds)))
         R, velocity = now.attitude().matrix(), np.asarray(now.velocity())
         F, G = transition(
             self._R, R, measured.deltaPij(), measured.deltaVij(), measured.deltaTij(), len(self._covariance)
@@ -98,7 +102,7 @@ class Propagator:
             position_m=np.asarray(now.position()),
             quaternion=quaternion_of(now.pose()),
             velocity_mps=velocity,
-            angular_velocity_radps=gyro_radps - state.gyro_bias_radps,
+            angular_velocity_radps=self._key.rate(gyro_radps),
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
             twist_covariance=twist_covariance(P, R, velocity, gyro_sigma_radps),

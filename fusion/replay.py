@@ -332,7 +332,7 @@ def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: float) -> State:
         position_m=np.asarray(key.pose.translation()),
         quaternion=quaternion_of(key.pose),
         velocity_mps=key.velocity,
-        angular_velocity_radps=live.angular_velocity_radps + live.gyro_bias_radps - key.bias.gyroscope(),
+        angular_velocity_radps=key.rate(key_state_of(live).reading(live.angular_velocity_radps)),
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
         slip=key.slip,

@@ -105,12 +105,28 @@ class KeyState:
             ]
         )
 
+    def rate(self, gyro_radps: Array) -> Array:
+        """Angular rate (3,) of the body behind a reading of the gyro: without bias, mounting set right."""
+        return np.asarray(gyro_radps - self.bias.gyroscope() + self._mounting(gyro_radps))
+
+    def specific_force(self, accel_mps2: Array) -> Array:
+        """Specific force (3,) of the body behind a reading of the accelerometer, likewise."""
+        return np.asarray(accel_mps2 - self.bias.accelerometer() + self._mounting(accel_mps2))
+
+    def reading(self, rate_radps: Array) -> Array:
+        """The reading (3,) of the gyro behind an angular rate; the inverse of `rate` to first order."""
+        reading = rate_radps + self.bias.gyroscope()
+        return np.asarray(reading - self._mounting(reading))
+
+    def _mounting(self, reading: Array) -> Array:
+        turn = self.of(IMU_ROTATION)
+        return np.cross(turn, reading) if turn.any() else np.zeros(3)
+
     def bias_seen(self, gyro_radps: Array, accel_mps2: Array) -> gtsam.imuBias.ConstantBias:
         """The bias that stands for bias and mounting: a small rotation d adds d x measured to a reading."""
-        turn = self.of(IMU_ROTATION)
         return gtsam.imuBias.ConstantBias(
-            self.bias.accelerometer() - np.cross(turn, accel_mps2),
-            self.bias.gyroscope() - np.cross(turn, gyro_radps),
+            self.bias.accelerometer() - self._mounting(accel_mps2),
+            self.bias.gyroscope() - self._mounting(gyro_radps),
         )
 
 

@@ -72,7 +72,7 @@ class MotionTrack:
         dt = (node.t_ns - self._t_ns[-1]) * 1e-9
         moved = node.wheels.displacement_m if node.wheels is not None else R.T @ state.velocity * dt
         east, north, _ = R @ moved
-        turn = float((R @ (node.gyro_radps - state.bias.gyroscope()))[2]) * dt
+        turn = float((R @ state.rate(node.gyro_radps))[2]) * dt
         level = complex(east, north) * np.exp(-1j * self._yaw_chain)
         self._append(node.t_ns, self._z[-1] + level * np.exp(1j * self._yaw[-1]), self._yaw[-1] + turn)
 

@@ -1,0 +1,79 @@
+"""The newest state carried to the newest sample of the IMU."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import gtsam
+import numpy as np
+import pytest
+
+from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimate import State
+from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.front import Inputs
+from terrafusion.fusion.graph.key_state import IMU_ROTATION, LINEAR, NAV, KeyState
+from terrafusion.fusion.inputs.streams import ImuStream
+from terrafusion.fusion.propagate import Propagator
+from terrafusion.twin.vehicle import load_vehicle
+
+ROTATION = np.array([0.01, -0.03, 0.02])
+
+
+@pytest.fixture(scope="module")
+def estimator() -> Estimator:
+    """At rest, level, started at a given place."""
+    made = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", calibrate=True))
+    made.set_start([0.0, 0.0, 0.0], 0.0)
+    for i in range(200):
+        made.add_wheels(i * 10**7, 0.0, 0.0)
+        made.add_imu(i * 10**7, [0.0, 0.0, 0.0], [0.0, 0.0, GRAVITY_MPS2])
+    return made
+
+
+def turned(state: State) -> State:
+    """The same robot whose IMU is mounted `ROTATION` off."""
+    linear = np.zeros(len(LINEAR))
+    linear[IMU_ROTATION.start - NAV.stop : IMU_ROTATION.stop - NAV.stop] = ROTATION
+    return dataclasses.replace(
+        state, linear=linear, velocity_mps=np.zeros(3), gyro_bias_radps=np.zeros(3),
+        accel_bias_mps2=np.zeros(3), quaternion=np.array([0.0, 0.0, 0.0, 1.0]),
+    )  # fmt: skip
+
+
+def test_a_mounting_that_is_known_moves_nothing(estimator: Estimator) -> None:
+    state = turned(estimator.latest())
+    body = np.array([0.0, 0.0, 0.3]), np.array([0.0, 0.0, GRAVITY_MPS2])
+    gyro, accel = (reading - np.cross(ROTATION, reading) for reading in body)
+    imu = ImuStream()
+    for i in range(21):
+        imu.add(state.t_ns + i * 10**7, gyro, accel)
+    covariance = 1e-4 * np.eye(estimator.chain.dim)
+    found = Propagator(estimator._preintegrator).carry(state, covariance, imu, estimator.weights.row)
+    assert np.linalg.norm(found.velocity_mps) < 0.2 * GRAVITY_MPS2 * 2.0 * np.sum(ROTATION**2)
+    assert found.angular_velocity_radps == pytest.approx(body[0], abs=2.0 * 0.3 * np.sum(ROTATION**2))
+
+
+def test_rates_and_readings_are_inverse_to_first_order() -> None:
+    rng = np.random.default_rng(0)
+    linear = np.zeros(len(LINEAR))
+    linear[IMU_ROTATION.start - NAV.stop : IMU_ROTATION.stop - NAV.stop] = ROTATION
+    bias = gtsam.imuBias.ConstantBias(rng.normal(size=3), 0.01 * rng.normal(size=3))
+    key = KeyState(gtsam.Pose3(), np.zeros(3), bias, linear)
+    gyro, accel = rng.normal(size=3), rng.normal(size=3)
+    assert key.reading(key.rate(gyro)) == pytest.approx(gyro, abs=2.0 * np.sum(ROTATION**2))
+    seen = key.bias_seen(gyro, accel)
+    assert key.rate(gyro) == pytest.approx(gyro - seen.gyroscope())
+    assert key.specific_force(accel) == pytest.approx(accel - seen.accelerometer())
+
+
+def test_a_gyro_of_one_axis_tells_no_other_rate() -> None:
+    inputs = Inputs(imu="gyro_z")
+    made = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=inputs))
+    made.set_start([0.0, 0.0, 0.0], 0.0)
+    for i in range(205):
+        made.add_wheels(i * 10**7, 0.0, 0.0)
+        made.add_imu(i * 10**7, [np.nan, np.nan, 0.1])
+    assert made.odometry().t_ns > made.latest().t_ns
+    assert np.isfinite(made.odometry().angular_velocity_radps).all()
