@@ -63,6 +63,8 @@ class Aids:
         Slow wheels may not have covered the first second when `level` was made; the level given back
         knows that the robot stood.
         """
+        self.height.forget(imu.t_ns[0])
+        self.heading.forget(imu.t_ns[0])
         early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
         if not early or not self.heading.ready:
             return level, None

@@ -1,8 +1,8 @@
 """Barometer: height differences, with a bias that follows the weather.
 
 The pressure becomes a height in the standard atmosphere; the difference to the height about the datum is a
-bias that is not known at the start, wanders with the weather, and errs by a share of every climb, since
-the air is not as warm as the standard's. So a barometer tells nothing of the height itself: it holds the one
+bias that is not known at the start and wanders with the weather, and a share of every climb, since the air is
+not as warm as the standard's. So a barometer tells nothing of the height itself: it holds the one
 that GNSS has told, or the start's where there is none. The samples of a second count as one.
 """
 
@@ -21,7 +21,7 @@ from terrafusion.datasets.sensors import BarometerSpec
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, KeyState
-from terrafusion.fusion.inputs.slow_bias import SlowBias
+from terrafusion.fusion.inputs.slow_bias import SlowBias, split
 
 Array = NDArray[np.float64]
 
@@ -63,7 +63,7 @@ class HeightAid:
         self._mean = [0.0, 0.0]
         self._due_ns: int | None = None
         self._last_ns = 0
-        self._last_m = 0.0
+        self._datum_m = 0.0
         self._slope = 0.0
         self._row = 0
         self._on_innovation = report
@@ -74,6 +74,10 @@ class HeightAid:
             self._samples.append((int(t_ns), float(pressure_pa)))
         else:
             self.refused += 1
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a time."""
+        self._samples = deque(sample for sample in self._samples if sample[0] >= before_ns)
 
     @property
     def active(self) -> bool:
@@ -103,8 +107,9 @@ class HeightAid:
 
     def _gather(self, t_ns: int, height_m: float, key: KeyState) -> None:
         """Sums of pressure height less own height over the samples up to now."""
-        while self._samples and self._samples[0][0] <= t_ns:
-            at_ns, pressure = self._samples.popleft()
+        due, self._samples, impossible = split(self._samples, t_ns)
+        self.refused += impossible
+        for at_ns, pressure in due:
             if t_ns - at_ns > OLDEST_NS:
                 continue
             own = height_m - float(key.velocity[2]) * (t_ns - at_ns) * 1e-9
@@ -118,14 +123,15 @@ class HeightAid:
         offset = total / count
         per_pa = self._slope
         noise = (self.spec.noise_pa * per_pa) ** 2 / count
-        H = np.ones(1)
         if self.bias is None:
-            self.bias = SlowBias.of(np.array([offset]), np.array([UNKNOWN_M]))
+            self._datum_m = height_m
+            self.bias = SlowBias.of(np.array([offset, 0.0]), np.array([UNKNOWN_M, SCALE_SIGMA]))
         else:
             walk = (self.spec.walk_paps_sqrthz * per_pa) ** 2 * (t_ns - self._last_ns) * 1e-9
-            self.bias.drift(np.array([walk + (SCALE_SIGMA * (height_m - self._last_m)) ** 2]))
-        self._last_ns, self._last_m = t_ns, height_m
-        innovation = offset - float(self.bias.mean[0])
+            self.bias.drift(np.array([walk, 0.0]))
+        self._last_ns = t_ns
+        H = np.array([1.0, height_m - self._datum_m])
+        innovation = offset - float(H @ self.bias.mean)
         nis = innovation**2 / self.bias.variance(H, variance, noise)
         accepted = nis <= GATE_SIGMA**2
         self._on_innovation(Innovation(t_ns, "barometer", np.array([innovation]), nis, 1, accepted))
@@ -145,7 +151,7 @@ class HeightAid:
         self.refused += 1
         self._row += 1
         if self._row >= PATIENCE and self.bias is not None:
-            self.bias.forget(np.array([UNKNOWN_M**2]))
+            self.bias.forget(np.array([UNKNOWN_M**2, 0.0]))
             self._row = 0
             self.jumps += 1
         return False

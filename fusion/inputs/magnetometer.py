@@ -22,12 +22,13 @@ import numpy as np
 from gtsam.symbol_shorthand import X
 from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.sensors import MagnetometerSpec
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE
-from terrafusion.fusion.inputs.alignment import Start
-from terrafusion.fusion.inputs.slow_bias import SlowBias
+from terrafusion.fusion.inputs.alignment import WINDOW_NS, Start
+from terrafusion.fusion.inputs.slow_bias import SlowBias, split
 
 Array = NDArray[np.float64]
 
@@ -164,8 +165,14 @@ class HeadingAid:
     def add(self, t_ns: int, field_t: ArrayLike) -> None:
         """One field (3,), body axes, tesla."""
         field = np.asarray(field_t, dtype=float)
-        if not self.off and field.shape == (3,) and np.isfinite(field).all():
+        if field.shape != (3,):
+            raise DataError(f"a field of shape {field.shape}", channel="magnetometer", remedy="give x, y, z")
+        if not self.off and np.isfinite(field).all():
             self._samples.append((int(t_ns), field))
+
+    def forget(self, before_ns: int) -> None:
+        """Drop the samples before a time."""
+        self._samples = deque(sample for sample in self._samples if sample[0] >= before_ns)
 
     @property
     def ready(self) -> bool:
@@ -191,17 +198,20 @@ class HeadingAid:
         """
         if not self.ready or level.gyro_bias_radps is None:
             return None
-        mean = np.mean([field for _, field in self._samples], axis=0)
+        still = [(t, field) for t, field in self._samples if 0 <= t - level.t_ns <= WINDOW_NS]
+        if len(still) < LEAST_START:  # those of later may be of a robot that turns by now
+            return None
+        mean = np.mean([field for _, field in still], axis=0)
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, 0.0).matrix()
         flat = R @ mean
-        if not self.reference.fits(self._samples[-1][0], flat):
+        if not self.reference.fits(still[-1][0], flat):
             return None
         yaw, H = self._told(R, mean)
-        noise = self._noise(flat, len(self._samples), tilt_rad)
+        noise = self._noise(flat, len(still), tilt_rad)
         own = self.bias.covariance @ H
         sigma = math.sqrt(float(H @ own) + noise)
         self.bias.cross = -own  # heading = told - H b: its error is the biases', turned round
-        self._last_ns = self._samples[-1][0]
+        self._last_ns = still[-1][0]
         return wrapped(yaw), sigma
 
     def update(self, chain: Chain, t_ns: int, before: Array, after: Array, turned: int = 0) -> bool:
@@ -227,12 +237,9 @@ class HeadingAid:
         return self._measure(chain, t_ns, R, np.mean(recent, axis=0), len(recent), now, tilt)
 
     def _recent(self, t_ns: int) -> list[Array]:
-        found = []
-        while self._samples and self._samples[0][0] <= t_ns:
-            at_ns, field = self._samples.popleft()
-            if t_ns - at_ns <= NEAR_NS:
-                found.append(field)
-        return found
+        due, self._samples, impossible = split(self._samples, t_ns)
+        self.refused += impossible
+        return [field for at_ns, field in due if t_ns - at_ns <= NEAR_NS]
 
     def _measure(
         self, chain: Chain, t_ns: int, R: Array, field: Array, count: int, variance: float, tilt: float

@@ -18,15 +18,36 @@ filter leaves parameters it only considers); motion adds to P_s alone.
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+T = TypeVar("T")
 
 LEAST_SHARE = 0.03
 """Below this a / P_s the measurement tells next to nothing new of s: it only teaches the bias."""
+
+AHEAD_NS = 10_000_000_000
+"""A sample stamped so far ahead of the estimate has a clock of its own; one less far waits."""
+
+
+def split(
+    samples: Iterable[tuple[int, T]], t_ns: int
+) -> tuple[list[tuple[int, T]], deque[tuple[int, T]], int]:
+    """Samples (time, value) up to `t_ns`, those to wait for, and how many have an impossible time."""
+    due, waiting, count = [], deque[tuple[int, T]](), 0
+    for sample in samples:
+        count += 1
+        if sample[0] <= t_ns:
+            due.append(sample)
+        elif sample[0] <= t_ns + AHEAD_NS:
+            waiting.append(sample)
+    return due, waiting, count - len(due) - len(waiting)
 
 
 @dataclass(frozen=True)

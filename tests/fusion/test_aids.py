@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.atmosphere import pressure_at
+from terrafusion.datasets.errors import DataError
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.inputs.alignment import Start
 from terrafusion.fusion.inputs.barometer import HeightAid, height_factor, height_jacobian
@@ -27,7 +28,7 @@ from terrafusion.fusion.inputs.magnetometer import (
     yaw_jacobian,
     yaw_of,
 )
-from terrafusion.fusion.inputs.slow_bias import SlowBias
+from terrafusion.fusion.inputs.slow_bias import AHEAD_NS, SlowBias, split
 
 ANGLES = st.floats(-3.1, 3.1)
 TILTS = st.floats(-0.5, 0.5)
@@ -198,6 +199,11 @@ def test_a_start_at_rest_and_its_sigma() -> None:
     assert told is not None
     assert told[0] == pytest.approx(2.0, abs=1e-6)
     assert told[1] == pytest.approx(math.hypot(0.03, 3e-6 / 19e-6, 0.05, 0.01 * 45 / 19), rel=0.02)
+    for i in range(21, 100):  # it has begun to turn
+        aid.add(i * 50_000_000, rotation(0.0, 0.0, -0.02 * i) @ field)
+    assert aid.heading_at_rest(level, 0.01)[0] == pytest.approx(2.0, abs=1e-6)
+    late = dataclasses.replace(level, t_ns=-1_000_000_000)
+    assert aid.heading_at_rest(late, 0.01) is None, "a sample of the second of rest, and no other"
     moving = dataclasses.replace(level, gyro_bias_radps=None)
     assert aid.heading_at_rest(moving, 0.01) is None
     unknown = HeadingAid(None, None, lambda _: None)
@@ -266,3 +272,33 @@ def test_a_magnetometer_that_does_not_turn_with_the_robot_is_left_out() -> None:
     aid.add(0, np.array([0.0, 19e-6, -45e-6]))
     assert not aid.active
     assert "left out" in aid.notes()[-1]
+
+
+def test_a_stamp_of_another_clock_stops_nothing() -> None:
+    due, waiting, impossible = split([(10, "a"), (10**18, "b"), (30, "c"), (20 + AHEAD_NS, "d")], 20)
+    assert [value for _, value in due] == ["a"]
+    assert [value for _, value in waiting] == ["c", "d"]
+    assert impossible == 1
+
+
+def test_a_climb_in_warm_air_is_within_the_sigma_told() -> None:
+    """Air 5 % thinner than the standard's, a climb of 100 m: the share of the climb is one bias, not many."""
+    bias = SlowBias.of(np.zeros(2), np.array([0.1, 0.05]))
+    height, s, variance = 0.0, 0.0, 1e-4
+    for _ in range(100):
+        height += 1.0
+        variance += 0.05**2
+        bias.drift(np.array([1e-4, 0.0]))
+        H = np.array([1.0, height])
+        own = bias.measure(0.05 * height - float(H @ bias.mean) - s, H, variance, 0.01)
+        if own is not None:
+            gain = variance / (variance + own.sigma**2)
+            s, before = s + gain * own.innovation, variance
+            variance *= 1.0 - gain
+            assert variance < before
+    assert abs(s) < 2.0 * math.sqrt(variance)
+
+
+def test_a_field_of_two_axes_is_refused() -> None:
+    with pytest.raises(DataError, match="magnetometer"):
+        HeadingAid(None, 0.0, lambda _: None).add(0, [1e-5, 2e-5])
