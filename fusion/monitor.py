@@ -20,6 +20,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.graph.key_state import KeyState
 
@@ -95,6 +96,8 @@ class MotionMonitor:
 
     def command(self, t_ns: int, v_mps: float) -> None:
         """The commanded forward speed, m/s."""
+        if not math.isfinite(v_mps):
+            raise DataError(f"a commanded speed of {v_mps}", channel="command", remedy="leave it out")
         self._command = (t_ns, v_mps)
 
     def watch(self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None) -> None:

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
@@ -180,3 +181,8 @@ def test_a_stuck_robot_is_told_within_a_second(case) -> None:
     told = stuck_trial(*case, "elevate", seed=0, gnss=True)
     assert told.told_s is not None
     assert 0.0 <= told.told_s - told.onset_s <= 1.0
+
+
+def test_a_command_that_is_no_number_is_refused() -> None:
+    with pytest.raises(DataError, match="command"):
+        MotionMonitor(rig()).command(0, float("nan"))
