@@ -53,7 +53,9 @@ def markdown(lines: Sequence[Line], refusals: Sequence[Refusal]) -> str:
     if others:
         parts.append(f"## Logs without a reference\n\n{_health_table(others)}")
     if refusals:
-        parts.append("## Not run\n\n" + "".join(f"- {r.log}: {r.why}\n" for r in refusals))
+        # The library's own errors name their log already.
+        told = [r.why if r.why.startswith(r.log) else f"{r.log}: {r.why}" for r in refusals]
+        parts.append("## Not run\n\n" + "".join(f"- {line}\n" for line in told))
     return "\n".join(parts)
 
 

@@ -200,11 +200,11 @@ def test_reference_is_truth_before_fixes(drive: Callable[..., Any]) -> None:
 
 def test_files_hold_all_runs_and_the_refusals(tmp_path: Path) -> None:
     runs = [made_run("a", "adaptive", 1.0), made_run("a", "fixed", 2.0), made_run("c", "fixed", None)]
-    text = write(tmp_path, runs, [Refusal("d", "holds 3 pieces")])
+    text = write(tmp_path, runs, [Refusal("d", "holds 3 pieces"), Refusal("e", "e: has no wheels")])
     with (tmp_path / "runs.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["error_m"] for row in rows] == ["1.0", "2.0", ""]
-    assert "- d: holds 3 pieces" in text
+    assert text.endswith("- d: holds 3 pieces\n- e: has no wheels\n")
     assert (tmp_path / "field_table.md").read_text(encoding="utf-8") == text
     assert (tmp_path / "field_table.png").stat().st_size > 1000
     assert len(plot_lines(condense(runs)).axes) == 1
