@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.scores.consistency import TRUE_SOURCES
 from terrafusion.fusion.terrain.classifier import UNKNOWN
+from terrafusion.fusion.terrain.external import TRUE_SOURCES
 from terrafusion.fusion.terrain.labels import GroundLabels
 from terrafusion.fusion.weights.modes import ModeTuning
 from terrafusion.fusion.weights.policy import Policy, SensorNoise, load_policy
@@ -69,6 +69,8 @@ OWN, BASE, ORACLE = "adaptive", "fixed", "oracle"
 def replay_options(arm: Arm, labels: GroundLabels | None, seed: int) -> dict[str, Any] | None:
     """Arguments of `replay` for an arm, or None where it needs labels and there are none.
 
+    Of ground that the policy does not know the oracle says "unknown", and an adversary has nothing to say.
+
     Args:
         labels: the true ground of the drive.
         seed: of shuffled labels.
@@ -82,7 +84,7 @@ def replay_options(arm: Arm, labels: GroundLabels | None, seed: int) -> dict[str
         }
     if not arm.labels:
         return {"mode": arm.mode}
-    if labels is None:
+    if labels is None or (arm.labels == "adversarial" and known_labels(labels) is None):
         return None
     told = {
         "true": labels,

@@ -14,11 +14,13 @@ from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.benchmark.arms import Arm, replay_options
 from terrafusion.fusion.benchmark.drives import Drive
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.scores.consistency import ground_at, position, summarise
+from terrafusion.fusion.scores.consistency import estimated_ground_at, position, summarise
 from terrafusion.fusion.scores.error_series import Errors
 from terrafusion.fusion.scores.field_table import UNFORESEEN
 from terrafusion.fusion.scores.health import examine_estimate
 from terrafusion.fusion.scores.metrics import OutageScore
+from terrafusion.fusion.terrain.classifier import UNKNOWN
+from terrafusion.fusion.weights.policy import load_policy
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
@@ -32,7 +34,8 @@ class GroundRow:
         seconds: spent there.
         forward_mps, side_mps: root mean square of the velocity error along and across the robot.
         heading_mps: that of speed times heading error: how fast a wrong heading moves the position.
-        recognised: share of the time in which the ground in force was the true one.
+        recognised: share of the time in which the ground in force was the true one, or "unknown" where the
+            policy does not know the true one.
         nees, effective: of the position per dimension, over the whole drive; independent samples it is worth.
         nees_outage, effective_outage: the same inside the outage.
     """
@@ -121,21 +124,22 @@ def _measured(row: Row, drive: Drive, result: Replay) -> Row:
         return row
     # The labels, not the channel: a log's own name of its terrain counts as one, too.
     true = np.array([drive.labels.at(t) for t in errors.t_ns.tolist()])
-    used = ground_at(dataclasses.replace(drive.recording, terrain=None), result.estimate, errors.t_ns)
+    known = load_policy().names()
+    right = np.where(np.isin(true, known), true, UNKNOWN) == estimated_ground_at(result.estimate, errors.t_ns)
     return dataclasses.replace(
         row,
-        switch_s=switch_delay_s(errors.t_ns[inside], true[inside], used[inside]),
-        grounds=tuple(_by_ground(errors, true, used, inside, drive.recording.start_ns)),
+        switch_s=switch_delay_s(errors.t_ns[inside], true[inside], right[inside]),
+        grounds=tuple(_by_ground(errors, true, right, inside, drive.recording.start_ns)),
     )
 
 
-def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], used: NDArray[Any]) -> float | None:
-    """Mean time from a change of `true` (N,) until `used` agrees, at most to the next; None without one."""
+def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], right: Rows) -> float | None:
+    """Mean time from a change of `true` (N,) until `right`, at most to the next change; None without one."""
     changes = np.flatnonzero(true[1:] != true[:-1]) + 1
     delays = []
     for first, end in itertools.pairwise([*changes, len(true)]):
-        right = np.flatnonzero(used[first:end] == true[first])
-        last = first + right[0] if len(right) else end - 1
+        seen = np.flatnonzero(right[first:end])
+        last = first + seen[0] if len(seen) else end - 1
         delays.append((t_ns[last] - t_ns[first]) * 1e-9)
     return float(np.mean(delays)) if delays else None
 
@@ -153,7 +157,7 @@ def _with_outage(row: Row, outage: OutageScore) -> Row:
 
 
 def _by_ground(
-    errors: Errors, true: NDArray[Any], used: NDArray[Any], inside: Rows, start_ns: int
+    errors: Errors, true: NDArray[Any], right: Rows, inside: Rows, start_ns: int
 ) -> list[GroundRow]:
     whitened = position(errors)
     speed = np.gradient(errors.path_m(), errors.t_ns * 1e-9) if len(errors.t_ns) > 1 else np.zeros(1)
@@ -171,7 +175,7 @@ def _by_ground(
                 forward_mps=_rms(errors.velocity_error_mps[lost, 0]),
                 side_mps=_rms(errors.velocity_error_mps[lost, 1]),
                 heading_mps=_rms((speed * errors.yaw_error_rad())[lost]),
-                recognised=float((used[lost] == ground).mean()) if lost.any() else None,
+                recognised=float(right[lost].mean()) if lost.any() else None,
                 nees=whole.mean if whole else None,
                 effective=whole.effective if whole else None,
                 nees_outage=outage.mean if outage else None,

@@ -29,6 +29,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.estimate import Estimate, Innovation
 from terrafusion.fusion.scores.error_series import Errors
+from terrafusion.fusion.terrain.external import TRUE_SOURCES
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -38,8 +39,6 @@ CONFIDENCE = 0.95
 """Share of consistent estimators whose mean falls into the band."""
 WINDOW_S = 20.0
 """Length of the windows of `over_time`."""
-TRUE_SOURCES = ("annotation", "simulation")
-"""Sources of a terrain channel that are taken for the truth; others are themselves estimates."""
 ALL = "all"
 
 
@@ -233,11 +232,18 @@ def ground_at(recording: Recording, estimate: Estimate, t_ns: TimesNs) -> NDArra
     """
     terrain = recording.terrain
     if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
-        clock, label = terrain.t_ns, terrain.label
-    elif estimate.classes and len(estimate.trajectory):
-        clock, label = estimate.trajectory.t_ns, estimate.dominant_terrain()
-    else:
+        return _held(terrain.t_ns, terrain.label, t_ns)
+    return estimated_ground_at(estimate, t_ns)
+
+
+def estimated_ground_at(estimate: Estimate, t_ns: TimesNs) -> NDArray[np.str_]:
+    """The most probable terrain (N,) at each time, "unknown" from an estimate without classes."""
+    if not estimate.classes or not len(estimate.trajectory):
         return np.full(len(t_ns), "unknown")
+    return _held(estimate.trajectory.t_ns, estimate.dominant_terrain(), t_ns)
+
+
+def _held(clock: TimesNs, label: NDArray[np.object_] | NDArray[np.str_], t_ns: TimesNs) -> NDArray[np.str_]:
     return np.asarray(label[np.maximum(np.searchsorted(clock, t_ns, side="right") - 1, 0)], dtype=str)
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from terrafusion.datasets.recording import Terrain
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
-TRUTHS = ("annotation", "simulation")
+TRUE_SOURCES = ("annotation", "simulation")
 """Sources that were not there when the robot drove: they are for scoring, not for the estimator."""
 
 
@@ -19,7 +19,7 @@ def external_probabilities(
     What the source gives to classes the policy does not know counts as `unknown`.
     Rows that are not finite, negative or all zero are left out.
     """
-    if terrain is None or terrain.probabilities is None or terrain.source in TRUTHS:
+    if terrain is None or terrain.probabilities is None or terrain.source in TRUE_SOURCES:
         return []
     rows = []
     for t_ns, p in zip(terrain.t_ns.tolist(), terrain.probabilities, strict=True):

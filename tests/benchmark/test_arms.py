@@ -45,6 +45,12 @@ def test_arms_that_need_labels_have_none_without_them() -> None:
     assert without == {"oracle", "shuffled", "adversarial"}
 
 
+def test_ground_that_the_policy_does_not_know_has_no_adversary() -> None:
+    snow = GroundLabels((START_NS,), ("snow",))
+    without = {arm.name for arm in ARMS if replay_options(arm, snow, seed=3) is None}
+    assert without == {"adversarial"}
+
+
 def test_the_data_sheet_knows_no_slip_and_no_tuning() -> None:
     options = replay_options(ARMS[0], None, seed=0)
     assert options is not None

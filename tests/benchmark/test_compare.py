@@ -167,9 +167,9 @@ def test_verdicts_go_by_the_whole_interval(interval, most, verdict) -> None:
 def test_the_delay_of_a_switch_ends_where_the_grounds_agree_or_change_again() -> None:
     t = np.arange(8) * 10**9
     true = np.array([*"aabbbbcc"])
-    assert switch_delay_s(t, true, np.array([*"aaaabbcc"])) == pytest.approx(1.0)  # 2 s, then at once
-    assert switch_delay_s(t, true, np.array([*"aaaaaaaa"])) == pytest.approx(2.0)  # 3 s and 1 s, never seen
-    assert switch_delay_s(t, np.array([*"aaaaaaaa"]), true) is None
+    assert switch_delay_s(t, true, true == [*"aaaabbcc"]) == pytest.approx(1.0)  # 2 s, then at once
+    assert switch_delay_s(t, true, true == [*"aaaaaaaa"]) == pytest.approx(2.0)  # 3 s and 1 s, never seen
+    assert switch_delay_s(t, np.full(8, "a"), true == "a") is None
 
 
 def test_targets_of_a_benchmark_that_reaches_them() -> None:

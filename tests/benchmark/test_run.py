@@ -22,7 +22,7 @@ from terrafusion.fusion.scores import field_table, parts
 from terrafusion.fusion.scores.field_table import Refusal
 
 FEW = ("fixed", "adaptive", "oracle")
-JOB = Job(Case("outages", "twin", FIRST_SEED + 1), FEW)
+JOB = Job(Case("outages", "twin", FIRST_SEED + 2), FEW)
 PLAN = Plan({"outages": None}, seeds=1)
 ORIGIN = {"command": "terrafusion benchmark"}
 
