@@ -19,6 +19,7 @@ from typing import Any
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
+from terrafusion.fusion.benchmark.drives import FIELD
 from terrafusion.fusion.benchmark.plan import Plan
 from terrafusion.fusion.benchmark.plots import plot_ratios
 from terrafusion.fusion.benchmark.reasons import reasons
@@ -84,13 +85,14 @@ def document_head(path: Path) -> str:
 
 def origin_of(plan: Plan, command: str) -> dict[str, str]:
     """What the numbers are made by and of: to be asked before they are made."""
+    seeds = [f"{family} {plan.seed_count(family)}" for family in plan.families if family != FIELD]
     return {
         "command": command,
         "commit": commit() or "not from a checkout",
         "sources": sources_sha256()[:16],
         "policy": load_policy().inputs_sha256[:16],
         "modes": load_modes().inputs_sha256[:16],
-        "seeds": ", ".join(f"{family} {plan.seed_count(family)}" for family in plan.families),
+        "seeds": ", ".join(seeds) or "none",
     }
 
 

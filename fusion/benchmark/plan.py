@@ -52,6 +52,8 @@ class Plan:
         for count in (self.seeds, *self.families.values()):
             if count is not None and not 1 <= count <= MOST_SEEDS:
                 raise ConfigError(f"{count} seeds", remedy=f"give 1 to {MOST_SEEDS}")
+        if self.seeds is not None and set(self.families) == {FIELD}:
+            raise ConfigError("field logs have no seeds", remedy="leave out the number of seeds")
 
     def seed_count(self, family: str) -> int:
         """Drives of a family on a plant."""

@@ -81,7 +81,8 @@ def _targets(found: Iterable[Target]) -> Table:
     ]  # fmt: skip
     about = (
         "Reached or missed: by the whole interval. Open: the interval holds the limit, or there is none "
-        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {OWN} that fails or diverges."
+        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {OWN} that fails or diverges, "
+        "and the estimator was made with its logs in view."
     )
     return Table("Targets", about, ("target", "what", "limit", "found", "verdict"), tuple(lines))
 

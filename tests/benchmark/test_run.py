@@ -212,6 +212,9 @@ def test_plans() -> None:
     assert {job.arms for job in full} == {tuple(arm.name for arm in ARMS)}
     with pytest.raises(ConfigError, match="0 seeds"):
         Plan({"mixed": None}, seeds=0)
+    with pytest.raises(ConfigError, match="field logs have no seeds"):
+        Plan({"field": None}, seeds=3)
+    assert outputs.origin_of(Plan({"mixed": 7, "field": None}), "")["seeds"] == "mixed 7"
 
 
 def test_families_by_name_with_seeds_of_their_own() -> None:
