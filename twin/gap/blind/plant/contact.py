@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PEAK_SHARE = 0.4
-"""Where the pressure under a wheel is highest, as a share of the entry angle (Wong and Reece 1967: c1 about 0.43)."""
+"""Where the pressure under a wheel is highest, as a share of the entry angle (Wong and Reece 1967: c1 about
+0.43)."""
 RESIDUAL = 0.95
 """Shear stress far past the hump over that at the hump (assumed; Wong 2008 has 0.4 to 1)."""
 HUMP = 1.0 / (1.0 - np.exp(-1.0)) - RESIDUAL
@@ -25,8 +26,8 @@ RELAXATION_SHARE = 1.0 / 3.0
 def stress_integrals(exponent: float) -> tuple[float, float]:
     """Vertical and horizontal integral (I, J) of the radial stress, per unit entry angle.
 
-    Stress (cos t - cos t1)^n from entry t1 to the peak at c1 t1, mirrored onto the rear part from there to the
-    bottom (Wong and Reece 1967), small angles: 1 - x^2 over the share x = t / t1.
+    Stress (cos t - cos t1)^n from entry t1 to the peak at c1 t1, mirrored onto the rear part from there to
+    the bottom (Wong and Reece 1967), small angles: 1 - x^2 over the share x = t / t1.
     """
     nodes, weights = np.polynomial.legendre.leggauss(40)
     at = lambda low, high: 0.5 * (high - low) * nodes + 0.5 * (high + low)  # noqa: E731
@@ -52,7 +53,8 @@ def lyasko(driven_slip: Array) -> Array:
 
 
 def skidded(skid: Array, gain: Array) -> Array:
-    """Growth of the sinkage of a wheel that slides over its way by the share `skid` (own form, saturating)."""
+    """Growth of the sinkage of a wheel that slides over its way by the share `skid` (own form,
+    saturating)."""
     return np.asarray(1.0 + gain * skid * skid / (skid + 0.3))
 
 
@@ -65,8 +67,8 @@ def compaction_drag(load: Array, sinkage: Array, n: dict[str, Any], radius: Arra
 def mean_shear_over_share(x: Array) -> Array:
     """Mean shear stress under the wheel over its peak, divided by x = j / K_w, j the shear at the rear end.
 
-    Local law K_r (1 + (1 / (K_r (1 - 1/e)) - 1) e^(1 - x)) (1 - e^-x) (Wong and Preston-Thomas 1983), integrated
-    over displacements that grow linearly from 0 to j.
+    Local law K_r (1 + (1 / (K_r (1 - 1/e)) - 1) e^(1 - x)) (1 - e^-x) (Wong and Preston-Thomas 1983),
+    integrated over displacements that grow linearly from 0 to j.
     """
     x = np.maximum(x, 1e-3)
     fallen = np.exp(-x)

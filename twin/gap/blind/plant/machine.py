@@ -1,10 +1,10 @@
 """The robot in motion: slow laws every frame, linearly implicit dynamics in between.
 
-Wheels are in the order front left, front right, rear left, rear right; arrays (4, B) or (B,), SI units. `u`, `v`,
-`r` are velocity of the centre of gravity in body axes and yaw rate. Every slip force is F+ = a F + (1 - a) C v_s+
-with the secant C = |F| / |v_s| of its law at the old slip velocity and a = 1 / (1 + h V / sigma) from the relaxation
-length sigma; drag, braking torque and speed loop are secants too. So a step is a linear system: wheel speeds are
-eliminated, three equations of the body remain.
+Wheels are in the order front left, front right, rear left, rear right; arrays (4, B) or (B,), SI units.
+`u`, `v`, `r` are velocity of the centre of gravity in body axes and yaw rate. Every slip force is F+ = a F
++ (1 - a) C v_s+ with the secant C = |F| / |v_s| of its law at the old slip velocity and a = 1 / (1 + h V /
+sigma) from the relaxation length sigma; drag, braking torque and speed loop are secants too. So a step is a
+linear system: wheel speeds are eliminated, three equations of the body remain.
 """
 
 from __future__ import annotations
@@ -93,8 +93,9 @@ class Machine:
         pull_x, pull_y = -np.tan(rise_x) * normal, -np.tan(rise_y) * normal
         cos, sin = np.cos(s["yaw"]), np.sin(s["yaw"])
         return {
-            "mass": mass * (1.0 - n["knob_slosh"]), "inertia": inertia, "cg_forward": forward, "cg_left": left,
-            "cg_height": n["cg_height_m"] + 0.3 * n["knob_mass_high"], "weight": mass * normal, "normal": normal,
+            "mass": mass * (1.0 - n["knob_slosh"]), "weight": mass * normal, "inertia": inertia,
+            "cg_forward": forward, "cg_left": left, "normal": normal,
+            "cg_height": n["cg_height_m"] + 0.3 * n["knob_mass_high"],
             "pull_u": cos * pull_x + sin * pull_y, "pull_v": -sin * pull_x + cos * pull_y,
             "rise_x": np.tan(rise_x), "rise_y": np.tan(rise_y), "cos": cos, "sin": sin,
         }  # fmt: skip
@@ -144,8 +145,8 @@ class Machine:
         grown = (grown + n["knob_sink_linear"] * driven) * np.exp(n["knob_sink_square"] * driven * driven)
         sunk = np.minimum(sunk * grown, 0.8 * f["radius"])
         chord = np.sqrt(2.0 * f["radius"] * sunk - sunk * sunk + n["patch_m"] ** 2)
-        return {"soil": soil, "sunk": sunk, "chord": chord, "skid": skid, "driven": driven, "follows": follows,
-                "rim": rim, "hub_u": hub_u, "hub_v": hub_v, "transport": transport}  # fmt: skip
+        return {"soil": soil, "sunk": sunk, "chord": chord, "skid": skid, "follows": follows,
+                "rim": rim, "hub_u": hub_u, "hub_v": hub_v}  # fmt: skip
 
     def _strengths(self, f: dict[str, Any]) -> dict[str, Any]:
         """Shear strength and modulus under each wheel."""
@@ -338,7 +339,8 @@ class Machine:
 
 
 def motor_current(n: dict[str, Any], torque: Array, speed: Array) -> Array:
-    """Current of each motor, A: torque over its constant, the gears' loss on the side the power comes from."""
+    """Current of each motor, A: torque over its constant, the gears' loss on the side the power comes
+    from."""
     forward = np.tanh(torque * speed / 0.3)
     loss = np.where(forward > 0.0, 1.0 + forward * (1.0 / n["efficiency"] - 1.0),
                     1.0 + forward * (1.0 - n["efficiency"]))  # fmt: skip

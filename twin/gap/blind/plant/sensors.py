@@ -26,6 +26,7 @@ SHAKE = np.array([0.8, 1.0, 1.1])
 """Vibration of the specific force along body x, y, z beside the soil's vertical figure (assumed)."""
 SHAKE_YAW = 0.3
 RING_HZ, RING_DAMPING = 6.0, 0.05
+BURST_S = 0.05
 FIELD_M, FIELD_WAVES = 3.0, 16
 
 
@@ -70,8 +71,8 @@ def _bursts(spec: RunSpec, t: Array) -> Array:
     share = spec.knobs.get("enc_burst", 0.0)
     if share <= 0.0:
         return np.ones((len(t), 1))
-    lost = spec.stream("bursts").uniform(size=(math.ceil(float(t[-1]) / 0.3) + 1, 4)) < share
-    return np.where(lost[np.floor(t / 0.3).astype(int)], 0.0, 1.0)
+    lost = spec.stream("bursts").uniform(size=(math.ceil(float(t[-1]) / BURST_S) + 1, 4)) < share
+    return np.where(lost[np.floor(t / BURST_S).astype(int)], 0.0, 1.0)
 
 
 def imu(spec: RunSpec, h: History) -> Imu:
@@ -81,8 +82,7 @@ def imu(spec: RunSpec, h: History) -> Imu:
     rate = np.diff(h["yaw"]) / dt
     force = _specific_force(spec, h, rate)
     force = _on_its_mount(spec, force, float(dt[0]))
-    pace = 0.5 * (np.abs(h["speed"]).mean(axis=1) * spec.vehicle.wheel.radius_m)[1:]
-    pace = 2.0 * pace
+    pace = np.abs(h["speed"][1:]).mean(axis=1) * spec.vehicle.wheel.radius_m
     turn = k("imu_turn", 0.0) + k("imu_turn_flex", 0.0) * (1.0 + 0.5 * np.tanh(force[:, 0]))
     cos, sin = np.cos(turn), np.sin(turn)
     force[:, 0], force[:, 1] = cos * force[:, 0] + sin * force[:, 1], cos * force[:, 1] - sin * force[:, 0]

@@ -21,7 +21,8 @@ SPREAD_RADIUS, SPREAD_DRAG = 0.002, 0.1
 
 @dataclass(frozen=True)
 class Segment:
-    """Commanded twist over `duration_s`: v + v_swing sin(2 pi f t), likewise the yaw rate; t from its start."""
+    """Commanded twist over `duration_s`: v + v_swing sin(2 pi f t), likewise the yaw rate; t from its
+    start."""
 
     duration_s: float
     v_mps: float = 0.0
@@ -109,8 +110,9 @@ def _numbers(spec: RunSpec) -> dict[str, float]:
         "cg_height_m": body.cg_height_m,
         "radius_m": wheel.radius_m, "width_m": wheel.width_m, "wheel_inertia_kgm2": wheel.inertia_kgm2,
         "grouser_m": wheel.grouser_height_m,
-        "ratio": drive.gear_ratio, "efficiency": drive.gear_efficiency, "no_load_radps": drive.no_load_speed_radps,
-        "stall_nm": drive.stall_torque_nm, "limit_nm": drive.torque_limit_nm, "supply_v": drive.supply_v,
+        "ratio": drive.gear_ratio, "efficiency": drive.gear_efficiency,
+        "no_load_radps": drive.no_load_speed_radps, "stall_nm": drive.stall_torque_nm,
+        "limit_nm": drive.torque_limit_nm, "supply_v": drive.supply_v,
         "loop_p": drive.speed_loop_p_nms, "loop_i": drive.speed_loop_i_nm, "lag_s": drive.lag_s,
         "dead_s": drive.dead_time_s, "no_load_a": drive.no_load_current_a,
         "open_v": drive.supply_v if battery is None else battery.full_v,
