@@ -18,7 +18,7 @@ LAYERS = ("datasets", "twin", "twin.gap", "fusion")
 
 COMMANDS = (
     "demo", "fetch", "inspect", "convert", "simulate", "sweep", "calibrate", "study", "replay",
-    "terrain", "policy",
+    "terrain", "policy", "gap-blind",
 )  # fmt: skip
 
 

@@ -28,16 +28,16 @@ def diagnosis(
 ) -> dict[str, Any]:
     """A full answer of the contract from what matters in it; each effect is a class of its own."""
     causes = [
-        {"effect": e, "class": [e], "probability": p, "parameters": {}, "explained_share": None}
-        for e, p in ranked
+        {"effect": effect, "class": [effect], "probability": p, "parameters": {}, "explained_share": None}
+        for effect, p in ranked
     ]
     found = verdict != "no_gap"
     gap = {"detected": found, "statistic": 1.0, "p_value": 0.0 if found else 1.0, "significance": 0.05}
     return {
         "schema": "terrafusion.gap/1", "runs": ["run-1"], "reference_runs": [], "vehicle": "elevate",
-        "seconds": 60.0, "gap": gap | {"uncalibrated": False}, "where": [], "verdict": verdict, "causes": causes,
-        "named": list(named), "p_unknown": unknown, "p_null": 0.0 if found else 1.0, "shrink": None,
-        "next_run": None,
+        "seconds": 60.0, "gap": gap | {"uncalibrated": False}, "where": [], "verdict": verdict,
+        "causes": causes, "named": list(named), "p_unknown": unknown, "p_null": 0.0 if found else 1.0,
+        "shrink": None, "next_run": None,
     }  # fmt: skip
 
 

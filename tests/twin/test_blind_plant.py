@@ -84,8 +84,8 @@ def test_a_coasting_robot_never_gains_energy(u: float, v: float, r: float, soil:
     for _ in range(100):
         coasting.step(rest, 0.01, 4)
         energies.append(coasting.energy_j()[0])
-    # A contact's shear holds energy and gives it back while the robot rocks to rest: from the start on, nothing
-    # exceeds what there was, and what swings dies away.
+    # A contact's shear holds energy and gives it back while the robot rocks to rest: from the start on,
+    # nothing exceeds what there was, and what swings dies away.
     assert max(energies) <= energies[0] * (1.0 + 1e-9) + 1e-12
     assert max(energies[50:]) <= max(energies[:50])
 
