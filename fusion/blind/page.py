@@ -41,10 +41,10 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
 def _head(title: str, scores: Scores) -> str:
     met = [t["met"] for t in scores["targets"]]
     lead = (
-        f"{met.count(True)} of {len(met)} targets are met, {met.count(False)} are not, "
-        f"{met.count(None)} were not measured. {len(scores['crashes'])} trials ended in a crash, which counts as "
-        "a wrong answer. The trials come from a plant that shares no equation with the twin; labels were sealed "
-        "until all answers stood."
+        f"Of {len(met)} targets {met.count(True)} are met, {met.count(False)} are missed, {met.count(None)} "
+        f"were not measured. {len(scores['crashes'])} trials ended in a crash, which counts as a wrong answer. "
+        "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
+        "all answers stood."
     )
     return f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(lead)}</p>'
 
@@ -83,12 +83,12 @@ def _effects(scores: Scores) -> str:
 def _shrink(scores: Scores) -> str:
     rows = [
         (
-            escape(plots.FAMILY_WORDS[family]), number(s["mean"]), str(s["count"]), number(s["beside_oracle"]),
-            number(s["oracle"]), str(s["count_oracle"]),
+            escape(plots.FAMILY_WORDS[family]), number(s["mean"]), str(s["count"]),
+            number(s["beside_oracle"]), number(s["oracle"]), str(s["count_oracle"]),
         )
         for family, s in scores["shrink"].items()
     ]  # fmt: skip
-    heads = ("", "share of the gap that goes away", "trials", "same trials", "oracle's", "trials with oracle")
+    heads = ("", "share of the gap gone", "trials", "same trials", "the oracle's", "trials with oracle")
     return f"<h2>Shrink</h2>\n{table(heads, rows, range(1, 6))}"
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from terrafusion.twin.gap.blind.plan import FAMILIES, Trial
 from terrafusion.twin.gap.blind.rates import Rate, rate, reliability
+from terrafusion.twin.gap.blind.shapes import shapes
 from terrafusion.twin.gap.blind.verdicts import Judged, judge
 
 SCHEMA = "terrafusion.gap-blind/1"
@@ -108,7 +109,8 @@ def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
         table.setdefault(j.trial.effects()[0], Counter())[_said(j)] += 1
     for j in _of(judged, "null"):
         table.setdefault("no_gap", Counter())[_said(j)] += 1
-    return {truth: dict(counts.most_common()) for truth, counts in table.items()}
+    order = [*dict.fromkeys(shape.effect for shape in shapes().values()), "no_gap"]
+    return {truth: dict(table[truth].most_common()) for truth in order if truth in table}
 
 
 def _said(j: Judged) -> str:

@@ -87,7 +87,7 @@ IN_CATALOGUE: tuple[Shape, ...] = (
     *_both("dead_time", "late_s", "hold_s", 0.05, 0.8),
     *_both("actuator_lag", "lag_s", "lag_second_s", 0.05, 0.6),
     *_both("encoder_scale", "enc_scale", "enc_scale_speed", 0.02, 0.3, signed=True),
-    *_both("encoder_dropout", "enc_loss", "enc_burst", 0.02, 0.5),
+    *_both("encoder_dropout", "enc_loss", "enc_loss_strain", 0.02, 0.5),
     *_both("gyro_bias", "gyro_bias", "gyro_bias_wave", 0.003, 0.1, signed=True),
     *_both("gyro_scale", "gyro_scale", "gyro_cubic", 0.02, 0.3, signed=True),
     *_both("accel_bias", "acc_bias_x,acc_bias_y", "acc_drift_x,acc_drift_y", 0.1, 2.0),

@@ -54,7 +54,7 @@ KNOBS: dict[str, str] = {
     "enc_scale": "wheel reading times 1 + e",
     "enc_scale_speed": "wheel reading times 1 + e (0.7 + 0.6 w^2 / (w^2 + (4 rad/s)^2))",
     "enc_loss": "share of all counts lost",
-    "enc_burst": "share of all counts lost, in bursts of 0.05 s",
+    "enc_loss_strain": "share 2 e T / (T + 2 N m) of all counts lost, T torque at the wheel",
     "gyro_bias": "yaw rate + e",
     "gyro_bias_wave": "yaw rate + e (1 + 0.5 sin(2 pi t / 90 s + phase))",
     "gyro_scale": "yaw rate times 1 + e",

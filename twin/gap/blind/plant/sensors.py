@@ -26,7 +26,6 @@ SHAKE = np.array([0.8, 1.0, 1.1])
 """Vibration of the specific force along body x, y, z beside the soil's vertical figure (assumed)."""
 SHAKE_YAW = 0.3
 RING_HZ, RING_DAMPING = 6.0, 0.05
-BURST_S = 0.05
 FIELD_M, FIELD_WAVES = 3.0, 16
 
 
@@ -50,7 +49,9 @@ def wheels(spec: RunSpec, h: History) -> Wheels:
     steps, interval = np.diff(angle, axis=0), np.diff(t)[:, None]
     pace = (steps / interval) ** 2
     scale = k("enc_scale", 0.0) + k("enc_scale_speed", 0.0) * (0.7 + 0.6 * pace / (pace + 16.0))
-    steps = steps * (1.0 + scale) * (1.0 - k("enc_loss", 0.0)) * _bursts(spec, t[1:])
+    strain = np.abs(h["torque"][rows][1:])
+    lost = k("enc_loss", 0.0) + k("enc_loss_strain", 0.0) * 2.0 * strain / (strain + 2.0)
+    steps = steps * (1.0 + scale) * (1.0 - np.minimum(lost, 1.0))
     left, right = steps[:, [0, 2]], steps[:, [1, 3]]
     steps = steps.copy()
     steps[:, [0, 2]] = left + k("enc_crosstalk", 0.0) * right
@@ -64,15 +65,6 @@ def wheels(spec: RunSpec, h: History) -> Wheels:
     speed = np.zeros_like(angle)
     speed[1:] = np.diff(angle, axis=0) / interval
     return Wheels(stamps(t), speed, WHEELS, "radps", angle)
-
-
-def _bursts(spec: RunSpec, t: Array) -> Array:
-    """1, and 0 in bursts in which an encoder counts nothing."""
-    share = spec.knobs.get("enc_burst", 0.0)
-    if share <= 0.0:
-        return np.ones((len(t), 1))
-    lost = spec.stream("bursts").uniform(size=(math.ceil(float(t[-1]) / BURST_S) + 1, 4)) < share
-    return np.where(lost[np.floor(t / BURST_S).astype(int)], 0.0, 1.0)
 
 
 def imu(spec: RunSpec, h: History) -> Imu:
