@@ -56,9 +56,7 @@ class Candidates:
         known = {k: v for k, v in parameters().items() if wanted is None or v[0].effect in wanted}
         keys = tuple(known)
         forms = [
-            Hypothesis(
-                f.effect, f.name, tuple(i for i, key in enumerate(keys) if known[key][0].key == f.key)
-            )
+            Hypothesis(f.effect, f.name, tuple(i for i, key in enumerate(keys) if known[key][0].key == f.key))
             for f in catalogue().values()
             if wanted is None or f.effect in wanted
         ]

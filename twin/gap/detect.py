@@ -34,7 +34,9 @@ class Detection:
     beliefs: Beliefs
 
 
-def judged(runs: Sequence[Score], references: Sequence[Score], candidates: Candidates) -> tuple[Pool, Beliefs]:
+def judged(
+    runs: Sequence[Score], references: Sequence[Score], candidates: Candidates
+) -> tuple[Pool, Beliefs]:
     """Sums and beliefs of some runs against the null of others."""
     null = learn(references, len(runs))
     pool = Pool.of(runs, null)

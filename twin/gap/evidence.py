@@ -98,9 +98,7 @@ def starting_model(
     return Model(loaded, found), None, notes
 
 
-def prepared(
-    recordings: Sequence[Recording], model: Model, ground: str | None, source: str
-) -> list[Log]:
+def prepared(recordings: Sequence[Recording], model: Model, ground: str | None, source: str) -> list[Log]:
     """Logs of the recordings."""
     return [prepare(r, model, source=source, window_s=WINDOW_S, ground=ground) for r in recordings]
 
@@ -204,7 +202,10 @@ def _common_step(
     H, g = np.zeros((K, K)), np.zeros(K)
     for run in filter(None, raws):
         G = whitened(run, noise).gram
-        keep, effect = np.arange(len(soil), T), np.arange(T, T + K)  # offsets are a run's own, the ground is not
+        keep, effect = (
+            np.arange(len(soil), T),
+            np.arange(T, T + K),
+        )  # offsets are a run's own, the ground is not
         inner = np.linalg.inv(G[np.ix_(keep, keep)] + np.eye(len(keep)))
         cross = G[np.ix_(keep, effect)]
         H += G[np.ix_(effect, effect)] - cross.T @ inner @ cross
@@ -256,5 +257,3 @@ def gather(
         model, candidates, channels, noise, evidence[: len(runs)], evidence[len(runs) :], raws[: len(runs)],
         drives, tuple(dict.fromkeys(notes)),
     )  # fmt: skip
-
-

@@ -91,9 +91,7 @@ class Beliefs:
     def statistic(self) -> float:
         """Log Bayes factor of any gap against none."""
         known = np.logaddexp.reduce(list(self.effects.values())) - np.log(len(self.effects))
-        return float(
-            np.logaddexp(known + np.log1p(-UNKNOWN_PRIOR), self.unknown + np.log(UNKNOWN_PRIOR))
-        )
+        return float(np.logaddexp(known + np.log1p(-UNKNOWN_PRIOR), self.unknown + np.log(UNKNOWN_PRIOR)))
 
 
 def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Beliefs:

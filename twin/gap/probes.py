@@ -19,7 +19,16 @@ from terrafusion.twin.identify.observations import Observed
 
 Array = NDArray[np.float64]
 
-BASIS = ("constant", "speed", "turn_rate", "acceleration", "turn_acceleration", "speed2", "abs_turn", "lateral")
+BASIS = (
+    "constant",
+    "speed",
+    "turn_rate",
+    "acceleration",
+    "turn_acceleration",
+    "speed2",
+    "abs_turn",
+    "lateral",
+)
 SMOOTH_S = 0.2
 """Rates of the commands are taken over this long."""
 PAIRS = {"gnss_east_m": "gnss_position", "gnss_v_e_mps": "gnss_velocity"}

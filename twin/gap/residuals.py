@@ -63,14 +63,17 @@ class Evidence:
     Attributes:
         name: of the recording.
         gram: (T + P + 1, T + P + 1) inner products.
-        rows: (n, T + P + 1) the rows themselves (float32), channel, time and window of each.
+        rows: (n, T + P + 1) the rows themselves, channel, time and window of each.
+        frame: (n, 3) orthonormal columns a window, along which the poses move the rows.
         seconds: length.
+        states: T.
     """
 
     name: str
     log: Log
     gram: Array
     rows: NDArray[np.float32]
+    frame: Array
     channel: NDArray[np.int64]
     time_s: Array
     window: NDArray[np.int64]
@@ -113,10 +116,15 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
     Raises:
         TerrafusionError: the twin diverges.
     """
-    model, keys = drives.model, drives.candidates.keys
+    return raw_of(log, drives.of(log), drives.model, drives.candidates, channels)
+
+
+def raw_of(log: Log, found: Drive, model: Model, candidates: Candidates, channels: Sequence[str]) -> Raw:
+    """Errors and derivatives of a run, from its signature."""
+    keys = candidates.keys
     soil = [keys.index(name) for name in SOIL_STATE if name in keys]
     error, state, change, probe, pose = [], [], [], [], []
-    for observed, s in zip(log.observed, signatures(log, drives.of(log)), strict=True):
+    for observed, s in zip(log.observed, signatures(log, found), strict=True):
         offsets = np.zeros((len(s.value), len(OFFSETS)))
         if observed.channel in OFFSETS:
             offsets[:, list(OFFSETS).index(observed.channel)] = OFFSETS[observed.channel]
@@ -144,7 +152,9 @@ def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
     effects, base = {}, drives.model.effects
     for i, name in enumerate(names):
         at = keys.index(name)
-        low, high, scale = (float(x[at]) for x in (drives.candidates.low, drives.candidates.high, drives.candidates.scale))
+        low, high, scale = (
+            float(x[at]) for x in (drives.candidates.low, drives.candidates.high, drives.candidates.scale)
+        )
         effects[name] = min(max(base.get(name, 0.0) + own[i] * scale, 0.95 * low), 0.95 * high)
         own[i] = (effects[name] - base.get(name, 0.0)) / scale
     start = drives.of(run.log).start
@@ -180,16 +190,39 @@ def whitened(run: Raw, noise: Mapping[str, Noise]) -> Evidence:
             times.append(0.5 * (observed.begin_s + observed.end_s)[rows])
             windows.append(np.full(len(rows), k))
     M, window = np.concatenate(parts), np.concatenate(windows)
-    rows_, pose = M[:, :-3], M[:, -3:]
+    rows_, frame = M[:, :-3], M[:, -3:].copy()
     for k in np.unique(window):
         mine = window == k
-        Q = pose[mine]
-        solved = np.linalg.solve(Q.T @ Q + 1e-6 * np.eye(3), Q.T @ rows_[mine])
-        rows_[mine] -= Q @ solved
+        frame[mine] = _orthonormal(frame[mine])
+        rows_[mine] -= frame[mine] @ (frame[mine].T @ rows_[mine])
     return Evidence(
-        run.log.name, run.log, rows_.T @ rows_, rows_.astype(np.float32), np.concatenate(channels),
+        run.log.name, run.log, rows_.T @ rows_, rows_.astype(np.float32), frame, np.concatenate(channels),
         np.concatenate(times), window, run.log.seconds(), states,
     )  # fmt: skip
+
+
+def _orthonormal(columns: Array) -> Array:
+    """Orthonormal columns (n, 3) that span those given; zero for those that say nothing."""
+    left, sizes, _ = np.linalg.svd(columns, full_matrices=False)
+    out = np.zeros_like(columns)
+    out[:, : left.shape[1]] = left * (sizes > 1e-6 * max(float(sizes[0]), 1e-12))
+    return out
+
+
+def whitened_error(run: Raw, evidence: Evidence, noise: Mapping[str, Noise], error: Sequence[Array]) -> Array:
+    """Another error (n,) of the run in the evidence's rows, poses projected out."""
+    parts = []
+    for observed, e in zip(run.log.observed, error, strict=True):
+        of = window_of(observed, run.log.windows)
+        for k in np.unique(of):
+            rows = np.flatnonzero(of == k)
+            white = noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], e[rows, None])
+            parts.append(white[:, 0])
+    out = np.concatenate(parts)
+    for k in np.unique(evidence.window):
+        mine = evidence.window == k
+        out[mine] -= evidence.frame[mine] @ (evidence.frame[mine].T @ out[mine])
+    return out
 
 
 def first_noise(runs: Sequence[Raw]) -> dict[str, Noise]:
@@ -264,9 +297,7 @@ def _left_over(
     K = len(prior)
     fit = np.linalg.solve(G[:K, :K] + np.diag(prior), G[:K, -1])
     out: dict[str, list[tuple[NDArray[np.int64], Array]]] = {}
-    lefts = [
-        e - np.hstack([s, c]) @ fit for e, s, c in zip(run.error, run.state, run.change, strict=True)
-    ]
+    lefts = [e - np.hstack([s, c]) @ fit for e, s, c in zip(run.error, run.state, run.change, strict=True)]
     _project_pose(run, lefts, noise)
     for observed, left in zip(run.log.observed, lefts, strict=True):
         of = window_of(observed, run.log.windows)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +87,9 @@ def predictions(
     samples, out = _samples(log, 1), list[list[Array] | None]()
     shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
     weights = [averaging(o, log, shift) for o in log.observed]
-    for states, plant, some, told_ in zip(_runs(log, plants, inputs, start), plants, sets, inputs, strict=True):
+    for states, plant, some, told_ in zip(
+        _runs(log, plants, inputs, start), plants, sets, inputs, strict=True
+    ):
         if not np.isfinite(states).all():
             out.append(None)
             continue
@@ -100,13 +102,19 @@ def predictions(
     return out
 
 
-def drive(log: Log, model: Model, candidates: Candidates, start: Array) -> Drive:
+def drive(
+    log: Log, model: Model, candidates: Candidates, start: Array, only: Collection[str] | None = None
+) -> Drive:
     """The twin's run at the model's own effects, with its derivatives.
+
+    Args:
+        only: keys of the columns that are wanted, the others stay zero; None: all.
 
     Raises:
         TerrafusionError: the run diverged.
     """
-    samples, moving = _samples(log, EVERY), candidates.moving
+    wanted = set(candidates.keys if only is None else only)
+    samples, moving = _samples(log, EVERY), tuple(k for k in candidates.moving if k in wanted)
     steps = {k: _step(candidates, i, model.effects.get(k, 0.0)) for i, k in enumerate(candidates.keys)}
     moved = {k: {**model.effects, k: model.effects.get(k, 0.0) + steps[k]} for k in candidates.keys}
     sets = [dict(model.effects), *(moved[k] for k in moving)]
@@ -115,7 +123,9 @@ def drive(log: Log, model: Model, candidates: Candidates, start: Array) -> Drive
     fine, coarse = _runs(log, plants[:1], inputs[:1], start)[0], _runs(log, plants, inputs, start, EVERY)
     if not np.isfinite(fine).all():
         raise TerrafusionError(
-            "the twin diverges on this log", file=log.name, remedy="check the vehicle's and the soil's numbers"
+            "the twin diverges on this log",
+            file=log.name,
+            remedy="check the vehicle's and the soil's numbers",
         )
     every = _samples(log, 1)
     sensors = _Sensors(model, candidates, plants[0], every * DT_S, inputs[0][every])
@@ -128,9 +138,10 @@ def drive(log: Log, model: Model, candidates: Candidates, start: Array) -> Drive
         return at.read(coarse[lane], _vector(candidates, some))
 
     y = read(None)
-    change = np.stack(
-        [(read(k) - y) * (candidates.scale[i] / steps[k]) for i, k in enumerate(candidates.keys)], axis=-1
-    )
+    change = np.zeros((*y.shape, len(candidates.keys)))
+    for i, k in enumerate(candidates.keys):
+        if k in wanted:
+            change[:, :, i] = (read(k) - y) * (candidates.scale[i] / steps[k])
     failed = ~np.isfinite(change).all(axis=(0, 1))
     change[:, :, failed] = 0.0  # a step that makes the twin diverge says nothing
     return Drive(start, exact, y, change, _by_pose(log, coarse[0], y), coarse[0][:, INDEX["yaw"]])
@@ -204,9 +215,7 @@ def _runs(log: Log, plants: Sequence[Plant], inputs: Array, start: Array, every:
 class _Sensors:
     """The measurement graph with all effects, at the samples of one run."""
 
-    def __init__(
-        self, model: Model, candidates: Candidates, plant: Plant, t_s: Array, inputs: Array
-    ) -> None:
+    def __init__(self, model: Model, candidates: Candidates, plant: Plant, t_s: Array, inputs: Array) -> None:
         self.names = tuple(sorted(candidates.keys))
         self.plant, self.inputs, self.mounting = plant, inputs, mounting_vector(model.vehicle)
         self.soil = np.tile(along(plant.route, plant.route.soil, t_s), (1, len(WHEELS)))
