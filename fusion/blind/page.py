@@ -42,7 +42,7 @@ def _head(title: str, scores: Scores) -> str:
     met = [t["met"] for t in scores["targets"]]
     lead = (
         f"Of {len(met)} targets {met.count(True)} are met, {met.count(False)} are missed, {met.count(None)} "
-        f"were not measured. {len(scores['crashes'])} trials ended in a crash, which counts as a wrong answer. "
+        f"not measured. {len(scores['crashes'])} trials ended in a crash, which counts as a wrong answer. "
         "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
         "all answers stood."
     )

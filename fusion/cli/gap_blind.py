@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -28,11 +29,14 @@ def gap_blind(
     Example: terrafusion gap-blind --quick --out blind
     """
     from terrafusion.fusion.blind.page import summary, write_blind
+    from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.check import run_blind_check
-    from terrafusion.twin.gap.diagnose import diagnose
 
+    judged = partial(diagnose, jobs=1) if jobs > 1 else diagnose  # processes, or threads inside
     with progress_bar("diagnosing") as progress:
-        scores = run_blind_check(out, diagnose, quick=quick, seed=seed, jobs=jobs, progress=progress)
+        scores = run_blind_check(
+            out, judged, quick=quick, seed=seed, jobs=jobs, progress=progress, oracle=judged
+        )
     write_blind(out, scores, {"command": shlex.join(["terrafusion", *sys.argv[1:]])})
     for line in summary(scores):
         print(line)

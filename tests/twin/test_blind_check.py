@@ -7,7 +7,6 @@ import math
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,20 +17,16 @@ from hypothesis.strategies import integers
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.twin.effects.catalogue import effect_names
 from terrafusion.twin.gap.blind import seal
-from terrafusion.twin.gap.blind.answers import Case, answered, cases
+from terrafusion.twin.gap.blind.answers import answered, cases
 from terrafusion.twin.gap.blind.check import run_blind_check
 from terrafusion.twin.gap.blind.drives import DURATION_S, KINDS, drive
-from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, Trial, from_text, plan, specs, to_text
+from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, from_text, plan, specs, to_text
 from terrafusion.twin.gap.blind.plant.knobs import KNOBS
-from terrafusion.twin.gap.blind.plant.run import record
-from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment
 from terrafusion.twin.gap.blind.rates import Rate, reliability
 from terrafusion.twin.gap.blind.score import score
 from terrafusion.twin.gap.blind.severity import Observer, half_power, size_for
 from terrafusion.twin.gap.blind.shapes import IN_CATALOGUE, OUT_OF_CATALOGUE, SAME, SHIFTED, shapes
 from terrafusion.twin.gap.blind.verdicts import judge
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
 
 from . import blind_answers as fake
 
@@ -224,14 +219,28 @@ def test_the_labels_stay_closed_until_all_answers_are_written(tmp_path: Path) ->
 
 @pytest.fixture
 def quickly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials with recordings of a second each, all of one robot: for what happens around the diagnosis."""
-    vehicle, soil = load_vehicle("elevate"), load_soil("gravel")
+    """For what happens around the diagnosis."""
+    monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", fake.short_cases)
 
-    def short(trials: Sequence[Trial]) -> Iterator[Case]:
-        runs = record([RunSpec(vehicle, soil, (Segment(1.0),), seed=t.seed % 997) for t in trials])
-        return (Case(t.trial, (run,), (), vehicle) for t, run in zip(trials, runs, strict=True))
 
-    monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", short)
+@pytest.mark.usefixtures("quickly")
+def test_the_oracle_is_asked_where_a_share_was_told(tmp_path: Path) -> None:
+    """It is given the true effects; its shares stand beside those of the same trials."""
+    asked = []
+
+    def tells(runs: Any, references: Any, vehicle: Any, *, seed: int, effects: Any = None) -> fake.Fixed:
+        answer = fake.diagnosis("effect", [("mass", 0.9)], ["mass"])
+        if effects is not None:
+            asked.append(effects)
+        return fake.Fixed(answer | {"shrink": {"share": 0.5 if effects is None else 0.8}})
+
+    scores = run_blind_check(tmp_path, tells, scale=TINY, seed=1, oracle=tells)
+    single = [t.effects() for t in plan(1, TINY) if t.family in ("same", "shifted")]
+    assert sorted(asked) == sorted(single)
+    for family in ("same", "shifted"):
+        found = scores["shrink"][family]
+        assert (found["beside_oracle"], found["oracle"]) == pytest.approx((0.5, 0.8))
+        assert found["over_oracle"] == pytest.approx(0.625)
 
 
 @pytest.mark.usefixtures("quickly")

@@ -3,6 +3,7 @@ there."""
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import time
@@ -18,8 +19,9 @@ from terrafusion.twin.gap.blind.plan import VEHICLE, Trial, specs
 from terrafusion.twin.pools import open_pool
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
+ORACLE = "oracle.jsonl"
 LANES = 160
-"""Runs of the plant computed side by side (memory: about 1.7 MB each)."""
+"""Runs of the plant computed side by side (memory: about 5 MB each)."""
 
 
 class Answer(Protocol):
@@ -73,9 +75,9 @@ def _blocks(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
         yield block
 
 
-def answered(folder: Path) -> dict[str, dict[str, Any]]:
+def answered(folder: Path, name: str = seal.ANSWERS) -> dict[str, dict[str, Any]]:
     """Answers that are there, by trial; a line that was cut off does not count."""
-    path = folder / seal.ANSWERS
+    path = folder / name
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
         try:
@@ -114,9 +116,13 @@ def answer_all(
     seal.close(folder)
 
 
-def answer(case: Case, diagnose: Diagnose, folder: Path) -> dict[str, Any]:
-    """One answer. What the diagnosis raises is noted as the answer: it counts as wrong."""
-    seal.forbid(folder)
+def answer(case: Case, diagnose: Diagnose, sealed: Path | None) -> dict[str, Any]:
+    """One answer. What the diagnosis raises is noted as the answer: it counts as wrong.
+
+    The process cannot open the labels in the folder `sealed`.
+    """
+    if sealed is not None:
+        seal.forbid(sealed)
     begun = time.perf_counter()
     try:
         given = diagnose(case.runs, case.references, case.vehicle, seed=0).to_json()
@@ -126,6 +132,31 @@ def answer(case: Case, diagnose: Diagnose, folder: Path) -> dict[str, Any]:
         given, error = None, f"{type(problem).__name__}: {problem}"
     seconds = round(time.perf_counter() - begun, 3)
     return {"trial": case.trial, "seconds": seconds, "error": error, "answer": given}
+
+
+def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, jobs: int) -> dict[str, float]:
+    """Share of the gap that goes away where the diagnosis is told the true effects, by trial.
+
+    Asked for trials whose answer tells a share itself, once the labels are open; `oracle.jsonl` keeps what
+    is done. The oracle is called as the diagnosis, with `effects`, the names of the candidates.
+    """
+    told = {
+        t
+        for t, entry in answered(folder).items()
+        if ((entry["answer"] or {}).get("shrink") or {}).get("share")
+    }
+    done = answered(folder, ORACLE)
+    asked = [t for t in trials if t.trial in told and t.family in ("same", "shifted")]
+    effects = {t.trial: t.effects() for t in asked}
+    missing = [t for t in asked if t.trial not in done]
+    with open_pool("loky", jobs) as pool, (folder / ORACLE).open("a", encoding="utf-8") as file:
+        questions = ((c, functools.partial(oracle, effects=effects[c.trial]), None) for c in cases(missing))
+        for entry in pool.results(answer, questions):
+            done[entry["trial"]] = entry
+            file.write(json.dumps(entry) + "\n")
+            file.flush()
+    shares = {t: ((entry["answer"] or {}).get("shrink") or {}).get("share") for t, entry in done.items()}
+    return {t: float(share) for t, share in shares.items() if share is not None}
 
 
 def _rewrite(folder: Path, entries: dict[str, dict[str, Any]]) -> None:

@@ -6,6 +6,7 @@ scores = run_blind_check("out", diagnose, quick=True)
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,12 +15,11 @@ from typing import Any
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.gap.blind import seal
-from terrafusion.twin.gap.blind.answers import Diagnose, answer_all, answered
+from terrafusion.twin.gap.blind.answers import Diagnose, answer_all, answered, ask_oracle
 from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, Trial, from_text, plan, to_text
 from terrafusion.twin.gap.blind.score import score
 
 RESULT = "blind.json"
-Oracle = Callable[[Trial], float | None]
 
 
 def run_blind_check(
@@ -31,7 +31,7 @@ def run_blind_check(
     seed: int = 0,
     jobs: int = 1,
     progress: Callable[[float], None] | None = None,
-    oracle: Oracle | None = None,
+    oracle: Diagnose | None = None,
 ) -> dict[str, Any]:
     """Scores of a diagnosis on sealed trials; `blind.json` in the folder `out` holds them too.
 
@@ -39,8 +39,7 @@ def run_blind_check(
         diagnose: what is judged, see `answers.Diagnose`.
         quick: a small subset of all families.
         scale: in place of the full or quick one.
-        oracle: share of the gap that goes away where the true effect is given; asked once the labels are
-        open.
+        oracle: the diagnosis once more, which then is told the true `effects`: how far the gap could shrink.
 
     Raises:
         ConfigError: the folder holds a check of another seed or scale.
@@ -53,17 +52,19 @@ def run_blind_check(
     _sealed(folder, trials, public)
     if not (folder / seal.CLOSED).is_file():
         answer_all(folder, trials, diagnose, jobs, progress)
-    return scored(folder, public, oracle)
+    return scored(folder, public, oracle, jobs)
 
 
-def scored(folder: Path, public: Mapping[str, Any], oracle: Oracle | None = None) -> dict[str, Any]:
+def scored(
+    folder: Path, public: Mapping[str, Any], oracle: Diagnose | None = None, jobs: int = 1
+) -> dict[str, Any]:
     """Opens the labels, scores the closed answers, writes `blind.json`.
 
     Raises:
         DataError: see `seal.unseal`.
     """
     trials = from_text(seal.unseal(folder))
-    best = {t.trial: share for t in trials if oracle is not None and (share := oracle(t)) is not None}
+    best = {} if oracle is None else ask_oracle(folder, trials, oracle, jobs)
     scores = {**score(trials, answered(folder), best), **public}
     text = json.dumps(scores, indent=1, allow_nan=False)
     write_atomically(folder / RESULT, lambda part: part.write_text(text + "\n", encoding="utf-8"))
@@ -83,6 +84,4 @@ def _sealed(folder: Path, trials: list[Trial], public: Mapping[str, Any]) -> Non
 
 
 def _told(scale: Scale) -> dict[str, Any]:
-    import dataclasses
-
     return {**dataclasses.asdict(scale), "severities": list(scale.severities)}

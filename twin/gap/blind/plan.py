@@ -46,7 +46,7 @@ class Scale:
 
 
 FULL = Scale(nulls=200, effects=37, outside=24, pairs=40, runs=3, references=20)
-QUICK = Scale(nulls=6, effects=4, outside=2, pairs=2, runs=3, references=12, severities=(4.0,))
+QUICK = Scale(nulls=4, effects=2, outside=1, pairs=1, runs=3, references=12, severities=(4.0,))
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,13 @@
 """How large an effect must be to be seen half of the time: the unit of severity.
 
-The points are those of an observer that has nothing to do with the diagnosis: a chi-square test on channel
-means (and spreads) over half seconds, with the covariance of null runs of the same drive. Made by
+A point has two factors. How effects compare is told by an observer that has nothing to do with the
+diagnosis: a chi-square test on channel means (and spreads) over half seconds, with the covariance of null
+runs of the same drive. Made by
 
     python -m terrafusion.twin.gap.blind.severity --seed 0
 
-which writes `severity.yaml` beside this file (about 3 minutes on one core).
+which writes `severity.yaml` beside this file (about 3 minutes of one core). How large they must be for the
+diagnosis is one number a kind of drive, `scale`, measured by `power`.
 """
 
 from __future__ import annotations
@@ -42,21 +44,29 @@ START = (0.3, 1.0, 3.0)
 
 
 def half_power(key: str, kind: str) -> float:
-    """Size of the shape `key` that is seen half of the time on drives of a kind; its largest where none is.
+    """Size of the shape `key` that the diagnosis sees half of the time on drives of a kind.
 
     Raises:
         KeyError: the shape has no point.
     """
-    return float(_points()[key][kind])
+    return _stored()["scale"][kind] * observed(key, kind)
+
+
+def observed(key: str, kind: str) -> float:
+    """The same of the observer.
+
+    Raises:
+        KeyError: the shape has no point.
+    """
+    return float(_stored()["points"][key][kind])
 
 
 @functools.cache
-def _points() -> dict[str, dict[str, float]]:
+def _stored() -> dict[str, Any]:
     from terrafusion.datasets.config import read_yaml
 
     with resources.as_file(resources.files("terrafusion.twin.gap.blind") / "severity.yaml") as path:
-        loaded: dict[str, Any] = read_yaml(path)
-    return dict(loaded["points"])
+        return read_yaml(path)
 
 
 def features(recording: Recording) -> tuple[Array, Array]:
@@ -185,7 +195,9 @@ def write(path: Path, seed: int) -> None:
     points = {kind: measure(kind, seed) for kind in KINDS}
     lines = [
         "# Half-power points of the blind check's shapes, in the unit of each knob (see shapes.py).",
-        f"# Made by: python -m terrafusion.twin.gap.blind.severity --seed {seed}",
+        f"# Points made by: python -m terrafusion.twin.gap.blind.severity --seed {seed}",
+        "# Scale made by: python -m terrafusion.twin.gap.blind.power --shapes 7",
+        "scale: {" + ", ".join(f"{kind}: {_stored()['scale'][kind]}" for kind in KINDS) + "}",
         "points:",
     ]
     for key in points[KINDS[0]]:
