@@ -22,6 +22,7 @@ from terrafusion.twin.gap.blind.check import run_blind_check
 from terrafusion.twin.gap.blind.drives import DURATION_S, KINDS, drive
 from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, from_text, plan, specs, to_text
 from terrafusion.twin.gap.blind.plant.knobs import KNOBS
+from terrafusion.twin.gap.blind.power import half_power_multiple
 from terrafusion.twin.gap.blind.rates import Rate, reliability
 from terrafusion.twin.gap.blind.score import score
 from terrafusion.twin.gap.blind.severity import Observer, half_power, size_for
@@ -362,5 +363,6 @@ def test_the_observer_measures_as_mahalanobis_does() -> None:
     full = observer.factors.T @ observer.factors + np.diag(observer.variances)
     step = rng.normal(size=6)
     assert observer.distance(step) == pytest.approx(math.sqrt(step @ np.linalg.solve(full, step)))
-    assert size_for([1.0, 2.0], [3.0, 12.0], 27.0, 99.0) == pytest.approx(3.0)
-    assert size_for([1.0, 2.0], [1.0, 2.0], 50.0, 9.0) == 9.0
+    assert size_for([(1.0, 3.0), (2.0, 12.0)], 27.0, 99.0) == pytest.approx(3.0)
+    assert half_power_multiple((1.0, 4.0, 16.0) * 2, (False, False, True) * 2) == pytest.approx(8.0, rel=0.2)
+    assert size_for([(1.0, 1.0), (2.0, 2.0)], 50.0, 9.0) == 9.0

@@ -82,8 +82,9 @@ class Trial:
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Trial:
         known = {spec.name for spec in dataclasses.fields(cls)}
-        own = {key: tuple(v) if isinstance(v, list) else v for key, v in entry.items() if key in known}
-        return cls(**own)
+        own: dict[str, Any] = {key: entry[key] for key in known}
+        lists = {key: tuple(own[key]) for key in ("shapes", "values")}
+        return cls(**{**own, **lists})
 
 
 def plan(seed: int, scale: Scale) -> list[Trial]:

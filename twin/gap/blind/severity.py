@@ -13,6 +13,7 @@ diagnosis is one number a kind of drive, `scale`, measured by `power`.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -123,14 +124,18 @@ class Observer:
         """Mahalanobis distance of `difference` (F,): the covariance is factors' factors + variances."""
         scaled = self.factors / self.variances
         inner = np.eye(len(self.factors)) + scaled @ self.factors.T
-        plain = difference @ (difference / self.variances)
-        return float(np.sqrt(max(plain - (b := scaled @ difference) @ np.linalg.solve(inner, b), 0.0)))
+        told = scaled @ difference
+        square = float(difference @ (difference / self.variances) - told @ np.linalg.solve(inner, told))
+        return math.sqrt(max(square, 0.0))
 
 
-def size_for(sizes: Sequence[float], distances: Sequence[float], wanted: float, most: float) -> float:
-    """Size whose distance is `wanted`, by the straight line through the logarithms of the two nearest."""
-    x = np.log(np.asarray(sizes, dtype=float))
-    y = np.log(np.maximum(np.asarray(distances, dtype=float), 1e-12))
+def size_for(known: Sequence[tuple[float, float]], wanted: float, most: float) -> float:
+    """Size whose distance is `wanted`, by the straight line through the logarithms of the two nearest.
+
+    `known` holds sizes and their distances.
+    """
+    sizes, distances = np.asarray(known, dtype=float).T
+    x, y = np.log(sizes), np.log(np.maximum(distances, 1e-12))
     order = np.argsort(np.abs(y - np.log(wanted)))[:2]
     (x0, x1), (y0, y1) = x[order], y[order]
     slope = (y1 - y0) / (x1 - x0) if abs(x1 - x0) > 1e-9 else 1.0
@@ -162,7 +167,7 @@ def _measure(kind: str, soil: str, seed: int, null_runs: int, rounds: int) -> di
         rows, _ = _features([base(seed, knobs, True) for knobs in ({}, *turned)])
         for (key, size), row in zip(jobs, rows[1:], strict=True):
             known[key].append((size, observer.distance(row - rows[0])))
-        sizes = {key: [size_for(*zip(*known[key], strict=True), wanted, shapes()[key].most)] for key in known}
+        sizes = {key: [size_for(known[key], wanted, shapes()[key].most)] for key in known}
     return {key: found[0] for key, found in sizes.items()}
 
 

@@ -40,7 +40,8 @@ class Machine:
         self.s |= {name: np.zeros((4, runs)) for name in WHEEL_STATES}
         self.s["yaw"] = n["heading_rad"].copy()
         self.s["slosh"] = np.zeros((4, runs))  # displacement and velocity of a swinging load, body x and y
-        self.t_s, self.frame = 0.0, {}
+        self.t_s = 0.0
+        self.frame: dict[str, Any] = {}
         integrals = np.array([law.stress_integrals(float(e)) for e in n["exponent"]])
         self.n["stress_vertical"], self.n["stress_along"] = integrals[:, 0], integrals[:, 1]
 

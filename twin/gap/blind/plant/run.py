@@ -55,7 +55,7 @@ def simulate(specs: Sequence[RunSpec], *, substeps: int = SUBSTEPS) -> list[sens
     if any(abs(spec.duration_s() - duration) > 1e-9 for spec in specs):
         raise ConfigError("runs that are computed together must last equally long")
     n = side_by_side(specs)
-    t_s = FRAME_S * np.arange(round(duration / FRAME_S) + 1)
+    t_s: Array = np.asarray(FRAME_S * np.arange(round(duration / FRAME_S) + 1), dtype=np.float64)
     machine = Machine(n, Patches(specs), _gusts(specs, len(t_s)))
     sides = side_commands(specs, n, t_s)
     kept: dict[str, list[Array]] = {name: [] for name in (*_BODY, *_WHEEL, *_FRAME, "soil")}
