@@ -17,6 +17,7 @@ from terrafusion.fusion.cli import (
     convert,
     demo,
     fetch,
+    gap,
     inspect,
     policy,
     replay,
@@ -40,6 +41,7 @@ app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("sweep")(sweep.sweep)
 app.command("calibrate")(calibrate.calibrate)
+app.command("gap")(gap.gap)
 app.command("study")(study.study)
 app.command("replay")(replay.replay)
 app.add_typer(terrain.app, name="terrain")

@@ -122,7 +122,7 @@ def errors_with(
     bench: Bench, run: Evidence, raw: Raw, sets: Sequence[Mapping[str, float]]
 ) -> list[Array | None]:
     """Whitened errors of a run against the twin with each set of effects; None where it diverges."""
-    start = bench.drives.of(run.log).start
+    start = run.log.start
     plain, *found = predictions(run.log, bench.model, bench.candidates, [{}, *sets], start)
     out: list[Array | None] = []
     for y in found:

@@ -11,13 +11,14 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.signatures import Drive, drive, predictions, signatures
+from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
 from terrafusion.twin.identify.log import Log, window_of
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise, autoregressive, clipped, gauss_markov
@@ -31,8 +32,8 @@ OFFSETS = {
     "current_left_a": 0.05, "current_right_a": 0.05,
 }  # fmt: skip
 """Channels with a turn-on offset, and its first 1 sigma (assumed)."""
-SAME_YAW_RAD = 0.02
-"""Two runs share a signature when they were told the same and start with headings this close."""
+SAME_YAW_RAD = 0.2
+"""Runs that were told the same share a signature where they set out within such a sector of headings."""
 LEAST_SCALE = 0.2
 """No channel is taken as better than this share of what its data sheet and scatter say (assumed)."""
 MOST_SOIL = 2.0
@@ -88,23 +89,22 @@ class Drives:
     model: Model
     candidates: Candidates
     kept: dict[str, Drive] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
 
     def of(self, log: Log) -> Drive:
-        """The drive of a log; its pose guesses may differ from the log's own by what is linear."""
-        key = hashlib.sha256()
+        """The drive of a log, from the poses that the log itself suggests."""
+        key = hashlib.sha256(np.round(log.start[:1, 2] / SAME_YAW_RAD).tobytes())
         for part in (log.sides, log.windows, log.borders):
             key.update(np.ascontiguousarray(part).tobytes())
         key.update(repr(log.labels).encode())
         name = key.hexdigest()
-        known = self.kept.get(name)
-        if known is not None:
-            apart = np.angle(np.exp(1j * (known.start[:, 2] - log.start[:, 2])))
-            if np.abs(apart).max() < SAME_YAW_RAD:
-                return known
-        found = drive(log, self.model, self.candidates, log.start)
+        with self.lock:
+            known = self.kept.get(name)
         if known is None:
-            self.kept[name] = found
-        return found
+            known = drive(log, self.model, self.candidates, log.start)
+            with self.lock:
+                self.kept[name] = known
+        return placed(known, log, log.start)
 
 
 def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
@@ -157,8 +157,7 @@ def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
         )
         effects[name] = min(max(base.get(name, 0.0) + own[i] * scale, 0.95 * low), 0.95 * high)
         own[i] = (effects[name] - base.get(name, 0.0)) / scale
-    start = drives.of(run.log).start
-    found = predictions(run.log, drives.model, drives.candidates, [effects], start)[0]
+    found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
     if found is None:
         return run
     error = [
