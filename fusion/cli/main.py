@@ -17,6 +17,7 @@ from terrafusion.fusion.cli import (
     convert,
     demo,
     fetch,
+    gap,
     gap_blind,
     inspect,
     policy,
@@ -41,8 +42,9 @@ app.command("convert")(convert.convert)
 app.command("simulate")(simulate.simulate)
 app.command("sweep")(sweep.sweep)
 app.command("calibrate")(calibrate.calibrate)
-app.command("study")(study.study)
+app.command("gap")(gap.gap)
 app.command("gap-blind")(gap_blind.gap_blind)
+app.command("study")(study.study)
 app.command("replay")(replay.replay)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")

@@ -19,7 +19,7 @@ from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
 from terrafusion.twin.gap.score import Score
 
-PERMUTATIONS = 199
+PERMUTATIONS = 99
 """Other choices of runs that the judged ones are compared with, at most."""
 
 

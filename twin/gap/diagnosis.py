@@ -12,16 +12,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.answer import as_dict
-from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.candidates import SOIL, Candidates
 from terrafusion.twin.gap.detect import Detection, detect
 from terrafusion.twin.gap.evidence import Bench, Soils, gather
 from terrafusion.twin.gap.next_run import NextRun, propose
 from terrafusion.twin.gap.null import Null, learn
 from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.refit import Refit, refit_all
+from terrafusion.twin.gap.refit import Refit, refit_all, scored
 from terrafusion.twin.gap.replicates import COUNT, replicates
 from terrafusion.twin.gap.residuals import state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
@@ -33,7 +33,8 @@ from terrafusion.twin.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-REFITTED = 5
+REFITTED = 6
+"""Forms that are refitted, the most probable ones: with the soil and the twin as it is, one vector of runs."""
 FLOORS = 20
 """Choices of references by which the floor of the gap is learnt."""
 
@@ -136,20 +137,17 @@ def diagnose(
     floor = floor_of(_null_pools(normal, len(scores), seed), range(len(found.pool.gain)))
     refits = _refits(bench, scores, sigma, null, found)
     factors = _corrected(found, refits)
+
+    def remaining(effects: Sequence[str]) -> tuple[Pool, Refit | None]:
+        return _remaining(bench, scores, sigma, null, found, refits, effects)
+
     verdict = judge(
-        found.p_value <= significance,
-        found.p_value,
-        found.pool,
-        found.beliefs,
-        factors,
-        refits,
-        candidates,
-        floor,
-    )
+        found.p_value <= significance, found.p_value, found.pool, found.beliefs, factors, refits, remaining,
+        candidates, floor,
+    )  # fmt: skip
     if progress is not None:
         progress(0.9)
-    fit = _chosen(bench, scores, sigma, null, found, verdict, refits)
-    shrinking = shrink(bench, scores, sigma, null, fit)
+    shrinking = shrink(bench, scores, sigma, null, verdict.fit)
     errors = [adapted(r, sigma, own_error(r, null)) for r in [*bench.runs, *bench.references]]
     where = gap_map(bench.runs, bench.references, bench.model, errors, seed)
     following = _next_run(bench, sigma, verdict)
@@ -200,13 +198,18 @@ def _null_pools(normal: Sequence[Score], judged: int, seed: int) -> list[Pool]:
 def _refits(
     bench: Bench, scores: Sequence[Score], sigma: Array, null: Null, found: Detection
 ) -> dict[str, Refit]:
-    order = sorted(found.beliefs.effects, key=lambda k: -found.beliefs.effects[k])[:REFITTED]
-    columns = [found.beliefs.best[name].columns for name in order]
-    try:
-        fits = refit_all(bench, scores, sigma, null, found.pool, columns)
-    except (TerrafusionError, np.linalg.LinAlgError, FloatingPointError):  # then the linear fits stand
-        return {}
-    return dict(zip(order, fits, strict=True))
+    forms = found.beliefs.forms
+    ranked = sorted((k for k in forms if k[0] != SOIL), key=lambda k: -forms[k])[:REFITTED]
+    columns = {(h.effect, h.form): h.columns for h in bench.candidates.hypotheses}
+    chosen = [(effect, columns[effect, form]) for effect, form in ranked]
+    if SOIL in bench.candidates.effects:  # both of its parameters, whatever its rank
+        chosen.append((SOIL, bench.candidates.columns(SOIL)))
+    fits = refit_all(bench, scores, sigma, null, found.pool, [columns for _, columns in chosen])
+    best: dict[str, Refit] = {}
+    for (effect, _), fit in zip(chosen, fits, strict=True):
+        if effect not in best or (fit.errors and fit.explained > best[effect].explained):
+            best[effect] = fit
+    return best
 
 
 def _corrected(found: Detection, refits: dict[str, Refit]) -> dict[str, float]:
@@ -214,30 +217,29 @@ def _corrected(found: Detection, refits: dict[str, Refit]) -> dict[str, float]:
     out = dict(found.beliefs.effects)
     for name, fit in refits.items():
         if fit.errors:
-            out[name] += 0.5 * (fit.explained - found.pool.fit(fit.columns)[2])
+            linear = found.pool.fit(found.beliefs.best[name].columns)[2]
+            out[name] += 0.5 * (fit.explained - linear)
     return out
 
 
-def _chosen(
+def _remaining(
     bench: Bench,
     scores: Sequence[Score],
     sigma: Array,
     null: Null,
     found: Detection,
-    verdict: Verdict,
     refits: dict[str, Refit],
-) -> Refit | None:
-    """The fit that stands for the verdict: of the effect named, or of several at once."""
-    if not verdict.named:
-        return None
-    if len(verdict.named) == 1 and verdict.named[0] in refits:
-        fit = refits[verdict.named[0]]
-        return fit if fit.errors else None
-    columns = tuple(i for name in verdict.named for i in found.beliefs.best[name].columns)
-    try:
-        return refit_all(bench, scores, sigma, null, found.pool, [columns])[0]
-    except (TerrafusionError, np.linalg.LinAlgError, FloatingPointError):
-        return None
+    effects: Sequence[str],
+) -> tuple[Pool, Refit | None]:
+    """What is left of the gap with some effects in the twin, and their fit; the gap itself where that fails."""
+    fit = refits.get(effects[0]) if len(effects) == 1 else None
+    if fit is None:
+        columns = tuple(i for name in effects for i in found.beliefs.best[name].columns)
+        fit = refit_all(bench, scores, sigma, null, found.pool, [columns])[0]
+    if not fit.errors:
+        return found.pool, fit
+    left = [scored(r, sigma, e, s.A) for r, e, s in zip(bench.runs, fit.errors, scores, strict=True)]
+    return Pool.of(left, null), fit
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:

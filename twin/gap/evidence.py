@@ -182,7 +182,7 @@ def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Mode
 
 def _at_ground(run: Raw, drives: Drives, effects: Mapping[str, float]) -> Raw | None:
     """The run against the twin on another ground; None where the twin diverges."""
-    found = predictions(run.log, drives.model, drives.candidates, [effects], drives.of(run.log).start)[0]
+    found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
     if found is None:
         return None
     error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]

@@ -7,6 +7,7 @@ all probes at once.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -102,7 +103,9 @@ def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Be
     for h in candidates.hypotheses:
         if set(h.columns) & set(given):
             continue
-        forms[h.effect, h.form] = pool.log_factor([*given, *h.columns]) - base
+        forms[h.effect, h.form] = (
+            pool.log_factor([*given, *h.columns]) - base + _one_sided(pool, h, candidates)
+        )
         kept = best.get(h.effect)
         if kept is None or forms[h.effect, h.form] > forms[kept.effect, kept.form]:
             best[h.effect] = h
@@ -113,3 +116,18 @@ def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Be
     probes = range(len(candidates.keys), len(pool.gain))
     unknown = pool.log_factor([*given, *probes], UNKNOWN_SIZES) - base
     return Beliefs(effects, best, forms, unknown)
+
+
+def _one_sided(pool: Pool, h: Hypothesis, candidates: Candidates) -> float:
+    """Log factor of a prior that has one side only: twice the posterior's share on that side."""
+    if len(h.columns) != 1:
+        return 0.0
+    i = h.columns[0]
+    if candidates.low[i] < 0.0 < candidates.high[i]:
+        return 0.0
+    best, covariance, _ = pool.fit(h.columns)
+    side = 1.0 if candidates.high[i] > 0.0 else -1.0
+    z = side * float(best[0]) / math.sqrt(float(covariance[0, 0]))
+    if z > -5.0:
+        return math.log(math.erfc(-z / math.sqrt(2.0)))
+    return -0.5 * z * z - math.log(-z * math.sqrt(0.5 * math.pi))  # the tail's leading term

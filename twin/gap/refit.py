@@ -17,13 +17,13 @@ from numpy.typing import NDArray
 from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.residuals import Evidence, Raw, whitened_error
+from terrafusion.twin.gap.residuals import SOIL_STATE, Evidence, Raw, whitened_error
 from terrafusion.twin.gap.score import Score
 from terrafusion.twin.gap.signatures import predictions
 
 Array = NDArray[np.float64]
 
-STEPS = 2
+STEPS = 3
 SIZE = 10.0
 """1 sigma of an effect's size in a refit, typical sizes: wide, the data decide."""
 
@@ -122,15 +122,22 @@ def errors_with(
     bench: Bench, run: Evidence, raw: Raw, sets: Sequence[Mapping[str, float]]
 ) -> list[Array | None]:
     """Whitened errors of a run against the twin with each set of effects; None where it diverges."""
-    start = bench.drives.of(run.log).start
-    plain, *found = predictions(run.log, bench.model, bench.candidates, [{}, *sets], start)
+    c, base = bench.candidates, bench.model.effects
+    soil = [name for name in SOIL_STATE if name in c.keys]
+    driven = [{k: v for k, v in some.items() if k not in soil} for some in sets]
+    plain, *found = predictions(run.log, bench.model, c, [{}, *driven], run.log.start)
     out: list[Array | None] = []
-    for y in found:
+    for some, y in zip(sets, found, strict=True):
         if y is None or plain is None:
             out.append(None)
             continue
-        # raw.error is linearised about the run's own ground: the effect changes it by what it changes the twin
-        error = [e - (new - old) for e, new, old in zip(raw.error, y, plain, strict=True)]
+        # The errors are linearised about the run's own ground: the ground itself enters linearly, all else as the
+        # twin has it.
+        moved = [(some.get(k, base.get(k, 0.0)) - base.get(k, 0.0)) / c.scale[c.keys.index(k)] for k in soil]
+        error = [
+            e - (new - old) - s[:, : len(soil)] @ np.array(moved)
+            for e, new, old, s in zip(raw.error, y, plain, raw.state, strict=True)
+        ]
         out.append(whitened_error(raw, run, bench.noise, error))
     return out
 

@@ -11,13 +11,14 @@ import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.signatures import Drive, drive, predictions, signatures
+from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
 from terrafusion.twin.identify.log import Log, window_of
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise, autoregressive, clipped, gauss_markov
@@ -31,12 +32,16 @@ OFFSETS = {
     "current_left_a": 0.05, "current_right_a": 0.05,
 }  # fmt: skip
 """Channels with a turn-on offset, and its first 1 sigma (assumed)."""
-SAME_YAW_RAD = 0.02
-"""Two runs share a signature when they were told the same and start with headings this close."""
+SAME_YAW_RAD = 0.2
+"""Runs that were told the same share a signature where they set out within such a sector of headings."""
 LEAST_SCALE = 0.2
 """No channel is taken as better than this share of what its data sheet and scatter say (assumed)."""
-MOST_SOIL = 2.0
+MOST_SOIL = 4.0
 """A run's own ground is looked for within so many typical sizes."""
+GROUND_STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
+"""Steps of that search; it ends when one gains less than 3 %, or the errors are near the noise."""
+NUISANCE = 0.3
+"""1 sigma of the effects, in typical sizes, while a run's own ground is looked for."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +49,7 @@ class Raw:
     """One run before whitening; lists hold one entry a channel of `log.observed`.
 
     Attributes:
-        error: (n,) measured less predicted.
+        error: (n,) measured less predicted, linearised about the run's own ground (see `at_own_ground`).
         state, change, probe, pose: (n, T), (n, K), (n, G) and (n, 3) derivatives.
     """
 
@@ -88,23 +93,22 @@ class Drives:
     model: Model
     candidates: Candidates
     kept: dict[str, Drive] = field(default_factory=dict)
+    lock: Lock = field(default_factory=Lock)
 
     def of(self, log: Log) -> Drive:
-        """The drive of a log; its pose guesses may differ from the log's own by what is linear."""
-        key = hashlib.sha256()
+        """The drive of a log, from the poses that the log itself suggests."""
+        key = hashlib.sha256(np.round(log.start[:1, 2] / SAME_YAW_RAD).tobytes())
         for part in (log.sides, log.windows, log.borders):
             key.update(np.ascontiguousarray(part).tobytes())
         key.update(repr(log.labels).encode())
         name = key.hexdigest()
-        known = self.kept.get(name)
-        if known is not None:
-            apart = np.angle(np.exp(1j * (known.start[:, 2] - log.start[:, 2])))
-            if np.abs(apart).max() < SAME_YAW_RAD:
-                return known
-        found = drive(log, self.model, self.candidates, log.start)
+        with self.lock:
+            known = self.kept.get(name)
         if known is None:
-            self.kept[name] = found
-        return found
+            known = drive(log, self.model, self.candidates, log.start)
+            with self.lock:
+                self.kept[name] = known
+        return placed(known, log, log.start)
 
 
 def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
@@ -137,35 +141,52 @@ def raw_of(log: Log, found: Drive, model: Model, candidates: Candidates, channel
 
 
 def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
-    """The run with errors linearised about its own ground's strength, not about that of the references.
+    """The run with errors linearised about its own ground, not about that of the references.
 
     Slip grows steeply with the ground's strength; to first order, a run on softer ground would show a gap. The twin
-    is run once more on the ground that suits this run, and what that explains is carried back linearly.
+    is run on the ground that suits this run, as long as that lowers the errors, and the way there is carried back
+    linearly.
     """
-    keys = drives.candidates.keys
-    names = [name for name in SOIL_STATE if name in keys]
-    G, sigma = whitened(run, noise).gram, state_sigmas(drives.candidates)
-    K = len(sigma) + len(keys)
-    prior = np.concatenate([sigma**-2.0, np.ones(len(keys))])
-    own = np.linalg.solve(G[:K, :K] + np.diag(prior), G[:K, -1])[: len(names)]
-    own = np.clip(own, -MOST_SOIL, MOST_SOIL)
-    effects, base = {}, drives.model.effects
+    names = [name for name in SOIL_STATE if name in drives.candidates.keys]
+    own, best = np.zeros(len(names)), run
+    evidence = whitened(run, noise)
+    cost = float(evidence.gram[-1, -1])
+    for _ in range(GROUND_STEPS):
+        tried = np.clip(own + _soil_step(evidence, drives.candidates, len(names)), -MOST_SOIL, MOST_SOIL)
+        effects = _soil_at(tried, names, drives)
+        found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
+        if found is None:
+            break
+        error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]
+        moved = dataclasses.replace(run, error=error)
+        evidence = whitened(moved, noise)
+        now, before = float(evidence.gram[-1, -1]), cost
+        if now >= before:
+            break
+        own, best, cost = tried, moved, now
+        if now > ENOUGH * before or now < GOOD * len(evidence.time_s):
+            break
+    back = [e + s[:, : len(names)] @ own for e, s in zip(best.error, run.state, strict=True)]
+    return dataclasses.replace(run, error=back)
+
+
+def _soil_step(evidence: Evidence, candidates: Candidates, count: int) -> Array:
+    """Step of the ground (T,), in typical sizes; effects take part as nuisances of lesser size."""
+    sigma = state_sigmas(candidates)
+    prior = np.concatenate([sigma**-2.0, np.full(len(candidates.keys), NUISANCE**-2.0)])
+    prior[:count] = 1.0
+    K, G = len(prior), evidence.gram
+    return np.asarray(np.linalg.solve(G[:K, :K] + np.diag(prior), G[:K, -1])[:count])
+
+
+def _soil_at(own: Array, names: Sequence[str], drives: Drives) -> dict[str, float]:
+    """Soil parameters that lie `own` (T,) typical sizes from the model's; `own` is kept within their ranges."""
+    c, effects = drives.candidates, {}
     for i, name in enumerate(names):
-        at = keys.index(name)
-        low, high, scale = (
-            float(x[at]) for x in (drives.candidates.low, drives.candidates.high, drives.candidates.scale)
-        )
-        effects[name] = min(max(base.get(name, 0.0) + own[i] * scale, 0.95 * low), 0.95 * high)
-        own[i] = (effects[name] - base.get(name, 0.0)) / scale
-    start = drives.of(run.log).start
-    found = predictions(run.log, drives.model, drives.candidates, [effects], start)[0]
-    if found is None:
-        return run
-    error = [
-        o.value - value + state[:, : len(names)] @ own
-        for o, value, state in zip(run.log.observed, found, run.state, strict=True)
-    ]
-    return dataclasses.replace(run, error=error)
+        at, base = c.keys.index(name), drives.model.effects.get(name, 0.0)
+        effects[name] = float(np.clip(base + own[i] * c.scale[at], 0.95 * c.low[at], 0.95 * c.high[at]))
+        own[i] = (effects[name] - base) / c.scale[at]
+    return effects
 
 
 def state_sigmas(candidates: Candidates) -> Array:

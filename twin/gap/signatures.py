@@ -147,6 +147,47 @@ def drive(
     return Drive(start, exact, y, change, _by_pose(log, coarse[0], y), coarse[0][:, INDEX["yaw"]])
 
 
+def placed(found: Drive, log: Log, start: Array) -> Drive:
+    """The drive from other poses (W, 3) at the windows' starts: on a level plane it shifts and turns as a whole."""
+    if np.array_equal(found.start, start):
+        return found
+    parts = {
+        name: (getattr(found, name).copy(), every)
+        for name, every in (("fine", 1), ("y", EVERY), ("change", EVERY))
+    }
+    heading = found.heading.copy()
+    for name, (values, every) in parts.items():
+        counts = [len(np.arange(first, last + 1, every)) for first, last in log.windows]
+        for k, first in enumerate(np.cumsum([0, *counts[:-1]])):
+            rows = slice(int(first), int(first) + counts[k])
+            turn = start[k, 2] - found.start[k, 2]
+            R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+            for pair, is_position in ((_POSITION, True), (_VELOCITY, False)):
+                block = values[rows][:, pair]
+                about, to = (
+                    (found.start[k, :2], start[k, :2]) if is_position and name != "change" else (0.0, 0.0)
+                )
+                if block.ndim == 2:
+                    values[rows, pair] = (block - about) @ R.T + to
+                else:
+                    values[rows, pair] = np.einsum("ab,nbk->nak", R, block)
+            if name == "y":
+                heading[rows] += turn
+    y = parts["y"][0]
+    by_pose = found.by_pose.copy()
+    at = np.repeat(start[:, :2], [len(np.arange(a, b + 1, EVERY)) for a, b in log.windows], axis=0)
+    (east, north), (v_e, v_n) = _POSITION_AT, _VELOCITY_AT
+    by_pose[:, east, 2], by_pose[:, north, 2] = at[:, 1] - y[:, north], y[:, east] - at[:, 0]
+    by_pose[:, v_e, 2], by_pose[:, v_n, 2] = -y[:, v_n], y[:, v_e]
+    return Drive(start, parts["fine"][0], y, parts["change"][0], by_pose, heading)
+
+
+_POSITION_AT = (OUTPUTS.index("gnss_east_m"), OUTPUTS.index("gnss_north_m"))
+_VELOCITY_AT = (OUTPUTS.index("gnss_v_e_mps"), OUTPUTS.index("gnss_v_n_mps"))
+_POSITION = slice(_POSITION_AT[0], _POSITION_AT[1] + 1)
+_VELOCITY = slice(_VELOCITY_AT[0], _VELOCITY_AT[1] + 1)
+
+
 def signatures(log: Log, drive: Drive) -> list[Signature]:
     """Every channel of the log as the twin has it: means over the rows' own intervals."""
     shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,15 +16,15 @@ from terrafusion.twin.gap.refit import Refit
 
 Array = NDArray[np.float64]
 
-TEMPER = 0.1
-"""Power of the Bayes factors in the posterior: candidates' laws are not the robot's (tuned on twin trials whose true
-form was withheld)."""
-KNOWN_SHARE, SHARE_WIDTH = 0.6, 0.08
-"""A gap of which the candidates explain less than the first is of unknown cause; width of that judgement."""
-SECOND_FACTOR = 12.0
-"""Log Bayes factor that a further effect must have beside those found."""
-SECOND_SHARE = 0.08
-"""Share of the gap that a further effect must explain in addition."""
+TEMPER, LEFT_OVER = 0.2, 40.0
+"""Power of the Bayes factors in the posterior, and the square left over that halves it (a quasi-likelihood: where
+the candidates' laws do not fit, the evidence between them is worth less). Tuned on twin trials."""
+UNKNOWN_PART, UNKNOWN_WIDTH = 0.1, 12.0
+"""An unknown cause is as likely as not when the log Bayes factor of a dependence on the input, beside all effects
+named, is this part of the first one's; and the width of that judgement (tuned on twin trials)."""
+SECOND_FACTOR, SECOND_PART = 20.0, 0.15
+"""Log Bayes factor that a further effect must have beside those found, and the least part of the first one's: a law
+of slightly another form leaves something over, which is no second effect (tuned on twin trials)."""
 MOST_EFFECTS = 3
 
 
@@ -50,7 +50,7 @@ class Verdict:
     causes: list[Cause]
     p_null: float
     p_unknown: float
-    found: tuple[int, ...]
+    fit: Refit | None
 
 
 def null_probability(p_value: float) -> float:
@@ -69,33 +69,58 @@ def floor_of(pools: Sequence[Pool], every: Sequence[int]) -> tuple[float, float]
     return float(np.mean(explained)), float(np.std(explained)) + 1e-9
 
 
-def shares(pool: Pool, columns: Sequence[int], floor: float) -> float:
-    """Share of the gap above its floor that some columns explain, 0 to 1."""
-    whole = pool.fit(range(len(pool.gain)))[2] - floor
-    mine = pool.fit(columns)[2] - len(columns)
-    return float(np.clip(mine / max(whole, 1e-9), 0.0, 1.0)) if whole > 0.0 else 0.0
+@dataclass(frozen=True)
+class Explained:
+    """What some effects explain of the gap: its share, and what is left over in standard deviations and as it is."""
+
+    share: float
+    left_sd: float
+    left: float
 
 
-def search_more(pool: Pool, candidates: Candidates, first: str, floor: float) -> list[str]:
-    """Effects judged present: the first, and others that the runs demand beside it."""
+def explained(
+    pool: Pool, columns: Sequence[int], floor: tuple[float, float], least: float = 0.0
+) -> Explained:
+    """What some columns explain, of what all columns and probes together do; `least` is what they are known to."""
+    whole = pool.fit(range(len(pool.gain)))[2] - floor[0]
+    mine = max(pool.fit(columns)[2] - len(columns), least)
+    left = max(whole - mine, 0.0)
+    return Explained(float(np.clip(mine / max(whole, floor[1], 1e-9), 0.0, 1.0)), left / floor[1], left)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Effects judged present, their joint fit, and by how much an unknown dependence is called for."""
+
+    effects: tuple[str, ...]
+    fit: Refit | None
+    unknown: float
+
+
+Remaining = Callable[[Sequence[str]], tuple[Pool, Refit | None]]
+"""What is left of the gap once some effects, refitted together, are in the twin; and their fit."""
+
+
+def search(remaining: Remaining, candidates: Candidates, factors: Mapping[str, float]) -> Found:
+    """The first effect, and others that the runs demand beside it."""
+    first = max(factors, key=lambda k: factors[k])
     found = [first]
-    while len(found) < MOST_EFFECTS:
-        given = [i for name in found for i in candidates.columns(name)]
-        share = shares(pool, given, floor)
-        beside = beliefs(pool, candidates, given)
-        if not beside.effects:
+    pool, fit = remaining(found)
+    while True:
+        beside = beliefs(pool, candidates, [i for name in found for i in candidates.columns(name)])
+        name = max(beside.effects, key=lambda k: beside.effects[k], default=None)
+        if name is None or len(found) == MOST_EFFECTS:
             break
-        name = max(beside.effects, key=lambda k: beside.effects[k])
-        gained = shares(pool, [*given, *candidates.columns(name)], floor) - share
-        if beside.effects[name] < SECOND_FACTOR or gained < SECOND_SHARE:
+        if beside.effects[name] < max(SECOND_FACTOR, SECOND_PART * factors[first]):
             break
         found.append(name)
-    return found
+        pool, fit = remaining(found)
+    return Found(tuple(found), fit, beside.unknown - UNKNOWN_PART * max(factors[first], 0.0))
 
 
-def posterior(found: Mapping[str, float]) -> dict[str, float]:
-    """Probabilities of the effects, given that one of them is the cause."""
-    values = np.array(list(found.values())) * TEMPER
+def posterior(found: Mapping[str, float], left: float) -> dict[str, float]:
+    """Probabilities of the effects, given that one of them is the cause and leaves `left` unexplained."""
+    values = np.array(list(found.values())) * TEMPER / (1.0 + left / LEFT_OVER)
     weights = np.exp(values - values.max())
     return dict(zip(found, (weights / weights.sum()).tolist(), strict=True))
 
@@ -107,6 +132,7 @@ def judge(
     believed: Beliefs,
     factors: Mapping[str, float],
     refits: Mapping[str, Refit],
+    remaining: Remaining,
     candidates: Candidates,
     floor: tuple[float, float],
 ) -> Verdict:
@@ -115,41 +141,37 @@ def judge(
     Args:
         factors: log Bayes factors by effect, those refitted corrected by what the twin itself explains.
         refits: by effect.
+        remaining: what is left of the gap beside some effects.
         floor: mean and standard deviation of what is explained where nothing is wrong.
     """
     p_null = null_probability(p_value)
     order = sorted(factors, key=lambda k: -factors[k])
-    first = order[0]
-    named = search_more(pool, candidates, first, floor[0]) if detected else []
-    columns = [i for name in (named or [first]) for i in candidates.columns(name)]
-    explained = shares(pool, columns, floor[0])
-    p_unknown = (1.0 - p_null) / (1.0 + math.exp((explained - KNOWN_SHARE) / SHARE_WIDTH))
-    weight = posterior(factors)
+    found = search(remaining, candidates, factors) if detected else Found((order[0],), None, -math.inf)
+    columns = [i for name in found.effects for i in candidates.columns(name)]
+    least = found.fit.explained if found.fit is not None and found.fit.errors else 0.0
+    told = explained(pool, columns, floor, least)
+    p_unknown = (1.0 - p_null) * _unknown(found.unknown)
+    weight = posterior(factors, told.left)
+    known = 1.0 - p_null - p_unknown
     causes = [
-        _cause(
-            name,
-            weight[name] * (1.0 - p_null - p_unknown),
-            pool,
-            believed,
-            refits,
-            candidates,
-            order,
-            floor[0],
-        )
-        for name in order
+        _cause(name, weight[name] * known, pool, believed, refits, candidates, order, floor) for name in order
     ]
-    kind = _kind(detected, explained, causes[0], named)
-    if kind in ("no_gap", "unknown"):
-        named = []
-    return Verdict(kind, tuple(named), causes, p_null, p_unknown, tuple(columns) if named else ())
+    kind = _kind(detected, found, causes[0])
+    named = found.effects if kind not in ("no_gap", "unknown") else ()
+    return Verdict(kind, named, causes, p_null, p_unknown, found.fit if named else None)
 
 
-def _kind(detected: bool, explained: float, first: Cause, named: Sequence[str]) -> str:
+def _unknown(factor: float) -> float:
+    """Probability of an unknown cause, given that there is a gap."""
+    return 1.0 / (1.0 + math.exp(-min(max(factor / UNKNOWN_WIDTH, -50.0), 50.0)))
+
+
+def _kind(detected: bool, found: Found, first: Cause) -> str:
     if not detected:
         return "no_gap"
-    if explained < KNOWN_SHARE:
+    if found.unknown > 0.0:
         return "unknown"
-    if list(named) == [SOIL]:
+    if found.effects == (SOIL,):
         return "parameters"
     return "ambiguous" if len(first.members) > 1 else "effect"
 
@@ -162,7 +184,7 @@ def _cause(
     refits: Mapping[str, Refit],
     candidates: Candidates,
     order: Sequence[str],
-    floor: float,
+    floor: tuple[float, float],
 ) -> Cause:
     columns = believed.best[name].columns
     value, covariance, _ = pool.fit(columns)
@@ -170,5 +192,5 @@ def _cause(
     if fit is not None and not fit.failure:
         columns, value, covariance = fit.columns, fit.value, fit.covariance
     members = class_of(pool, candidates, name, columns, order) if order.index(name) < 5 else (name,)
-    share = shares(pool, candidates.columns(name), floor)
+    share = explained(pool, candidates.columns(name), floor).share
     return Cause(name, members, max(probability, 0.0), columns, value, np.sqrt(np.diag(covariance)), share)
