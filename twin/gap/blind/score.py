@@ -8,15 +8,14 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 from terrafusion.twin.gap.blind.plan import FAMILIES, Trial
-from terrafusion.twin.gap.blind.rates import Rate, rate, reliability
+from terrafusion.twin.gap.blind.rates import rate, reliability
 from terrafusion.twin.gap.blind.shapes import shapes
 from terrafusion.twin.gap.blind.verdicts import Judged, judge
 
 SCHEMA = "terrafusion.gap-blind/1"
 SINGLE = ("same", "shifted")
 MATTERS = 1.5
-"""Severity from which an effect counts as one that ought to be told (half of 0.5 lies below any
-threshold)."""
+"""Severity from which an effect counts as one that ought to be told."""
 
 
 def score(
@@ -96,8 +95,7 @@ def _by_family(judged: Sequence[Judged], outcome: Callable[[Judged], bool]) -> d
 
 
 def _class_size(judged: Sequence[Judged]) -> dict[str, float | None]:
-    """Mean size of the class ranked first: a class that holds everything is always right, and says
-    nothing."""
+    """Mean size of the class ranked first: one that holds everything is always right, and says nothing."""
     sizes = {f: [len(j.first_class) for j in _of(judged, f, detected=True) if j.first] for f in SINGLE}
     return {family: statistics.fmean(many) if many else None for family, many in sizes.items()}
 
@@ -229,6 +227,3 @@ def _met(value: float | None, sign: str, limit: float) -> bool | None:
     if value is None:
         return None
     return value <= limit if sign == "<=" else value >= limit
-
-
-__all__ = ["Rate", "score", "targets"]

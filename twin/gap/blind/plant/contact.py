@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 PEAK_SHARE = 0.4
-"""Where the pressure under a wheel is highest, as a share of the entry angle (Wong and Reece 1967: c1 about
-0.43)."""
+"""Where the pressure under a wheel is highest, over the entry angle (Wong and Reece 1967: c1 about 0.43)."""
 RESIDUAL = 0.95
 """Shear stress far past the hump over that at the hump (assumed; Wong 2008 has 0.4 to 1)."""
 HUMP = 1.0 / (1.0 - np.exp(-1.0)) - RESIDUAL
@@ -30,8 +29,8 @@ def stress_integrals(exponent: float) -> tuple[float, float]:
     the bottom (Wong and Reece 1967), small angles: 1 - x^2 over the share x = t / t1.
     """
     nodes, weights = np.polynomial.legendre.leggauss(40)
-    at = lambda low, high: 0.5 * (high - low) * nodes + 0.5 * (high + low)  # noqa: E731
-    front, rear = at(PEAK_SHARE, 1.0), at(0.0, PEAK_SHARE)
+    front = 0.5 * (1.0 - PEAK_SHARE) * nodes + 0.5 * (1.0 + PEAK_SHARE)
+    rear = 0.5 * PEAK_SHARE * (nodes + 1.0)
     mirrored = 1.0 - rear * (1.0 - PEAK_SHARE) / PEAK_SHARE
     w_front, w_rear = 0.5 * (1.0 - PEAK_SHARE) * weights, 0.5 * PEAK_SHARE * weights
     stress_front, stress_rear = (1.0 - front**2) ** exponent, (1.0 - mirrored**2) ** exponent
@@ -53,8 +52,7 @@ def lyasko(driven_slip: Array) -> Array:
 
 
 def skidded(skid: Array, gain: Array) -> Array:
-    """Growth of the sinkage of a wheel that slides over its way by the share `skid` (own form,
-    saturating)."""
+    """Growth of the sinkage of a wheel that slides over its way by the share `skid` (own form)."""
     return np.asarray(1.0 + gain * skid * skid / (skid + 0.3))
 
 

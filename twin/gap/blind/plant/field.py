@@ -16,8 +16,7 @@ QUANTITIES = ("strength", "bearing", "modulus")
 WEIGHTS = {"strength": 1.0, "bearing": 2.0, "modulus": -1.5}
 """How far each quantity's logarithm varies beside that of the strength (assumed)."""
 SHARED = 0.7
-"""Correlation of what is common to all quantities: dense ground is strong, stiff and shears early
-(assumed)."""
+"""Correlation of the quantities: dense ground is strong, stiff and shears early (assumed)."""
 
 
 class Patches:

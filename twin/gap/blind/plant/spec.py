@@ -21,8 +21,7 @@ SPREAD_RADIUS, SPREAD_DRAG = 0.002, 0.1
 
 @dataclass(frozen=True)
 class Segment:
-    """Commanded twist over `duration_s`: v + v_swing sin(2 pi f t), likewise the yaw rate; t from its
-    start."""
+    """Commanded twist: v + v_swing sin(2 pi hz t), likewise the yaw rate; t from the segment's start."""
 
     duration_s: float
     v_mps: float = 0.0
