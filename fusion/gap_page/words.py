@@ -16,8 +16,8 @@ def sentences(d: Diagnosis) -> list[str]:
         said.append(f"Next, drive '{d.next_run.scenario}': {d.next_run.why}.")
     if d.uncalibrated:
         said.append(
-            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in for them."
-        )
+            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in
+            for them." )
     return [s for s in said if s]
 
 

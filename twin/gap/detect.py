@@ -1,8 +1,8 @@
 """Is there a gap: a permutation test over runs.
 
 If nothing has changed, judged runs and references are exchangeable: any of them could have been the judged
-ones. The statistic of the judged runs is compared with that of other choices from all runs, each judged against
-the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
+ones. The statistic of the judged runs is compared with that of other choices from all runs, each judged
+against the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
 """
 
 from __future__ import annotations

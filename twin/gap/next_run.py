@@ -38,7 +38,8 @@ class NextRun:
 
 
 def propose(bench: Bench, sigma: Array, one: str, other: str) -> NextRun | None:
-    """The drive on which two effects look least alike for their signal; None where no drive separates them."""
+    """The drive on which two effects look least alike for their signal; None where no drive separates
+    them."""
     best: tuple[float, float, str] | None = None
     for name in SCENARIOS:
         try:
@@ -98,6 +99,6 @@ def _rows(observed: Observed, end_s: float) -> Observed:
     end = slot * observed.slot_s
     length = float(np.median(observed.end_s - observed.begin_s))
     return Observed(
-        observed.channel, end - length, end, np.zeros(len(slot)), np.full(len(slot), np.median(observed.sigma)),
-        slot, observed.slot_s, observed.least, observed.correlation,
+        observed.channel, end - length, end, np.zeros(len(slot)), np.full(len(slot),
+        np.median(observed.sigma)), slot, observed.slot_s, observed.least, observed.correlation,
     )  # fmt: skip

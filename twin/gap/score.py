@@ -42,7 +42,8 @@ def score(run: Evidence, sigma: Array) -> Score:
 
 
 def learnt_sigma(runs: Sequence[Evidence], first: Array) -> Array:
-    """1 sigma (T,) of theta about its mean over the runs, by expectation-maximisation (Dempster et al. 1977)."""
+    """1 sigma (T,) of theta about its mean over the runs, by expectation-maximisation (Dempster et al.
+    1977)."""
     sigma = first.copy()
     if len(runs) < 2:
         return sigma
