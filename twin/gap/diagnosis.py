@@ -171,8 +171,8 @@ def _candidates(effects: Sequence[str] | None) -> Candidates:
 
 def _too_few(references: int, runs: int, significance: float) -> str:
     return (
-        f"{references} reference run(s) and {runs} run(s) cannot show a gap at {significance:g} by themselves: twin "
-        "replicates stand in, and false alarms are as frequent as the twin is wrong (uncalibrated)"
+        f"{references} reference run(s) and {runs} run(s) cannot show a gap at {significance:g} by themselves"
+        ": twin replicates stand in, and false alarms are as frequent as the twin is wrong (uncalibrated)"
     )
 
 

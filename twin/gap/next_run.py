@@ -52,8 +52,8 @@ def propose(bench: Bench, sigma: Array, one: str, other: str) -> NextRun | None:
     if best is None or best[1] > ENOUGH:
         return None
     why = (
-        f"in the twin, {SECONDS:.0f} s of '{best[2]}' make {one} and {other} look alike to {best[1]:.2f} only "
-        "(1 = the same), the clearest of the drives tried"
+        f"in the twin, {SECONDS:.0f} s of '{best[2]}' make {one} and {other} look alike to {best[1]:.2f} "
+        "only (1 = the same), the clearest of the drives tried"
     )
     return NextRun(best[2], (one, other), why)
 

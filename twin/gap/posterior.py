@@ -1,8 +1,8 @@
 """Which effect: Bayes factors of every effect against the learned null, and against a gap of no known shape.
 
-Under effect k the standardised scores of all runs shift along one direction a parameter, x = U_k phi + noise, with
-phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight. `unknown` shifts them
-along all probes at once.
+Under effect k the standardised scores of all runs shift along one direction a parameter, x = U_k phi + noise,
+with phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight. `unknown` shifts
+them along all probes at once.
 """
 
 from __future__ import annotations

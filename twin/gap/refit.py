@@ -132,7 +132,7 @@ def errors_with(
             out.append(None)
             continue
         # The errors are linearised about the run's own ground: the ground itself enters linearly, all else
-        as the # twin has it.
+        # as the twin has it.
         moved = [(some.get(k, base.get(k, 0.0)) - base.get(k, 0.0)) / c.scale[c.keys.index(k)] for k in soil]
         error = [
             e - (new - old) - s[:, : len(soil)] @ np.array(moved)

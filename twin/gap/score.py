@@ -1,7 +1,7 @@
 """Efficient scores: what a run says of every effect once theta is projected out.
 
-With V = I + J_theta Sigma J_theta' the score is b = P' V^-1 e and its information A = P' V^-1 P (Neyman 1959, C(alpha)
-tests; here theta is random with variance Sigma, so it is projected out as far as it varies).
+With V = I + J_theta Sigma J_theta' the score is b = P' V^-1 e and its information A = P' V^-1 P (Neyman 1959,
+C(alpha) tests; here theta is random with variance Sigma, so it is projected out as far as it varies).
 """
 
 from __future__ import annotations
