@@ -143,7 +143,7 @@ def diagnose(
         return _remaining(bench, scores, sigma, null, found, refits, effects)
 
     verdict = judge(
-        found.p_value <= significance, found.p_value, found.pool, found.beliefs, factors, refits, remaining,
+        found.p_value <= significance, found.tail(), found.pool, found.beliefs, factors, refits, remaining,
         candidates, floor,
     )  # fmt: skip
     if progress is not None:

@@ -1,8 +1,8 @@
 """One-run evidence: prediction errors of every channel, whitened, and their derivatives.
 
 A run's residual is e = J_phi phi + J_theta theta + Q pose + noise: phi the effects' parameters and the
-probes, theta what legitimately varies from run to run (soil strength, turn-on offsets), pose the start of each
-window. The poses are projected out at once; theta stays, its variance is learnt from the references.
+probes, theta what legitimately varies from run to run (soil strength, turn-on offsets), pose the start of
+each window. The poses are projected out at once; theta stays, its variance is learnt from the references.
 """
 
 from __future__ import annotations
