@@ -17,7 +17,7 @@ LAYERS = ("datasets", "twin", "twin.gap", "fusion")
 
 
 COMMANDS = (
-    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "calibrate", "study", "replay",
+    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "calibrate", "gap", "study", "replay",
     "terrain", "policy", "gap-blind",
 )  # fmt: skip
 

@@ -62,7 +62,8 @@ def gap(
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
 ) -> None:
-    """Tell where runs differ from reference runs, which effect causes it, and how far the gap shrinks with it.
+    """Tell where runs differ from reference runs, which effect causes it, and how far the gap shrinks with
+    it.
 
     Writes diagnosis.json and report.html. No truth channel is read.
 

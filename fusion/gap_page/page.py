@@ -43,7 +43,10 @@ def _where(d: Diagnosis) -> str:
         (escape(c.channel), escape(c.regime), escape(c.band), f"{100.0 * c.share:.1f}", f"{c.p_value:.3g}")
         for c in d.where[:10]
     ]
-    caption = "Where the runs err more than the references. Dots: significant for the whole map (max-T over choices of runs)."
+    caption = (
+        "Where the runs err more than the references. Dots: significant for the whole map "
+        "(max-T over choices of runs)."
+    )
     return f"<h2>Where</h2>\n{figure(fig, caption)}\n" + table(
         ("channel", "regime", "band", "share, %", "p"), rows, (3, 4)
     )

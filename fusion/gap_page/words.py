@@ -16,7 +16,8 @@ def sentences(d: Diagnosis) -> list[str]:
         said.append(f"Next, drive '{d.next_run.scenario}': {d.next_run.why}.")
     if d.uncalibrated:
         said.append(
-            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in for them."
+            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in "
+            "for them."
         )
     return [s for s in said if s]
 
@@ -78,15 +79,15 @@ def _shrink(d: Diagnosis) -> str:
         return ""
     if s.share is None:
         return (
-            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap stands too little "
-            "above its floor to call that a share."
+            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap stands "
+            "too little above its floor to call that a share."
         )
     interval = (
         "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
     )
     held = "on runs left out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
     return (
-        f"With the effect in the twin {100.0 * s.share:.0f} % of the gap above its floor goes away {held}{interval}: "
-        f"{s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the references; soil and sensor "
-        f"offsets set anew alone leave {s.recalibrated:.3g}."
+        f"With the effect in the twin {100.0 * s.share:.0f} % of the gap above its floor goes away "
+        f"{held}{interval}: {s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the "
+        f"references; soil and sensor offsets set anew alone leave {s.recalibrated:.3g}."
     )

@@ -26,12 +26,12 @@ TELLING = 3.0
 def likeness(pool: Pool, one: Sequence[int], coefficients: Array, other: Sequence[int]) -> float:
     """Correlation of the signature of `one` with these coefficients and the best of `other`."""
     a, b = np.asarray(one), np.asarray(other)
-    I = pool.information
-    size = float(coefficients @ I[np.ix_(a, a)] @ coefficients)
+    whole = pool.information
+    size = float(coefficients @ whole[np.ix_(a, a)] @ coefficients)
     if not size > 0.0:
         return 0.0
-    cross = I[np.ix_(b, a)] @ coefficients
-    within = I[np.ix_(b, b)] + 1e-9 * np.eye(len(b)) * max(float(np.trace(I[np.ix_(b, b)])), 1e-12)
+    cross = whole[np.ix_(b, a)] @ coefficients
+    within = whole[np.ix_(b, b)] + 1e-9 * np.eye(len(b)) * max(float(np.trace(whole[np.ix_(b, b)])), 1e-12)
     return float(np.sqrt(np.clip(cross @ np.linalg.solve(within, cross) / size, 0.0, 1.0)))
 
 

@@ -48,7 +48,8 @@ def values_of(diagnosis: Diagnosis) -> dict[str, float]:
 def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> list[str]:
     """Write the vehicle's file with the effects named that are numbers of it; what was done, in sentences.
 
-    An effect that is no number of the vehicle cannot go into its file; the sentence says how to give it to the twin.
+    An effect that is no number of the vehicle cannot go into its file; the sentence says how to give it to
+    the twin.
 
     Raises:
         ConfigError: the vehicle's file cannot be read.

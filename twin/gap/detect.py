@@ -1,8 +1,8 @@
 """Is there a gap: a permutation test over runs.
 
 If nothing has changed, judged runs and references are exchangeable: any of them could have been the judged
-ones. The statistic of the judged runs is compared with that of other choices from all runs, each judged against
-the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
+ones. The statistic of the judged runs is compared with that of other choices from all runs, each judged
+against the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
 from terrafusion.twin.gap.score import Score
 
+TAIL_FREEDOM = 10
+"""Degrees of freedom of that tail: heavier than normal (assumed)."""
 PERMUTATIONS = 99
 """Other choices of runs that the judged ones are compared with, at most."""
 
@@ -32,6 +34,19 @@ class Detection:
     others: tuple[float, ...]
     pool: Pool
     beliefs: Beliefs
+
+    def tail(self) -> float:
+        """The p-value carried on beyond what so few choices resolve, for the odds of a gap and not for the test.
+
+        On a scale that is linear for small and logarithmic for large statistics, others are taken as Student's t.
+        """
+        from scipy.stats import t
+
+        if self.p_value > 1.5 / (1 + len(self.others)) or len(self.others) < 3:
+            return self.p_value
+        others = np.arcsinh(self.others)
+        z = (math.asinh(self.statistic) - others.mean()) / max(float(others.std(ddof=1)), 0.2)
+        return min(self.p_value, float(t.sf(z, TAIL_FREEDOM)))
 
 
 def judged(

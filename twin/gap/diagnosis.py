@@ -34,7 +34,8 @@ Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
 REFITTED = 6
-"""Forms that are refitted, the most probable ones: with the soil and the twin as it is, one vector of runs."""
+"""Forms that are refitted, the most probable ones: with the soil and the twin as it is, one vector of
+runs."""
 FLOORS = 20
 """Choices of references by which the floor of the gap is learnt."""
 
@@ -142,7 +143,7 @@ def diagnose(
         return _remaining(bench, scores, sigma, null, found, refits, effects)
 
     verdict = judge(
-        found.p_value <= significance, found.p_value, found.pool, found.beliefs, factors, refits, remaining,
+        found.p_value <= significance, found.tail(), found.pool, found.beliefs, factors, refits, remaining,
         candidates, floor,
     )  # fmt: skip
     if progress is not None:
@@ -170,8 +171,8 @@ def _candidates(effects: Sequence[str] | None) -> Candidates:
 
 def _too_few(references: int, runs: int, significance: float) -> str:
     return (
-        f"{references} reference run(s) and {runs} run(s) cannot show a gap at {significance:g} by themselves: twin "
-        "replicates stand in, and false alarms are as frequent as the twin is wrong (uncalibrated)"
+        f"{references} reference run(s) and {runs} run(s) cannot show a gap at {significance:g} by themselves"
+        ": twin replicates stand in, and false alarms are as frequent as the twin is wrong (uncalibrated)"
     )
 
 
@@ -231,7 +232,8 @@ def _remaining(
     refits: dict[str, Refit],
     effects: Sequence[str],
 ) -> tuple[Pool, Refit | None]:
-    """What is left of the gap with some effects in the twin, and their fit; the gap itself where that fails."""
+    """What is left of the gap with some effects in the twin, and their fit; the gap itself where that
+    fails."""
     fit = refits.get(effects[0]) if len(effects) == 1 else None
     if fit is None:
         columns = tuple(i for name in effects for i in found.beliefs.best[name].columns)

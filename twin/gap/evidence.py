@@ -40,7 +40,8 @@ WINDOW_S = 10.0
 BASE_RUNS, BASE_STEPS = 3, 5
 """References by which the ground is set, and steps of that search at most."""
 BASE_MOVED, MOST_STEP = 0.1, 1.0
-"""The search ends with a step shorter than the first, and takes none longer than the second (typical sizes)."""
+"""The search ends with a step shorter than the first, and takes none longer than the second (typical
+sizes)."""
 GENERIC_GROUND = "medium_sand"
 """Stands in where a log says no ground that is known; the references then set its strength."""
 
@@ -145,7 +146,8 @@ def set_ground(
 ) -> Model:
     """The twin with its ground's strength, bearing and rolling resistance set to the references.
 
-    The other columns take part as nuisances of typical size, so that a commissioning error does not pass for soil.
+    The other columns take part as nuisances of typical size, so that a commissioning error does not pass
+    for soil.
     """
     keys = candidates.keys
     names = [name for name in SOIL_STATE if name in keys]
@@ -236,7 +238,7 @@ def gather(
     logs = prepared([*runs, *references], model, ground, source)
     channels = common_channels(logs)
     logs = [restricted(log, channels) for log in logs]
-    mine, others = logs[: len(runs)], logs[len(runs) :]
+    others = logs[len(runs) :]
     if others:
         model = set_ground(others, model, candidates, channels, jobs)
     drives, done = Drives(model, candidates), [0]

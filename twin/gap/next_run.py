@@ -38,7 +38,8 @@ class NextRun:
 
 
 def propose(bench: Bench, sigma: Array, one: str, other: str) -> NextRun | None:
-    """The drive on which two effects look least alike for their signal; None where no drive separates them."""
+    """The drive on which two effects look least alike for their signal; None where no drive separates
+    them."""
     best: tuple[float, float, str] | None = None
     for name in SCENARIOS:
         try:
@@ -51,8 +52,8 @@ def propose(bench: Bench, sigma: Array, one: str, other: str) -> NextRun | None:
     if best is None or best[1] > ENOUGH:
         return None
     why = (
-        f"in the twin, {SECONDS:.0f} s of '{best[2]}' make {one} and {other} look alike to {best[1]:.2f} only "
-        "(1 = the same), the clearest of the drives tried"
+        f"in the twin, {SECONDS:.0f} s of '{best[2]}' make {one} and {other} look alike to {best[1]:.2f} "
+        "only (1 = the same), the clearest of the drives tried"
     )
     return NextRun(best[2], (one, other), why)
 
@@ -98,6 +99,6 @@ def _rows(observed: Observed, end_s: float) -> Observed:
     end = slot * observed.slot_s
     length = float(np.median(observed.end_s - observed.begin_s))
     return Observed(
-        observed.channel, end - length, end, np.zeros(len(slot)), np.full(len(slot), np.median(observed.sigma)),
-        slot, observed.slot_s, observed.least, observed.correlation,
+        observed.channel, end - length, end, np.zeros(len(slot)), np.full(len(slot),
+        np.median(observed.sigma)), slot, observed.slot_s, observed.least, observed.correlation,
     )  # fmt: skip

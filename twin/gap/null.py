@@ -1,8 +1,8 @@
 """The learned null: how scores scatter from run to run where nothing has changed.
 
-Commissioning errors and whatever the twin lacks anyway shift and correlate the scores of every run. Their mean and
-covariance come from reference runs; the covariance is shrunk to the Fisher form, which is what it would be
-were the twin right (Ledoit and Wolf 2004: shrinkage to a structured target).
+Commissioning errors and whatever the twin lacks anyway shift and correlate the scores of every run. Their
+mean and covariance come from reference runs; the covariance is shrunk to the Fisher form, which is what it
+would be were the twin right (Ledoit and Wolf 2004: shrinkage to a structured target).
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Which effect: Bayes factors of every effect against the learned null, and against a gap of no known shape.
 
-Under effect k the standardised scores of all runs shift along one direction a parameter, x = U_k phi + noise, with
-phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight. `unknown` shifts them along
-all probes at once.
+Under effect k the standardised scores of all runs shift along one direction a parameter, x = U_k phi + noise,
+with phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight. `unknown` shifts
+them along all probes at once.
 """
 
 from __future__ import annotations
@@ -61,8 +61,8 @@ class Pool:
     def log_factor(self, columns: Sequence[int], sizes: Sequence[float] = SIZES) -> float:
         """Log Bayes factor of the columns, N(0, s^2) with s over `sizes`, against the null."""
         at = np.asarray(columns)
-        I, g = self.information[np.ix_(at, at)], self.gain[at]
-        values, vectors = np.linalg.eigh(I)
+        g = self.gain[at]
+        values, vectors = np.linalg.eigh(self.information[np.ix_(at, at)])
         values, h = np.maximum(values, 0.0), vectors.T @ g
         each = [
             0.5 * float(np.sum(h**2 * s * s / (1.0 + s * s * values) - np.log1p(s * s * values)))

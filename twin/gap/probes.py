@@ -1,7 +1,8 @@
 """Probes: what a gap could look like that no candidate has in store.
 
 A probe adds a function of what the robot was told to do to one channel: a constant, speed, turn rate, their
-rates and products. Whatever the missing physics is, it shows as some dependence of the residuals on the input.
+rates and products. Whatever the missing physics is, it shows as some dependence of the residuals on the
+input.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Refits: the most probable effects once more, through the twin itself and not its linearisation.
 
-Gauss-Newton in the scores: the twin is run with the effect, the errors that are left are scored again, and the
-coefficients move along the linear information. Bounded by the effect's range; a run that diverges or a
+Gauss-Newton in the scores: the twin is run with the effect, the errors that are left are scored again, and
+the coefficients move along the linear information. Bounded by the effect's range; a run that diverges or a
 step that does not help ends the fit where it stands, and that is reported.
 """
 
@@ -131,8 +131,8 @@ def errors_with(
         if y is None or plain is None:
             out.append(None)
             continue
-        # The errors are linearised about the run's own ground: the ground itself enters linearly, all else as the
-        # twin has it.
+        # The errors are linearised about the run's own ground: the ground itself enters linearly, all else
+        # as the twin has it.
         moved = [(some.get(k, base.get(k, 0.0)) - base.get(k, 0.0)) / c.scale[c.keys.index(k)] for k in soil]
         error = [
             e - (new - old) - s[:, : len(soil)] @ np.array(moved)

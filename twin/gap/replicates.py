@@ -1,7 +1,8 @@
 """Twin replicates: runs that differ by nothing but noise and theta, where references are too few.
 
-They are drawn in the whitened rows: e = J_theta theta + noise, poses projected out, which is what the twin itself says
-of the scatter from run to run. What it does not know of, they do not show: an answer made with them is uncalibrated.
+They are drawn in the whitened rows: e = J_theta theta + noise, poses projected out, which is what the twin
+itself says of the scatter from run to run. What it does not know of, they do not show: an answer made with
+them is uncalibrated.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """One-run evidence: prediction errors of every channel, whitened, and their derivatives.
 
-A run's residual is e = J_phi phi + J_theta theta + Q pose + noise: phi the effects' parameters and the probes, theta
-what legitimately varies from run to run (soil strength, turn-on offsets), pose the start of each window. The
-poses are projected out at once; theta stays, its variance is learnt from the references.
+A run's residual is e = J_phi phi + J_theta theta + Q pose + noise: phi the effects' parameters and the
+probes, theta what legitimately varies from run to run (soil strength, turn-on offsets), pose the start of
+each window. The poses are projected out at once; theta stays, its variance is learnt from the references.
 """
 
 from __future__ import annotations
@@ -143,9 +143,9 @@ def raw_of(log: Log, found: Drive, model: Model, candidates: Candidates, channel
 def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
     """The run with errors linearised about its own ground, not about that of the references.
 
-    Slip grows steeply with the ground's strength; to first order, a run on softer ground would show a gap. The twin
-    is run on the ground that suits this run, as long as that lowers the errors, and the way there is carried back
-    linearly.
+    Slip grows steeply with the ground's strength; to first order, a run on softer ground would show a gap.
+    The twin is run on the ground that suits this run, as long as that lowers the errors, and the way there
+    is carried back linearly.
     """
     names = [name for name in SOIL_STATE if name in drives.candidates.keys]
     own, best = np.zeros(len(names)), run
@@ -180,7 +180,8 @@ def _soil_step(evidence: Evidence, candidates: Candidates, count: int) -> Array:
 
 
 def _soil_at(own: Array, names: Sequence[str], drives: Drives) -> dict[str, float]:
-    """Soil parameters that lie `own` (T,) typical sizes from the model's; `own` is kept within their ranges."""
+    """Soil parameters that lie `own` (T,) typical sizes from the model's; `own` is kept within their
+    ranges."""
     c, effects = drives.candidates, {}
     for i, name in enumerate(names):
         at, base = c.keys.index(name), drives.model.effects.get(name, 0.0)
@@ -277,8 +278,8 @@ def _sheet_rho(runs: Sequence[Raw], channel: str) -> tuple[float, ...] | None:
 def learnt_noise(runs: Sequence[Raw], every: Sequence[Raw], candidates: Candidates) -> dict[str, Noise]:
     """Noise by channel, from residuals of reference runs that are fitted with all that could differ.
 
-    What theta, a common set of effects and the poses explain is taken out (ridge, one typical size); what is left
-    is noise, its scale and its correlation in time.
+    What theta, a common set of effects and the poses explain is taken out (ridge, one typical size); what
+    is left is noise, its scale and its correlation in time.
 
     Args:
         runs: the references.
@@ -324,7 +325,7 @@ def _left_over(
         of = window_of(observed, run.log.windows)
         scaled = left / observed.sigma
         out[observed.channel] = [(observed.slot[of == k], scaled[of == k]) for k in np.unique(of)]
-    assert T == len(sigma)
+    assert len(sigma) == T
     return out
 
 

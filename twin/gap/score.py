@@ -1,7 +1,7 @@
 """Efficient scores: what a run says of every effect once theta is projected out.
 
-With V = I + J_theta Sigma J_theta' the score is b = P' V^-1 e and its information A = P' V^-1 P (Neyman 1959, C(alpha)
-tests; here theta is random with variance Sigma, so it is projected out as far as it varies).
+With V = I + J_theta Sigma J_theta' the score is b = P' V^-1 e and its information A = P' V^-1 P (Neyman 1959,
+C(alpha) tests; here theta is random with variance Sigma, so it is projected out as far as it varies).
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ def score(run: Evidence, sigma: Array) -> Score:
 
 
 def learnt_sigma(runs: Sequence[Evidence], first: Array) -> Array:
-    """1 sigma (T,) of theta about its mean over the runs, by expectation-maximisation (Dempster et al. 1977)."""
+    """1 sigma (T,) of theta about its mean over the runs, by expectation-maximisation (Dempster et al.
+    1977)."""
     sigma = first.copy()
     if len(runs) < 2:
         return sigma

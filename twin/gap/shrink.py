@@ -1,7 +1,7 @@
 """How far the gap shrinks on runs the effect was not fitted on.
 
-Each judged run is left out in turn, the effect fitted on the others, the twin run with it on the one left out,
-and theta and poses adapted anew in both arms. One run alone is scored on itself, without an interval.
+Each judged run is left out in turn, the effect fitted on the others, the twin run with it on the one left
+out, and theta and poses adapted anew in both arms. One run alone is scored on itself, without an interval.
 """
 
 from __future__ import annotations

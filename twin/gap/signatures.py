@@ -148,7 +148,8 @@ def drive(
 
 
 def placed(found: Drive, log: Log, start: Array) -> Drive:
-    """The drive from other poses (W, 3) at the windows' starts: on a level plane it shifts and turns as a whole."""
+    """The drive from other poses (W, 3) at the windows' starts: on a level plane it shifts and turns as a
+    whole."""
     if np.array_equal(found.start, start):
         return found
     parts = {
@@ -277,7 +278,8 @@ def _compiled(effects: tuple[str, ...]) -> Pointwise | None:
 
 
 def _by_pose(log: Log, states: Array, y: Array) -> Array:
-    """Derivatives (N, Y, 3) of the outputs by x, y and yaw of the window's start: the run shifts and turns."""
+    """Derivatives (N, Y, 3) of the outputs by x, y and yaw of the window's start: the run shifts and
+    turns."""
     out = np.zeros((*y.shape, 3))
     east, north, v_e, v_n = (
         OUTPUTS.index(n) for n in ("gnss_east_m", "gnss_north_m", "gnss_v_e_mps", "gnss_v_n_mps")
@@ -292,7 +294,8 @@ def _by_pose(log: Log, states: Array, y: Array) -> Array:
 
 
 def _coarse(observed: Observed, log: Log) -> tuple[Rows, Array]:
-    """Coarse samples (n, 6) that a row depends on and their weights: a mean of three linear interpolations."""
+    """Coarse samples (n, 6) that a row depends on and their weights: a mean of three linear
+    interpolations."""
     step = EVERY * DT_S
     counts = np.array([len(np.arange(first, last + 1, EVERY)) for first, last in log.windows])
     offset = np.concatenate([[0], np.cumsum(counts)[:-1]])

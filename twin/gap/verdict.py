@@ -17,14 +17,17 @@ from terrafusion.twin.gap.refit import Refit
 Array = NDArray[np.float64]
 
 TEMPER, LEFT_OVER = 0.2, 40.0
-"""Power of the Bayes factors in the posterior, and the square left over that halves it (a quasi-likelihood: where
-the candidates' laws do not fit, the evidence between them is worth less). Tuned on twin trials."""
+"""Power of the Bayes factors in the posterior, and the square left over that halves it (a quasi-likelihood:
+where the candidates' laws do not fit, the evidence between them is worth less). Tuned on twin trials."""
 UNKNOWN_PART, UNKNOWN_WIDTH = 0.1, 12.0
-"""An unknown cause is as likely as not when the log Bayes factor of a dependence on the input, beside all effects
-named, is this part of the first one's; and the width of that judgement (tuned on twin trials)."""
-SECOND_FACTOR, SECOND_PART = 20.0, 0.15
-"""Log Bayes factor that a further effect must have beside those found, and the least part of the first one's: a law
-of slightly another form leaves something over, which is no second effect (tuned on twin trials)."""
+"""An unknown cause is as likely as not when the log Bayes factor of a dependence on the input, beside all
+effects named, is this part of the first one's; and the width of that judgement (tuned on twin trials)."""
+SECOND_FACTOR, SECOND_PART, COMPLETING_PART = 20.0, 0.15, 0.04
+"""Log Bayes factor that a further effect must have beside those found, and its least part of the first
+one's; the last where nothing is left over once it is there. A law of slightly another form leaves something
+over, which is no second effect (tuned on twin trials)."""
+COMPLETE = -50.0
+"""Nothing is left over where the log Bayes factor of an unknown dependence is below this."""
 MOST_EFFECTS = 3
 
 
@@ -71,7 +74,8 @@ def floor_of(pools: Sequence[Pool], every: Sequence[int]) -> tuple[float, float]
 
 @dataclass(frozen=True)
 class Explained:
-    """What some effects explain of the gap: its share, and what is left over in standard deviations and as it is."""
+    """What some effects explain of the gap: its share, and what is left over in standard deviations and as
+    it is."""
 
     share: float
     left_sd: float
@@ -81,7 +85,8 @@ class Explained:
 def explained(
     pool: Pool, columns: Sequence[int], floor: tuple[float, float], least: float = 0.0
 ) -> Explained:
-    """What some columns explain, of what all columns and probes together do; `least` is what they are known to."""
+    """What some columns explain, of what all columns and probes together do; `least` is what they are known
+    to."""
     whole = pool.fit(range(len(pool.gain)))[2] - floor[0]
     mine = max(pool.fit(columns)[2] - len(columns), least)
     left = max(whole - mine, 0.0)
@@ -111,10 +116,16 @@ def search(remaining: Remaining, candidates: Candidates, factors: Mapping[str, f
         name = max(beside.effects, key=lambda k: beside.effects[k], default=None)
         if name is None or len(found) == MOST_EFFECTS:
             break
-        if beside.effects[name] < max(SECOND_FACTOR, SECOND_PART * factors[first]):
+        gain, first_one = beside.effects[name], max(factors[first], 0.0)
+        if gain < max(SECOND_FACTOR, COMPLETING_PART * first_one):
             break
+        after, joint = remaining([*found, name])
+        if gain < SECOND_PART * first_one:
+            columns = [i for other in (*found, name) for i in candidates.columns(other)]
+            if beliefs(after, candidates, columns).unknown > COMPLETE:
+                break
         found.append(name)
-        pool, fit = remaining(found)
+        pool, fit = after, joint
     return Found(tuple(found), fit, beside.unknown - UNKNOWN_PART * max(factors[first], 0.0))
 
 

@@ -1,7 +1,7 @@
 """Where: cells of channel, regime and band in which the judged runs err more than the references.
 
-A cell's share is what it adds to the excess of squared errors. Its p-value holds for all cells together: the greatest
-standardised excess over all cells, of other choices of runs (max-T, Westfall and Young 1993).
+A cell's share is what it adds to the excess of squared errors. Its p-value holds for all cells together:
+the greatest standardised excess over all cells, of other choices of runs (max-T, Westfall and Young 1993).
 """
 
 from __future__ import annotations
