@@ -18,8 +18,8 @@ LAYERS = ("datasets", "twin", "twin.gap", "fusion")
 
 
 COMMANDS = (
-    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "benchmark", "calibrate", "study", "replay",
-    "terrain", "policy",
+    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "benchmark", "calibrate", "gap", "study", "replay",
+    "terrain", "policy", "gap-blind",
 )  # fmt: skip
 
 
