@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from terrafusion.datasets.atomic import write_atomically
+from terrafusion.twin.identify.files import write_yaml
 from terrafusion.twin.library import read_named
 from terrafusion.twin.vehicle import VehicleParams
 
@@ -55,8 +55,6 @@ def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> 
         ConfigError: the vehicle's file cannot be read.
         TerrafusionError: the file cannot be written.
     """
-    import yaml
-
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
     out, said = copy.deepcopy(raw), []
     written = False
@@ -68,8 +66,7 @@ def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> 
             said.append(_change(out, diagnosis.bench.model.vehicle, path, how, value))
             written = True
     if written:
-        text = yaml.safe_dump(out, sort_keys=False, allow_unicode=True, width=100)
-        write_atomically(target, lambda part: part.write_text(text, encoding="utf-8"))
+        write_yaml(target, out)
         said.append(f"written to {target}")
     return said or ["no effect was named: the vehicle's file stays as it is"]
 

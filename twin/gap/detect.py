@@ -36,9 +36,10 @@ class Detection:
     beliefs: Beliefs
 
     def tail(self) -> float:
-        """The p-value carried on beyond what so few choices resolve, for the odds of a gap and not for the test.
+        """The p-value carried on beyond what so few choices resolve: for the odds of a gap, not for the test.
 
-        On a scale that is linear for small and logarithmic for large statistics, others are taken as Student's t.
+        On a scale that is linear for small and logarithmic for large statistics, others are taken as
+        Student's t.
         """
         from scipy.stats import t
 

@@ -155,7 +155,8 @@ def set_ground(
     drives = Drives(model, candidates)
     raws = raws_of(logs[:BASE_RUNS], drives, channels, jobs, lambda: None)
     noise = learnt_noise(raws, raws, candidates)
-    at, best = np.zeros(len(soil)), raws
+    at = np.zeros(len(soil))
+    best: Sequence[Raw | None] = raws
     cost = _cost(raws, noise)
     step = np.clip(_common_step(raws, noise, candidates, soil), -MOST_STEP, MOST_STEP)
     for _ in range(BASE_STEPS):

@@ -96,7 +96,7 @@ def _forecast(bench: Bench, scenario: Scenario, one: str, other: str) -> Evidenc
 def _rows(observed: Observed, end_s: float) -> Observed:
     """Regular rows of a channel up to a time, as noisy as those of a log."""
     slot = np.arange(1, max(2, int(end_s / observed.slot_s)))
-    end = slot * observed.slot_s
+    end: Array = slot.astype(float) * observed.slot_s
     length = float(np.median(observed.end_s - observed.begin_s))
     return Observed(
         observed.channel, end - length, end, np.zeros(len(slot)), np.full(len(slot),

@@ -54,7 +54,7 @@ def learn(references: Sequence[Score], judged: int) -> Null:
     x = np.array([d * (r.b - r.A @ offset) for d, r in zip(roots, references, strict=True)])
     fisher = sum((d[:, None] * r.A * d for d, r in zip(roots, references, strict=True)), np.zeros((P, P)))
     fisher = fisher / count
-    mean = x.mean(axis=0)
+    mean: Array = np.asarray(x.mean(axis=0))
     centred = x - mean
     shown = centred.T @ centred
     # Inflation of each score's variance over the Fisher form, itself shrunk to their median.

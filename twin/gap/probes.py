@@ -50,7 +50,7 @@ def told_twist(log: Log, model: Model) -> tuple[Array, Array]:
     """Times (N,) and told forward speed and turn rate (N, 2) of the log's grid, m/s and rad/s."""
     odometry = model.vehicle.odometry
     left, right = log.sides.T * odometry.wheel_radius_m
-    t_s = DT_S * np.arange(len(log.sides))
+    t_s: Array = DT_S * np.arange(float(len(log.sides)))
     return t_s, np.stack([0.5 * (left + right), (right - left) / odometry.track_m], axis=1)
 
 

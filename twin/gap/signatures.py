@@ -93,7 +93,7 @@ def predictions(
         if not np.isfinite(states).all():
             out.append(None)
             continue
-        sensors = _Sensors(model, candidates, plant, samples * DT_S, told_[samples])
+        sensors = _Sensors(model, candidates, plant, samples.astype(float) * DT_S, told_[samples])
         y = sensors.read(states, _vector(candidates, some))
         out.append([
             np.einsum("nk,nk->n", weight, y[:, _OUTPUTS[o.channel]].mean(axis=1)[at])
@@ -128,13 +128,13 @@ def drive(
             remedy="check the vehicle's and the soil's numbers",
         )
     every = _samples(log, 1)
-    sensors = _Sensors(model, candidates, plants[0], every * DT_S, inputs[0][every])
+    sensors = _Sensors(model, candidates, plants[0], every.astype(float) * DT_S, inputs[0][every])
     exact = sensors.read(fine, _vector(candidates, model.effects))
 
     def read(key: str | None) -> Array:
         lane = 1 + moving.index(key) if key in moving else 0
         some = model.effects if key is None else moved[key]
-        at = _Sensors(model, candidates, plants[lane], samples * DT_S, inputs[lane][samples])
+        at = _Sensors(model, candidates, plants[lane], samples.astype(float) * DT_S, inputs[lane][samples])
         return at.read(coarse[lane], _vector(candidates, some))
 
     y = read(None)
@@ -198,9 +198,9 @@ def signatures(log: Log, drive: Drive) -> list[Signature]:
         fine_at, fine_weight = averaging(observed, log, shift)
         value = np.einsum("nk,nk->n", fine_weight, drive.fine[:, columns].mean(axis=1)[fine_at])
         at, weight = _coarse(observed, log)
-        mean = [np.einsum("nk,nkm->nm", weight, part[:, columns].mean(axis=1)[at])
+        change, by_pose = [np.einsum("nk,nkm->nm", weight, part[:, columns].mean(axis=1)[at])
                 for part in (drive.change, drive.by_pose)]  # fmt: skip
-        out.append(Signature(value, *mean, drive.heading[at[:, 2]]))
+        out.append(Signature(value, change, by_pose, drive.heading[at[:, 2]]))
     return out
 
 

@@ -22,7 +22,7 @@ where the candidates' laws do not fit, the evidence between them is worth less).
 UNKNOWN_PART, UNKNOWN_WIDTH = 0.1, 12.0
 """An unknown cause is as likely as not when the log Bayes factor of a dependence on the input, beside all
 effects named, is this part of the first one's; and the width of that judgement (tuned on twin trials)."""
-SECOND_FACTOR, SECOND_PART, COMPLETING_PART = 20.0, 0.15, 0.04
+SECOND_FACTOR, SECOND_PART, COMPLETING_PART = 30.0, 0.15, 0.04
 """Log Bayes factor that a further effect must have beside those found, and its least part of the first
 one's; the last where nothing is left over once it is there. A law of slightly another form leaves something
 over, which is no second effect (tuned on twin trials)."""
