@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from terrafusion.datasets.recording import Recording
 
 RunsArgument = Annotated[
-    list[str], typer.Argument(metavar="RUN...", help="Runs of the robot as it is now: folders, bags, names.")
+    list[str],
+    typer.Argument(
+        metavar="RUN...",
+        help="Runs of the robot as it is now: folders, bags, names; "
+        "LOG@60-105 is a piece of one, LOG@/45 all of its pieces of 45 s.",
+    ),
 ]
 ReferenceOption = Annotated[
     list[str] | None,
@@ -96,6 +101,11 @@ def gap(
 
 def _opened(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
     from terrafusion.datasets.readers import open_recordings
+    from terrafusion.twin.gap.pieces import split_name
 
-    found = [r for name in names for r in open_recordings(name, **options)]
+    found: list[Recording] = []
+    for name in names:
+        log, cut = split_name(name)
+        for recording in open_recordings(log, **options):
+            found += [recording] if cut is None else cut.of(recording)
     return [clock_accepted(r) for r in found] if repair_clock else found
