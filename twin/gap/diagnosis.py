@@ -26,6 +26,7 @@ from terrafusion.twin.gap.replicates import COUNT, replicates
 from terrafusion.twin.gap.residuals import state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
 from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
+from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.gap.verdict import Verdict, floor_of, judge
 from terrafusion.twin.gap.where import Cell, gap_map
 from terrafusion.twin.vehicle import VehicleParams
@@ -98,6 +99,7 @@ def diagnose(
     seed: int = 0,
     jobs: int = 2,
     progress: Callable[[float], None] | None = None,
+    kept: dict[str, Drive] | None = None,
 ) -> Diagnosis:
     """Compare runs with reference runs through the twin.
 
@@ -112,6 +114,8 @@ def diagnose(
         seed: of permutations and replicates.
         jobs: threads.
         progress: told the share done, 0 to 1.
+        kept: one's own empty dict, given to each of several diagnoses with the same vehicle and soils: what
+            the twin makes of a drive is computed once.
 
     Raises:
         ConfigError: an unknown effect or soil, a significance out of range.
@@ -124,7 +128,9 @@ def diagnose(
     if not 0.0 < significance < 1.0:
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
     candidates = _candidates(effects)
-    bench = gather(runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress)
+    bench = gather(
+        runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
+    )
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
     scores = [score(run, sigma) for run in bench.runs]
     normal = [score(run, sigma) for run in bench.references]

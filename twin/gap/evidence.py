@@ -25,7 +25,7 @@ from terrafusion.twin.gap.residuals import (
     state_sigmas,
     whitened,
 )
-from terrafusion.twin.gap.signatures import predictions
+from terrafusion.twin.gap.signatures import Drive, predictions
 from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
@@ -141,18 +141,16 @@ def raws_of(
         return first + list(pool.map(one, logs[1:]))
 
 
-def set_ground(
-    logs: Sequence[Log], model: Model, candidates: Candidates, channels: Sequence[str], jobs: int
-) -> Model:
+def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int) -> Model:
     """The twin with its ground's strength, bearing and rolling resistance set to the references.
 
     The other columns take part as nuisances of typical size, so that a commissioning error does not pass
     for soil.
     """
+    model, candidates = drives.model, drives.candidates
     keys = candidates.keys
     names = [name for name in SOIL_STATE if name in keys]
     soil = [keys.index(name) for name in names]
-    drives = Drives(model, candidates)
     raws = raws_of(logs[:BASE_RUNS], drives, channels, jobs, lambda: None)
     noise = learnt_noise(raws, raws, candidates)
     at = np.zeros(len(soil))
@@ -228,8 +226,9 @@ def gather(
     source: str = "auto",
     jobs: int = 2,
     progress: Callable[[float], None] | None = None,
+    kept: dict[str, Drive] | None = None,
 ) -> Bench:
-    """Evidence of all runs.
+    """Evidence of all runs; `kept` holds signatures for diagnoses to come with the same vehicle and soils.
 
     Raises:
         DataError: a log without what it needs.
@@ -239,10 +238,10 @@ def gather(
     logs = prepared([*runs, *references], model, ground, source)
     channels = common_channels(logs)
     logs = [restricted(log, channels) for log in logs]
-    others = logs[len(runs) :]
+    others, kept = logs[len(runs) :], {} if kept is None else kept
     if others:
-        model = set_ground(others, model, candidates, channels, jobs)
-    drives, done = Drives(model, candidates), [0]
+        model = set_ground(others, Drives(model, candidates, kept), channels, jobs)
+    drives, done = Drives(model, candidates, kept), [0]
 
     def told() -> None:
         done[0] += 1

@@ -14,7 +14,7 @@ import argparse
 import json
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.diagnosis import diagnose
 from terrafusion.twin.gap.injected import INJECTIONS, Injection, pose_as_gnss
 from terrafusion.twin.gap.pieces import piece, spans
+from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 SEVERITIES = (0.5, 1.0, 2.0)
@@ -76,6 +77,7 @@ class Source:
     vehicle: VehicleParams
     recordings: list[Recording]
     spans: list[tuple[int, float, float]]
+    kept: dict[int, dict[str, Drive]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, logs: LogSet) -> Source:
@@ -93,6 +95,12 @@ class Source:
     def judged(self, fold: int) -> list[int]:
         """Numbers of the pieces that are judged in a fold."""
         return list(range(fold % FOLDS, len(self.spans), FOLDS))
+
+    def kept_for(self, fold: int) -> dict[str, Drive]:
+        """Signatures of a fold; those of another are forgotten."""
+        if fold not in self.kept:
+            self.kept.clear()
+        return self.kept.setdefault(fold, {})
 
     def cut(
         self, numbers: Sequence[int], injection: Injection | None = None, severity: float = 0.0
@@ -148,11 +156,12 @@ def estimated(cause: dict[str, Any], injection: Injection) -> list[float] | None
 
 
 def cases(logs: Sequence[str]) -> Iterator[tuple[str, Injection | None, float, int]]:
-    """Set, change, severity and fold of every row: nulls of all folds, then changes on folds in turn."""
+    """Set, change, severity and fold of every row: in each fold nothing, and changes in turn."""
+    changes = [(injection, severity) for injection in INJECTIONS for severity in SEVERITIES]
     for name in logs:
-        yield from ((name, None, 0.0, fold) for fold in range(FOLDS))
-        for k, (injection, severity) in enumerate((i, s) for i in INJECTIONS for s in SEVERITIES):
-            yield name, injection, severity, k
+        for fold in range(FOLDS):
+            yield name, None, 0.0, fold
+            yield from ((name, *change, fold) for change in changes[fold::FOLDS])
 
 
 def answered(
@@ -167,10 +176,11 @@ def answered(
     except TerrafusionError as error:
         return {"skipped": str(error)}
     try:
-        found = diagnose(runs, source.cut(others), source.vehicle, logs.soil, source="wheels").to_json()
+        normal, kept = source.cut(others), source.kept_for(fold)
+        answer = diagnose(runs, normal, source.vehicle, logs.soil, source="wheels", kept=kept).to_json()
     except Exception as error:  # a crash is a wrong answer, whatever it was
         return {"crash": f"{type(error).__name__}: {error}", "right": False}
-    told = verdict_on(found, injection)
+    told = verdict_on(answer, injection)
     return {**told, "runs": len(judged), "references": len(others), "elapsed_s": time.perf_counter() - began}
 
 

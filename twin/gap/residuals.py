@@ -88,7 +88,7 @@ class Evidence:
 
 @dataclass(eq=False)
 class Drives:
-    """Signatures by what was told: runs that repeat a drive share one."""
+    """Signatures by the twin and what it was told: runs that repeat a drive share one."""
 
     model: Model
     candidates: Candidates
@@ -100,7 +100,7 @@ class Drives:
         key = hashlib.sha256(np.round(log.start[:1, 2] / SAME_YAW_RAD).tobytes())
         for part in (log.sides, log.windows, log.borders):
             key.update(np.ascontiguousarray(part).tobytes())
-        key.update(repr(log.labels).encode())
+        key.update(repr((log.labels, self.candidates.keys, sorted(self.model.effects.items()))).encode())
         name = key.hexdigest()
         with self.lock:
             known = self.kept.get(name)
