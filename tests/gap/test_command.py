@@ -18,14 +18,14 @@ SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schemas/diagnosis.schema.
 @pytest.fixture(scope="module")
 def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("gap")
-    for recording in [*runs(100, 5), *runs(300, 2, {"wheel_radius/scale": 0.03})]:
+    for recording in [*runs(100, 6), *runs(300, 2, {"wheel_radius/scale": 0.03})]:
         write_log_folder(recording, folder / recording.name)
     return folder
 
 
 def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Path, terrafusion) -> None:
     arguments = ["gap", str(logs / "run300"), str(logs / "run301"), "--out", str(tmp_path / "out")]
-    for i in range(5):
+    for i in range(6):
         arguments += ["--reference", str(logs / f"run{100 + i}")]
     done = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"))
     assert done.status == 0, done.err

@@ -49,7 +49,8 @@ def learn(references: Sequence[Score], judged: int) -> Null:
     """The null of the references, for a judgement of so many runs together."""
     count, P = len(references), len(references[0].b)
     total = sum((r.A for r in references), np.zeros((P, P)))
-    offset = np.linalg.solve(total + np.eye(P), sum((r.b for r in references), np.zeros(P)))
+    shared = sum((r.b for r in references), np.zeros(P))
+    offset: Array = np.asarray(np.linalg.solve(total + np.eye(P), shared), dtype=np.float64)
     roots = [1.0 / np.sqrt(np.diag(r.A) + 1.0) for r in references]
     x = np.array([d * (r.b - r.A @ offset) for d, r in zip(roots, references, strict=True)])
     fisher = sum((d[:, None] * r.A * d for d, r in zip(roots, references, strict=True)), np.zeros((P, P)))
@@ -66,4 +67,5 @@ def learn(references: Sequence[Score], judged: int) -> Null:
     covariance = (shown + SHRINK_RUNS * target) / (count - 1 + SHRINK_RUNS)
     covariance = covariance + JITTER * np.eye(P)
     covariance *= 1.0 + judged / count
-    return Null(offset, mean, np.linalg.inv(covariance), count)
+    inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
+    return Null(offset, mean, inverse, count)

@@ -32,6 +32,8 @@ BANDS = ("below 0.5 Hz", "above 0.5 Hz")
 SLOW_S = 2.0
 """Means over this long are the slow band."""
 LEAST_ROWS = 5
+LEAST_REFERENCES = 2
+"""Fewer have no scatter from run to run."""
 
 
 @dataclass(frozen=True)
@@ -84,11 +86,13 @@ def cells(run: Evidence, model: Model, errors: Array) -> dict[tuple[str, int, in
 def gap_map(
     runs: Sequence[Evidence], references: Sequence[Evidence], model: Model, errors: Sequence[Array], seed: int
 ) -> list[Cell]:
-    """All cells with enough rows, most important first.
+    """All cells with enough rows, most important first; none without references to compare with.
 
     Args:
         errors: whitened errors of runs, then references, theta and the common offset taken out.
     """
+    if len(references) < LEAST_REFERENCES:
+        return []
     every = [*runs, *references]
     table = [cells(run, model, e) for run, e in zip(every, errors, strict=True)]
     keys = [
