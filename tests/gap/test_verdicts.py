@@ -15,6 +15,7 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.twin.effects.catalogue import effect_names
 from terrafusion.twin.gap import Diagnosis, diagnose
 from terrafusion.twin.gap.corrected import values_of, write_corrected
+from terrafusion.twin.gap.next_run import BY_HAND, DRIVES
 from terrafusion.twin.vehicle import load_vehicle
 
 from .drives import runs
@@ -75,6 +76,11 @@ def test_ambiguous_larger_wheels_and_encoder_scale(wide: Diagnosis) -> None:
     assert set(answer["causes"][0]["class"]) == {"wheel_radius", "encoder_scale"}
     number = answer["causes"][0]["parameters"]["wheel_radius/scale"]
     assert number["value"] == pytest.approx(0.03, abs=0.004)
+    following = answer["next_run"]
+    assert following["scenario"] in DRIVES
+    assert set(following["separates"]) == {"wheel_radius", "encoder_scale"}
+    assert wide.next_run is not None
+    assert wide.next_run.sigmas > 3.0
 
 
 def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references: list[Recording]) -> None:
@@ -84,6 +90,7 @@ def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references
     assert {"encoder_scale", "encoder_dropout"} <= set(answer["causes"][0]["class"])
     assert len(answer["named"]) == 2
     assert "gyro_scale" in answer["named"]
+    assert answer["next_run"]["scenario"] == BY_HAND  # lost counts are a scale whatever is driven
 
 
 def test_parameters_ground_of_stiffer_bearing(references: list[Recording]) -> None:

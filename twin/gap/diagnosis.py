@@ -251,11 +251,8 @@ def _remaining(
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:
-    first = verdict.causes[0]
+    """For the first cause and the likeliest of those that cannot be told from it."""
     if verdict.kind != "ambiguous":
         return None
-    for other in first.members[1:3]:
-        proposal = propose(bench, sigma, first.effect, other)
-        if proposal is not None:
-            return proposal
-    return None
+    first, by_name = verdict.causes[0], {c.effect: c for c in verdict.causes}
+    return propose(bench, sigma, first, by_name[first.members[1]])
