@@ -131,3 +131,11 @@ def test_calibration_error_and_interval() -> None:
     assert low == 0.0
     assert high == pytest.approx(1.0 - 0.025 ** (1 / 60), rel=1e-6)
     assert math.isclose(interval(60, 60)[1], 1.0)
+
+
+def test_factors_of_all_columns_are_those_of_each() -> None:
+    rng = np.random.default_rng(8)
+    shift = np.zeros(len(CANDIDATES.keys) + 6)
+    shift[4] = 0.3
+    pool = Pool.of(_scores(rng, 3, shift), learn(_scores(rng, 20, 0.0 * shift), 3))
+    np.testing.assert_allclose(pool.log_factors(), [pool.log_factor([i]) for i in range(len(shift))])

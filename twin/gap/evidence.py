@@ -24,6 +24,7 @@ from terrafusion.twin.gap.residuals import (
     raw,
     state_sigmas,
     whitened,
+    without_probes,
 )
 from terrafusion.twin.gap.signatures import Drive, predictions
 from terrafusion.twin.identify.log import Log, grounds, prepare
@@ -129,16 +130,20 @@ def restricted(log: Log, channels: Sequence[str]) -> Log:
 def raws_of(
     logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int, told: Callable[[], None]
 ) -> list[Raw]:
-    """Errors and derivatives of each run; the first alone, as it compiles."""
+    """Errors and derivatives of each run. The first run of each drive makes its signature, whichever thread
+    is faster; the very first alone, as it compiles."""
 
     def one(log: Log) -> Raw:
         found = raw(log, drives, channels)
         told()
         return found
 
-    first = [one(log) for log in logs[:1]]
+    first = list({drives.name(log): log for log in reversed(logs)}.values())[::-1]
+    made = {id(log): one(log) for log in first[:1]}
     with ThreadPoolExecutor(jobs) as pool:
-        return first + list(pool.map(one, logs[1:]))
+        for part in (first[1:], [log for log in logs if not any(log is other for other in first)]):
+            made.update(zip(map(id, part), pool.map(one, part), strict=True))
+    return [made[id(log)] for log in logs]
 
 
 def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int) -> Model:
@@ -192,7 +197,9 @@ def _at_ground(run: Raw, drives: Drives, effects: Mapping[str, float]) -> Raw | 
 
 def _cost(raws: Sequence[Raw | None], noise: Mapping[str, Noise]) -> float:
     """Sum of squared whitened errors, the poses fitted."""
-    return sum(np.inf if run is None else float(whitened(run, noise).gram[-1, -1]) for run in raws)
+    return sum(
+        np.inf if run is None else float(whitened(without_probes(run), noise).gram[-1, -1]) for run in raws
+    )
 
 
 def _common_step(
@@ -202,7 +209,7 @@ def _common_step(
     T, K = len(state_sigmas(candidates)), len(candidates.keys)
     H, g = np.zeros((K, K)), np.zeros(K)
     for run in filter(None, raws):
-        G = whitened(run, noise).gram
+        G = whitened(without_probes(run), noise).gram
         keep, effect = (
             np.arange(len(soil), T),
             np.arange(T, T + K),

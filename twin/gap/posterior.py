@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 SIZES = (0.1, 0.3, 1.0, 3.0, 10.0)
 """1 sigma of an effect's size, in typical sizes; equal weights."""
+WIDE = 10.0
+"""1 sigma of an effect's size where it is fitted: the data decide."""
 UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
 UNKNOWN_PRIOR = 0.1
 """Prior probability that a gap has a cause outside the catalogue (assumed)."""
@@ -70,7 +72,14 @@ class Pool:
         ]
         return float(np.logaddexp.reduce(each) - np.log(len(each)))
 
-    def fit(self, columns: Sequence[int], size: float = 10.0) -> tuple[Array, Array, float]:
+    def log_factors(self) -> Array:
+        """`log_factor` (P,) of each column by itself."""
+        square = np.array(SIZES)[:, None] ** 2
+        spread = square * np.maximum(np.diag(self.information), 0.0)
+        each = 0.5 * (self.gain**2 * square / (1.0 + spread) - np.log1p(spread))
+        return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(SIZES)))
+
+    def fit(self, columns: Sequence[int], size: float = WIDE) -> tuple[Array, Array, float]:
         """Best coefficients (k,), their covariance (k, k), and how much of `square` they explain."""
         at = np.asarray(columns)
         H = self.information[np.ix_(at, at)] + np.eye(len(at)) / size**2
@@ -98,14 +107,17 @@ class Beliefs:
 def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Beliefs:
     """Bayes factors of all effects; with `given` columns those of the effects beside these."""
     base = pool.log_factor(given) if len(given) else 0.0
+    alone = pool.log_factors() if not len(given) else None
     forms: dict[tuple[str, str], float] = {}
     best: dict[str, Hypothesis] = {}
     for h in candidates.hypotheses:
         if set(h.columns) & set(given):
             continue
-        forms[h.effect, h.form] = (
-            pool.log_factor([*given, *h.columns]) - base + _one_sided(pool, h, candidates)
-        )
+        if alone is not None and len(h.columns) == 1:
+            factor = float(alone[h.columns[0]])
+        else:
+            factor = pool.log_factor([*given, *h.columns]) - base
+        forms[h.effect, h.form] = factor + _one_sided(pool, h, candidates)
         kept = best.get(h.effect)
         if kept is None or forms[h.effect, h.form] > forms[kept.effect, kept.form]:
             best[h.effect] = h
@@ -125,9 +137,8 @@ def _one_sided(pool: Pool, h: Hypothesis, candidates: Candidates) -> float:
     i = h.columns[0]
     if candidates.low[i] < 0.0 < candidates.high[i]:
         return 0.0
-    best, covariance, _ = pool.fit(h.columns)
     side = 1.0 if candidates.high[i] > 0.0 else -1.0
-    z = side * float(best[0]) / math.sqrt(float(covariance[0, 0]))
+    z = side * float(pool.gain[i]) / math.sqrt(float(pool.information[i, i]) + 1.0 / WIDE**2)
     if z > -5.0:
         return math.log(math.erfc(-z / math.sqrt(2.0)))
     return -0.5 * z * z - math.log(-z * math.sqrt(0.5 * math.pi))  # the tail's leading term

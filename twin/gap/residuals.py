@@ -95,13 +95,18 @@ class Drives:
     kept: dict[str, Drive] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 
-    def of(self, log: Log) -> Drive:
-        """The drive of a log, from the poses that the log itself suggests."""
-        key = hashlib.sha256(np.round(log.start[:1, 2] / SAME_YAW_RAD).tobytes())
+    def name(self, log: Log) -> str:
+        """What runs that share a signature have in common."""
+        sector = np.round(log.start[:1, 2] / SAME_YAW_RAD) + 0.0  # no negative zero
+        key = hashlib.sha256(sector.tobytes())
         for part in (log.sides, log.windows, log.borders):
             key.update(np.ascontiguousarray(part).tobytes())
         key.update(repr((log.labels, self.candidates.keys, sorted(self.model.effects.items()))).encode())
-        name = key.hexdigest()
+        return key.hexdigest()
+
+    def of(self, log: Log) -> Drive:
+        """The drive of a log, from the poses that the log itself suggests."""
+        name = self.name(log)
         with self.lock:
             known = self.kept.get(name)
         if known is None:
@@ -149,34 +154,41 @@ def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
     """
     names = [name for name in SOIL_STATE if name in drives.candidates.keys]
     own, best = np.zeros(len(names)), run
-    evidence = whitened(run, noise)
-    cost = float(evidence.gram[-1, -1])
+    evidence = whitened(without_probes(run), noise)
+    rows, cost = evidence.rows[:, :-1].astype(float), float(evidence.gram[-1, -1])
+    gain = evidence.gram[:-1, -1]
     for _ in range(GROUND_STEPS):
-        tried = np.clip(own + _soil_step(evidence, drives.candidates, len(names)), -MOST_SOIL, MOST_SOIL)
+        step = _soil_step(evidence, gain, drives.candidates, len(names))
+        tried = np.clip(own + step, -MOST_SOIL, MOST_SOIL)
         effects = _soil_at(tried, names, drives)
         found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
         if found is None:
             break
         error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]
-        moved = dataclasses.replace(run, error=error)
-        evidence = whitened(moved, noise)
-        now, before = float(evidence.gram[-1, -1]), cost
+        white = whitened_error(run, evidence, noise, error)
+        now, before = float(white @ white), cost
         if now >= before:
             break
-        own, best, cost = tried, moved, now
+        own, best, cost, gain = tried, dataclasses.replace(run, error=error), now, rows.T @ white
         if now > ENOUGH * before or now < GOOD * len(evidence.time_s):
             break
     back = [e + s[:, : len(names)] @ own for e, s in zip(best.error, run.state, strict=True)]
     return dataclasses.replace(run, error=back)
 
 
-def _soil_step(evidence: Evidence, candidates: Candidates, count: int) -> Array:
-    """Step of the ground (T,), in typical sizes; effects take part as nuisances of lesser size."""
+def _soil_step(evidence: Evidence, gain: Array, candidates: Candidates, count: int) -> Array:
+    """Step of the ground (T,), in typical sizes, by inner products (K,) of columns and error; effects take
+    part as nuisances of lesser size."""
     sigma = state_sigmas(candidates)
     prior = np.concatenate([sigma**-2.0, np.full(len(candidates.keys), NUISANCE**-2.0)])
     prior[:count] = 1.0
-    K, G = len(prior), evidence.gram
-    return np.asarray(np.linalg.solve(G[:K, :K] + np.diag(prior), G[:K, -1])[:count])
+    K = len(prior)
+    return np.asarray(np.linalg.solve(evidence.gram[:K, :K] + np.diag(prior), gain)[:count])
+
+
+def without_probes(run: Raw) -> Raw:
+    """The run with no probes: they are half of all columns, and only the scores need them."""
+    return dataclasses.replace(run, probe=[p[:, :0] for p in run.probe])
 
 
 def _soil_at(own: Array, names: Sequence[str], drives: Drives) -> dict[str, float]:
@@ -313,7 +325,7 @@ def _left_over(
     run: Raw, noise: Mapping[str, Noise], sigma: Array
 ) -> dict[str, list[tuple[NDArray[np.int64], Array]]]:
     """Residuals of one run after its own fit, in first-guess sigmas, by channel and window."""
-    evidence = whitened(run, noise)
+    evidence = whitened(without_probes(run), noise)
     G, T = evidence.gram, evidence.states
     prior = np.concatenate([1.0 / sigma**2, np.ones(run.change[0].shape[1])])
     K = len(prior)
