@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 import sys
 import time
@@ -18,8 +19,8 @@ LAYERS = ("datasets", "twin", "twin.gap", "fusion")
 
 
 COMMANDS = (
-    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "benchmark", "calibrate", "study", "replay",
-    "terrain", "policy",
+    "demo", "fetch", "inspect", "convert", "simulate", "sweep", "benchmark", "calibrate", "gap", "study",
+    "replay", "terrain", "policy", "gap-blind",
 )  # fmt: skip
 
 
@@ -78,7 +79,9 @@ def test_imports_point_left(path: Path) -> None:
 def test_help_answers_at_once_and_lists_the_commands() -> None:
     command = [sys.executable, "-c", "from terrafusion.fusion.cli.main import main; main()", "--help"]
     started = time.perf_counter()
-    out = subprocess.run(command, capture_output=True, text=True, check=True, env={"COLUMNS": "100"}).stdout
+    out = subprocess.run(
+        command, capture_output=True, text=True, check=True, env={**os.environ, "COLUMNS": "100"}
+    ).stdout
     took = time.perf_counter() - started
     for name in COMMANDS:
         assert name in out

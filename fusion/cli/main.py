@@ -19,6 +19,8 @@ from terrafusion.fusion.cli import (
     convert,
     demo,
     fetch,
+    gap,
+    gap_blind,
     inspect,
     policy,
     replay,
@@ -62,6 +64,8 @@ app.command("simulate")(simulate.simulate)
 app.command("sweep")(sweep.sweep)
 app.command("benchmark")(benchmark.benchmark)
 app.command("calibrate")(calibrate.calibrate)
+app.command("gap")(gap.gap)
+app.command("gap-blind")(gap_blind.gap_blind)
 app.command("study")(study.study)
 app.command("replay")(replay.replay)
 app.add_typer(terrain.app, name="terrain")

@@ -35,7 +35,7 @@ def write_files(
         logs += " by a search that did not converge"
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
     mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith("vehicle.")}
-    written = [_write(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]
+    written = [write_yaml(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]
     for name, soil in model.soils.items():
         given = str((soils or {}).get(name, name))
         raw = published_soil(given) if is_published(given) else read_named("soils", given, kind="terrain")[0]
@@ -43,7 +43,7 @@ def write_files(
             f.name.removeprefix(f"{name}."): f for f in calibration.fitted if f.name.startswith(f"{name}.")
         }
         target = out / ("soil.yaml" if len(model.soils) == 1 else f"soil_{name}.yaml")
-        written.append(_write(target, _updated(raw, soil, mine, logs)))
+        written.append(write_yaml(target, _updated(raw, soil, mine, logs)))
     return written
 
 
@@ -87,7 +87,8 @@ def _overridden(raw: dict[str, Any], values: Any) -> None:
             raw[name] = _entry(entry, plain, "as the log says")
 
 
-def _write(path: Path, content: dict[str, Any]) -> Path:
+def write_yaml(path: Path, content: dict[str, Any]) -> Path:
+    """Write a mapping as YAML, in the order of its keys."""
     from ruamel.yaml import YAML
 
     yaml: Any = YAML(typ="safe", pure=True)

@@ -57,7 +57,7 @@ def predict(log: Log, model: Model, names: Sequence[str], start: Array) -> list[
     Raises:
         TerrafusionError: the run diverged.
     """
-    plant, directions = _plant(log, model, names)
+    plant, directions = plant_of(log, model, names)
     inputs = told(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
     states, changes = _run(log, plant, directions, inputs, start)
     samples = np.concatenate([np.arange(first, last + 1) for first, last in log.windows])
@@ -75,7 +75,7 @@ def predict(log: Log, model: Model, names: Sequence[str], start: Array) -> list[
     return out
 
 
-def _plant(log: Log, model: Model, names: Sequence[str]) -> tuple[Plant, Directions]:
+def plant_of(log: Log, model: Model, names: Sequence[str]) -> tuple[Plant, Directions]:
     """The plant, and as directions the named numbers, then x, y and yaw of a start."""
     route = route_of(log, model)
     vehicle, count = model.vehicle_vector(), len(names)
@@ -136,8 +136,8 @@ def _run(log: Log, plant: Plant, d: Directions, inputs: Array, start: Array) -> 
     turns = not plant.effect_names(d.effects) and not plant.vehicle[_GRAVITY].any()
     kept = np.arange(d.count - (len(POSE) if turns else len(POSE) - 1))
     kept = kept if turns else np.append(kept, d.count - 1)
-    run = _part(d, kept)
-    x, S = _led_in(log, plant, run, inputs)
+    run = part_of(d, kept)
+    x, S = led_in(log, plant, run, inputs)
     pose = [INDEX[name] for name in POSE]
     states, changes = [], []
     for (begin, end), guess in zip(log.windows, start, strict=True):
@@ -158,7 +158,7 @@ def _run(log: Log, plant: Plant, d: Directions, inputs: Array, start: Array) -> 
 _GRAVITY = [VEHICLE_PARAMETERS.index(name) for name in ("gravity_x_mps2", "gravity_y_mps2")]
 
 
-def _part(d: Directions, kept: NDArray[np.int64]) -> Directions:
+def part_of(d: Directions, kept: NDArray[np.int64]) -> Directions:
     """Some of the directions."""
     effects = {name: values[kept] for name, values in d.effects.items()}
     return Directions(d.start[:, kept], d.vehicle[:, kept], d.soil[:, :, kept], effects)
@@ -184,8 +184,14 @@ def _carried(
     return xs[-1].copy(), Ss[-1].copy()
 
 
-def _led_in(log: Log, plant: Plant, d: Directions, inputs: Array) -> tuple[Array, Array]:
+def led_in(log: Log, plant: Plant, d: Directions, inputs: Array) -> tuple[Array, Array]:
     """State (X,) and derivatives (X, M) at the first window, after driving as first told for `LEAD_S`."""
+    x, before = run_up(log, plant, inputs)
+    return _carried(plant, d, before, x, np.zeros((len(STATES), d.count)), -LEAD_S)
+
+
+def run_up(log: Log, plant: Plant, inputs: Array) -> tuple[Array, Array]:
+    """State (X,) `LEAD_S` before the log, and the inputs from there up to the first window."""
     x = np.zeros(len(STATES))
     x[INDEX["yaw"]] = log.start[0, 2]
     first = inputs[0].copy()
@@ -194,8 +200,7 @@ def _led_in(log: Log, plant: Plant, d: Directions, inputs: Array) -> tuple[Array
         x[state_slice("wheel_speed")] = first[[0, 1, 0, 1]]
         x[INDEX["u"]] = first[:2].mean() * plant.vehicle[VEHICLE_PARAMETERS.index("radius_m")]
     before = np.tile(first, (round(LEAD_S / DT_S), 1))
-    run_up = np.vstack([before, inputs[: log.windows[0, 0] + 1]])
-    return _carried(plant, d, run_up, x, np.zeros((len(STATES), d.count)), -LEAD_S)
+    return x, np.vstack([before, inputs[: log.windows[0, 0] + 1]])
 
 
 def averaging(observed: Observed, log: Log, shift: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:

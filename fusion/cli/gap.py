@@ -1,0 +1,111 @@
+"""`terrafusion gap`: where a robot and its twin disagree, why, and how far the gap shrinks."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from terrafusion.fusion.cli.calibrate import parse_terrain, split
+from terrafusion.fusion.cli.common import (
+    ColumnsOption,
+    RepairClockOption,
+    StampsOption,
+    TopicOption,
+    clock_accepted,
+    load_rig,
+    progress_bar,
+    reading,
+)
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.recording import Recording
+
+RunsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="RUN...",
+        help="Runs of the robot as it is now: folders, bags, names; "
+        "LOG@60-105 is a piece of one, LOG@/45 all of its pieces of 45 s.",
+    ),
+]
+ReferenceOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--reference", metavar="REF", help="Runs that count as normal; repeat for more. None: twin."
+    ),
+]
+
+
+def gap(
+    runs: RunsArgument,
+    out: Annotated[Path, typer.Option("--out", help="Folder for diagnosis.json and report.html.")],
+    reference: ReferenceOption = None,
+    vehicle: Annotated[str, typer.Option(help="The twin's vehicle, by name or YAML file.")] = "elevate",
+    terrain: Annotated[
+        list[str] | None,
+        typer.Option("--terrain", metavar="SOIL|LABEL=SOIL", help="Ground of all logs, or of one label."),
+    ] = None,
+    effects: Annotated[
+        str | None, typer.Option(help="Candidates by name, with commas. Default: the whole catalogue.")
+    ] = None,
+    significance: Annotated[float, typer.Option(help="False alarms accepted, 0.001 to 0.5.")] = 0.05,
+    source: Annotated[
+        str, typer.Option("--input", help="What drives the twin: auto, command, wheels.")
+    ] = "auto",
+    write_vehicle: Annotated[
+        Path | None,
+        typer.Option(
+            "--write-vehicle", metavar="FILE", help="Write the vehicle's file with the effect in it."
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(help="Of permutations and replicates.")] = 0,
+    topic: TopicOption = None,
+    stamps: StampsOption = "header",
+    columns: ColumnsOption = None,
+    repair_clock: RepairClockOption = False,
+) -> None:
+    """Tell where runs differ from reference runs, which effect causes it, and how far the gap shrinks with
+    it.
+
+    Writes diagnosis.json and report.html. No truth channel is read.
+
+    Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
+    """
+    from terrafusion.fusion.gap_page.page import write_diagnosis
+    from terrafusion.fusion.gap_page.words import sentences
+    from terrafusion.twin.gap.diagnosis import diagnose
+    from terrafusion.twin.vehicle import load_vehicle
+
+    options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
+    judged = _opened(runs, options, repair_clock)
+    normal = _opened(reference or [], options, repair_clock)
+    with progress_bar("comparing") as progress:
+        found = diagnose(
+            judged, normal, load_vehicle(vehicle), parse_terrain(terrain),
+            effects=split(effects) or None, significance=significance, source=source, seed=seed,
+            progress=progress,
+        )  # fmt: skip
+    write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
+    for line in sentences(found):
+        print(line)
+    if write_vehicle is not None:
+        from terrafusion.twin.gap.corrected import write_corrected
+
+        for line in write_corrected(found, vehicle, write_vehicle):
+            print(line)
+    print(f"written to {out} ({found.elapsed_s:.1f} s)")
+
+
+def _opened(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
+    from terrafusion.datasets.readers import open_recordings
+    from terrafusion.twin.gap.pieces import split_name
+
+    found: list[Recording] = []
+    for name in names:
+        log, cut = split_name(name)
+        for recording in open_recordings(log, **options):
+            found += [recording] if cut is None else cut.of(recording)
+    return [clock_accepted(r) for r in found] if repair_clock else found

@@ -1,0 +1,43 @@
+"""`terrafusion gap-blind`: the diagnosis judged on sealed trials of a plant that is not the twin."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from functools import partial
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from terrafusion.fusion.cli.common import progress_bar
+
+
+def gap_blind(
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for blind.json, report.html and the sealed labels.")
+    ],
+    quick: Annotated[bool, typer.Option("--quick", help="A small subset: every family, few trials.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes that diagnose.")] = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the trials; the same seed makes the same ones.")] = 0,
+) -> None:
+    """Judge the gap diagnosis on trials whose truth is sealed until all answers are given.
+
+    The trials come from a plant with laws and integrator of its own. Stopped, the same command continues.
+    Writes commitment.json first, answers.jsonl, then blind.json, sheet.png and report.html.
+
+    Example: terrafusion gap-blind --quick --out blind
+    """
+    from terrafusion.fusion.blind.page import summary, write_blind
+    from terrafusion.twin.gap import diagnose
+    from terrafusion.twin.gap.blind.check import run_blind_check
+
+    judged = partial(diagnose, jobs=1) if jobs > 1 else diagnose  # processes, or threads inside
+    with progress_bar("diagnosing") as progress:
+        scores = run_blind_check(
+            out, judged, quick=quick, seed=seed, jobs=jobs, progress=progress, oracle=judged
+        )
+    write_blind(out, scores, {"command": shlex.join(["terrafusion", *sys.argv[1:]])})
+    for line in summary(scores):
+        print(line)
+    print(f"written to {out}")

@@ -1,0 +1,93 @@
+"""A diagnosis in plain words that say only what its numbers carry."""
+
+from __future__ import annotations
+
+from terrafusion.twin.gap.diagnosis import Diagnosis
+
+MOST_LISTED = 4
+
+
+def sentences(d: Diagnosis) -> list[str]:
+    """The answer in sentences."""
+    said = [_detection(d)]
+    if d.detected:
+        said += [_cause(d), _place(d), _shrink(d)]
+    if d.next_run is not None:
+        said.append(f"Next, drive '{d.next_run.scenario}': {d.next_run.why}.")
+    if d.uncalibrated:
+        said.append(
+            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in "
+            "for them."
+        )
+    return [s for s in said if s]
+
+
+def _detection(d: Diagnosis) -> str:
+    p, runs = d.detection.p_value, f"{len(d.runs)} run(s), {d.seconds:.0f} s"
+    against = f"{len(d.references)} reference run(s)" if d.references else "the twin's own replicates"
+    if not d.detected:
+        return (
+            f"No gap was found: {runs} differ from {against} no more than these among themselves "
+            f"(p = {p:.3g}, threshold {d.significance:g}). A small gap may still be there."
+        )
+    return f"There is a gap: {runs} differ from {against} (p = {p:.3g}, threshold {d.significance:g})."
+
+
+def _cause(d: Diagnosis) -> str:
+    verdict, first = d.verdict, d.verdict.causes[0]
+    share = "" if first.share is None else f", which explains {100.0 * first.share:.0f} % of it"
+    if verdict.kind == "unknown":
+        return (
+            f"No candidate explains it: the best, {first.effect}, leaves too much. "
+            "Something is at work that the catalogue does not have."
+        )
+    if verdict.kind == "parameters":
+        return f"The ground has changed its strength; nothing structural is missing ({numbers(d)})."
+    if verdict.kind == "ambiguous":
+        listed = ", ".join(first.members)
+        return f"Its cause is one of {listed}: these runs cannot tell them apart{share} ({numbers(d)})."
+    others = ""
+    if len(verdict.named) > 1:
+        others = f", together with {' and '.join(verdict.named[1:])}"
+    return (
+        f"The most probable cause is {first.effect}{others} "
+        f"(probability {100.0 * first.probability:.0f} %){share} ({numbers(d)})."
+    )
+
+
+def numbers(d: Diagnosis) -> str:
+    """The first cause's parameters with one sigma."""
+    first, c = d.verdict.causes[0], d.bench.candidates
+    parts = []
+    for i, value, sigma in zip(first.columns, first.value, first.sigma, strict=True):
+        unit = f" {c.units[i]}" if c.units[i] else ""
+        parts.append(f"{c.keys[i]} = {value * c.scale[i]:.3g} +- {sigma * c.scale[i]:.2g}{unit}")
+    return ", ".join(parts)
+
+
+def _place(d: Diagnosis) -> str:
+    sure = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
+    if not sure:
+        return "It shows in no single channel and regime clearly enough to name one."
+    listed = "; ".join(f"{c.channel} while {c.regime}, {c.band} ({100.0 * c.share:.0f} %)" for c in sure)
+    return f"It shows in: {listed}. A channel in which a gap shows is not its cause."
+
+
+def _shrink(d: Diagnosis) -> str:
+    s = d.shrinking
+    if s is None or not d.verdict.named:
+        return ""
+    if s.share is None:
+        return (
+            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap stands "
+            "too little above its floor to call that a share."
+        )
+    interval = (
+        "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
+    )
+    held = "on runs left out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
+    return (
+        f"With the effect in the twin {100.0 * s.share:.0f} % of the gap above its floor goes away "
+        f"{held}{interval}: {s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the "
+        f"references; soil and sensor offsets set anew alone leave {s.recalibrated:.3g}."
+    )

@@ -1,0 +1,49 @@
+"""`terrafusion gap` from log folders to its two files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from terrafusion.datasets.writers.log_folder import write_log_folder
+
+from .drives import runs
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gap")
+    for recording in [*runs(100, 6), *runs(300, 2, {"wheel_radius/scale": 0.03})]:
+        write_log_folder(recording, folder / recording.name)
+    return folder
+
+
+def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Path, terrafusion) -> None:
+    arguments = ["gap", str(logs / "run300"), str(logs / "run301"), "--out", str(tmp_path / "out")]
+    for i in range(6):
+        arguments += ["--reference", str(logs / f"run{100 + i}")]
+    done = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"))
+    assert done.status == 0, done.err
+    answer = json.loads((tmp_path / "out/diagnosis.json").read_text("utf-8"))
+    jsonschema.validate(answer, SCHEMA)
+    assert answer["named"] == ["wheel_radius"]
+    page = (tmp_path / "out/report.html").read_text("utf-8")
+    assert "wheel_radius" in page
+    assert "Before and after" in page
+    assert "wheel_radius" in done.out
+    assert "wheel.radius_m" in done.out
+    assert (tmp_path / "corrected.yaml").is_file()
+
+
+def test_gap_refuses_an_unknown_effect_in_one_line(logs: Path, tmp_path: Path, terrafusion) -> None:
+    done = terrafusion(
+        "gap", str(logs / "run300"), "--effects", "wheels_fell_off", "--out", str(tmp_path / "o")
+    )
+    assert done.status == 1
+    assert done.err.count("\n") == 1
+    assert "wheels_fell_off" in done.err

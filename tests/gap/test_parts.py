@@ -1,0 +1,141 @@
+"""Parts of the diagnosis by themselves: signatures, choices of runs, probabilities, candidates."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.effects import catalogue
+from terrafusion.twin.effects.form import Form, one
+from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.classes import likeness
+from terrafusion.twin.gap.detect import choices
+from terrafusion.twin.gap.evidence import prepared, starting_model
+from terrafusion.twin.gap.null import learn
+from terrafusion.twin.gap.posterior import Pool, beliefs
+from terrafusion.twin.gap.score import Score
+from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
+from terrafusion.twin.gap.trials import calibration_error, interval
+from terrafusion.twin.gap.verdict import null_probability
+from terrafusion.twin.vehicle import load_vehicle
+
+from .drives import run
+
+CANDIDATES = Candidates.of()
+
+
+@pytest.fixture(scope="module")
+def log_and_model():
+    recording = run(1)
+    model, ground, _ = starting_model([recording], load_vehicle("elevate"), None)
+    return prepared([recording], model, ground, "auto")[0], model
+
+
+def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model) -> None:
+    log, model = log_and_model
+    moved = log.start + np.array([2.0, -1.0, 0.3])
+    here = placed(drive(log, model, CANDIDATES, log.start, ()), log, moved)
+    there = drive(log, model, CANDIDATES, moved, ())
+    for name in ("fine", "y", "by_pose", "heading"):
+        np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=1e-8)
+
+
+def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
+    log, model = log_and_model
+    keys = ("wheel_radius/scale", "gyro_scale/scale", "gnss_latency/both")
+    found = signatures(log, drive(log, model, CANDIDATES, log.start, keys))
+    columns = [CANDIDATES.keys.index(k) for k in keys]
+    sets = [{k: 0.1 * float(CANDIDATES.scale[c])} for k, c in zip(keys, columns, strict=True)]
+    plain, *with_effect = predictions(log, model, CANDIDATES, [{}, *sets], log.start)
+    assert plain is not None
+    for column, values in zip(columns, with_effect, strict=True):
+        assert values is not None
+        for i, observed in enumerate(log.observed):
+            if observed.channel in ("accel_x_mps2", "wheel_left_radps", "wheel_right_radps"):
+                continue  # a wheel that is about to slide is not linear in anything
+            true = (values[i] - plain[i]) / 0.1
+            error = np.linalg.norm(true - found[i].change[:, column])
+            assert error < 0.12 * np.linalg.norm(true) + 0.02 * np.median(observed.sigma) * len(true) ** 0.5
+
+
+def test_choices_are_all_others_where_there_are_few() -> None:
+    assert len(choices(5, 2, 0)) == 9
+    assert (0, 1) not in choices(5, 2, 0)
+    some = choices(23, 3, 0)
+    assert len(set(some)) == len(some) == 99
+    assert some == choices(23, 3, 0)
+
+
+def test_null_probability_rises_with_the_p_value() -> None:
+    values = [null_probability(p) for p in np.linspace(1e-6, 1.0, 60)]
+    assert all(0.0 <= v <= 1.0 for v in values)
+    assert np.all(np.diff(values) >= 0.0)
+    assert null_probability(0.05) == pytest.approx(0.2893, abs=1e-3)  # Sellke et al. 2001, table 1
+
+
+def _scores(rng: np.random.Generator, count: int, shift: np.ndarray) -> list[Score]:
+    P = len(CANDIDATES.keys) + 6
+    J = np.random.default_rng(0).standard_normal((400, P))
+    errors = rng.standard_normal((count, 400)) + J @ shift
+    return [Score(J.T @ e, J.T @ J, float(e @ e), 400) for e in errors]
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_effect_of_one_side_is_not_believed_on_the_other(sign: float) -> None:
+    shift = np.zeros(len(CANDIDATES.keys) + 6)
+    column = CANDIDATES.keys.index("encoder_dropout/share")
+    rng = np.random.default_rng(3)
+    normal = _scores(rng, 20, shift)
+    shift[column] = sign
+    found = beliefs(Pool.of(_scores(rng, 3, shift), learn(normal, 3)), CANDIDATES)
+    first = max(found.effects, key=lambda k: found.effects[k])
+    assert (first == "encoder_dropout") == (sign > 0.0)
+
+
+def test_what_references_share_is_no_gap() -> None:
+    rng = np.random.default_rng(5)
+    wrong = 0.5 * rng.standard_normal(len(CANDIDATES.keys) + 6)
+    null = learn(_scores(rng, 20, wrong), 3)
+    alike = beliefs(Pool.of(_scores(rng, 3, wrong), null), CANDIDATES).statistic()
+    repaired = beliefs(Pool.of(_scores(rng, 3, 0.0 * wrong), null), CANDIDATES).statistic()
+    assert alike < 0.01 * repaired
+
+
+def test_an_effect_is_wholly_like_itself() -> None:
+    null = learn(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
+    pool = Pool.of(_scores(np.random.default_rng(2), 3, np.zeros(len(CANDIDATES.keys) + 6)), null)
+    assert likeness(pool, [3], np.ones(1), [3, 4]) == pytest.approx(1.0)
+    assert likeness(pool, [3], np.ones(1), [5]) < 0.5
+
+
+def test_an_effect_of_ones_own_takes_part(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "_OWN", {})
+    form = Form(
+        "trailer", "drag", one("N", 10.0, 0.0, 200.0),
+        {"body": lambda q, e: {"body_force_x_n": q["body_force_x_n"] - e * q["u"]}},
+        "force e against the motion",
+    )  # fmt: skip
+    catalogue.register(form)
+    own = Candidates.of()
+    assert "trailer" in own.effects
+    assert "trailer/drag" in own.moving
+    assert own.columns("trailer") == (own.keys.index("trailer/drag"),)
+
+
+def test_calibration_error_and_interval() -> None:
+    assert calibration_error([0.95] * 20, [True] * 19 + [False]) == pytest.approx(0.0, abs=1e-9)
+    assert calibration_error([1.0] * 10, [False] * 10) == pytest.approx(1.0)
+    low, high = interval(0, 60)
+    assert low == 0.0
+    assert high == pytest.approx(1.0 - 0.025 ** (1 / 60), rel=1e-6)
+    assert math.isclose(interval(60, 60)[1], 1.0)
+
+
+def test_factors_of_all_columns_are_those_of_each() -> None:
+    rng = np.random.default_rng(8)
+    shift = np.zeros(len(CANDIDATES.keys) + 6)
+    shift[4] = 0.3
+    pool = Pool.of(_scores(rng, 3, shift), learn(_scores(rng, 20, 0.0 * shift), 3))
+    np.testing.assert_allclose(pool.log_factors(), [pool.log_factor([i]) for i in range(len(shift))])

@@ -1,0 +1,163 @@
+"""Each verdict occurs on the right data, through the whole diagnosis and without any truth channel."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.recording import Recording
+from terrafusion.twin.effects.catalogue import effect_names
+from terrafusion.twin.gap import Diagnosis, diagnose
+from terrafusion.twin.gap.corrected import values_of, write_corrected
+from terrafusion.twin.gap.next_run import BY_HAND, DRIVES
+from terrafusion.twin.vehicle import load_vehicle
+
+from .drives import runs
+
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
+VEHICLE = load_vehicle("elevate")
+WIDE = {"wheel_radius/scale": 0.03}
+
+
+@pytest.fixture(scope="module")
+def references() -> list[Recording]:
+    """Six: with two judged runs 28 choices, the fewest that can be significant at 5 %."""
+    return runs(100, 6)
+
+
+@pytest.fixture(scope="module")
+def wide(references: list[Recording]) -> Diagnosis:
+    """Wheels 3 % larger than the twin's."""
+    return diagnose(runs(300, 2, WIDE), references, VEHICLE)
+
+
+def checked(d: Diagnosis) -> dict:
+    answer = d.to_json()
+    jsonschema.validate(answer, SCHEMA)
+    probabilities = [c["probability"] for c in answer["causes"]]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert sum(probabilities) + answer["p_unknown"] + answer["p_null"] == pytest.approx(1.0, abs=1e-6)
+    return answer
+
+
+def test_no_gap_runs_like_the_references(references: list[Recording]) -> None:
+    answer = checked(diagnose(runs(200, 2), references, VEHICLE))
+    assert answer["verdict"] == "no_gap"
+    assert answer["named"] == []
+    assert not answer["gap"]["detected"]
+
+
+def test_no_gap_where_all_runs_share_a_commissioning_error() -> None:
+    wrong = {"track_width/scale": 0.1, "gyro_scale/scale": 0.02}
+    answer = checked(diagnose(runs(800, 2, wrong), runs(810, 6, wrong), VEHICLE))
+    assert answer["verdict"] == "no_gap"
+
+
+def test_effect_a_wider_track(references: list[Recording]) -> None:
+    answer = checked(diagnose(runs(720, 2, {"track_width/scale": 0.1}), references, VEHICLE))
+    assert answer["verdict"] == "effect"
+    assert answer["named"] == ["track_width"]
+    assert not answer["gap"]["uncalibrated"]
+    assert answer["causes"][0]["parameters"]["track_width/scale"]["value"] == pytest.approx(0.1, abs=0.01)
+    assert {c["effect"] for c in answer["causes"]} == set(effect_names())
+    assert answer["next_run"] is None
+
+
+def test_ambiguous_larger_wheels_and_encoder_scale(wide: Diagnosis) -> None:
+    answer = checked(wide)
+    assert answer["verdict"] == "ambiguous"
+    assert answer["named"] == ["wheel_radius"]
+    assert set(answer["causes"][0]["class"]) == {"wheel_radius", "encoder_scale"}
+    number = answer["causes"][0]["parameters"]["wheel_radius/scale"]
+    assert number["value"] == pytest.approx(0.03, abs=0.004)
+    following = answer["next_run"]
+    assert following["scenario"] in DRIVES
+    assert set(following["separates"]) == {"wheel_radius", "encoder_scale"}
+    assert wide.next_run is not None
+    assert wide.next_run.sigmas > 3.0
+
+
+def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references: list[Recording]) -> None:
+    both = {"gyro_scale/scale": 0.08, "encoder_dropout/share": 0.03}
+    answer = checked(diagnose(runs(700, 2, both), references, VEHICLE))
+    assert answer["verdict"] == "ambiguous"
+    assert {"encoder_scale", "encoder_dropout"} <= set(answer["causes"][0]["class"])
+    assert len(answer["named"]) == 2
+    assert "gyro_scale" in answer["named"]
+    assert answer["next_run"]["scenario"] == BY_HAND  # lost counts are a scale whatever is driven
+
+
+def test_parameters_ground_of_stiffer_bearing(references: list[Recording]) -> None:
+    """The ground varies among the references too: it takes more of them to call a change of it a gap."""
+    softer = runs(400, 2, {"soil_strength/bearing": 0.9})
+    answer = checked(diagnose(softer, [*references, *runs(106, 4)], VEHICLE))
+    assert answer["verdict"] == "parameters"
+    assert answer["named"] == ["soil_strength"]
+
+
+def test_unknown_motor_current_in_the_gyro(references: list[Recording]) -> None:
+    """An effect that no catalogue has."""
+    odd = [_with_crosstalk(run) for run in runs(600, 2)]
+    answer = checked(diagnose(odd, references, VEHICLE))
+    assert answer["verdict"] == "unknown"
+    assert answer["named"] == []
+    assert answer["p_unknown"] > 0.5
+
+
+def _with_crosstalk(run: Recording) -> Recording:
+    """2 mrad/s of yaw rate an ampere of all motors."""
+    assert run.imu is not None
+    assert run.motor is not None
+    gyro = run.imu.gyro_radps.copy()
+    gyro[:, 2] += 2e-3 * np.interp(run.imu.t_ns, run.motor.t_ns, run.motor.current_a.sum(axis=1))
+    return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
+
+
+def test_the_gap_shrinks_on_runs_left_out(wide: Diagnosis) -> None:
+    s = wide.to_json()["shrink"]
+    assert s["after"] < s["before"]
+    assert s["after"] < 1.2 * s["floor"]
+    assert s["recalibration_only"] > s["after"]
+    assert set(s["per_channel"]) >= {"gnss_position", "yaw_rate", "wheel_left"}
+
+
+def test_the_map_names_a_cell_of_the_gap(wide: Diagnosis) -> None:
+    cells = wide.to_json()["where"]
+    assert cells[0]["p_value"] <= 0.05
+    assert sum(c["share"] for c in cells) == pytest.approx(1.0, abs=1e-6)
+
+
+def test_without_references_it_answers_and_says_that_it_is_uncalibrated(wide: Diagnosis) -> None:
+    again = runs(300, 2, WIDE)
+    first = checked(diagnose(again, [], VEHICLE))
+    assert first["gap"]["uncalibrated"]
+    assert first["gap"]["detected"]
+    assert first["reference_runs"] == []
+    assert first["where"] == []
+    assert first["shrink"]["floor"] is None
+    assert first["causes"][0]["effect"] in wide.verdict.causes[0].members
+    assert json.dumps(first) == json.dumps(checked(diagnose(again, [], VEHICLE)))  # to the bit
+
+
+def test_the_corrected_vehicle_has_the_larger_wheels(wide: Diagnosis, tmp_path: Path) -> None:
+    target = tmp_path / "corrected.yaml"
+    said = write_corrected(wide, "elevate", target)
+    corrected = load_vehicle(target)
+    shift = values_of(wide)["wheel_radius/scale"]
+    assert corrected.wheel.radius_m == pytest.approx(VEHICLE.wheel.radius_m * (1.0 + shift))
+    assert any("radius_m" in line for line in said)
+
+
+def test_nonsense_is_refused(references: list[Recording]) -> None:
+    with pytest.raises(DataError, match="no run"):
+        diagnose([], references, VEHICLE)
+    with pytest.raises(ConfigError, match="unknown effect"):
+        diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
+    with pytest.raises(ConfigError, match="significance"):
+        diagnose(references[:1], references[1:], VEHICLE, significance=np.nan)

@@ -1,0 +1,126 @@
+"""Runs of the plant, many side by side: specs in, `Recording`s out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.recording import Command, Recording, Terrain
+from terrafusion.twin.gap.blind.plant import sensors
+from terrafusion.twin.gap.blind.plant.field import Patches
+from terrafusion.twin.gap.blind.plant.machine import Machine
+from terrafusion.twin.gap.blind.plant.spec import RunSpec, side_by_side
+from terrafusion.twin.gap.blind.plant.told import side_commands, wanted_twist
+
+Array = NDArray[np.float64]
+
+FRAME_S = 0.01
+SUBSTEPS = 4
+COMMAND_HZ = 50.0
+GUST_S = 3.0
+_BODY = ("x", "y", "z", "yaw", "u", "v", "r", "lean_x", "lean_y", "motor_work")
+_WHEEL = ("angle", "speed", "torque", "play")
+_FRAME = ("pull_u", "pull_v", "normal", "rise_x", "rise_y", "cg_forward", "cg_left")
+
+
+def record(
+    specs: Sequence[RunSpec], *, substeps: int = SUBSTEPS, names: Sequence[str] = ()
+) -> list[Recording]:
+    """The logs of all runs, in their order. Runs of one call take the time of the longest.
+
+    Args:
+        specs: of one duration.
+        substeps: integration steps a frame of 10 ms.
+        names: of the recordings, else run-1 and so on.
+
+    Raises:
+        ConfigError: durations differ.
+    """
+    histories = simulate(specs, substeps=substeps)
+    names = names or [f"run-{i + 1}" for i in range(len(specs))]
+    return [_recording(spec, h, name) for spec, h, name in zip(specs, histories, names, strict=True)]
+
+
+def simulate(specs: Sequence[RunSpec], *, substeps: int = SUBSTEPS) -> list[sensors.History]:
+    """What happened in each run, at frames of 10 ms: arrays (N,) or (N, 4) by name, SI units.
+
+    Raises:
+        ConfigError: durations differ.
+    """
+    duration = specs[0].duration_s()
+    if any(abs(spec.duration_s() - duration) > 1e-9 for spec in specs):
+        raise ConfigError("runs that are computed together must last equally long")
+    n = side_by_side(specs)
+    t_s: Array = np.asarray(FRAME_S * np.arange(round(duration / FRAME_S) + 1), dtype=np.float64)
+    machine = Machine(n, Patches(specs), _gusts(specs, len(t_s)))
+    sides = side_commands(specs, n, t_s)
+    kept: dict[str, list[Array]] = {name: [] for name in (*_BODY, *_WHEEL, *_FRAME, "soil")}
+    _settle(machine, sides[0])
+    _keep(machine, kept)
+    for i in range(len(t_s) - 1):
+        machine.step(sides[i : i + 2], FRAME_S, substeps)
+        _keep(machine, kept)
+    whole = {name: np.stack(kept.pop(name)) for name in list(kept)}  # one after the other: half the memory
+    return [_one(whole, n, t_s, b) for b in range(len(specs))]
+
+
+def _settle(machine: Machine, command: Array, seconds: float = 6.0) -> None:
+    """Loads, shear and speed loops settle where the robot stands; what it moved in doing so is taken back."""
+    start = {
+        name: machine.s[name].copy()
+        for name in ("x", "y", "z", "yaw", "travel", "angle", "motor_work", "heat")
+    }
+    for _ in range(round(seconds / FRAME_S)):
+        machine.step(np.stack([command, command]), FRAME_S, 1)
+    machine.s |= start
+    machine.t_s = 0.0
+
+
+def _keep(machine: Machine, kept: dict[str, list[Array]]) -> None:
+    for name in (*_BODY, *_WHEEL):
+        kept[name].append(machine.s[name])
+    shape = machine.s["u"].shape
+    for name in _FRAME:
+        kept[name].append(np.broadcast_to(machine.frame[name], shape))
+    kept["soil"].append(machine.frame["soil"][0].mean(axis=0))
+
+
+def _one(whole: dict[str, Array], n: dict[str, Any], t_s: Array, b: int) -> sensors.History:
+    h = {name: values[..., b] for name, values in whole.items()}
+    own = {name: values[..., b] for name, values in n.items()}
+    return h | {"t": t_s, "current": sensors.currents(own, h["torque"], h["speed"])}
+
+
+def _gusts(specs: Sequence[RunSpec], count: int) -> Array | None:
+    """Side force (N, B) of gusts: first-order Gauss-Markov, N."""
+    sizes = [spec.knobs.get("gust_n", 0.0) for spec in specs]
+    if not any(sizes):
+        return None
+    from scipy.signal import lfilter
+
+    keep = np.exp(-FRAME_S / GUST_S)
+    drive = np.stack([spec.stream("gusts").normal(size=count) for spec in specs], axis=1)
+    return np.asarray(sizes * lfilter([np.sqrt(1.0 - keep**2)], [1.0, -keep], drive, axis=0))
+
+
+def _recording(spec: RunSpec, h: sensors.History, name: str) -> Recording:
+    told = sensors.every(COMMAND_HZ, 1.0 / FRAME_S, len(h["t"]))
+    twist = wanted_twist(spec, h["t"][told])
+    seen = sensors.stamps(np.array([0.0]))
+    return Recording(
+        name=name,
+        start_ns=sensors.START_NS,
+        vehicle=spec.vehicle.name,
+        command=Command(sensors.stamps(h["t"][told]), twist[:, 0], twist[:, 1]),
+        wheels=sensors.wheels(spec, h),
+        imu=sensors.imu(spec, h),
+        gnss=sensors.gnss(spec, h),
+        motor=sensors.motor(spec, h),
+        terrain=Terrain(seen, np.array([spec.soil.name], dtype=object)),
+        terrain_name=spec.soil.name,
+        description="simulated by the plant of the blind check",
+    )

@@ -1,0 +1,77 @@
+"""The candidates of a diagnosis: every effect with its forms, their parameters as columns, and priors.
+
+An effect is one hypothesis; its functional forms are alternatives within it. A column is one parameter,
+counted in its catalogue scale ("typical" size), so that all columns are comparable.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.effects.catalogue import catalogue, moves, parameters
+
+Array = NDArray[np.float64]
+
+SOIL = "soil_strength"
+"""The effect that is a known parameter of the ground, not missing physics: verdict `parameters`."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """One functional form of one effect: the columns (indices) that it may move."""
+
+    effect: str
+    form: str
+    columns: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """All effects that take part.
+
+    Attributes:
+        keys: parameter keys of the catalogue, one a column.
+        scale, low, high: typical size and range of each, in its unit.
+        units: of each.
+        hypotheses: the forms, in the order of the catalogue.
+        moving: keys that change how the robot moves, sorted as the engine wants them.
+    """
+
+    keys: tuple[str, ...]
+    scale: Array
+    low: Array
+    high: Array
+    units: tuple[str, ...]
+    hypotheses: tuple[Hypothesis, ...]
+    moving: tuple[str, ...]
+
+    @classmethod
+    def of(cls, effects: Iterable[str] | None = None) -> Candidates:
+        """The named effects; None: all of the catalogue, the user's own included."""
+        wanted = None if effects is None else set(effects)
+        known = {k: v for k, v in parameters().items() if wanted is None or v[0].effect in wanted}
+        keys = tuple(known)
+        forms = [
+            Hypothesis(f.effect, f.name, tuple(i for i, key in enumerate(keys) if known[key][0].key == f.key))
+            for f in catalogue().values()
+            if wanted is None or f.effect in wanted
+        ]
+        numbers = [p for _, p in known.values()]
+        return cls(
+            keys, np.array([p.scale for p in numbers]), np.array([p.low for p in numbers]),
+            np.array([p.high for p in numbers]), tuple(p.unit for p in numbers), tuple(forms),
+            tuple(sorted(key for key in keys if moves(key))),
+        )  # fmt: skip
+
+    @property
+    def effects(self) -> tuple[str, ...]:
+        """Names of the effects, in the order of the catalogue."""
+        return tuple(dict.fromkeys(h.effect for h in self.hypotheses))
+
+    def columns(self, effect: str) -> tuple[int, ...]:
+        """All columns of an effect, whatever their form."""
+        return tuple(i for h in self.hypotheses if h.effect == effect for i in h.columns)

@@ -1,0 +1,87 @@
+"""The vehicle's file with the effect in it, where that is one of its numbers."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from terrafusion.twin.identify.files import write_yaml
+from terrafusion.twin.library import read_named
+from terrafusion.twin.vehicle import VehicleParams
+
+if TYPE_CHECKING:
+    from terrafusion.twin.gap.diagnosis import Diagnosis
+
+FIELDS = {
+    "mass/at_cg": (("body.mass_kg", "times"), ("body.yaw_inertia_kgm2", "times")),
+    "cg_lateral/shift": (("body.cg_left_m", "plus"),),
+    "cg_longitudinal/shift": (("body.cg_forward_m", "plus"),),
+    "wheel_radius/scale": (("wheel.radius_m", "times"),),
+    "track_width/scale": (("body.track_m", "times"),),
+    "torque_limit/scale": (("drive.torque_limit_nm", "less"),),
+    "drivetrain_friction/efficiency": (("drive.gear_efficiency", "less"),),
+    "dead_time/transport": (("drive.dead_time_s", "plus"),),
+    "actuator_lag/torque": (("drive.lag_s", "plus"),),
+}
+"""Numbers of the vehicle's file that an effect changes: by a factor 1 + e, 1 - e, or by e."""
+_CHANGES = {
+    "times": lambda x, e: x * (1.0 + e),
+    "less": lambda x, e: x * (1.0 - e),
+    "plus": lambda x, e: x + e,
+}
+
+
+def values_of(diagnosis: Diagnosis) -> dict[str, float]:
+    """Parameters of the effects named, by key."""
+    answer = diagnosis.to_json()
+    named = set(answer["named"])
+    return {
+        key: number["value"]
+        for cause in answer["causes"]
+        if cause["effect"] in named
+        for key, number in cause["parameters"].items()
+    }
+
+
+def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> list[str]:
+    """Write the vehicle's file with the effects named that are numbers of it; what was done, in sentences.
+
+    An effect that is no number of the vehicle cannot go into its file; the sentence says how to give it to
+    the twin.
+
+    Raises:
+        ConfigError: the vehicle's file cannot be read.
+        TerrafusionError: the file cannot be written.
+    """
+    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    out, said = copy.deepcopy(raw), []
+    written = False
+    for key, value in values_of(diagnosis).items():
+        if key not in FIELDS:
+            said.append(f"{key} is no number of a vehicle's file: use --effect {key}={value:.6g}")
+            continue
+        for path, how in FIELDS[key]:
+            said.append(_change(out, diagnosis.bench.model.vehicle, path, how, value))
+            written = True
+    if written:
+        write_yaml(target, out)
+        said.append(f"written to {target}")
+    return said or ["no effect was named: the vehicle's file stays as it is"]
+
+
+def _change(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, value: float) -> str:
+    before: Any = vehicle
+    for part in path.split("."):
+        before = getattr(before, part)
+    after = float(_CHANGES[how](before, value))
+    *sections, last = path.split(".")
+    section: Any = raw
+    for part in sections:
+        section = section.setdefault(part, {})
+    old = section.get(last)
+    source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
+    kept: Mapping[str, Any] = {k: v for k, v in old.items() if k == "valid"} if isinstance(old, dict) else {}
+    section[last] = {"value": after, **kept, "source": source}
+    return f"{path}: {before:.6g} -> {after:.6g}"

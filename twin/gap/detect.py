@@ -1,0 +1,86 @@
+"""Is there a gap: a permutation test over runs.
+
+If nothing has changed, judged runs and references are exchangeable: any of them could have been the judged
+ones. The statistic of the judged runs is compared with that of other choices from all runs, each judged
+against the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.null import learn
+from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
+from terrafusion.twin.gap.score import Score
+
+TAIL_FREEDOM = 10
+"""Degrees of freedom of that tail: heavier than normal (assumed)."""
+PERMUTATIONS = 99
+"""Other choices of runs that the judged ones are compared with, at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """Statistic of the judged runs, its p-value, and those of other choices of runs."""
+
+    statistic: float
+    p_value: float
+    others: tuple[float, ...]
+    pool: Pool
+    beliefs: Beliefs
+
+    def tail(self) -> float:
+        """The p-value carried on beyond what so few choices resolve: for the odds of a gap, not for the test.
+
+        On a scale that is linear for small and logarithmic for large statistics, others are taken as
+        Student's t.
+        """
+        from scipy.stats import t
+
+        if self.p_value > 1.5 / (1 + len(self.others)) or len(self.others) < 3:
+            return self.p_value
+        others = np.arcsinh(self.others)
+        z = (math.asinh(self.statistic) - others.mean()) / max(float(others.std(ddof=1)), 0.2)
+        return min(self.p_value, float(t.sf(z, TAIL_FREEDOM)))
+
+
+def judged(
+    runs: Sequence[Score], references: Sequence[Score], candidates: Candidates
+) -> tuple[Pool, Beliefs]:
+    """Sums and beliefs of some runs against the null of others."""
+    null = learn(references, len(runs))
+    pool = Pool.of(runs, null)
+    return pool, beliefs(pool, candidates)
+
+
+def choices(total: int, size: int, seed: int) -> list[tuple[int, ...]]:
+    """Other choices of `size` out of `total` runs than the first ones, at most `PERMUTATIONS`."""
+    own = tuple(range(size))
+    if math.comb(total, size) <= PERMUTATIONS + 1:
+        return [c for c in itertools.combinations(range(total), size) if c != own]
+    rng, found = np.random.default_rng(seed), dict[tuple[int, ...], None]()
+    while len(found) < PERMUTATIONS:
+        some = tuple(sorted(int(i) for i in rng.choice(total, size, replace=False)))
+        if some != own:
+            found[some] = None
+    return list(found)
+
+
+def detect(
+    runs: Sequence[Score], references: Sequence[Score], candidates: Candidates, seed: int
+) -> Detection:
+    """The permutation test."""
+    pool, found = judged(runs, references, candidates)
+    every, own = [*runs, *references], found.statistic()
+    others = []
+    for choice in choices(len(every), len(runs), seed):
+        rest = [r for i, r in enumerate(every) if i not in choice]
+        others.append(judged([every[i] for i in choice], rest, candidates)[1].statistic())
+    at_least = sum(o >= own for o in others)
+    return Detection(own, (1 + at_least) / (1 + len(others)), tuple(others), pool, found)

@@ -1,0 +1,258 @@
+"""`diagnose`: where twin and robot disagree, which effect causes it, and how far the gap shrinks with it."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.recording import Recording
+from terrafusion.twin.gap.answer import as_dict
+from terrafusion.twin.gap.candidates import SOIL, Candidates
+from terrafusion.twin.gap.detect import Detection, detect
+from terrafusion.twin.gap.evidence import Bench, Soils, gather
+from terrafusion.twin.gap.next_run import NextRun, propose
+from terrafusion.twin.gap.null import Null, learn
+from terrafusion.twin.gap.posterior import Pool
+from terrafusion.twin.gap.refit import Refit, refit_all, scored
+from terrafusion.twin.gap.replicates import COUNT, replicates
+from terrafusion.twin.gap.residuals import state_sigmas
+from terrafusion.twin.gap.score import Score, learnt_sigma, score
+from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
+from terrafusion.twin.gap.signatures import Drive
+from terrafusion.twin.gap.verdict import Verdict, floor_of, judge
+from terrafusion.twin.gap.where import Cell, gap_map
+from terrafusion.twin.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+
+SIGNIFICANCE = 0.05
+REFITTED = 6
+"""Forms that are refitted, the most probable ones: with the soil and the twin as it is, one vector of
+runs."""
+FLOORS = 20
+"""Choices of references by which the floor of the gap is learnt."""
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What `diagnose` finds.
+
+    Attributes:
+        runs, references, vehicle: names.
+        seconds: length of what was judged.
+        detection: the permutation test.
+        significance: threshold of its p-value.
+        uncalibrated: whether twin replicates stood in for references.
+        where: cells of the gap map, most important first.
+        verdict: causes and the judgement.
+        shrinking: how far the gap shrinks on runs left out.
+        next_run: drive that would separate look-alikes.
+        refits: by effect, failures included.
+        bench: the evidence, for plots.
+        notes: what was assumed, in sentences.
+        elapsed_s: time the diagnosis took.
+    """
+
+    runs: tuple[str, ...]
+    references: tuple[str, ...]
+    vehicle: str
+    seconds: float
+    detection: Detection
+    significance: float
+    uncalibrated: bool
+    where: list[Cell]
+    verdict: Verdict
+    shrinking: Shrink | None
+    next_run: NextRun | None
+    refits: dict[str, Refit]
+    bench: Bench
+    notes: tuple[str, ...]
+    elapsed_s: float
+
+    @property
+    def detected(self) -> bool:
+        """Whether there is a gap at this significance."""
+        return self.detection.p_value <= self.significance
+
+    def to_json(self) -> dict[str, Any]:
+        """The answer as `docs/schemas/diagnosis.schema.json` has it."""
+        return as_dict(self)
+
+
+def diagnose(
+    runs: Sequence[Recording],
+    references: Sequence[Recording],
+    vehicle: VehicleParams,
+    soils: Soils = None,
+    *,
+    effects: Sequence[str] | None = None,
+    significance: float = SIGNIFICANCE,
+    source: str = "auto",
+    seed: int = 0,
+    jobs: int = 2,
+    progress: Callable[[float], None] | None = None,
+    kept: dict[str, Drive] | None = None,
+) -> Diagnosis:
+    """Compare runs with reference runs through the twin.
+
+    Args:
+        runs: the robot as it is now; its truth channels are not read.
+        references: runs of the same robot that count as normal; none: twin replicates stand in.
+        vehicle: the twin's vehicle.
+        soils: the ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
+        effects: candidates by name; None: the whole catalogue, one's own included.
+        significance: threshold of the test for a gap.
+        source: one of `identify.inputs.SOURCES`: what drives the twin.
+        seed: of permutations and replicates.
+        jobs: threads.
+        progress: told the share done, 0 to 1.
+        kept: one's own empty dict, given to each of several diagnoses with the same vehicle and soils: what
+            the twin makes of a drive is computed once.
+
+    Raises:
+        ConfigError: an unknown effect or soil, a significance out of range.
+        DataError: a log without what the diagnosis needs.
+        TerrafusionError: the twin diverges on a log.
+    """
+    began = time.perf_counter()
+    if not runs:
+        raise DataError("no run to diagnose was given", remedy="give at least one")
+    if not 0.0 < significance < 1.0:
+        raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
+    candidates = _candidates(effects)
+    bench = gather(
+        runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
+    )
+    sigma = learnt_sigma(bench.references, state_sigmas(candidates))
+    scores = [score(run, sigma) for run in bench.runs]
+    normal = [score(run, sigma) for run in bench.references]
+    notes = list(bench.notes)
+    uncalibrated = math.comb(len(runs) + len(normal), len(runs)) < 1.0 / significance
+    if uncalibrated:
+        notes.append(_too_few(len(normal), len(runs), significance))
+        normal = _filled(bench, sigma, normal, seed)
+    found = detect(scores, normal, candidates, seed)
+    null = learn(normal, len(scores))
+    floor = floor_of(_null_pools(normal, len(scores), seed), range(len(found.pool.gain)))
+    refits = _refits(bench, scores, sigma, null, found)
+    factors = _corrected(found, refits)
+
+    def remaining(effects: Sequence[str]) -> tuple[Pool, Refit | None]:
+        return _remaining(bench, scores, sigma, null, found, refits, effects)
+
+    verdict = judge(
+        found.p_value <= significance, found.tail(), found.pool, found.beliefs, factors, refits, remaining,
+        candidates, floor,
+    )  # fmt: skip
+    if progress is not None:
+        progress(0.9)
+    shrinking = shrink(bench, scores, sigma, null, verdict.fit)
+    errors = [adapted(r, sigma, own_error(r, null)) for r in [*bench.runs, *bench.references]]
+    where = gap_map(bench.runs, bench.references, bench.model, errors, seed)
+    following = _next_run(bench, sigma, verdict)
+    failed = [f"{name}: {r.failure}" for name, r in refits.items() if r.failure]
+    return Diagnosis(
+        tuple(r.name for r in runs), tuple(r.name for r in references), vehicle.name,
+        sum(r.seconds for r in bench.runs), found, significance, uncalibrated, where, verdict, shrinking,
+        following, refits, bench, (*notes, *failed), time.perf_counter() - began,
+    )  # fmt: skip
+
+
+def _candidates(effects: Sequence[str] | None) -> Candidates:
+    from terrafusion.twin.effects.catalogue import effect_names
+
+    unknown = sorted(set(effects or ()) - set(effect_names()))
+    if unknown:
+        raise ConfigError(f"unknown effect '{unknown[0]}'", remedy="see docs/effects.md")
+    return Candidates.of(effects)
+
+
+def _too_few(references: int, runs: int, significance: float) -> str:
+    return (
+        f"{references} reference run(s) and {runs} run(s) cannot show a gap at {significance:g} by themselves"
+        ": twin replicates stand in, and false alarms are as frequent as the twin is wrong (uncalibrated)"
+    )
+
+
+def _filled(bench: Bench, sigma: Array, normal: list[Score], seed: int) -> list[Score]:
+    """References, and replicates around what they have in common."""
+    templates = bench.references or bench.runs
+    common = learn(normal, 1).offset if normal else None
+    return normal + replicates(templates, sigma, common, COUNT, seed)
+
+
+def _null_pools(normal: Sequence[Score], judged: int, seed: int) -> list[Pool]:
+    """References judged as if they were runs, against the rest."""
+    size = min(judged, max(1, len(normal) // 2))
+    some = list(itertools.combinations(range(len(normal)), size))
+    order = np.random.default_rng(seed).permutation(len(some))[:FLOORS]
+    pools = []
+    for choice in (some[i] for i in order):
+        rest = [s for i, s in enumerate(normal) if i not in choice]
+        if rest:
+            pools.append(Pool.of([normal[i] for i in choice], learn(rest, size)))
+    return pools
+
+
+def _refits(
+    bench: Bench, scores: Sequence[Score], sigma: Array, null: Null, found: Detection
+) -> dict[str, Refit]:
+    forms = found.beliefs.forms
+    ranked = sorted((k for k in forms if k[0] != SOIL), key=lambda k: -forms[k])[:REFITTED]
+    columns = {(h.effect, h.form): h.columns for h in bench.candidates.hypotheses}
+    chosen = [(effect, columns[effect, form]) for effect, form in ranked]
+    if SOIL in bench.candidates.effects:  # both of its parameters, whatever its rank
+        chosen.append((SOIL, bench.candidates.columns(SOIL)))
+    fits = refit_all(bench, scores, sigma, null, found.pool, [columns for _, columns in chosen])
+    best: dict[str, Refit] = {}
+    for (effect, _), fit in zip(chosen, fits, strict=True):
+        if effect not in best or (fit.errors and fit.explained > best[effect].explained):
+            best[effect] = fit
+    return best
+
+
+def _corrected(found: Detection, refits: dict[str, Refit]) -> dict[str, float]:
+    """Log Bayes factors, by what an effect explains in the twin itself where it was refitted."""
+    out = dict(found.beliefs.effects)
+    for name, fit in refits.items():
+        if fit.errors:
+            linear = found.pool.fit(found.beliefs.best[name].columns)[2]
+            out[name] += 0.5 * (fit.explained - linear)
+    return out
+
+
+def _remaining(
+    bench: Bench,
+    scores: Sequence[Score],
+    sigma: Array,
+    null: Null,
+    found: Detection,
+    refits: dict[str, Refit],
+    effects: Sequence[str],
+) -> tuple[Pool, Refit | None]:
+    """What is left of the gap with some effects in the twin, and their fit; the gap itself where that
+    fails."""
+    fit = refits.get(effects[0]) if len(effects) == 1 else None
+    if fit is None:
+        columns = tuple(i for name in effects for i in found.beliefs.best[name].columns)
+        fit = refit_all(bench, scores, sigma, null, found.pool, [columns])[0]
+    if not fit.errors:
+        return found.pool, fit
+    left = [scored(r, sigma, e, s.A) for r, e, s in zip(bench.runs, fit.errors, scores, strict=True)]
+    return Pool.of(left, null), fit
+
+
+def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:
+    """For the first cause and the likeliest of those that cannot be told from it."""
+    if verdict.kind != "ambiguous":
+        return None
+    first, by_name = verdict.causes[0], {c.effect: c for c in verdict.causes}
+    return propose(bench, sigma, first, by_name[first.members[1]])

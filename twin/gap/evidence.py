@@ -1,0 +1,268 @@
+"""From recordings to evidence: one twin, set to the references, and what each run says against it."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.recording import Recording
+from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.residuals import (
+    SOIL_STATE,
+    Drives,
+    Evidence,
+    Raw,
+    at_own_ground,
+    learnt_noise,
+    raw,
+    state_sigmas,
+    whitened,
+    without_probes,
+)
+from terrafusion.twin.gap.signatures import Drive, predictions
+from terrafusion.twin.identify.log import Log, grounds, prepare
+from terrafusion.twin.identify.model import Model
+from terrafusion.twin.identify.noise import Noise
+from terrafusion.twin.soil import SoilParams, load_soil
+from terrafusion.twin.vehicle import VehicleParams, with_overrides
+
+Array = NDArray[np.float64]
+Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
+
+WINDOW_S = 10.0
+"""The pose starts anew after so long."""
+BASE_RUNS, BASE_STEPS = 3, 5
+"""References by which the ground is set, and steps of that search at most."""
+BASE_MOVED, MOST_STEP = 0.1, 1.0
+"""The search ends with a step shorter than the first, and takes none longer than the second (typical
+sizes)."""
+GENERIC_GROUND = "medium_sand"
+"""Stands in where a log says no ground that is known; the references then set its strength."""
+
+
+@dataclass(frozen=True, eq=False)
+class Bench:
+    """Everything that a diagnosis compares.
+
+    Attributes:
+        model: the twin, its ground set to the references.
+        candidates: effects.
+        channels: observed channels, those of the probes.
+        noise: of each channel.
+        runs, references: evidence of each.
+        drives: signatures, shared by runs that were told the same.
+        notes: what was assumed, in sentences.
+    """
+
+    model: Model
+    candidates: Candidates
+    channels: tuple[str, ...]
+    noise: dict[str, Noise]
+    runs: list[Evidence]
+    references: list[Evidence]
+    raws: list[Raw]
+    drives: Drives
+    notes: tuple[str, ...]
+
+
+def starting_model(
+    recordings: Sequence[Recording], vehicle: VehicleParams, soils: Soils
+) -> tuple[Model, str | None, list[str]]:
+    """The twin before anything is learnt, the one ground of all logs where one is given, and notes.
+
+    Raises:
+        ConfigError: a soil that was named is not known.
+    """
+    loaded = with_overrides(vehicle, recordings[0].overrides)
+    if soils is not None and not isinstance(soils, Mapping):
+        soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
+        return Model(loaded, {soil.name: soil}), soil.name, []
+    given, found, notes = dict(soils or {}), dict[str, SoilParams](), list[str]()
+    for recording in recordings:
+        for label in dict.fromkeys(grounds(recording, recording.start_ns)[0]):
+            if label in found:
+                continue
+            try:
+                named = given.get(label, label)
+                found[label] = named if isinstance(named, SoilParams) else load_soil(named)
+            except ConfigError:
+                if label in given:
+                    raise
+                found[label] = load_soil(GENERIC_GROUND)
+                notes.append(f"the ground '{label}' is not in the library: {GENERIC_GROUND} stands in")
+    return Model(loaded, found), None, notes
+
+
+def prepared(recordings: Sequence[Recording], model: Model, ground: str | None, source: str) -> list[Log]:
+    """Logs of the recordings."""
+    return [prepare(r, model, source=source, window_s=WINDOW_S, ground=ground) for r in recordings]
+
+
+def common_channels(logs: Sequence[Log]) -> tuple[str, ...]:
+    """Channels that every log has.
+
+    Raises:
+        DataError: there is none.
+    """
+    shared = [o.channel for o in logs[0].observed if all(o.channel in _names(log) for log in logs)]
+    if not shared:
+        raise DataError("the logs have no channel in common", remedy="diagnose logs of one robot")
+    return tuple(shared)
+
+
+def _names(log: Log) -> set[str]:
+    return {o.channel for o in log.observed}
+
+
+def restricted(log: Log, channels: Sequence[str]) -> Log:
+    """The log with these channels only."""
+    by_name = {o.channel: o for o in log.observed}
+    return dataclasses.replace(log, observed=tuple(by_name[c] for c in channels))
+
+
+def raws_of(
+    logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int, told: Callable[[], None]
+) -> list[Raw]:
+    """Errors and derivatives of each run. The first run of each drive makes its signature, whichever thread
+    is faster; the very first alone, as it compiles."""
+
+    def one(log: Log) -> Raw:
+        found = raw(log, drives, channels)
+        told()
+        return found
+
+    first = list({drives.name(log): log for log in reversed(logs)}.values())[::-1]
+    made = {id(log): one(log) for log in first[:1]}
+    with ThreadPoolExecutor(jobs) as pool:
+        for part in (first[1:], [log for log in logs if not any(log is other for other in first)]):
+            made.update(zip(map(id, part), pool.map(one, part), strict=True))
+    return [made[id(log)] for log in logs]
+
+
+def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int) -> Model:
+    """The twin with its ground's strength, bearing and rolling resistance set to the references.
+
+    The other columns take part as nuisances of typical size, so that a commissioning error does not pass
+    for soil.
+    """
+    model, candidates = drives.model, drives.candidates
+    keys = candidates.keys
+    names = [name for name in SOIL_STATE if name in keys]
+    soil = [keys.index(name) for name in names]
+    raws = raws_of(logs[:BASE_RUNS], drives, channels, jobs, lambda: None)
+    noise = learnt_noise(raws, raws, candidates)
+    at = np.zeros(len(soil))
+    best: Sequence[Raw | None] = raws
+    cost = _cost(raws, noise)
+    step = np.clip(_common_step(raws, noise, candidates, soil), -MOST_STEP, MOST_STEP)
+    for _ in range(BASE_STEPS):
+        if np.abs(step).max(initial=0.0) < BASE_MOVED:
+            break
+        tried = at + step
+        moved = [_at_ground(run, drives, _ground(tried, names, candidates, model)) for run in raws]
+        now = _cost(moved, noise)
+        if now < cost:
+            at, best, cost = tried, moved, now
+            step = np.clip(_common_step(best, noise, candidates, soil), -MOST_STEP, MOST_STEP)
+        else:
+            step = 0.4 * step
+    return dataclasses.replace(model, effects={**model.effects, **_ground(at, names, candidates, model)})
+
+
+def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Model) -> dict[str, float]:
+    """Soil parameters that lie `at` (T,) typical sizes from the model's own, within their ranges."""
+    out = {}
+    for name, d in zip(names, at, strict=True):
+        i = candidates.keys.index(name)
+        value = model.effects.get(name, 0.0) + float(d * candidates.scale[i])
+        out[name] = float(np.clip(value, 0.95 * candidates.low[i], 0.95 * candidates.high[i]))
+    return out
+
+
+def _at_ground(run: Raw, drives: Drives, effects: Mapping[str, float]) -> Raw | None:
+    """The run against the twin on another ground; None where the twin diverges."""
+    found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
+    if found is None:
+        return None
+    error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]
+    return dataclasses.replace(run, error=error)
+
+
+def _cost(raws: Sequence[Raw | None], noise: Mapping[str, Noise]) -> float:
+    """Sum of squared whitened errors, the poses fitted."""
+    return sum(
+        np.inf if run is None else float(whitened(without_probes(run), noise).gram[-1, -1]) for run in raws
+    )
+
+
+def _common_step(
+    raws: Sequence[Raw | None], noise: Mapping[str, Noise], candidates: Candidates, soil: Sequence[int]
+) -> Array:
+    """Step of the ground that all runs share, in typical sizes."""
+    T, K = len(state_sigmas(candidates)), len(candidates.keys)
+    H, g = np.zeros((K, K)), np.zeros(K)
+    for run in filter(None, raws):
+        G = whitened(without_probes(run), noise).gram
+        keep, effect = (
+            np.arange(len(soil), T),
+            np.arange(T, T + K),
+        )  # offsets are a run's own, the ground is not
+        inner = np.linalg.inv(G[np.ix_(keep, keep)] + np.eye(len(keep)))
+        cross = G[np.ix_(keep, effect)]
+        H += G[np.ix_(effect, effect)] - cross.T @ inner @ cross
+        g += G[effect, -1] - cross.T @ inner @ G[keep, -1]
+    prior = np.ones(K)
+    prior[list(soil)] = 0.1
+    return np.asarray(np.linalg.solve(H + np.diag(prior), g)[list(soil)])
+
+
+def gather(
+    runs: Sequence[Recording],
+    references: Sequence[Recording],
+    vehicle: VehicleParams,
+    soils: Soils,
+    candidates: Candidates,
+    *,
+    source: str = "auto",
+    jobs: int = 2,
+    progress: Callable[[float], None] | None = None,
+    kept: dict[str, Drive] | None = None,
+) -> Bench:
+    """Evidence of all runs; `kept` holds signatures for diagnoses to come with the same vehicle and soils.
+
+    Raises:
+        DataError: a log without what it needs.
+        TerrafusionError: the twin diverges on every reference.
+    """
+    model, ground, notes = starting_model([*runs, *references], vehicle, soils)
+    logs = prepared([*runs, *references], model, ground, source)
+    channels = common_channels(logs)
+    logs = [restricted(log, channels) for log in logs]
+    others, kept = logs[len(runs) :], {} if kept is None else kept
+    if others:
+        model = set_ground(others, Drives(model, candidates, kept), channels, jobs)
+    drives, done = Drives(model, candidates, kept), [0]
+
+    def told() -> None:
+        done[0] += 1
+        if progress is not None:
+            progress(0.7 * done[0] / len(logs))
+
+    raws = raws_of(logs, drives, channels, jobs, told)
+    noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates)
+    with ThreadPoolExecutor(jobs) as pool:
+        raws = list(pool.map(lambda run: at_own_ground(run, drives, noise), raws))
+    noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates)
+    evidence = [whitened(run, noise) for run in raws]
+    notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
+    return Bench(
+        model, candidates, channels, noise, evidence[: len(runs)], evidence[len(runs) :], raws[: len(runs)],
+        drives, tuple(dict.fromkeys(notes)),
+    )  # fmt: skip

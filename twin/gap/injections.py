@@ -1,0 +1,240 @@
+"""Known changes in real logs, and what the diagnosis names: a table.
+
+    python -m terrafusion.twin.gap.injections --out injections [--set wvu_s5t1 ...]
+
+A log is cut into pieces. In turn, every fourth piece is judged and the others are its references; the change
+is put into the judged ones only. Unchanged pieces are judged likewise: a gap found there is a false alarm,
+or a change within the drive. Pieces in which the robot rests are left out. A crash is a wrong answer.
+Answers are kept one by one in `injections.jsonl`; the same command continues where it was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.readers import open_recordings
+from terrafusion.datasets.recording import Recording
+from terrafusion.twin.gap.diagnosis import diagnose
+from terrafusion.twin.gap.injected import INJECTIONS, Injection, pose_as_gnss
+from terrafusion.twin.gap.pieces import piece, spans
+from terrafusion.twin.gap.signatures import Drive
+from terrafusion.twin.vehicle import VehicleParams, load_vehicle
+
+SEVERITIES = (0.5, 1.0, 2.0)
+FOLDS = 4
+LEAST_SPEED_MPS = 0.15
+"""Mean rim speed of a piece that counts as driven."""
+
+
+@dataclass(frozen=True)
+class LogSet:
+    """Logs of one robot on one ground, and how they are cut.
+
+    Attributes:
+        pose_sigma_m: the log's reference pose is taken as GNSS with this sigma; None: it is not used.
+    """
+
+    logs: tuple[str, ...]
+    vehicle: str
+    piece_s: float
+    soil: str | None = None
+    pose_sigma_m: float | None = None
+
+
+_ASPHALT = ("norlab_drive/asphalt_2024_9_20_8h13s12/raw", "norlab_drive/asphalt_2024_9_25_12h8s57/raw")
+_GRASS = (
+    "norlab_drive/grass_2024_7_29_14h46s15/raw", "norlab_drive/grass_2024_7_29_14h4s53/raw",
+    "norlab_drive/grass_2024_8_8_15h56s39/raw", "norlab_drive/grass_2024_8_8_16h11s19/raw",
+)  # fmt: skip
+SETS = {
+    "wvu_s5t1": LogSet(("wvu_pathfinder/s5t1",), "pathfinder", 12.0),
+    "wvu_test17run": LogSet(("wvu_pathfinder/test17run",), "pathfinder", 6.0),
+    "husky_parkinglot": LogSet(("husky_parkinglot/test1",), "husky", 20.0, "asphalt"),
+    "norlab_asphalt": LogSet(_ASPHALT, "warthog", 10.0),
+    "norlab_grass": LogSet(_GRASS, "warthog", 20.0),
+    "norlab_grass_pose": LogSet(_GRASS, "warthog", 20.0, pose_sigma_m=0.05),
+    "umich_mair": LogSet(("umich_husky/mair_mocap/trial1", "umich_husky/mair_mocap/trial7"), "husky", 8.0),
+    "umich_field": LogSet(
+        ("umich_husky/field/slip_detect2", "umich_husky/field/sand_small_pebble"), "husky", 10.0
+    ),
+}
+"""What the catalogue has; the poses of `norlab_grass_pose` are lidar ICP taken as GNSS of 5 cm (assumed)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """The logs of a set, opened, and the pieces of each that are driven."""
+
+    vehicle: VehicleParams
+    recordings: list[Recording]
+    spans: list[tuple[int, float, float]]
+    kept: dict[int, dict[str, Drive]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, logs: LogSet) -> Source:
+        vehicle = load_vehicle(logs.vehicle)
+        recordings = [r for name in logs.logs for r in open_recordings(name, rig=vehicle.rig())]
+        if logs.pose_sigma_m is not None:
+            recordings = [pose_as_gnss(r, logs.pose_sigma_m) for r in recordings]
+        found = []
+        for i, recording in enumerate(recordings):
+            for begin, end in spans(recording, logs.piece_s):
+                if driven(piece(recording, begin, end), vehicle):
+                    found.append((i, begin, end))
+        return cls(vehicle, recordings, found)
+
+    def judged(self, fold: int) -> list[int]:
+        """Numbers of the pieces that are judged in a fold."""
+        return list(range(fold % FOLDS, len(self.spans), FOLDS))
+
+    def kept_for(self, fold: int) -> dict[str, Drive]:
+        """Signatures of a fold; those of another are forgotten."""
+        if fold not in self.kept:
+            self.kept.clear()
+        return self.kept.setdefault(fold, {})
+
+    def cut(
+        self, numbers: Sequence[int], injection: Injection | None = None, severity: float = 0.0
+    ) -> list[Recording]:
+        """Pieces, with the change in them where one is given.
+
+        Raises:
+            DataError: the logs do not have its channel.
+        """
+        logs = [i for i, _, _ in (self.spans[k] for k in numbers)]
+        changed = {
+            i: self.recordings[i]
+            if injection is None
+            else injection.into(self.recordings[i], self.vehicle, severity)
+            for i in dict.fromkeys(logs)
+        }
+        return [piece(changed[i], begin, end) for i, begin, end in (self.spans[k] for k in numbers)]
+
+
+def driven(run: Recording, vehicle: VehicleParams) -> bool:
+    """Whether the robot moves in a piece."""
+    if run.wheels is None or len(run.wheels) < 3:
+        return False
+    speed = run.wheels.side_speeds_mps(vehicle.odometry.wheel_radius_m)
+    return bool(np.nanmean(np.abs(speed)) > LEAST_SPEED_MPS)
+
+
+def verdict_on(answer: dict[str, Any], injection: Injection | None) -> dict[str, Any]:
+    """What an answer says, and whether it is right: a gap whose first cause has the change in its class."""
+    causes = answer["causes"]
+    first = causes[0]
+    wanted = () if injection is None else injection.named
+    ranks = [k for k, c in enumerate(causes) if c["effect"] in wanted]
+    rank = ranks[0] + 1 if ranks else None
+    seen = answer["gap"]["detected"]
+    named = seen and answer["verdict"] in ("effect", "ambiguous", "parameters")
+    right = not seen if injection is None else bool(named and set(first["class"]) & set(wanted))
+    return {
+        "p_value": answer["gap"]["p_value"], "verdict": answer["verdict"], "first": first["effect"],
+        "class": first["class"], "named": answer["named"], "rank": rank, "right": right,
+        "estimate": None if injection is None or rank is None else estimated(causes[rank - 1], injection),
+        "share": (answer["shrink"] or {}).get("share"),
+    }  # fmt: skip
+
+
+def estimated(cause: dict[str, Any], injection: Injection) -> list[float] | None:
+    """Size and one sigma of the change, in its unit, as its best cause has it."""
+    for key, factor in injection.estimates.items():
+        if key in cause["parameters"]:
+            told = cause["parameters"][key]
+            return [factor * told["value"], abs(factor) * (told["sigma"] or 0.0)]
+    return None
+
+
+def cases(logs: Sequence[str]) -> Iterator[tuple[str, Injection | None, float, int]]:
+    """Set, change, severity and fold of every row: in each fold nothing, and changes in turn."""
+    changes = [(injection, severity) for injection in INJECTIONS for severity in SEVERITIES]
+    for name in logs:
+        for fold in range(FOLDS):
+            yield name, None, 0.0, fold
+            yield from ((name, *change, fold) for change in changes[fold::FOLDS])
+
+
+def answered(
+    source: Source, logs: LogSet, injection: Injection | None, severity: float, fold: int
+) -> dict[str, Any]:
+    """One row: the diagnosis of a fold's pieces with the change in them."""
+    judged = source.judged(fold)
+    others = [k for k in range(len(source.spans)) if k not in judged]
+    began = time.perf_counter()
+    try:
+        runs = source.cut(judged, injection, severity)
+    except TerrafusionError as error:
+        return {"skipped": str(error)}
+    try:
+        normal, kept = source.cut(others), source.kept_for(fold)
+        answer = diagnose(runs, normal, source.vehicle, logs.soil, source="wheels", kept=kept).to_json()
+    except Exception as error:  # a crash is a wrong answer, whatever it was
+        return {"crash": f"{type(error).__name__}: {error}", "right": False}
+    told = verdict_on(answer, injection)
+    return {**told, "runs": len(judged), "references": len(others), "elapsed_s": time.perf_counter() - began}
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Make the table, or go on with it."""
+    parser = argparse.ArgumentParser(description="Known changes in real logs, and what the diagnosis names.")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the answers and the table")
+    parser.add_argument("--set", action="append", choices=sorted(SETS), help="logs; default: all")
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    kept, path = dict[str, dict[str, Any]](), given.out / "injections.jsonl"
+    if path.exists():
+        kept = {row["case"]: row for row in map(json.loads, path.read_text("utf-8").splitlines())}
+    sources = dict[str, Source]()
+    with path.open("a", encoding="utf-8") as file:
+        for name, injection, severity, fold in cases(given.set or sorted(SETS)):
+            what = "unchanged" if injection is None else injection.name
+            case = f"{name}/{what}/{severity:g}/{fold}"
+            if case in kept:
+                continue
+            if name not in sources:
+                sources[name] = Source.of(SETS[name])
+            answer = answered(sources[name], SETS[name], injection, severity, fold)
+            size = 0.0 if injection is None else severity * injection.size
+            row = {"case": case, "set": name, "change": what, "severity": severity, "size": size, **answer}
+            kept[case] = row
+            print(json.dumps(row), file=file, flush=True)
+            print(table([row])[-1], flush=True)
+    rows = list(kept.values())
+    (given.out / "injections.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
+
+
+HEAD = ("set", "change", "size", "p", "verdict", "first (class)", "rank", "estimated", "right")
+
+
+def table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Rows as lines of a Markdown table."""
+    lines = ["| " + " | ".join(HEAD) + " |", "|" + " --- |" * len(HEAD)]
+    for row in rows:
+        lines.append("| " + " | ".join([row["set"], row["change"], f"{row['size']:g}", *_told(row)]) + " |")
+    return lines
+
+
+def _told(row: dict[str, Any]) -> list[str]:
+    if "skipped" in row:
+        return ["", "cannot be judged", row["skipped"], "", "", ""]
+    if "crash" in row:
+        return ["", "crash", row["crash"], "", "", "no"]
+    others = [name for name in row["class"] if name != row["first"]]
+    first = row["first"] + (f" ({', '.join(others)})" if others else "")
+    size = "" if row["estimate"] is None else "{:.3g} +- {:.2g}".format(*row["estimate"])
+    rank = "" if row["rank"] is None else str(row["rank"])
+    return [f"{row['p_value']:.3f}", row["verdict"], first, rank, size, "yes" if row["right"] else "no"]
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""Which effect: Bayes factors of every effect against the learned null, and against a gap of no known shape.
+
+Under effect k the standardised scores of all runs shift along one direction a parameter, x = U_k phi + noise,
+with phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight. `unknown` shifts
+them along all probes at once.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.gap.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.null import Null
+from terrafusion.twin.gap.score import Score
+
+Array = NDArray[np.float64]
+
+SIZES = (0.1, 0.3, 1.0, 3.0, 10.0)
+"""1 sigma of an effect's size, in typical sizes; equal weights."""
+WIDE = 10.0
+"""1 sigma of an effect's size where it is fitted: the data decide."""
+UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
+UNKNOWN_PRIOR = 0.1
+"""Prior probability that a gap has a cause outside the catalogue (assumed)."""
+NULL_PRIOR = 0.5
+"""Prior probability that there is no gap (assumed)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pool:
+    """All judged runs together, against a null, in the space of the columns.
+
+    Attributes:
+        information: (P, P) sum of U' C^-1 U.
+        gain: (P,) sum of U' C^-1 x.
+        square: sum of x' C^-1 x.
+        dims: length of all x.
+    """
+
+    information: Array
+    gain: Array
+    square: float
+    dims: int
+
+    @classmethod
+    def of(cls, runs: Sequence[Score], null: Null) -> Pool:
+        """Sums over the runs."""
+        P = len(null.mean)
+        information, gain, square = np.zeros((P, P)), np.zeros(P), 0.0
+        for run in runs:
+            x, U = null.standardised(run)
+            weighted = null.inverse @ U
+            information += U.T @ weighted
+            gain += weighted.T @ x
+            square += float(x @ null.inverse @ x)
+        return cls(0.5 * (information + information.T), gain, square, P * len(runs))
+
+    def log_factor(self, columns: Sequence[int], sizes: Sequence[float] = SIZES) -> float:
+        """Log Bayes factor of the columns, N(0, s^2) with s over `sizes`, against the null."""
+        at = np.asarray(columns)
+        g = self.gain[at]
+        values, vectors = np.linalg.eigh(self.information[np.ix_(at, at)])
+        values, h = np.maximum(values, 0.0), vectors.T @ g
+        each = [
+            0.5 * float(np.sum(h**2 * s * s / (1.0 + s * s * values) - np.log1p(s * s * values)))
+            for s in sizes
+        ]
+        return float(np.logaddexp.reduce(each) - np.log(len(each)))
+
+    def log_factors(self) -> Array:
+        """`log_factor` (P,) of each column by itself."""
+        square = np.array(SIZES)[:, None] ** 2
+        spread = square * np.maximum(np.diag(self.information), 0.0)
+        each = 0.5 * (self.gain**2 * square / (1.0 + spread) - np.log1p(spread))
+        return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(SIZES)))
+
+    def fit(self, columns: Sequence[int], size: float = WIDE) -> tuple[Array, Array, float]:
+        """Best coefficients (k,), their covariance (k, k), and how much of `square` they explain."""
+        at = np.asarray(columns)
+        H = self.information[np.ix_(at, at)] + np.eye(len(at)) / size**2
+        covariance = np.linalg.inv(H)
+        best = covariance @ self.gain[at]
+        explained = 2.0 * best @ self.gain[at] - best @ self.information[np.ix_(at, at)] @ best
+        return best, covariance, float(explained)
+
+
+@dataclass(frozen=True, eq=False)
+class Beliefs:
+    """Log Bayes factors against the null: by effect, its best form, by form, and of the unknown."""
+
+    effects: dict[str, float]
+    best: dict[str, Hypothesis]
+    forms: dict[tuple[str, str], float]
+    unknown: float
+
+    def statistic(self) -> float:
+        """Log Bayes factor of any gap against none."""
+        known = np.logaddexp.reduce(list(self.effects.values())) - np.log(len(self.effects))
+        return float(np.logaddexp(known + np.log1p(-UNKNOWN_PRIOR), self.unknown + np.log(UNKNOWN_PRIOR)))
+
+
+def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Beliefs:
+    """Bayes factors of all effects; with `given` columns those of the effects beside these."""
+    base = pool.log_factor(given) if len(given) else 0.0
+    alone = pool.log_factors() if not len(given) else None
+    forms: dict[tuple[str, str], float] = {}
+    best: dict[str, Hypothesis] = {}
+    for h in candidates.hypotheses:
+        if set(h.columns) & set(given):
+            continue
+        if alone is not None and len(h.columns) == 1:
+            factor = float(alone[h.columns[0]])
+        else:
+            factor = pool.log_factor([*given, *h.columns]) - base
+        forms[h.effect, h.form] = factor + _one_sided(pool, h, candidates)
+        kept = best.get(h.effect)
+        if kept is None or forms[h.effect, h.form] > forms[kept.effect, kept.form]:
+            best[h.effect] = h
+    effects = {}
+    for name in best:
+        mine = [v for (effect, _), v in forms.items() if effect == name]
+        effects[name] = float(np.logaddexp.reduce(mine) - np.log(len(mine)))
+    probes = range(len(candidates.keys), len(pool.gain))
+    unknown = pool.log_factor([*given, *probes], UNKNOWN_SIZES) - base
+    return Beliefs(effects, best, forms, unknown)
+
+
+def _one_sided(pool: Pool, h: Hypothesis, candidates: Candidates) -> float:
+    """Log factor of a prior that has one side only: twice the posterior's share on that side."""
+    if len(h.columns) != 1:
+        return 0.0
+    i = h.columns[0]
+    if candidates.low[i] < 0.0 < candidates.high[i]:
+        return 0.0
+    side = 1.0 if candidates.high[i] > 0.0 else -1.0
+    z = side * float(pool.gain[i]) / math.sqrt(float(pool.information[i, i]) + 1.0 / WIDE**2)
+    if z > -5.0:
+        return math.log(math.erfc(-z / math.sqrt(2.0)))
+    return -0.5 * z * z - math.log(-z * math.sqrt(0.5 * math.pi))  # the tail's leading term

@@ -1,0 +1,168 @@
+"""Refits: the most probable effects once more, through the twin itself and not its linearisation.
+
+Gauss-Newton in the scores: the twin is run with the effect, the errors that are left are scored again, and
+the coefficients move along the linear information. Bounded by the effect's range; a run that diverges or a
+step that does not help ends the fit where it stands, and that is reported.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.gap.evidence import Bench
+from terrafusion.twin.gap.null import Null
+from terrafusion.twin.gap.posterior import Pool
+from terrafusion.twin.gap.residuals import SOIL_STATE, Evidence, Raw, whitened_error
+from terrafusion.twin.gap.score import Score
+from terrafusion.twin.gap.signatures import predictions
+
+Array = NDArray[np.float64]
+
+STEPS = 3
+SIZE = 10.0
+"""1 sigma of an effect's size in a refit, typical sizes: wide, the data decide."""
+
+
+@dataclass(frozen=True, eq=False)
+class Refit:
+    """An effect (or several) fitted to the judged runs.
+
+    Attributes:
+        columns: indices of the parameters.
+        value, covariance: (k,) and (k, k) in typical sizes.
+        trial: (k,) where the next step would go.
+        explained: how much of the gap's square it takes away.
+        errors: whitened errors of each run at the value.
+        failure: what went wrong, in words; "" where nothing did.
+    """
+
+    columns: tuple[int, ...]
+    value: Array
+    trial: Array
+    covariance: Array
+    explained: float
+    errors: list[Array]
+    failure: str
+
+
+def scored(run: Evidence, sigma: Array, error: Array, A: Array) -> Score:
+    """The score of another whitened error (n,) of the run."""
+    T = run.states
+    rows = run.rows[:, :-1].astype(float)
+    inner = rows.T @ error
+    H = run.gram[:T, :T] + np.diag(sigma**-2.0)
+    solved = np.linalg.solve(H, inner[:T])
+    b = inner[T:] - run.gram[T:-1, :T] @ solved
+    return Score(b, A, float(error @ error - inner[:T] @ solved), len(error))
+
+
+def effects_at(bench: Bench, columns: Sequence[int], value: Array) -> dict[str, float]:
+    """Parameters by key of coefficients in typical sizes, on top of the twin's own, within their ranges."""
+    c = bench.candidates
+    out = {}
+    for i, v in zip(columns, value, strict=True):
+        base = bench.model.effects.get(c.keys[i], 0.0)
+        out[c.keys[i]] = float(np.clip(base + v * c.scale[i], c.low[i], c.high[i]))
+    return out
+
+
+def refit_all(
+    bench: Bench,
+    scores: Sequence[Score],
+    sigma: Array,
+    null: Null,
+    pool: Pool,
+    chosen: Sequence[Sequence[int]],
+) -> list[Refit]:
+    """Refits of several sets of columns, side by side."""
+    fits = [_linear(bench, pool, tuple(columns)) for columns in chosen]
+    active = list(range(len(fits)))
+    for _ in range(STEPS):
+        if not active:
+            break
+        sets = [effects_at(bench, fits[i].columns, fits[i].trial) for i in active]
+        errors = [errors_with(bench, run, raw, sets) for run, raw in zip(bench.runs, bench.raws, strict=True)]
+        still = []
+        for n, i in enumerate(active):
+            mine = [run[n] for run in errors]
+            if any(e is None for e in mine):
+                fits[i] = dataclasses.replace(fits[i], failure="the twin diverges with the fitted value")
+                continue
+            better = _step(bench, scores, sigma, null, pool, fits[i], [e for e in mine if e is not None])
+            if better is not None:
+                fits[i] = better
+                still.append(i)
+            elif not fits[i].errors:
+                fits[i] = dataclasses.replace(fits[i], failure="the linear fit does not hold in the twin")
+        active = still
+    return fits
+
+
+def _linear(bench: Bench, pool: Pool, columns: tuple[int, ...]) -> Refit:
+    value, covariance, explained = pool.fit(columns, SIZE)
+    value = _bounded(bench, columns, value)
+    at = np.asarray(columns)
+    explained = float(2.0 * value @ pool.gain[at] - value @ pool.information[np.ix_(at, at)] @ value)
+    return Refit(columns, value, value, covariance, explained, [], "")
+
+
+def _bounded(bench: Bench, columns: Sequence[int], value: Array) -> Array:
+    c = bench.candidates
+    at = np.asarray(columns)
+    base = np.array([bench.model.effects.get(c.keys[i], 0.0) for i in columns])
+    return np.clip(value, (c.low[at] - base) / c.scale[at], (c.high[at] - base) / c.scale[at])
+
+
+def errors_with(
+    bench: Bench, run: Evidence, raw: Raw, sets: Sequence[Mapping[str, float]]
+) -> list[Array | None]:
+    """Whitened errors of a run against the twin with each set of effects; None where it diverges."""
+    c, base = bench.candidates, bench.model.effects
+    soil = [name for name in SOIL_STATE if name in c.keys]
+    driven = [{k: v for k, v in some.items() if k not in soil} for some in sets]
+    plain, *found = predictions(run.log, bench.model, c, [{}, *driven], run.log.start)
+    out: list[Array | None] = []
+    for some, y in zip(sets, found, strict=True):
+        if y is None or plain is None:
+            out.append(None)
+            continue
+        # The errors are linearised about the run's own ground: the ground itself enters linearly, all else
+        # as the twin has it.
+        moved = [(some.get(k, base.get(k, 0.0)) - base.get(k, 0.0)) / c.scale[c.keys.index(k)] for k in soil]
+        error = [
+            e - (new - old) - s[:, : len(soil)] @ np.array(moved)
+            for e, new, old, s in zip(raw.error, y, plain, raw.state, strict=True)
+        ]
+        out.append(whitened_error(raw, run, bench.noise, error))
+    return out
+
+
+def _step(
+    bench: Bench,
+    scores: Sequence[Score],
+    sigma: Array,
+    null: Null,
+    pool: Pool,
+    fit: Refit,
+    errors: list[Array],
+) -> Refit | None:
+    """The fit at its trial value, as the twin has it; None where that explains less than before."""
+    at = np.asarray(fit.columns)
+    square, gain = 0.0, np.zeros(len(at))
+    for run, first, error in zip(bench.runs, scores, errors, strict=True):
+        x, U = null.standardised(scored(run, sigma, error, first.A))
+        weighted = null.inverse @ x
+        square += float(x @ weighted)
+        gain += U[:, at].T @ weighted
+    explained = pool.square - square
+    if fit.errors and explained < fit.explained:
+        return None
+    if not fit.errors and explained < 0.0:
+        return None
+    trial = _bounded(bench, fit.columns, fit.trial + fit.covariance @ (gain - fit.trial / SIZE**2))
+    return Refit(fit.columns, fit.trial, trial, fit.covariance, explained, errors, "")
