@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.errors import DataError, TerrafusionError
 from terrafusion.datasets.frames import rpy_to_quaternion
 from terrafusion.datasets.recording import Recording, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
@@ -193,6 +193,13 @@ def test_the_command_takes_soils_and_logs(tmp_path: Path, monkeypatch: pytest.Mo
     log.write_text("another\n")
     CliRunner().invoke(app, words)
     assert load_policy(out).inputs_sha256 != policy.inputs_sha256
+
+
+def test_a_ground_on_which_the_wheels_never_turn_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    still = logged_evidence(circled(seconds=7.0))["grass"]
+    monkeypatch.setattr(policy_fit, "evidence_of", lambda recording: still)
+    with pytest.raises(TerrafusionError, match=r"asphalt.*never turned"):
+        fit_policy(GRID)
 
 
 @pytest.mark.parametrize(
