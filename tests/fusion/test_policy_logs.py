@@ -108,6 +108,26 @@ def test_nothing_is_known_across_a_gap() -> None:
     assert not silent[(middle < 9.8 - half) | (middle > 15.2 + half)].any()
 
 
+def test_samples_that_are_no_numbers_are_left_out() -> None:
+    whole = circled()
+    assert whole.truth is not None
+    assert whole.wheels is not None
+    position, speed = whole.truth.position_m.copy(), whole.wheels.speed.copy()
+    position[50], speed[100] = np.nan, np.nan
+    holed = dataclasses.replace(
+        whole,
+        truth=dataclasses.replace(whole.truth, position_m=position),
+        wheels=dataclasses.replace(whole.wheels, speed=speed),
+    )
+    slip = logged_evidence(holed)["grass"].slip
+    assert len(slip) == len(logged_evidence(whole)["grass"].slip)
+    assert slip == pytest.approx(0.1, abs=1e-3)
+
+
+def test_a_drive_labelled_unknown_names_no_ground() -> None:
+    assert logged_evidence(dataclasses.replace(circled(), terrain_name="unknown")) == {}
+
+
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
@@ -117,6 +137,7 @@ def test_nothing_is_known_across_a_gap() -> None:
         ({"truth_frame": "antenna"}, "truth with position and yaw"),
         ({"terrain_name": ""}, "no ground label"),
         ({"vehicle": None}, "--vehicle"),
+        ({"truth": circled().truth.select(slice(1))}, "no two samples"),
     ],
 )
 def test_a_log_that_lacks_something_is_refused(changes: dict[str, object], words: str) -> None:
