@@ -2,7 +2,8 @@
 
 A reader module has two functions: `claims(path, head)` tells from the name and the first bytes
 whether a file is of its format, `read(request)` reads it. Modules import their parsers inside
-`read`, so that asking all of them costs nothing.
+`read`, so that asking all of them costs nothing. Where a recording has several files, `kin(path)`
+tells those that are read with one of them.
 """
 
 from __future__ import annotations
@@ -65,6 +66,15 @@ class Format:
         """The recordings in the file."""
         recordings: Sequence[Recording] = import_module(self.module).read(request)
         return recordings
+
+    def files(self, path: Path) -> list[Path]:
+        """What `read` opens: all files of a folder; else the file, and those beside it that belong to it."""
+        if path.is_dir():
+            return sorted(file for file in path.rglob("*") if file.is_file())
+        module = import_module(self.module)
+        kin: Sequence[Path] = module.kin(path) if hasattr(module, "kin") else ()
+        columns = path.with_name(path.name + MAP_SUFFIX)
+        return sorted({path, *kin, *([columns] if columns.is_file() else [])})
 
 
 _READERS = "terrafusion.datasets.readers"

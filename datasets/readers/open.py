@@ -104,6 +104,16 @@ def find_log(path: Path | str) -> tuple[Path, int | None]:
         ) from None
 
 
+def files_of(path: Path | str) -> list[Path]:
+    """The files that `open_recordings` reads of a log.
+
+    Raises:
+        DataError: there is no such log, or no format claims it.
+    """
+    place, _ = find_log(path)
+    return format_of(place).files(place)
+
+
 def _find_log(path: Path | str) -> tuple[Path, int | None]:
     text, mark, number = str(path).rpartition("#")
     numbered = (

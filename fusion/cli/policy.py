@@ -42,7 +42,7 @@ def fit(
     with the same parameter files and logs, the policy file has the same bytes.
 
     Example: terrafusion policy fit --out policy.yaml
-    Example: terrafusion policy fit --out warthog.yaml --vehicle warthog norlab/*/raw_dataframe.pkl
+    Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
     """
     from terrafusion.fusion.cli.terrain import checked_output, progress
     from terrafusion.fusion.terrain.drives import GROUNDS

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -25,7 +25,10 @@ def train(
     logs: Annotated[
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: drives of the twin.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds of the twin's drives.")] = 3,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, max=1000, help="Seeds of the twin's drives (3).", show_default=False),
+    ] = None,
 ) -> None:
     """Train the terrain model on drives of the twin, or a learner of a robot's own grounds on its logs.
 
@@ -37,12 +40,13 @@ def train(
     """
     checked_output(out)
     if logs:
+        no_seeds(seeds)
         train_on_logs(logs, out)
         return
     from terrafusion.fusion.terrain.train import Plan, write_model
     from terrafusion.fusion.terrain.train import train as run
 
-    plan = Plan(seeds=seeds)
+    plan = Plan() if seeds is None else Plan(seeds=seeds)
     with progress("drives", plan.drives()) as tick:
         model, scores = run(plan, tick)
     write_model(model, out)
@@ -54,9 +58,10 @@ def train_on_logs(logs: list[str], out: Path) -> None:
     """Fit, calibrate and write a learner of labelled logs."""
     import dataclasses
 
-    from terrafusion.fusion.terrain.labelled import hashes_of, open_runs, train_on
+    from terrafusion.fusion.terrain.labelled import check_runs, hashes_of, open_runs, train_on
 
     runs = open_runs(logs)
+    check_runs(runs)
     made_by = f"terrafusion terrain train --out {out.name}, {len(runs)} runs"
     model = dataclasses.replace(train_on(runs), inputs=hashes_of(logs), made_by=made_by)
     model.write(out)
@@ -70,9 +75,16 @@ def evaluate(
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: fresh drives of the twin.")
     ] = None,
     model: Annotated[
-        Path | None, typer.Option("--model", help="Model file for the twin's drives; else the shipped one.")
+        Path | None,
+        typer.Option(
+            "--model",
+            help="Model file: with logs a learner's, else the detector's; by default the shipped one.",
+        ),
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Fresh seeds of the twin to score on.")] = 1,
+    seeds: Annotated[
+        int | None,
+        typer.Option(min=1, max=1000, help="Fresh seeds of the twin to score on (1).", show_default=False),
+    ] = None,
     test: Annotated[
         list[str] | None, typer.Option("--test", help="Labelled logs of another robot (may be given again).")
     ] = None,
@@ -81,15 +93,23 @@ def evaluate(
     """Score a terrain model on fresh drives of the twin, or a learner on labelled logs, by run.
 
     With logs: five folds, no run in two of them; changes of ground, each input
-    left out, grounds never seen, and the split that leaks beside it.
+    left out, grounds never seen, and the split that leaks beside it. With logs
+    and a learner: how it does on these logs, none of which it may have seen.
 
     Example: terrafusion terrain eval
     Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
+    Example: terrafusion terrain eval --model grounds.yaml another_day/*/imu_*.csv
     """
     if out is not None:
         checked_output(out)
     if logs:
-        evaluate_logs(logs, test or [], out)
+        no_seeds(seeds)
+        if model is None:
+            evaluate_logs(logs, test or [], out)
+        elif test:
+            raise TerrafusionError("--test is of a learner made here", remedy="leave out --model")
+        else:
+            evaluate_learner(model, logs, out)
         return
     if test or out is not None:
         raise TerrafusionError("--test and --out are of labelled logs", remedy="name the logs to train on")
@@ -97,8 +117,8 @@ def evaluate(
     from terrafusion.fusion.terrain.classifier import load_terrain_model
 
     loaded = load_terrain_model(model)
-    with progress("drives", trials.count(seeds)) as tick:
-        results = trials.run(loaded, seeds, tick)
+    with progress("drives", trials.count(seeds or 1)) as tick:
+        results = trials.run(loaded, seeds or 1, tick)
     for name, scores in results.items():
         print_scores(name, scores)
         print()
@@ -106,19 +126,51 @@ def evaluate(
 
 def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
     """Print the figures of labelled logs, and write them."""
-    import json
-
     from terrafusion.fusion.terrain.labelled import hashes_of, open_runs
     from terrafusion.fusion.terrain.surface_report import STEPS, lines_of, report_on
 
     runs, others = open_runs(logs), open_runs(test) if test else []
     with progress("steps", STEPS) as tick:
         report = report_on(runs, others, tick)
-    for line in lines_of(report):
-        print(line)
+    print("\n".join(lines_of(report)))
+    write_figures(report | {"inputs": hashes_of([*logs, *test])}, out)
+
+
+def evaluate_learner(model: Path, logs: list[str], out: Path | None) -> None:
+    """Print how a learner does on labelled logs that it has not seen, and write it."""
+    from terrafusion.fusion.terrain.labelled import hashes_of, open_runs
+    from terrafusion.fusion.terrain.softmax import read_softmax
+    from terrafusion.fusion.terrain.surface_report import figures_lines, score
+
+    learner, inputs = read_softmax(model), hashes_of(logs)
+    known = sorted(name for name, sha256 in inputs.items() if sha256 in learner.inputs.values())
+    if known:
+        raise TerrafusionError(
+            f"was trained on {len(known)} of these files, such as {known[0]}",
+            file=model,
+            remedy="give other logs; without --model they are left out in turn",
+        )
+    report = score(learner, open_runs(logs))
+    print("\n".join(figures_lines(report)))
+    write_figures(report | {"inputs": inputs}, out)
+
+
+def write_figures(report: dict[str, Any], out: Path | None) -> None:
+    """Write figures as JSON where a file is asked for."""
+    from terrafusion.fusion.report.outputs import to_json
+
     if out is not None:
-        text = json.dumps(report | {"inputs": hashes_of([*logs, *test])}, indent=1)
-        out.write_text(text + "\n", encoding="utf-8")
+        out.write_text(to_json(report, indent=1) + "\n", encoding="utf-8")
+
+
+def no_seeds(seeds: int | None) -> None:
+    """Refuse a number of seeds beside logs.
+
+    Raises:
+        TerrafusionError: there is one.
+    """
+    if seeds is not None:
+        raise TerrafusionError("--seeds is of the twin's drives", remedy="leave it out, or the logs")
 
 
 def print_scores(name: str, scores: Scores) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 from terrafusion.datasets.atomic import unwritable, write_atomically
 from terrafusion.datasets.catalog import load_catalog
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.datasets.readers.open import find_log
+from terrafusion.datasets.readers import files_of
 from terrafusion.fusion.report.outputs import to_json
 
 FOLDER = "parts"
@@ -71,15 +71,11 @@ def log_state(log: str) -> str:
     if log in load_catalog().recordings():
         return ""
     try:
-        place, _ = find_log(log)
-    except TerrafusionError:
+        states = [(file.name, file.stat()) for file in files_of(log)]
+    except (OSError, TerrafusionError):
         return ""
-    digest = hashlib.sha256()
-    for file in sorted([place, *place.rglob("*")]):
-        if file.is_file():
-            found = file.stat()
-            digest.update(f"{file.relative_to(place)}\0{found.st_size}\0{found.st_mtime_ns}\0".encode())
-    return digest.hexdigest()
+    text = "".join(f"{name}\0{found.st_size}\0{found.st_mtime_ns}\0" for name, found in states)
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 @functools.cache

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.catalog import sha256_of
 from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.readers import files_of
 from terrafusion.fusion.terrain.evaluate import calibration_error
 from terrafusion.fusion.terrain.softmax import (
     UNKNOWN_SHARE,
@@ -25,8 +26,10 @@ Array = NDArray[np.float64]
 
 FOLDS = 5
 INNER_FOLDS = 4
-TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
-"""Windows of 2 s every 0.5 s see each moment four times."""
+LEAST_RUNS = 2
+"""Of a ground: one to learn from, another to answer for."""
+TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0, 11.0, 16.0, 22.0, 32.0)
+"""Windows of 2 s every 0.5 s see each moment four times, and those of one run err alike."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,18 +99,36 @@ def open_runs(logs: Sequence[str]) -> list[Run]:
 
 
 def hashes_of(logs: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of every file given by path, or in a folder given, name by name: what was learnt from.
+    """SHA-256 of every file that is read of the logs: what was learnt from.
 
-    Logs given by their name in the catalogue are pinned there.
+    Files are named by folder and name, by more folders where two would be called the same.
+
+    Raises:
+        DataError: there is no such log.
     """
-    hashes: dict[str, str] = {}
-    for log in logs:
-        path = Path(log) if Path(log).exists() else Path(log.rpartition("#")[0])
-        files = sorted(f for f in path.rglob("*") if f.is_file()) if log and path.is_dir() else [path]
-        hashes |= {
-            "/".join(f.parts[-2:]): hashlib.sha256(f.read_bytes()).hexdigest() for f in files if f.is_file()
-        }
-    return hashes
+    files = sorted({file.resolve() for log in logs for file in files_of(log)})
+    longest = max((len(file.parts) for file in files), default=0)
+    names: list[str] = []
+    for parts in range(2, longest + 1):
+        names = ["/".join(file.parts[-parts:]) for file in files]
+        if len(set(names)) == len(files):
+            break
+    return {name: sha256_of(file) for name, file in zip(names, files, strict=True)}
+
+
+def check_runs(runs: Sequence[Run]) -> None:
+    """Refuse what no run can be left out of.
+
+    Raises:
+        DataError: a ground has fewer than `LEAST_RUNS` runs.
+    """
+    for label, count in sorted(Counter(r.label for r in runs).items()):
+        if count < LEAST_RUNS:
+            raise DataError(
+                f"ground '{label}' has {count} run, {LEAST_RUNS} are needed to leave one out",
+                channel="terrain",
+                remedy="give more runs of it, or none",
+            )
 
 
 def deal(runs: Sequence[Run], folds: int = FOLDS) -> NDArray[np.intp]:
@@ -135,6 +156,7 @@ def train_on(
 
     Raises:
         ConfigError: fewer than two grounds, or no scikit-learn.
+        DataError: no ground has a run to leave out.
     """
     model = fit_softmax(np.vstack([r.x for r in runs]), labels_of(runs), features)
     if temperature is not None:
@@ -148,7 +170,9 @@ def train_on(
         part = fit_softmax(np.vstack([r.x for r in inner]), labels_of(inner), features)
         held += [(part, r) for r, f in zip(runs, fold_of, strict=True) if f == fold]
     if not held:
-        return model
+        raise DataError(
+            "no ground has a second run: nothing to calibrate on", channel="terrain", remedy="give more runs"
+        )
 
     def loss(t: float) -> float:
         scores = [

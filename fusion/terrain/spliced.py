@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 PATCHES = 30
 PATCH_S = (10.0, 30.0)
 """Shortest and longest time on one ground."""
+LEAST_RUN_S = PATCH_S[0] + 1.0
+"""Shorter runs give no patch."""
 SEEN_WITHIN_S = 2.0
 
 
@@ -36,9 +38,10 @@ class Changes:
 
 
 def spliced(runs: Sequence[tuple[Signals, str]], seed: int) -> tuple[Signals, list[tuple[float, str]]]:
-    """One route cut from runs of several grounds, and when each ground begins.
+    """One route cut from runs of two grounds or more, and when each ground begins.
 
-    The cut is in the raw samples, so windows across a change see both grounds.
+    The cut is in the raw samples, so windows across a change see both grounds. No run may be shorter than
+    `LEAST_RUN_S`.
     """
     rng = np.random.default_rng([seed, 23])
     grounds = sorted({label for _, label in runs})
@@ -47,9 +50,7 @@ def spliced(runs: Sequence[tuple[Signals, str]], seed: int) -> tuple[Signals, li
     at, last = 0.0, ""
     for _ in range(PATCHES):
         label = str(rng.choice([g for g in grounds if g != last]))
-        choices = [s for s, g in runs if g == label and s.end_s() > PATCH_S[0] + 1.0]
-        if not choices:
-            continue
+        choices = [s for s, g in runs if g == label]
         source = choices[int(rng.integers(len(choices)))]
         length = min(float(rng.uniform(*PATCH_S)), source.end_s() - 0.5)
         begin = float(rng.uniform(0.0, source.end_s() - length))
@@ -93,15 +94,23 @@ def delays(
 
 def changes_seen(
     models: Sequence[SoftmaxModel], held_out: Sequence[Sequence[tuple[Signals, str]]]
-) -> Changes:
-    """Each model on two routes over the runs (signals, label) it has not seen."""
+) -> Changes | None:
+    """Each model on two routes over the runs (signals, label) it has not seen.
+
+    None where no model has runs of two grounds that are long enough.
+    """
     found: list[float] = []
     right: list[float] = []
-    for fold, (model, runs) in enumerate(zip(models, held_out, strict=True)):
+    for fold, (model, given) in enumerate(zip(models, held_out, strict=True)):
+        runs = [(signals, label) for signals, label in given if signals.end_s() > LEAST_RUN_S]
+        if len({label for _, label in runs}) < 2:
+            continue
         for seed in (2 * fold, 2 * fold + 1):
             here, share = delays(model, *spliced(runs, seed))
             found += here
             right.append(share)
+    if not found:
+        return None
     seen = np.array([d for d in found if np.isfinite(d)])
     return Changes(
         median_s=float(np.median(seen)) if len(seen) else np.inf,

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.errors import DataError
 from terrafusion.fusion.terrain.labelled import (
     FOLDS,
+    LEAST_RUNS,
     Folded,
     Run,
+    check_runs,
     cross_validate,
     deal,
     figures_of,
@@ -20,8 +24,8 @@ from terrafusion.fusion.terrain.labelled import (
     train_on,
     window_ms,
 )
-from terrafusion.fusion.terrain.softmax import fit_softmax
-from terrafusion.fusion.terrain.spliced import changes_seen
+from terrafusion.fusion.terrain.softmax import SoftmaxModel, fit_softmax
+from terrafusion.fusion.terrain.spliced import LEAST_RUN_S, changes_seen
 from terrafusion.fusion.terrain.surface import GROUPS, SURFACE_FEATURES
 
 Array = NDArray[np.float64]
@@ -39,13 +43,16 @@ def report_on(
 
     Raises:
         ConfigError: fewer than two grounds, or no scikit-learn.
+        DataError: a ground of a single run.
     """
+    check_runs(runs)
     folded = cross_validate(runs)
     tick()
     held_out = [
         [(r.signals, r.label) for r, f in zip(runs, folded.fold_of, strict=True) if f == fold]
         for fold in range(FOLDS)
     ]
+    changes = changes_seen(folded.models, held_out)
     report: dict[str, Any] = {
         "runs": {
             f"fold {k}": [r.name for r, f in zip(runs, folded.fold_of, strict=True) if f == k]
@@ -54,7 +61,7 @@ def report_on(
         "temperatures": [m.temperature for m in folded.models],
         "window by window": dataclasses.asdict(folded.figures(filtered=False)),
         "filtered": dataclasses.asdict(folded.figures()),
-        "changes of ground": dataclasses.asdict(changes_seen(folded.models, held_out)),
+        "changes of ground": None if changes is None else dataclasses.asdict(changes),
         "window_ms": window_ms(folded.models[0], max(runs, key=lambda r: len(r.x))),
     }
     tick()
@@ -107,7 +114,8 @@ def never_seen(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
     for ground in sorted({r.label for r in runs}):
         known = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f != 0]
         test = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f == 0]
-        if len({r.label for r in known}) < 2 or not test:
+        counts = Counter(r.label for r in known)
+        if len(counts) < 2 or max(counts.values()) < LEAST_RUNS or not test:
             continue
         model = train_on(known)
         odd = {
@@ -138,9 +146,29 @@ def transfer(runs: Sequence[Run], others: Sequence[Run]) -> dict[str, Any]:
     return result
 
 
-def lines_of(report: dict[str, Any]) -> list[str]:
-    """The report in words and tables, line by line."""
-    lines = [f"{fold}: {', '.join(names)}" for fold, names in report["runs"].items()]
+def score(model: SoftmaxModel, runs: Sequence[Run]) -> dict[str, Any]:
+    """Figures of a finished model on runs that it was not trained on; JSON-able.
+
+    Raises:
+        DataError: a ground that the model does not know.
+    """
+    strange = sorted({r.label for r in runs} - set(model.classes))
+    if strange:
+        raise DataError(
+            f"the model does not know {', '.join(strange)}",
+            channel="terrain",
+            remedy=f"give runs on {', '.join(model.classes)}",
+        )
+    answers = {
+        "window by window": [np.exp(model.log_probabilities(r.x)) for r in runs],
+        "filtered": [model.filtered(r.windows) for r in runs],
+    }
+    return {name: dataclasses.asdict(figures_of(model.classes, runs, p)) for name, p in answers.items()}
+
+
+def figures_lines(report: dict[str, Any]) -> list[str]:
+    """The figures of single and of filtered answers in words and tables, line by line."""
+    lines: list[str] = []
     for name in ("window by window", "filtered"):
         figures = report[name]
         lines += [
@@ -149,11 +177,16 @@ def lines_of(report: dict[str, Any]) -> list[str]:
             f"ECE {figures['ece']:.3f}, {figures['windows']} windows",
             *_table(figures),
         ]
-    change = report["changes of ground"]
+    return lines
+
+
+def lines_of(report: dict[str, Any]) -> list[str]:
+    """The report in words and tables, line by line."""
+    lines = [f"{fold}: {', '.join(names)}" for fold, names in report["runs"].items()]
+    lines += figures_lines(report)
     lines += [
         "",
-        f"change of ground seen after {change['median_s']:.1f} s (median), {change['p95_s']:.1f} s (95 %); "
-        f"within 2 s {change['within_2_s']:.0%}, never {change['never']:.0%} of {change['changes']}",
+        _change(report["changes of ground"]),
         f"one window {report['window_ms']:.2f} ms",
         "",
         "macro-F1 without an input, and with it alone:",
@@ -186,6 +219,15 @@ def lines_of(report: dict[str, Any]) -> list[str]:
     return lines
 
 
+def _change(change: dict[str, Any] | None) -> str:
+    if change is None:
+        return f"change of ground: not measured, no fold has two grounds with runs above {LEAST_RUN_S:g} s"
+    return (
+        f"change of ground seen after {change['median_s']:.1f} s (median), {change['p95_s']:.1f} s (95 %); "
+        f"within 2 s {change['within_2_s']:.0%}, never {change['never']:.0%} of {change['changes']}"
+    )
+
+
 def _table(figures: dict[str, Any]) -> list[str]:
     head = " " * 14 + " ".join(f"{c:>12s}" for c in figures["classes"])
     rows = zip(figures["classes"], figures["confusion"], strict=True)
@@ -212,7 +254,7 @@ def _tree_f1(x: Array, y: NDArray[Any], fold: NDArray[np.intp]) -> float:
 
     filled = np.where(np.isfinite(x), x, 0.0)
     named = np.empty(len(y), dtype=object)
-    for k in range(FOLDS):
+    for k in np.unique(fold):
         machine = ExtraTreesClassifier(200, min_samples_leaf=2, class_weight="balanced", random_state=0)
         named[fold == k] = machine.fit(filled[fold != k], y[fold != k]).predict(filled[fold == k])
     return float(f1_score(y, named.astype(str), average="macro"))

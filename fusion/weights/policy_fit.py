@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.terrain.drives import GROUNDS, Grid, run_all
 from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise, within_ranges
 from terrafusion.fusion.weights.policy_evidence import (
@@ -63,6 +64,9 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logg
 
     What a log says of a ground stands in place of what the twin says. What it does not say is taken from the
     twin's drives on that ground, or from all of them where the twin has no such ground.
+
+    Raises:
+        TerrafusionError: on some ground the wheels hardly turned.
     """
     drives: dict[str, list[Evidence]] = {ground: [] for ground in grid.grounds}
     for condition, recording in run_all(grid.conditions(), tick):
@@ -72,7 +76,7 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logg
         everywhere = Evidence.joined(grounds.values())
         told = {n: e.completed_by(grounds.get(n, everywhere)) for n, e in sorted(logged.grounds.items())}
         grounds |= told
-    rows = {name: _rounded(row_of([evidence])) for name, evidence in grounds.items()}
+    rows = {name: _row_on(name, evidence) for name, evidence in grounds.items()}
     matched = Policy(rows, next(iter(rows.values())), "").blend(np.full(len(rows), 1.0 / len(rows)))
     return Policy(
         classes={**rows, "unknown": _rounded(_spread(matched))},
@@ -84,6 +88,15 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logg
 def default_grid(seeds: int, grounds: tuple[str, ...] = GROUNDS, vehicle: str = "elevate") -> Grid:
     """The drives of a policy, by default of the shipped one, with seeds 0 to `seeds` - 1."""
     return Grid(SCENARIOS, SLOPES_DEG, PAYLOADS_KG, tuple(range(seeds)), grounds, vehicle)
+
+
+def _row_on(ground: str, evidence: Evidence) -> SensorNoise:
+    try:
+        return _rounded(row_of([evidence]))
+    except ValueError as error:
+        raise TerrafusionError(
+            str(error), channel=ground, remedy="leave the ground out, or drive another vehicle"
+        ) from None
 
 
 def row_of(grounds: list[Evidence]) -> SensorNoise:

@@ -15,7 +15,7 @@ from terrafusion.datasets.doctor.finding import Patient
 from terrafusion.datasets.doctor.measures import measure
 from terrafusion.datasets.doctor.mounting import heading
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import borealtc_csv
 from terrafusion.datasets.recording import TERRAINS, Recording, differences
 
@@ -197,6 +197,8 @@ def test_either_file_opens_both(run: Path) -> None:
     assert one.start_ns == 0
     assert any("assumed to start together" in note for note in one.notes)
     assert any("exactly even" in note for note in one.notes)
+    pair = [run.with_name(f"{kind}_00.csv") for kind in ("imu", "pro")]
+    assert [files_of(file) for file in pair] == [pair, pair]
 
 
 def test_numbers_are_those_of_the_files(run: Path) -> None:

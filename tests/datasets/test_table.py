@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.frames import enu_to_geodetic, geodetic_to_enu
-from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.text.column_map import FIELDS, starter_map
 from terrafusion.datasets.readers.text.units import UNITS, units_of
 from terrafusion.datasets.recording import Fix, Recording
@@ -69,6 +69,12 @@ EXACT = {
     ("field_x_t", "mG"): (10.0, 1e-6),
     ("p_mud", "%"): (50.0, 0.5),
 }
+
+
+def test_the_map_is_among_the_files_of_a_table(tmp_path: Path) -> None:
+    path = table(tmp_path, "t,wz\n0,1\n")
+    (tmp_path / "other.csv").write_text("t,wz\n0,1\n")
+    assert files_of(path) == [path, tmp_path / "drive.csv.columns.yaml"]
 
 
 def test_every_unit_is_checked() -> None:

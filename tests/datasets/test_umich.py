@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import umich_text
 from terrafusion.datasets.readers.text import number_rows
 from terrafusion.datasets.recording import differences
@@ -54,6 +54,7 @@ def test_any_file_opens_the_whole(trial: Path, file: str) -> None:
     joined = next(note for note in other.notes if note.startswith("joined with"))
     assert all(name in joined for name in FAMILY)
     assert any(note.startswith("front: second rigid body") for note in other.notes)
+    assert files_of(trial / file) == sorted(trial / name for name in FAMILY)
 
 
 def test_numbers_are_those_of_the_files(trial: Path) -> None:

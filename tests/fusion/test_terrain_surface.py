@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import glob
 import itertools
+import json
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,14 +16,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.fusion.cli.terrain import app
 from terrafusion.fusion.terrain.labelled import (
     FOLDS,
+    TEMPERATURES,
     Run,
+    check_runs,
     cross_validate,
     deal,
-    figures_of,
+    hashes_of,
     open_runs,
     train_on,
     window_ms,
@@ -37,7 +40,15 @@ from terrafusion.fusion.terrain.surface import (
     surface_windows,
     window_features,
 )
-from terrafusion.fusion.terrain.surface_report import leaking, lines_of, never_seen, report_on, transfer
+from terrafusion.fusion.terrain.surface_report import (
+    figures_lines,
+    leaking,
+    lines_of,
+    never_seen,
+    report_on,
+    score,
+    transfer,
+)
 
 SHAKES = {"gravel": 1.0, "lawn": 0.35, "pavement": 0.12}
 
@@ -268,6 +279,88 @@ def test_the_report_of_made_drives(runs: Sequence[Run]) -> None:
     assert transfer(short, short[:6])["common grounds"] == ["gravel"]
 
 
+@pytest.mark.parametrize("counts", [(6, 6, 1), (1, 1, 1)])
+def test_a_ground_of_one_run_is_refused_by_name(runs: Sequence[Run], counts: tuple[int, int, int]) -> None:
+    few = [
+        r for label, n in zip(SHAKES, counts, strict=True) for r in [x for x in runs if x.label == label][:n]
+    ]
+    ground = next(label for label, n in sorted(zip(SHAKES, counts, strict=True)) if n == 1)
+    for refused in (check_runs, report_on):
+        with pytest.raises(DataError, match=f"ground '{ground}' has 1 run, 2 are needed"):
+            refused(few)
+    if max(counts) == 1:
+        with pytest.raises(DataError, match="nothing to calibrate on"):
+            train_on(few)
+
+
+def test_two_runs_a_ground_are_reported_with_what_they_cannot_tell() -> None:
+    few = [
+        made_run(label, 10 * i + n, seconds=8.0) for i, label in enumerate(("gravel", "lawn")) for n in (0, 1)
+    ]
+    report = report_on(few)
+    assert report["filtered"]["windows"] == sum(len(r.x) for r in few)
+    assert report["changes of ground"] is None  # each fold holds one run
+    assert "change of ground: not measured" in "\n".join(lines_of(report))
+
+
+def test_folds_of_one_ground_or_of_short_runs_are_left_out_of_the_changes(
+    model: SoftmaxModel, runs: Sequence[Run]
+) -> None:
+    whole = [(r.signals, r.label) for r in runs if r.name.endswith("5")]
+    short = [(signals.between(0.0, 10.0), label) for signals, label in whole]
+    one = [(signals, label) for signals, label in whole if label == "lawn"]
+    alone = changes_seen([model], [whole])
+    assert alone is not None
+    assert alone.changes == 10  # five on each of two routes
+    assert changes_seen([model] * 3, [whole, short, one]) == alone
+    assert changes_seen([model] * 2, [short, one]) is None
+
+
+def test_the_temperature_is_chosen_inside_its_range(model: SoftmaxModel) -> None:
+    assert TEMPERATURES[0] <= model.temperature < TEMPERATURES[-1]
+
+
+def test_what_was_learnt_from_is_every_file_that_was_read(tmp_path: Path) -> None:
+    folders = [tmp_path / day / "ICE" for day in ("one", "two")]
+    for i, folder in enumerate(folders):
+        folder.mkdir(parents=True)
+        for kind, head in (("imu", "time,wx,wy,wz,ax,ay,az"), ("pro", "time,curL,curR,velL,velR")):
+            (folder / f"{kind}_01.csv").write_text(
+                f"{head}\n" + ",".join([str(i)] * (head.count(",") + 1)) + "\n"
+            )
+        (folder / "imu_02.csv").write_text("of another run")
+    hashes = hashes_of([str(folder / "imu_01.csv") for folder in folders])
+    assert list(hashes) == [f"{day}/ICE/{kind}_01.csv" for day in ("one", "two") for kind in ("imu", "pro")]
+    assert len(set(hashes.values())) == 4
+    one = hashes_of([str(folders[0] / "pro_01.csv")])
+    assert list(one) == ["ICE/imu_01.csv", "ICE/pro_01.csv"]
+    assert set(one.values()) < set(hashes.values())
+    with pytest.raises(DataError, match="no such file"):
+        hashes_of(["absent.csv"])
+
+
+def test_a_learner_is_scored_on_grounds_it_knows(model: SoftmaxModel, runs: Sequence[Run]) -> None:
+    held = [r for r in runs if r.name.endswith("5")]
+    report = score(model, held)
+    assert report["filtered"]["macro_f1"] > 0.9
+    assert figures_lines(report)[1].startswith("window by window: macro-F1")
+    with pytest.raises(DataError, match="does not know tarmac"):
+        score(model, [*held, dataclasses.replace(held[0], label="tarmac")])
+
+
+@pytest.mark.parametrize(
+    ("words", "why"),
+    [
+        (("train", "--seeds", "2"), "--seeds is of the twin's drives"),
+        (("eval", "--seeds", "2"), "--seeds is of the twin's drives"),
+        (("eval", "--model", "a.yaml", "--test", "b"), "--test is of a learner made here"),
+    ],
+)
+def test_options_that_mean_nothing_beside_logs_are_refused(tmp_path: Path, words, why: str) -> None:
+    result = CliRunner().invoke(app, [*words, "--out", str(tmp_path / "out"), "log"])
+    assert why in str(result.exception)
+
+
 FIELD = os.environ.get("TERRAFUSION_DATA", "")
 
 
@@ -281,10 +374,18 @@ def test_a_real_husky_is_told_ice_from_loam_by_run(tmp_path: Path) -> None:
     runs = open_runs(logs)
     assert cross_validate(runs, temperature=8.0).figures().macro_f1 > 0.95
     assert window_ms(train_on(runs, temperature=8.0), runs[0], 50) < 20.0
-    out = tmp_path / "grounds.yaml"
-    result = CliRunner().invoke(app, ["train", "--out", str(out), *logs])
+    out, figures = tmp_path / "grounds.yaml", tmp_path / "figures.json"
+    held = logs[::4]
+    known = [log for log in logs if log not in held]
+    result = CliRunner().invoke(app, ["train", "--out", str(out), *known])
     assert result.exit_code == 0, result.output
     model = read_softmax(out)
     assert model.classes == ("ice", "sandy_loam")
-    assert len(model.inputs) == len(logs)
-    assert figures_of(model.classes, runs, [model.filtered(r.windows) for r in runs]).macro_f1 > 0.95
+    assert len(model.inputs) == 2 * len(known)  # IMU and wheels of each
+    result = CliRunner().invoke(app, ["eval", "--model", str(out), "--out", str(figures), *held])
+    assert result.exit_code == 0, result.output
+    found = json.loads(figures.read_text())
+    assert found["filtered"]["macro_f1"] > 0.95
+    assert not set(found["inputs"].values()) & set(model.inputs.values())
+    seen = CliRunner().invoke(app, ["eval", "--model", str(out), held[0], known[0]])
+    assert "was trained on 2 of these files" in str(seen.exception)

@@ -50,16 +50,18 @@ def claims(path: Path, head: bytes) -> bool:
     return sorted(split(header, ",")) == sorted(COLUMNS[named["kind"]])
 
 
+def kin(path: Path) -> list[Path]:
+    """The files of the run."""
+    return [file for file in _pair(path).values() if file.is_file()]
+
+
 def read(request: Request) -> list[Recording]:
     """The one run that the file belongs to; its times count from the start of the run.
 
     Raises:
         DataError: a file of the run is bad, or a time runs backwards.
     """
-    named = NAME.fullmatch(request.path.name)
-    assert named is not None, "claimed by its name"
-    folder = request.path.parent
-    files = {kind: folder / f"{kind}_{named['run']}.csv" for kind in COLUMNS}
+    folder, run, files = request.path.parent, _run(request.path), _pair(request.path)
     rows = {
         kind: read_rows(path, COLUMNS[kind], separator=",", header=True)
         for kind, path in files.items()
@@ -77,7 +79,7 @@ def read(request: Request) -> list[Recording]:
     notes = [*_pairing(rows), *clock, *(note for r in rows.values() for note in r.notes), ground.note]
     label = np.array([ground.label], dtype=object)
     recording = Recording(
-        name=f"{folder.resolve().name}/{named['run']}",
+        name=f"{folder.resolve().name}/{run}",
         start_ns=0,
         wheels=_wheels(rows["pro"]) if "pro" in rows else None,
         imu=_imu(rows["imu"]) if "imu" in rows else None,
@@ -88,6 +90,17 @@ def read(request: Request) -> list[Recording]:
         notes=tuple(notes),
     )
     return [recording]
+
+
+def _run(path: Path) -> str:
+    named = NAME.fullmatch(path.name)
+    assert named is not None, "claimed by its name"
+    return named["run"]
+
+
+def _pair(path: Path) -> dict[str, Path]:
+    """Where the files of the run lie, or would lie, by kind."""
+    return {kind: path.parent / f"{kind}_{_run(path)}.csv" for kind in COLUMNS}
 
 
 def _ground(folder: str) -> Ground:

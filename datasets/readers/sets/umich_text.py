@@ -62,6 +62,13 @@ def claims(path: Path, head: bytes) -> bool:
     return path.is_file() and _part(path) is not None and are_numbers(head)
 
 
+def kin(path: Path) -> list[Path]:
+    """The files that are read with it, also those that are then found to be of another time."""
+    given = _part(path)
+    assert given is not None, "claimed by its name"
+    return [part.path for part in _family(given)[1]]
+
+
 def read(request: Request) -> list[Recording]:
     """The one recording that the file belongs to.
 
