@@ -41,13 +41,13 @@ class Detection:
         On a scale that is linear for small and logarithmic for large statistics, others are taken as
         Student's t.
         """
-        from scipy.stats import t
+        from scipy.special import stdtr
 
         if self.p_value > 1.5 / (1 + len(self.others)) or len(self.others) < 3:
             return self.p_value
         others = np.arcsinh(self.others)
         z = (math.asinh(self.statistic) - others.mean()) / max(float(others.std(ddof=1)), 0.2)
-        return min(self.p_value, float(t.sf(z, TAIL_FREEDOM)))
+        return min(self.p_value, float(stdtr(TAIL_FREEDOM, -z)))
 
 
 def judged(

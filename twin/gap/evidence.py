@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.outliers import bounded
 from terrafusion.twin.gap.residuals import (
     SOIL_STATE,
     Drives,
@@ -261,8 +262,9 @@ def gather(
         raws = list(pool.map(lambda run: at_own_ground(run, drives, noise), raws))
     noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates)
     evidence = [whitened(run, noise) for run in raws]
+    judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates))
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return Bench(
-        model, candidates, channels, noise, evidence[: len(runs)], evidence[len(runs) :], raws[: len(runs)],
-        drives, tuple(dict.fromkeys(notes)),
+        model, candidates, channels, noise, judged, normal,
+        raws[: len(runs)], drives, tuple(dict.fromkeys(notes)),
     )  # fmt: skip

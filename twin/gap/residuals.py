@@ -72,6 +72,8 @@ class Evidence:
         frame: (n, 3) orthonormal columns a window, along which the poses move the rows.
         seconds: length.
         states: T.
+        told: (n,) part of the error that the run's own states explain.
+        limit: by channel, beyond which what they leave counts as this much (see `outliers`).
     """
 
     name: str
@@ -84,6 +86,8 @@ class Evidence:
     window: NDArray[np.int64]
     seconds: float
     states: int
+    told: Array
+    limit: Array
 
 
 @dataclass(eq=False)
@@ -232,6 +236,7 @@ def whitened(run: Raw, noise: Mapping[str, Noise]) -> Evidence:
     return Evidence(
         run.log.name, run.log, rows_.T @ rows_, rows_.astype(np.float32), frame, np.concatenate(channels),
         np.concatenate(times), window, run.log.seconds(), states,
+        np.zeros(len(window)), np.full(len(run.log.observed), np.inf),
     )  # fmt: skip
 
 
@@ -244,7 +249,7 @@ def _orthonormal(columns: Array) -> Array:
 
 
 def whitened_error(run: Raw, evidence: Evidence, noise: Mapping[str, Noise], error: Sequence[Array]) -> Array:
-    """Another error (n,) of the run in the evidence's rows, poses projected out."""
+    """Another error (n,) of the run in the evidence's rows, poses projected out, within its limits."""
     parts = []
     for observed, e in zip(run.log.observed, error, strict=True):
         of = window_of(observed, run.log.windows)
@@ -256,7 +261,8 @@ def whitened_error(run: Raw, evidence: Evidence, noise: Mapping[str, Noise], err
     for k in np.unique(evidence.window):
         mine = evidence.window == k
         out[mine] -= evidence.frame[mine] @ (evidence.frame[mine].T @ out[mine])
-    return out
+    most = evidence.limit[evidence.channel]
+    return np.asarray(evidence.told + np.clip(out - evidence.told, -most, most))
 
 
 def first_noise(runs: Sequence[Raw]) -> dict[str, Noise]:

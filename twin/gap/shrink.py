@@ -107,10 +107,10 @@ def _share(
     share = float((before.mean() - after.mean()) / (before.mean() - floor))
     if len(before) < 2:
         return share, None
-    from scipy.stats import t
+    from scipy.special import stdtrit
 
     each = (before - after) / (before.mean() - floor)
-    half = float(t.ppf(0.975, len(each) - 1) * each.std(ddof=1) / np.sqrt(len(each)))
+    half = float(stdtrit(len(each) - 1, 0.975) * each.std(ddof=1) / np.sqrt(len(each)))
     return share, (share - half, share + half)
 
 

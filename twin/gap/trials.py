@@ -75,10 +75,10 @@ def null_scores(seed: int, jobs: int) -> tuple[list[Score], Candidates]:
 
 def interval(hits: int, count: int) -> tuple[float, float]:
     """95 % interval of a share (Clopper and Pearson 1934)."""
-    from scipy.stats import beta
+    from scipy.special import betaincinv
 
-    low = float(beta.ppf(0.025, hits, count - hits + 1)) if hits else 0.0
-    high = float(beta.ppf(0.975, hits + 1, count - hits)) if hits < count else 1.0
+    low = float(betaincinv(hits, count - hits + 1, 0.025)) if hits else 0.0
+    high = float(betaincinv(hits + 1, count - hits, 0.975)) if hits < count else 1.0
     return low, high
 
 

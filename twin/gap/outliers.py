@@ -1,0 +1,77 @@
+"""Errors beyond what noise makes of them count as much as its limit, and no more (Huber 1964).
+
+In the field a wheel hits a stone, a fix jumps, a skid starts a moment early: of a Warthog on asphalt every
+sixth whitened error is beyond three sigma. Squared, such moments decide what a run says; their scatter from
+run to run then hides changes that all other rows show. Only channels are bounded in which the references
+themselves have such moments: where noise is normal, a large error is news.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.gap.residuals import Evidence
+
+Array = NDArray[np.float64]
+
+SIGMAS = 4.0
+"""Limit in sigmas of the channel's noise: one in 16 000 normal errors is beyond it."""
+HEAVY = 0.02
+"""A channel is bounded where more than this share of the references' errors is beyond the limit."""
+STRONG = 1.5
+"""Where half of the judged runs' errors exceed by this factor what noise makes of them, the runs themselves
+have changed: their limit is in their own sigmas."""
+STEPS = 8
+"""Steps of the fit that outliers do not pull on."""
+NORMAL = 1.4826
+"""Standard deviation over median absolute deviation of normal errors."""
+
+
+def bounded(
+    runs: Sequence[Evidence], references: Sequence[Evidence], sigma: Array
+) -> tuple[list[Evidence], list[Evidence]]:
+    """Judged runs and references, their errors within the limits of each channel.
+
+    Args:
+        sigma: (T,) first 1 sigma of the states (ground, offsets): what these explain is no outlier.
+    """
+    channels = range(len(references[0].limit) if references else 0)
+    left = {id(run): _adapted(run, sigma, STEPS) for run in (*runs, *references)}
+
+    def errors(group: Sequence[Evidence], channel: int) -> Array:
+        parts = [left[id(run)][1][run.channel == channel] for run in group]
+        return np.abs(np.concatenate(parts))
+
+    heavy = [float(np.mean(errors(references, i) > SIGMAS)) > HEAVY for i in channels]
+    own = [NORMAL * float(np.median(errors(runs, i))) for i in channels]
+    normal = np.where(heavy, SIGMAS, np.inf)
+    changed = np.where(np.array(own) > STRONG, own, 1.0) * normal
+    return (
+        [_bounded(run, *left[id(run)], changed) for run in runs],
+        [_bounded(run, *left[id(run)], normal) for run in references],
+    )
+
+
+def _adapted(run: Evidence, sigma: Array, steps: int) -> tuple[Array, Array]:
+    """Error (n,) as the run's own states explain it, and what they leave; outliers do not pull on them."""
+    J, e = run.rows[:, : run.states].astype(float), run.rows[:, -1].astype(float)
+    gain = np.linalg.solve(run.gram[: run.states, : run.states] + np.diag(sigma**-2.0), J.T)
+    told = np.zeros(len(e))
+    for _ in range(steps):
+        told = J @ (gain @ (told + np.clip(e - told, -SIGMAS, SIGMAS)))
+    return told, e - told
+
+
+def _bounded(run: Evidence, told: Array, left: Array, limit: Array) -> Evidence:
+    if not np.isfinite(limit).any():
+        return run
+    rows = run.rows.astype(float)
+    most = limit[run.channel]
+    rows[:, -1] = told + np.clip(left, -most, most)
+    gram = run.gram.copy()
+    gram[:, -1] = gram[-1, :] = rows.T @ rows[:, -1]
+    return dataclasses.replace(run, gram=gram, rows=rows.astype(np.float32), told=told, limit=limit)
