@@ -74,11 +74,6 @@ class Evidence:
     accel: Array
     gnss: Array
 
-    def completed_by(self, other: Evidence) -> Evidence:
-        """This evidence, and that of `other` of every quantity this says nothing of."""
-        names = [f.name for f in dataclasses.fields(Evidence)]
-        return Evidence(**{n: getattr(self if len(getattr(self, n)) else other, n) for n in names})
-
     @staticmethod
     def joined(parts: Iterable[Evidence]) -> Evidence:
         """All of them together."""

@@ -48,22 +48,28 @@ TAIL = 0.005
 GRADE_RIDGE, LAD_STEPS, LAD_FLOOR = 1e-5, 30, 5e-3
 RADIUS_SIGMA = 0.01
 UNKNOWN_SPREAD = 1.5
+HILLY = 0.05
+"""Standard deviation of the grade (sine of the pitch) from which logs tell how slip follows it."""
 DIGITS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class Logged:
-    """What labelled logs say: evidence by ground, and file name -> SHA-256 of what it was read from."""
+    """What labelled logs say: evidence by ground, from means of `mean_s`.
+
+    `inputs` is file name -> SHA-256 of what was read.
+    """
 
     grounds: Mapping[str, Evidence] = dataclasses.field(default_factory=dict)
     inputs: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    mean_s: float = 0.0
 
 
 def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logged = Logged()) -> Policy:
     """Simulate the drives of `grid` and fit a row to each ground; `tick` is called after each drive.
 
-    What a log says of a ground stands in place of what the twin says. What it does not say is taken from the
-    twin's drives on that ground, or from all of them where the twin has no such ground.
+    What logs say of a ground goes into the twin's row of it, or into the row of all grounds together where
+    the twin has none. With logs, `fixed` is the moment match of the rows so informed.
 
     Raises:
         TerrafusionError: on some ground the wheels hardly turned.
@@ -72,16 +78,39 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logg
     for condition, recording in run_all(grid.conditions(), tick):
         drives[condition.terrain].append(evidence_of(recording))
     grounds = {name: Evidence.joined(parts) for name, parts in drives.items()}
-    if logged.grounds:
-        everywhere = Evidence.joined(grounds.values())
-        told = {n: e.completed_by(grounds.get(n, everywhere)) for n, e in sorted(logged.grounds.items())}
-        grounds |= told
-    rows = {name: _row_on(name, evidence) for name, evidence in grounds.items()}
-    matched = Policy(rows, next(iter(rows.values())), "").blend(np.full(len(rows), 1.0 / len(rows)))
+    found = {name: _row_on(name, evidence) for name, evidence in grounds.items()}
+    fixed = row_of(list(grounds.values()))
+    found |= {name: informed(found.get(name, fixed), told) for name, told in sorted(logged.grounds.items())}
+    rows = {name: _rounded(row) for name, row in found.items()}
+    matched = Policy(rows, fixed, "").blend(np.full(len(rows), 1.0 / len(rows)))
     return Policy(
         classes={**rows, "unknown": _rounded(_spread(matched))},
-        fixed=_rounded(row_of(list(grounds.values()))),
+        fixed=_rounded(matched if logged.grounds else fixed),
         inputs_sha256=fingerprint_of(grid, logged),
+    )
+
+
+def informed(row: SensorNoise, told: Evidence) -> SensorNoise:
+    """A row of the twin with what logs tell: they move its means; a scatter they may widen, not narrow.
+
+    Logs are few, and their means are long. The slope over the grade is theirs only where they were in hills.
+    """
+    hilly = len(told.grade) > 0 and float(np.std(told.grade)) > HILLY
+    level, slope = _slip_line([told]) if hilly else (0.0, row.slip_per_grade)
+    level = level if hilly else float(np.median(told.slip - slope * told.grade))
+    left = told.slip - level - slope * told.grade
+    scatter = float(np.hypot(_rms([left]), RADIUS_SIGMA))
+    told_slip = dataclasses.replace(
+        row, slip_mean=level, slip_per_grade=slope, slip_sigma=max(row.slip_sigma, scatter)
+    )
+    if not len(told.yaw_scale):
+        return told_slip  # a drive straight ahead tells nothing of turning, nor of skidding in it
+    scale, scatter = _yaw_scale_of([told.yaw_scale])
+    return dataclasses.replace(
+        told_slip,
+        yaw_scale_mean=scale,
+        yaw_scale_sigma=max(row.yaw_scale_sigma, scatter),
+        side_slip_sigma=max(row.side_slip_sigma, _rms([told.side_slip])),
     )
 
 
@@ -92,7 +121,7 @@ def default_grid(seeds: int, grounds: tuple[str, ...] = GROUNDS, vehicle: str = 
 
 def _row_on(ground: str, evidence: Evidence) -> SensorNoise:
     try:
-        return _rounded(row_of([evidence]))
+        return row_of([evidence])
     except ValueError as error:
         raise TerrafusionError(
             str(error), channel=ground, remedy="leave the ground out, or drive another vehicle"
@@ -196,8 +225,10 @@ def fingerprint_of(grid: Grid, logged: Logged = Logged()) -> str:
         "tail": TAIL, "line": [GRADE_RIDGE, LAD_STEPS, LAD_FLOOR],
         "radius_sigma": RADIUS_SIGMA, "unknown_spread": UNKNOWN_SPREAD,
     }  # fmt: skip
-    logs = {"logs": dict(logged.inputs)} if logged.inputs else {}
-    return grid.fingerprint(policy=settings, **logs)
+    if not logged.inputs:
+        return grid.fingerprint(policy=settings)
+    logs = {"files": dict(logged.inputs), "mean_s": logged.mean_s, "hilly": HILLY}
+    return grid.fingerprint(policy=settings, logs=logs)
 
 
 def write_policy(policy: Policy, path: Path, made_by: str) -> None:

@@ -20,7 +20,6 @@ from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.fusion.cli.terrain import app
 from terrafusion.fusion.terrain.labelled import (
     FOLDS,
-    TEMPERATURES,
     Run,
     check_runs,
     cross_validate,
@@ -314,10 +313,6 @@ def test_folds_of_one_ground_or_of_short_runs_are_left_out_of_the_changes(
     assert alone.changes == 10  # five on each of two routes
     assert changes_seen([model] * 3, [whole, short, one]) == alone
     assert changes_seen([model] * 2, [short, one]) is None
-
-
-def test_the_temperature_is_chosen_inside_its_range(model: SoftmaxModel) -> None:
-    assert TEMPERATURES[0] <= model.temperature < TEMPERATURES[-1]
 
 
 def test_what_was_learnt_from_is_every_file_that_was_read(tmp_path: Path) -> None:
