@@ -22,6 +22,8 @@ from terrafusion.fusion.cli.common import (
 
 if TYPE_CHECKING:
     from terrafusion.datasets.recording import Recording
+    from terrafusion.twin.gap.as_judged import Compared
+    from terrafusion.twin.gap.diagnosis import Diagnosis
 
 RunsArgument = Annotated[
     list[str],
@@ -61,6 +63,9 @@ def gap(
             "--write-vehicle", metavar="FILE", help="Write the vehicle's file with the effect in it."
         ),
     ] = None,
+    judge: Annotated[
+        bool, typer.Option("--judge", help="Also tell what the estimator makes of these logs and the twin's.")
+    ] = False,
     seed: Annotated[int, typer.Option(help="Of permutations and replicates.")] = 0,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
@@ -88,7 +93,8 @@ def gap(
             effects=split(effects) or None, significance=significance, source=source, seed=seed,
             progress=progress,
         )  # fmt: skip
-    write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
+    marks = _judged(found, judged, normal, vehicle, seed) if judge else None
+    write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])}, marks)
     for line in sentences(found):
         print(line)
     if write_vehicle is not None:
@@ -97,6 +103,22 @@ def gap(
         for line in write_corrected(found, vehicle, write_vehicle):
             print(line)
     print(f"written to {out} ({found.elapsed_s:.1f} s)")
+
+
+def _judged(
+    found: Diagnosis, runs: list[Recording], references: list[Recording], vehicle: str, seed: int
+) -> tuple[list[Compared], list[str]]:
+    from terrafusion.fusion.gap_page.judge import estimator_judge
+    from terrafusion.twin.gap.as_judged import judged
+
+    marks, failed = judged(found, runs, references, estimator_judge(vehicle), seed)
+    for mark in marks:
+        told = [(word, value) for word, value in (
+            ("references", mark.references), ("runs", mark.runs), ("their twin", mark.twin),
+            ("twin with the effect", mark.corrected),
+        ) if value is not None]  # fmt: skip
+        print(f"{mark.mark}: " + ", ".join(f"{word} {value:.3g}" for word, value in told))
+    return marks, failed
 
 
 def _opened(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:

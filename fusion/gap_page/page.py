@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion.gap_page import plots
 from terrafusion.fusion.gap_page.words import sentences
 from terrafusion.fusion.report.page import bullets, figure, table, where_from, write_page
+from terrafusion.twin.gap.as_judged import Compared
 from terrafusion.twin.gap.diagnosis import Diagnosis
 
 MOST_RUNS = 3
@@ -18,8 +20,13 @@ MOST_RUNS = 3
 MOST_CAUSES = 12
 
 
-def write_diagnosis(out: Path, d: Diagnosis, provenance: Mapping[str, object] | None = None) -> None:
-    """Both files in the folder `out`, numbers first.
+def write_diagnosis(
+    out: Path,
+    d: Diagnosis,
+    provenance: Mapping[str, object] | None = None,
+    judged: tuple[Sequence[Compared], Sequence[str]] | None = None,
+) -> None:
+    """Both files in the folder `out`, numbers first; and `judge.json` where somebody judged the logs.
 
     Raises:
         TerrafusionError: the folder cannot be written.
@@ -29,10 +36,29 @@ def write_diagnosis(out: Path, d: Diagnosis, provenance: Mapping[str, object] | 
     title = f"Gap between {d.vehicle} and its twin"
     body = [f'<h1>{escape(title)}</h1>\n<p class="lead">{escape(" ".join(sentences(d)))}</p>']
     body += [_where(d), _causes(d), _shrink(d)]
+    if judged is not None:
+        marks, failed = judged
+        told = json.dumps([dataclasses.asdict(mark) for mark in marks], indent=1, allow_nan=False)
+        write_atomically(out / "judge.json", lambda part: part.write_text(told + "\n", encoding="utf-8"))
+        body.append(_judged(marks, failed))
     if d.notes:
         body.append(f"<h2>What was assumed</h2>\n{bullets(escape(note) for note in d.notes)}")
     body.append(where_from(dict(provenance or {}), ("casadi", "numpy", "scipy")))
     write_page(out / "report.html", title, body)
+
+
+def _judged(marks: Sequence[Compared], failed: Sequence[str]) -> str:
+    rows = [
+        (
+            escape(m.mark),
+            *("" if v is None else f"{v:.3g}" for v in (m.references, m.runs, m.twin, m.corrected)),
+        )
+        for m in marks
+    ]
+    heads = ("mark", "references", "judged runs", "twin of these", "twin with the effect")
+    said = "<p>Means over the logs. Where twin and robot agree, so do the columns.</p>"
+    lost = bullets(f"left out: {escape(line)}" for line in failed) if failed else ""
+    return f"<h2>As the estimator sees it</h2>\n{said}\n{table(heads, rows, (1, 2, 3, 4))}\n{lost}"
 
 
 def _where(d: Diagnosis) -> str:

@@ -3,6 +3,9 @@
 If nothing has changed, judged runs and references are exchangeable: any of them could have been the judged
 ones. The statistic of the judged runs is compared with that of other choices from all runs, each judged
 against the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
+What is compared is the greatest of all effects' deviations, each in units of what it usually is over all
+choices (max-T, Westfall and Young 1993): in the field some effects scatter from run to run, and a sum over
+effects would show these only.
 """
 
 from __future__ import annotations
@@ -13,21 +16,29 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
 from terrafusion.twin.gap.score import Score
 
+Array = NDArray[np.float64]
+
 TAIL_FREEDOM = 10
 """Degrees of freedom of that tail: heavier than normal (assumed)."""
+EXACT = 1e-9
+"""Deviations that differ by less than this share are equal."""
+LEAST_SQUARE = 1.5
+"""The usual square of an effect's deviation is taken as no less: one and a half parameters."""
 PERMUTATIONS = 99
 """Other choices of runs that the judged ones are compared with, at most."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Statistic of the judged runs, its p-value, and those of other choices of runs."""
+    """Log Bayes factor of any gap in the judged runs, the p-value of the test, and that factor in other
+    choices of runs."""
 
     statistic: float
     p_value: float
@@ -77,10 +88,19 @@ def detect(
 ) -> Detection:
     """The permutation test."""
     pool, found = judged(runs, references, candidates)
-    every, own = [*runs, *references], found.statistic()
-    others = []
+    every, squares, others = [*runs, *references], [_squares(pool, found, candidates)], list[float]()
     for choice in choices(len(every), len(runs), seed):
         rest = [r for i, r in enumerate(every) if i not in choice]
-        others.append(judged([every[i] for i in choice], rest, candidates)[1].statistic())
-    at_least = sum(o >= own for o in others)
-    return Detection(own, (1 + at_least) / (1 + len(others)), tuple(others), pool, found)
+        other, believed = judged([every[i] for i in choice], rest, candidates)
+        squares.append(_squares(other, believed, candidates))
+        others.append(believed.statistic())
+    usual = np.maximum(np.mean(squares, axis=0), LEAST_SQUARE)
+    greatest = np.sqrt(np.array(squares) / usual).max(axis=1)
+    p_value = float(np.mean(greatest >= greatest[0] * (1.0 - EXACT)))
+    return Detection(found.statistic(), p_value, tuple(others), pool, found)
+
+
+def _squares(pool: Pool, found: Beliefs, candidates: Candidates) -> Array:
+    """Square of the deviation along every form, and twice the log Bayes factor of an unknown cause."""
+    known = [max(pool.fit(h.columns)[2], 0.0) for h in candidates.hypotheses]
+    return np.array([*known, 2.0 * max(found.unknown, 0.0)])
