@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis.strategies import integers
 
 from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.twin.effects.catalogue import effect_names
+from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.answers import answered, cases
 from terrafusion.twin.gap.blind.check import run_blind_check
@@ -31,6 +31,7 @@ from terrafusion.twin.gap.blind.verdicts import judge
 
 from . import blind_answers as fake
 
+BUILT_IN = tuple(dict.fromkeys(form.effect for form in built_in().values()))
 TINY = Scale(nulls=2, effects=1, outside=1, pairs=1, runs=1, references=1, severities=(4.0,))
 
 
@@ -50,13 +51,13 @@ def test_the_full_check_is_as_large_as_it_has_to_be() -> None:
     for family in (SAME, SHIFTED):
         for kind in KINDS:
             own = {t.effects()[0] for t in trials if (t.family, t.drive, t.severity) == (family, kind, 1.5)}
-            assert own == set(effect_names())
+            assert own == set(BUILT_IN)
 
 
 def test_every_effect_has_two_shapes_of_its_own() -> None:
     """37 effects, each in two shapes that turn different knobs; eight more that the catalogue does not
     hold."""
-    names = effect_names()
+    names = BUILT_IN
     assert len(names) == 37
     for kind in (SAME, SHIFTED):
         assert [s.effect for s in IN_CATALOGUE if s.kind == kind] == list(names)
@@ -115,7 +116,7 @@ def test_a_case_tells_nothing_of_the_truth() -> None:
     """What a diagnosis is given: recordings with neutral names and no truth."""
     first = next(iter(cases(plan(0, TINY)[:1])))
     told = f"{first.trial} {first.runs[0].name} {first.runs[0].description} {first.runs[0].notes}"
-    assert not any(name in told for name in (*effect_names(), *KNOBS, "null", "pair"))
+    assert not any(name in told for name in (*BUILT_IN, *KNOBS, "null", "pair"))
     assert first.runs[0].truth is None
 
 
@@ -299,7 +300,7 @@ def test_the_truth_scores_full_marks() -> None:
     assert {cell["rate"] for cell in scores["power"]} == {1.0}
     assert scores["pairs"]["false_extras_a_case"] == 0.0
     for truth, said in scores["confusion"].items():
-        outside = truth not in (*effect_names(), "no_gap")
+        outside = truth not in (*BUILT_IN, "no_gap")
         assert set(said) == {"unknown" if outside else truth}
 
 
@@ -320,8 +321,8 @@ def test_guesses_score_at_chance_and_their_confidence_is_honest() -> None:
 def test_look_alikes_count_once_and_extras_are_told() -> None:
     pair = next(t for t in plan(0, FULL) if t.family == "pair")
     first, second = pair.effects()
-    extra = next(e for e in effect_names() if e not in (first, second))
-    alike = next(e for e in effect_names() if e not in (first, second, extra))
+    extra = next(e for e in BUILT_IN if e not in (first, second))
+    alike = next(e for e in BUILT_IN if e not in (first, second, extra))
     answer = fake.diagnosis("effect", [(first, 0.4), (extra, 0.3), (alike, 0.2)], [alike, first, extra])
     for cause in answer["causes"]:
         if cause["effect"] in (first, alike):
