@@ -1,8 +1,9 @@
-"""Files that appear only when they are whole."""
+"""Files that appear only when they are whole, and folders for them."""
 
 from __future__ import annotations
 
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -26,6 +27,19 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
         if path.parent.is_dir():
             temporary.unlink(missing_ok=True)
     return path
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder for results, if it is not there: to be called before anything is computed.
+
+    Raises:
+        TerrafusionError: it cannot be made or written.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=path).close()
+    except OSError as error:
+        raise unwritable(path, error) from None
 
 
 def unwritable(path: Path, error: OSError) -> TerrafusionError:

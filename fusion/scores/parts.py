@@ -8,12 +8,11 @@ from __future__ import annotations
 import functools
 import hashlib
 import json
-import tempfile
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.atomic import unwritable, write_atomically
+from terrafusion.datasets.atomic import make_folder, write_atomically
 from terrafusion.datasets.catalog import load_catalog
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import files_of
@@ -30,11 +29,7 @@ def prepare(out: Path) -> None:
     Raises:
         TerrafusionError: it cannot be made or written.
     """
-    try:
-        (out / FOLDER).mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=out / FOLDER).close()
-    except OSError as error:
-        raise unwritable(out, error) from None
+    make_folder(out / FOLDER)
 
 
 def write_part(out: Path, key: str, content: dict[str, Any], state: str = "") -> dict[str, Any]:

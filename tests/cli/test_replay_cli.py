@@ -157,6 +157,16 @@ def test_husky(mode: str, husky_bag: Path, tmp_path: Path, terrafusion) -> None:
     assert metrics["outages"] == []
 
 
+def test_a_file_for_a_folder_is_refused_before_anything_is_computed(
+    terrafusion: Any, drive: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    monkeypatch.setattr("terrafusion.fusion.replay.replay", lambda *_, **__: pytest.fail("computed"))
+    terrafusion("replay", drive, "--out", taken).refused("cannot be written", "taken")
+    assert taken.read_text() == "mine"
+
+
 @pytest.mark.parametrize("mode", ["fixed", "adaptive"])
 @pytest.mark.parametrize("start_s", [120, 200])
 def test_husky_without_gnss_for_a_minute(
