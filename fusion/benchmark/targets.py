@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -115,12 +116,9 @@ def _kept(found: Sequence[Share], plant: str) -> Target:
 
 def _drift(rows: Sequence[Row], family: str, plant: str, limit: float) -> Target:
     what = f"{family}, {plant}: drift of {OWN} in {LONG_S:g} s, % of the way"
-    percent = [
-        row.percent
-        for row in rows
-        if (row.family, row.plant, row.arm, row.outage_s) == (family, plant, OWN, LONG_S)
-        and row.percent is not None
-    ]
+    own = [row for row in rows if (row.family, row.plant, row.arm) == (family, plant, OWN)]
+    percent = [row.percent for row in own if row.outage_s == LONG_S and row.percent is not None]
+    percent += [math.inf for row in own if row.failed]
     if not percent:
         return Target("G5", what, limit, True, None, None, "%")
     return Target("G5", what, limit, True, *median_interval(percent), "%")

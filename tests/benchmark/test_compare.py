@@ -108,6 +108,14 @@ def test_one_field_log_that_fails_or_diverges_misses_its_target(trouble) -> None
     assert alone.verdict() == MISSED
 
 
+def test_a_failed_replay_drifts_without_end() -> None:
+    own = rows("adaptive", [1.0] * 6, family="firm", outage_s=120.0, percent=0.3)
+    broken = [Row("firm", "twin", f"seed {i}", f"seed {i}", "adaptive", failed="singular") for i in (7, 8)]
+    assert [t.verdict() for t in targets(own)] == [REACHED]
+    (target,) = targets(own + broken)
+    assert (target.found, target.interval, target.verdict()) == (0.3, (0.3, np.inf), OPEN)
+
+
 def test_an_arm_of_fewer_drives_tells_their_number() -> None:
     all_rows = rows("fixed", [1.0] * 8) + rows("adaptive", [0.9] * 8) + rows("oracle", [0.2] * 3)
     cells = tables(all_rows)[0].rows[0]
