@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from terrafusion.twin.gap.diagnosis import Diagnosis
+from terrafusion.twin.gap.next_run import BY_HAND
 
 MOST_LISTED = 4
 
@@ -13,7 +14,8 @@ def sentences(d: Diagnosis) -> list[str]:
     if d.detected:
         said += [_cause(d), _place(d), _shrink(d)]
     if d.next_run is not None:
-        said.append(f"Next, drive '{d.next_run.scenario}': {d.next_run.why}.")
+        what = d.next_run.scenario
+        said.append(f"Next, {what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}.")
     if d.uncalibrated:
         said.append(
             "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import numpy as np
@@ -12,13 +13,15 @@ from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.classes import likeness
 from terrafusion.twin.gap.detect import choices
+from terrafusion.twin.gap.discrepancy import FUNCTIONS, modulated
 from terrafusion.twin.gap.evidence import prepared, starting_model
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
-from terrafusion.twin.gap.score import Score
+from terrafusion.twin.gap.residuals import first_noise, raw_of, state_sigmas, whitened
+from terrafusion.twin.gap.score import Score, score
 from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
 from terrafusion.twin.gap.trials import calibration_error, interval
-from terrafusion.twin.gap.verdict import null_probability
+from terrafusion.twin.gap.verdict import HeldOut, null_probability
 from terrafusion.twin.vehicle import load_vehicle
 
 from .drives import run
@@ -139,3 +142,54 @@ def test_factors_of_all_columns_are_those_of_each() -> None:
     shift[4] = 0.3
     pool = Pool.of(_scores(rng, 3, shift), learn(_scores(rng, 20, 0.0 * shift), 3))
     np.testing.assert_allclose(pool.log_factors(), [pool.log_factor([i]) for i in range(len(shift))])
+
+
+def test_scores_of_other_forms_are_those_of_the_whole_covariance(log_and_model) -> None:
+    log, model = log_and_model
+    keys = ("gyro_scale/scale", "wheel_radius/scale")
+    channels = tuple(o.channel for o in log.observed)
+    raw = raw_of(log, drive(log, model, CANDIDATES, log.start, keys), model, CANDIDATES, channels)
+    run, sigma = whitened(raw, first_noise([raw])), state_sigmas(CANDIDATES)
+    T, K = run.states, len(CANDIDATES.keys)
+    rows = run.rows.astype(float)
+    covariance = np.eye(len(rows)) + (rows[:, :T] * sigma**2) @ rows[:, :T].T
+    P = rows[:, T:-1]
+    np.testing.assert_allclose(
+        score(run, sigma).A, P.T @ np.linalg.solve(covariance, P), rtol=1e-3, atol=1e-2
+    )
+    time = (run.time_s - run.time_s.mean()) / run.time_s.std()
+    at = CANDIDATES.keys.index(keys[1])
+    expected = P.T @ np.linalg.solve(covariance, P[:, at] * time)
+    found = modulated(run, model, sigma, K)[:, at, FUNCTIONS.index("time")]
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
+
+
+def test_a_law_of_another_form_is_believed_beside_its_effect() -> None:
+    """What the gap shows is an effect times an unknown function: with other forms it stands first."""
+    rng = np.random.default_rng(12)
+    zero = np.zeros(len(CANDIDATES.keys) + 6)
+    normal, plain = _scores(rng, 20, zero), _scores(rng, 3, zero)
+    column = CANDIDATES.keys.index("encoder_scale/reading")
+    hidden = np.random.default_rng(13).standard_normal(len(zero)) * 40.0
+    other = np.zeros((len(zero), len(CANDIDATES.keys), len(FUNCTIONS)))
+    other[:, column, 0] = hidden
+    gap = [dataclasses.replace(r, b=r.b + 0.2 * r.A[:, column] + 0.3 * hidden) for r in plain]
+    null = learn(normal, 3)
+    with_forms = [dataclasses.replace(r, other=other) for r in gap]
+    believed = [beliefs(Pool.of(runs, null), CANDIDATES) for runs in (gap, with_forms)]
+    assert believed[1].effects["encoder_scale"] > believed[0].effects["encoder_scale"] + 20.0
+    assert max(believed[1].effects, key=lambda k: believed[1].effects[k]) == "encoder_scale"
+
+
+def test_held_out_share_is_of_what_runs_have_in_common() -> None:
+    """An effect in all runs explains the run left out; one in a single run does not."""
+    rng = np.random.default_rng(21)
+    shift = np.zeros(len(CANDIDATES.keys) + 6)
+    null = learn(_scores(rng, 20, shift), 3)
+    still = _scores(rng, 2, shift)
+    shift[3] = 0.5
+    shared, single = _scores(rng, 3, shift), [*_scores(rng, 1, shift), *still]
+    pools = [[Pool.of([r], null) for r in runs] for runs in (shared, single)]
+    np.testing.assert_allclose(Pool.sum(pools[0]).information, Pool.of(shared, null).information)
+    assert HeldOut.of(pools[0]).explained([3]) > 0.8 * Pool.of(shared, null).fit([3])[2]
+    assert HeldOut.of(pools[1]).explained([3]) < 0.0

@@ -133,25 +133,49 @@ def test_the_map_names_a_cell_of_the_gap(wide: Diagnosis) -> None:
     assert sum(c["share"] for c in cells) == pytest.approx(1.0, abs=1e-6)
 
 
-def test_without_references_it_answers_and_says_that_it_is_uncalibrated(wide: Diagnosis) -> None:
-    again = runs(300, 2, WIDE)
-    first = checked(diagnose(again, [], VEHICLE))
-    assert first["gap"]["uncalibrated"]
-    assert first["gap"]["detected"]
-    assert first["reference_runs"] == []
-    assert first["where"] == []
-    assert first["shrink"]["floor"] is None
-    assert first["causes"][0]["effect"] in wide.verdict.causes[0].members
-    assert json.dumps(first) == json.dumps(checked(diagnose(again, [], VEHICLE)))  # to the bit
+@pytest.fixture(scope="module")
+def fresh() -> list[Recording]:
+    """Runs that no fit has seen."""
+    return runs(320, 2, WIDE)
 
 
-def test_the_corrected_vehicle_has_the_larger_wheels(wide: Diagnosis, tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def unreferred(fresh: list[Recording]) -> Diagnosis:
+    """Against the uncorrected twin alone."""
+    return diagnose(fresh, [], VEHICLE)
+
+
+def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferred: Diagnosis) -> None:
+    answer = checked(unreferred)
+    assert answer["gap"]["uncalibrated"]
+    assert answer["gap"]["detected"]
+    assert answer["reference_runs"] == []
+    assert answer["where"] == []
+    assert answer["shrink"]["floor"] is None
+    assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale")
+
+
+def test_the_same_input_gives_the_same_bits(fresh: list[Recording], unreferred: Diagnosis) -> None:
+    assert json.dumps(diagnose(fresh, [], VEHICLE).to_json()) == json.dumps(unreferred.to_json())
+
+
+def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
+    wide: Diagnosis, fresh: list[Recording], unreferred: Diagnosis, tmp_path: Path
+) -> None:
     target = tmp_path / "corrected.yaml"
     said = write_corrected(wide, "elevate", target)
     corrected = load_vehicle(target)
     shift = values_of(wide)["wheel_radius/scale"]
     assert corrected.wheel.radius_m == pytest.approx(VEHICLE.wheel.radius_m * (1.0 + shift))
     assert any("radius_m" in line for line in said)
+
+    after = diagnose(fresh, [], corrected)
+    assert unreferred.detected
+    assert after.detection.statistic < 0.2 * unreferred.detection.statistic
+    assert unreferred.shrinking is not None
+    assert after.shrinking is not None
+    assert after.shrinking.before < 0.7 * unreferred.shrinking.before
+    assert not after.detected
 
 
 def test_nonsense_is_refused(references: list[Recording]) -> None:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -105,7 +106,9 @@ def twin_of(
         effects={**model.effects, **effects},
     )  # fmt: skip
     made = run.recording
-    absent = {name: None for name in ("wheels", "imu", "gnss", "motor") if getattr(recording, name) is None}
+    absent: dict[str, Any] = {
+        name: None for name in ("wheels", "imu", "gnss", "motor") if getattr(recording, name) is None
+    }
     return dataclasses.replace(
         made, name=f"twin of {recording.name}", vehicle=recording.vehicle, overrides=recording.overrides,
         truth=None, truth_channels=(), **absent,

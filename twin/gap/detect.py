@@ -10,6 +10,7 @@ effects would show these only.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
@@ -64,9 +65,9 @@ class Detection:
 def judged(
     runs: Sequence[Score], references: Sequence[Score], candidates: Candidates
 ) -> tuple[Pool, Beliefs]:
-    """Sums and beliefs of some runs against the null of others."""
+    """Sums and beliefs of some runs against the null of others, by the catalogue's own forms alone."""
     null = learn(references, len(runs))
-    pool = Pool.of(runs, null)
+    pool = Pool.of([dataclasses.replace(r, other=None) for r in runs], null)
     return pool, beliefs(pool, candidates)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import time
@@ -15,19 +16,20 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.answer import as_dict
-from terrafusion.twin.gap.candidates import SOIL, Candidates
+from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
 from terrafusion.twin.gap.detect import Detection, detect
+from terrafusion.twin.gap.discrepancy import modulated
 from terrafusion.twin.gap.evidence import Bench, Soils, gather
 from terrafusion.twin.gap.next_run import NextRun, propose
 from terrafusion.twin.gap.null import Null, learn
-from terrafusion.twin.gap.posterior import Pool
+from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
 from terrafusion.twin.gap.refit import Refit, refit_all, scored
 from terrafusion.twin.gap.replicates import COUNT, replicates
-from terrafusion.twin.gap.residuals import state_sigmas
+from terrafusion.twin.gap.residuals import Evidence, state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
 from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
 from terrafusion.twin.gap.signatures import Drive
-from terrafusion.twin.gap.verdict import Verdict, floor_of, judge
+from terrafusion.twin.gap.verdict import HeldOut, Verdict, floor_of, judge
 from terrafusion.twin.gap.where import Cell, gap_map
 from terrafusion.twin.vehicle import VehicleParams
 
@@ -132,7 +134,7 @@ def diagnose(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
     )
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
-    scores = [score(run, sigma) for run in bench.runs]
+    scores = [_with_other_forms(bench, sigma, run) for run in bench.runs]
     normal = [score(run, sigma) for run in bench.references]
     notes = list(bench.notes)
     uncalibrated = math.comb(len(runs) + len(normal), len(runs)) < 1.0 / significance
@@ -141,16 +143,18 @@ def diagnose(
         normal = _filled(bench, sigma, normal, seed)
     found = detect(scores, normal, candidates, seed)
     null = learn(normal, len(scores))
-    floor = floor_of(_null_pools(normal, len(scores), seed), range(len(found.pool.gain)))
-    refits = _refits(bench, scores, sigma, null, found)
-    factors = _corrected(found, refits)
+    pool = Pool.of(scores, null)
+    plain = [dataclasses.replace(s, other=None) for s in scores]
+    case = _Case(bench, scores, sigma, null, pool, beliefs(pool, candidates))
+    floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
+    refits = _refits(case)
 
-    def remaining(effects: Sequence[str]) -> tuple[Pool, Refit | None]:
-        return _remaining(bench, scores, sigma, null, found, refits, effects)
+    def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
+        return _remaining(case, refits, forms)
 
     verdict = judge(
-        found.p_value <= significance, found.tail(), found.pool, found.beliefs, factors, refits, remaining,
-        candidates, floor,
+        found.p_value <= significance, found.tail(), pool, case.believed, _corrected(case, refits), refits,
+        remaining, HeldOut.of([Pool.of([s], null) for s in plain]), candidates, floor,
     )  # fmt: skip
     if progress is not None:
         progress(0.9)
@@ -202,52 +206,66 @@ def _null_pools(normal: Sequence[Score], judged: int, seed: int) -> list[Pool]:
     return pools
 
 
-def _refits(
-    bench: Bench, scores: Sequence[Score], sigma: Array, null: Null, found: Detection
-) -> dict[str, Refit]:
-    forms = found.beliefs.forms
+@dataclass(frozen=True, eq=False)
+class _Case:
+    """The judged runs against the null: their scores, sums and Bayes factors."""
+
+    bench: Bench
+    scores: list[Score]
+    sigma: Array
+    null: Null
+    pool: Pool
+    believed: Beliefs
+
+    def refitted(self, chosen: Sequence[Sequence[int]]) -> list[Refit]:
+        """Several sets of columns, fitted through the twin itself."""
+        return refit_all(self.bench, self.scores, self.sigma, self.null, self.pool, chosen)
+
+
+def _with_other_forms(bench: Bench, sigma: Array, run: Evidence) -> Score:
+    columns = len(bench.candidates.keys)
+    return dataclasses.replace(score(run, sigma), other=modulated(run, bench.model, sigma, columns))
+
+
+def _refits(case: _Case) -> dict[str, Refit]:
+    forms, candidates = case.believed.forms, case.bench.candidates
     ranked = sorted((k for k in forms if k[0] != SOIL), key=lambda k: -forms[k])[:REFITTED]
-    columns = {(h.effect, h.form): h.columns for h in bench.candidates.hypotheses}
+    columns = {(h.effect, h.form): h.columns for h in candidates.hypotheses}
     chosen = [(effect, columns[effect, form]) for effect, form in ranked]
-    if SOIL in bench.candidates.effects:  # both of its parameters, whatever its rank
-        chosen.append((SOIL, bench.candidates.columns(SOIL)))
-    fits = refit_all(bench, scores, sigma, null, found.pool, [columns for _, columns in chosen])
+    if SOIL in candidates.effects:  # both of its parameters, whatever its rank
+        chosen.append((SOIL, candidates.columns(SOIL)))
     best: dict[str, Refit] = {}
-    for (effect, _), fit in zip(chosen, fits, strict=True):
+    for (effect, _), fit in zip(chosen, case.refitted([columns for _, columns in chosen]), strict=True):
         if effect not in best or (fit.errors and fit.explained > best[effect].explained):
             best[effect] = fit
     return best
 
 
-def _corrected(found: Detection, refits: dict[str, Refit]) -> dict[str, float]:
+def _corrected(case: _Case, refits: dict[str, Refit]) -> dict[str, float]:
     """Log Bayes factors, by what an effect explains in the twin itself where it was refitted."""
-    out = dict(found.beliefs.effects)
+    out = dict(case.believed.effects)
     for name, fit in refits.items():
         if fit.errors:
-            linear = found.pool.fit(found.beliefs.best[name].columns)[2]
+            linear = case.pool.fit(case.believed.best[name].columns)[2]
             out[name] += 0.5 * (fit.explained - linear)
     return out
 
 
 def _remaining(
-    bench: Bench,
-    scores: Sequence[Score],
-    sigma: Array,
-    null: Null,
-    found: Detection,
-    refits: dict[str, Refit],
-    effects: Sequence[str],
+    case: _Case, refits: dict[str, Refit], forms: Sequence[Hypothesis]
 ) -> tuple[Pool, Refit | None]:
     """What is left of the gap with some effects in the twin, and their fit; the gap itself where that
     fails."""
-    fit = refits.get(effects[0]) if len(effects) == 1 else None
+    fit = refits.get(forms[0].effect) if len(forms) == 1 else None
     if fit is None:
-        columns = tuple(i for name in effects for i in found.beliefs.best[name].columns)
-        fit = refit_all(bench, scores, sigma, null, found.pool, [columns])[0]
+        fit = case.refitted([tuple(i for h in forms for i in h.columns)])[0]
     if not fit.errors:
-        return found.pool, fit
-    left = [scored(r, sigma, e, s.A) for r, e, s in zip(bench.runs, fit.errors, scores, strict=True)]
-    return Pool.of(left, null), fit
+        return case.pool, fit
+    left = [
+        dataclasses.replace(scored(run, case.sigma, error, own.A), other=own.other)
+        for run, error, own in zip(case.bench.runs, fit.errors, case.scores, strict=True)
+    ]
+    return Pool.of(left, case.null), fit
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:

@@ -30,6 +30,12 @@ from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 SEVERITIES = (0.5, 1.0, 2.0)
+SUSPECTS = (
+    "encoder_scale", "wheel_radius", "wheel_radius_asymmetry", "gnss_latency", "gnss_lever_arm",
+    "imu_yaw_misalignment", "imu_time_offset", "gyro_bias", "gyro_scale", "accel_bias", "track_width",
+    "soil_strength", "left_right_friction",
+)  # fmt: skip
+"""What a test team would ask about after work on wheels and sensors: fewer effects to choose from."""
 FOLDS = 4
 LEAST_SPEED_MPS = 0.15
 """Mean rim speed of a piece that counts as driven."""
@@ -165,9 +171,14 @@ def cases(logs: Sequence[str]) -> Iterator[tuple[str, Injection | None, float, i
 
 
 def answered(
-    source: Source, logs: LogSet, injection: Injection | None, severity: float, fold: int
+    source: Source,
+    logs: LogSet,
+    injection: Injection | None,
+    severity: float,
+    fold: int,
+    effects: Sequence[str] | None = None,
 ) -> dict[str, Any]:
-    """One row: the diagnosis of a fold's pieces with the change in them."""
+    """One row: the diagnosis of a fold's pieces with the change in them, among some effects or all."""
     judged = source.judged(fold)
     others = [k for k in range(len(source.spans)) if k not in judged]
     began = time.perf_counter()
@@ -177,7 +188,9 @@ def answered(
         return {"skipped": str(error)}
     try:
         normal, kept = source.cut(others), source.kept_for(fold)
-        answer = diagnose(runs, normal, source.vehicle, logs.soil, source="wheels", kept=kept).to_json()
+        answer = diagnose(
+            runs, normal, source.vehicle, logs.soil, effects=effects, source="wheels", kept=kept
+        ).to_json()
     except Exception as error:  # a crash is a wrong answer, whatever it was
         return {"crash": f"{type(error).__name__}: {error}", "right": False}
     told = verdict_on(answer, injection)
@@ -189,7 +202,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description="Known changes in real logs, and what the diagnosis names.")
     parser.add_argument("--out", type=Path, required=True, help="folder for the answers and the table")
     parser.add_argument("--set", action="append", choices=sorted(SETS), help="logs; default: all")
+    parser.add_argument(
+        "--suspects", action="store_true", help="only sensors, wheels and ground, see SUSPECTS"
+    )
     given = parser.parse_args(arguments)
+    effects = SUSPECTS if given.suspects else None
     given.out.mkdir(parents=True, exist_ok=True)
     kept, path = dict[str, dict[str, Any]](), given.out / "injections.jsonl"
     if path.exists():
@@ -203,7 +220,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 continue
             if name not in sources:
                 sources[name] = Source.of(SETS[name])
-            answer = answered(sources[name], SETS[name], injection, severity, fold)
+            answer = answered(sources[name], SETS[name], injection, severity, fold, effects)
             size = 0.0 if injection is None else severity * injection.size
             row = {"case": case, "set": name, "change": what, "severity": severity, "size": size, **answer}
             kept[case] = row

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import re
+from typing import Any
 
 import numpy as np
 
@@ -74,7 +75,7 @@ def piece(recording: Recording, begin_s: float, end_s: float) -> Recording:
         last = max(first + 1, int(np.searchsorted(terrain.t_ns, end)))
         held = terrain.select(slice(first, last))
         parts["terrain"] = dataclasses.replace(held, t_ns=np.maximum(held.t_ns, start))
-    left = {name: channel if len(channel) else None for name, channel in parts.items()}
+    left: dict[str, Any] = {name: channel if len(channel) else None for name, channel in parts.items()}
     if not any(channel is not None for name, channel in left.items() if name != "terrain"):
         raise DataError(
             f"nothing was recorded from {begin_s:g} to {end_s:g} s",

@@ -1,7 +1,8 @@
 """Which effect: Bayes factors of every effect against the learned null, and against a gap of no known shape.
 
 Under effect k the standardised scores of all runs shift along one direction a parameter, x = U_k phi + noise,
-with phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight. `unknown` shifts
+with phi ~ N(0, s^2) and s spread over a decade; forms are alternatives with equal weight, and each may depart
+from its law (see `discrepancy`). `unknown` shifts
 them along all probes at once.
 """
 
@@ -15,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.discrepancy import FUNCTIONS
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.score import Score
 
@@ -27,8 +29,8 @@ WIDE = 10.0
 UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
 UNKNOWN_PRIOR = 0.1
 """Prior probability that a gap has a cause outside the catalogue (assumed)."""
-NULL_PRIOR = 0.5
-"""Prior probability that there is no gap (assumed)."""
+OTHER_FORM = 0.1
+"""1 sigma of a law's departure from its form, in the effect's size (tuned on twin trials)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,35 +38,73 @@ class Pool:
     """All judged runs together, against a null, in the space of the columns.
 
     Attributes:
-        information: (P, P) sum of U' C^-1 U.
-        gain: (P,) sum of U' C^-1 x.
+        information: (M, M) sum of U' C^-1 U; the first P columns are those of the candidates and probes, then
+            come those of laws of another form, F for each of the K candidates, where the scores have them.
+        gain: (M,) sum of U' C^-1 x.
         square: sum of x' C^-1 x.
         dims: length of all x.
+        own: P.
     """
 
     information: Array
     gain: Array
     square: float
     dims: int
+    own: int
 
     @classmethod
     def of(cls, runs: Sequence[Score], null: Null) -> Pool:
         """Sums over the runs."""
-        P = len(null.mean)
-        information, gain, square = np.zeros((P, P)), np.zeros(P), 0.0
+        P, square = len(null.mean), 0.0
+        extra = 0 if runs[0].other is None else runs[0].other[0].size
+        information, gain = np.zeros((P + extra, P + extra)), np.zeros(P + extra)
         for run in runs:
             x, U = null.standardised(run)
+            if run.other is not None:
+                root = 1.0 / np.sqrt(np.diag(run.A) + 1.0)
+                U = np.hstack([U, root[:, None] * run.other.reshape(P, -1)])
             weighted = null.inverse @ U
             information += U.T @ weighted
             gain += weighted.T @ x
             square += float(x @ null.inverse @ x)
-        return cls(0.5 * (information + information.T), gain, square, P * len(runs))
+        return cls(0.5 * (information + information.T), gain, square, P * len(runs), P)
+
+    @classmethod
+    def sum(cls, pools: Sequence[Pool]) -> Pool:
+        """Those of all runs together."""
+        return cls(
+            sum((p.information for p in pools), np.zeros_like(pools[0].information)),
+            sum((p.gain for p in pools), np.zeros_like(pools[0].gain)),
+            sum(p.square for p in pools), sum(p.dims for p in pools), pools[0].own,
+        )  # fmt: skip
+
+    def plain(self) -> Pool:
+        """The same without laws of another form."""
+        P = self.own
+        return Pool(self.information[:P, :P], self.gain[:P], self.square, self.dims, P)
+
+    def without(self, other: Pool) -> Pool:
+        """Those of the runs that `other` does not have."""
+        return Pool(
+            self.information - other.information, self.gain - other.gain, self.square - other.square,
+            self.dims - other.dims, self.own,
+        )  # fmt: skip
+
+    def with_other_forms(self, columns: Sequence[int]) -> tuple[NDArray[np.int64], Array]:
+        """The columns and those of laws of another form of the candidates among them, and 1 sigma of each in
+        that of the candidate's size."""
+        extra = (len(self.gain) - self.own) // len(FUNCTIONS)
+        more = [
+            self.own + i * len(FUNCTIONS) + j for i in columns if i < extra for j in range(len(FUNCTIONS))
+        ]
+        weights = np.repeat([1.0, OTHER_FORM], [len(columns), len(more)])
+        return np.array([*columns, *more], dtype=np.int64), weights
 
     def log_factor(self, columns: Sequence[int], sizes: Sequence[float] = SIZES) -> float:
         """Log Bayes factor of the columns, N(0, s^2) with s over `sizes`, against the null."""
-        at = np.asarray(columns)
-        g = self.gain[at]
-        values, vectors = np.linalg.eigh(self.information[np.ix_(at, at)])
+        at, weights = self.with_other_forms(columns)
+        g = self.gain[at] * weights
+        values, vectors = np.linalg.eigh(self.information[np.ix_(at, at)] * weights[:, None] * weights)
         values, h = np.maximum(values, 0.0), vectors.T @ g
         each = [
             0.5 * float(np.sum(h**2 * s * s / (1.0 + s * s * values) - np.log1p(s * s * values)))
@@ -73,10 +113,10 @@ class Pool:
         return float(np.logaddexp.reduce(each) - np.log(len(each)))
 
     def log_factors(self) -> Array:
-        """`log_factor` (P,) of each column by itself."""
+        """`log_factor` (P,) of each column by itself, in the catalogue's own forms."""
         square = np.array(SIZES)[:, None] ** 2
-        spread = square * np.maximum(np.diag(self.information), 0.0)
-        each = 0.5 * (self.gain**2 * square / (1.0 + spread) - np.log1p(spread))
+        spread = square * np.maximum(np.diag(self.information)[: self.own], 0.0)
+        each = 0.5 * (self.gain[: self.own] ** 2 * square / (1.0 + spread) - np.log1p(spread))
         return np.asarray(np.logaddexp.reduce(each, axis=0) - np.log(len(SIZES)))
 
     def fit(self, columns: Sequence[int], size: float = WIDE) -> tuple[Array, Array, float]:
@@ -107,7 +147,7 @@ class Beliefs:
 def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Beliefs:
     """Bayes factors of all effects; with `given` columns those of the effects beside these."""
     base = pool.log_factor(given) if len(given) else 0.0
-    alone = pool.log_factors() if not len(given) else None
+    alone = pool.log_factors() if not len(given) and len(pool.gain) == pool.own else None
     forms: dict[tuple[str, str], float] = {}
     best: dict[str, Hypothesis] = {}
     for h in candidates.hypotheses:
@@ -125,7 +165,7 @@ def beliefs(pool: Pool, candidates: Candidates, given: Sequence[int] = ()) -> Be
     for name in best:
         mine = [v for (effect, _), v in forms.items() if effect == name]
         effects[name] = float(np.logaddexp.reduce(mine) - np.log(len(mine)))
-    probes = range(len(candidates.keys), len(pool.gain))
+    probes = range(len(candidates.keys), pool.own)
     unknown = pool.log_factor([*given, *probes], UNKNOWN_SIZES) - base
     return Beliefs(effects, best, forms, unknown)
 

@@ -25,12 +25,17 @@ LEAST_SIGMA = 0.03
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score b (P,), information A (P, P) of one run, and the sum of squares that theta leaves."""
+    """Score b (P,), information A (P, P) of one run, and the sum of squares that theta leaves.
+
+    `other` (P, K, F): how the score changes by laws of another form (see `discrepancy`); None where they are
+    not asked for.
+    """
 
     b: Array
     A: Array
     square: float
     rows: int
+    other: Array | None = None
 
 
 def score(run: Evidence, sigma: Array) -> Score:

@@ -23,13 +23,14 @@ from numpy.typing import NDArray
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
 from terrafusion.twin.gap.detect import choices, detect, judged
+from terrafusion.twin.gap.discrepancy import modulated
 from terrafusion.twin.gap.evidence import gather
 from terrafusion.twin.gap.null import Null, learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
 from terrafusion.twin.gap.refit import Refit
 from terrafusion.twin.gap.residuals import state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
-from terrafusion.twin.gap.verdict import Verdict, floor_of, judge
+from terrafusion.twin.gap.verdict import HeldOut, Verdict, floor_of, judge
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
@@ -70,7 +71,12 @@ def null_scores(seed: int, jobs: int) -> tuple[list[Score], Candidates]:
         recordings[REFERENCES:], recordings[:REFERENCES], load_vehicle("elevate"), None, candidates
     )
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
-    return [score(run, sigma) for run in [*bench.references, *bench.runs]], candidates
+    columns = len(candidates.keys)
+    scores = [
+        dataclasses.replace(score(run, sigma), other=modulated(run, bench.model, sigma, columns))
+        for run in [*bench.references, *bench.runs]
+    ]
+    return scores, candidates
 
 
 def interval(hits: int, count: int) -> tuple[float, float]:
@@ -126,7 +132,7 @@ class Trials:
         rest = [[r for i, r in enumerate(self.references) if i not in c] for c in picks]
         mine = [[self.references[i] for i in c] for c in picks]
         pools = [Pool.of(a, learn(b, JUDGED)) for a, b in zip(mine, rest, strict=True)]
-        self.floor = floor_of(pools, range(len(pools[0].gain)))
+        self.floor = floor_of(pools, range(pools[0].own))
         others = [judged(a, b, candidates)[1].statistic() for a, b in zip(mine, rest, strict=True)]
         self.threshold = float(np.quantile(others, 0.95))
         self.laws = [h for h in candidates.hypotheses if h.effect != SOIL]
@@ -152,16 +158,19 @@ class Trials:
             runs = self._with(runs, h, ratio) if runs is not None else None
         if runs is None:
             return None
+        names = tuple(h.effect for h in truth)
+        if judged(runs, self.references, candidates)[1].statistic() <= self.threshold:
+            return Trial(family, ratio, names, None)
         pool = Pool.of(runs, self.null)
         believed = beliefs(pool, candidates)
-        names = tuple(h.effect for h in truth)
-        if believed.statistic() <= self.threshold:
-            return Trial(family, ratio, names, None)
 
-        def remaining(effects: Sequence[str]) -> tuple[Pool, Refit | None]:
+        def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
             return pool, None
 
-        verdict = judge(True, 0.01, pool, believed, believed.effects, {}, remaining, candidates, self.floor)
+        each = HeldOut.of([Pool.of([dataclasses.replace(r, other=None)], self.null) for r in runs])
+        verdict = judge(
+            True, 0.01, pool, believed, believed.effects, {}, remaining, each, candidates, self.floor
+        )
         return Trial(family, ratio, names, verdict)
 
     def _with(self, runs: list[Score], law: Hypothesis, ratio: float) -> list[Score] | None:
@@ -169,7 +178,8 @@ class Trials:
         way = self.rng.standard_normal(len(at))
         if self.candidates.low[at[0]] >= 0.0:
             way = np.abs(way)
-        information = Pool.of(runs, self.null).information[np.ix_(at, at)]
+        plain = [dataclasses.replace(r, other=None) for r in runs]
+        information = Pool.of(plain, self.null).information[np.ix_(at, at)]
         size = ratio / math.sqrt(max(float(way @ information @ way), 1e-12))
         if np.abs(size * way).max() > MOST_UNITS:
             return None
