@@ -1,4 +1,4 @@
-"""Files that appear only when they are whole, and folders for them."""
+"""Files that appear only when they are whole."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     return path
 
 
-def make_folder(path: Path) -> None:
-    """Make a folder for results, if it is not there: to be called before anything is computed.
+def check_folder(path: Path) -> None:
+    """Refuse a folder for results before anything is computed; one that is not there is not made yet.
 
     Raises:
         TerrafusionError: it cannot be made or written.
     """
     try:
-        path.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=path).close()
+        there = next(place for place in (path, *path.absolute().parents) if place.exists())
+        tempfile.TemporaryFile(dir=there).close()
     except OSError as error:
         raise unwritable(path, error) from None
 

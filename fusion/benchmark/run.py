@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.atomic import check_folder
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.drives import Case, drive_of
@@ -15,7 +16,7 @@ from terrafusion.fusion.benchmark.field import drives_of
 from terrafusion.fusion.benchmark.measure import Row, measure
 from terrafusion.fusion.benchmark.plan import Job, Plan
 from terrafusion.fusion.scores.field_table import Refusal
-from terrafusion.fusion.scores.parts import log_state, prepare, read_part, write_part
+from terrafusion.fusion.scores.parts import FOLDER, log_state, read_part, write_part
 from terrafusion.twin.pools import open_pool
 
 
@@ -52,7 +53,7 @@ def run_benchmark(
             "there is nothing to run: no field log is at hand",
             remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`, or leave out --only field",
         )
-    prepare(out)
+    check_folder(out / FOLDER)
     found = {job: kept for job in wanted if (kept := _kept(out, job)) is not None}
     missing = [job for job in wanted if job not in found]
     with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:

@@ -105,7 +105,7 @@ def replay(
 
     Example: terrafusion replay drive.bag --vehicle husky --calibrate --batch --out calibrated
     """
-    from terrafusion.datasets.atomic import make_folder
+    from terrafusion.datasets.atomic import check_folder
     from terrafusion.datasets.errors import errors_of
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config import MODES
@@ -125,7 +125,7 @@ def replay(
     if repair_clock:
         recording = clock_accepted(recording)
     refuse_errors(log, recording, rig)
-    make_folder(out)
+    check_folder(out)
     with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording,

@@ -26,6 +26,7 @@ from urllib.parse import quote
 
 import numpy as np
 
+from terrafusion.datasets.atomic import check_folder
 from terrafusion.datasets.catalog import CatalogFile, at_hand, data_folders, load_catalog
 from terrafusion.datasets.doctor import examine
 from terrafusion.datasets.errors import DataError, TerrafusionError, errors_of
@@ -36,7 +37,7 @@ from terrafusion.fusion.replay import Replay, choose_vehicle, replay
 from terrafusion.fusion.scores.health import examine_estimate, rolled_until_m
 from terrafusion.fusion.scores.metrics import Outage
 from terrafusion.fusion.scores.outage_plan import aided_by_truth, lead_s, plan_outages, until
-from terrafusion.fusion.scores.parts import log_state, prepare, read_part, write_part
+from terrafusion.fusion.scores.parts import FOLDER, log_state, read_part, write_part
 from terrafusion.twin.pools import open_pool
 
 OUTAGES_S = (30.0, 60.0, 120.0)
@@ -138,7 +139,7 @@ def run_tasks(
     Raises:
         TerrafusionError: workers died, or the folder cannot be written.
     """
-    prepare(out)
+    check_folder(out / FOLDER)
     missing = [task for task in tasks if read_part(out, task.key, log_state(task.log)) is None]
     with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
         for task, found in pool.results(run_task, [(task,) for task in missing]):

@@ -12,7 +12,7 @@ from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.atomic import make_folder, write_atomically
+from terrafusion.datasets.atomic import write_atomically
 from terrafusion.datasets.catalog import load_catalog
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import files_of
@@ -21,15 +21,6 @@ from terrafusion.fusion.report.outputs import to_json
 FOLDER = "parts"
 LIBRARIES = ("casadi", "gtsam", "numpy", "scipy")
 """Their versions make the numbers, too."""
-
-
-def prepare(out: Path) -> None:
-    """Make the folder of the parts: to be called before anything is computed.
-
-    Raises:
-        TerrafusionError: it cannot be made or written.
-    """
-    make_folder(out / FOLDER)
 
 
 def write_part(out: Path, key: str, content: dict[str, Any], state: str = "") -> dict[str, Any]:
