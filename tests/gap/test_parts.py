@@ -10,6 +10,7 @@ import pytest
 
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, one
+from terrafusion.twin.effects.reece import second_terramechanics
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.classes import likeness
 from terrafusion.twin.gap.detect import choices
@@ -125,6 +126,14 @@ def test_an_effect_of_ones_own_takes_part(monkeypatch: pytest.MonkeyPatch) -> No
     assert "trailer" in own.effects
     assert "trailer/drag" in own.moving
     assert own.columns("trailer") == (own.keys.index("trailer/drag"),)
+
+
+def test_other_terramechanics_are_no_candidate_unless_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(catalogue, "_OWN", {})
+    name = next(iter(second_terramechanics())).split("/")[0]
+    assert name in catalogue.effect_names()
+    assert Candidates.of().keys == CANDIDATES.keys
+    assert Candidates.of([name]).effects == (name,)
 
 
 def test_calibration_error_and_interval() -> None:

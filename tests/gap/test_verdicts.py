@@ -12,8 +12,8 @@ import pytest
 
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
-from terrafusion.twin.effects.catalogue import effect_names
 from terrafusion.twin.gap import Diagnosis, diagnose
+from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.corrected import values_of, write_corrected
 from terrafusion.twin.gap.next_run import BY_HAND, DRIVES
 from terrafusion.twin.vehicle import load_vehicle
@@ -65,7 +65,7 @@ def test_effect_a_wider_track(references: list[Recording]) -> None:
     assert answer["named"] == ["track_width"]
     assert not answer["gap"]["uncalibrated"]
     assert answer["causes"][0]["parameters"]["track_width/scale"]["value"] == pytest.approx(0.1, abs=0.01)
-    assert {c["effect"] for c in answer["causes"]} == set(effect_names())
+    assert {c["effect"] for c in answer["causes"]} == set(Candidates.of().effects)
     assert answer["next_run"] is None
 
 

@@ -81,6 +81,7 @@ class Form:
         terms: what it does at each stage where it acts.
         equation: the law, in words of the docs.
         source: author and year, or "ours" for a phenomenological law.
+        candidate: whether a gap may be explained by it without having been asked for by name.
     """
 
     effect: str
@@ -89,6 +90,7 @@ class Form:
     terms: Mapping[str, Term]
     equation: str
     source: str = "ours"
+    candidate: bool = True
 
     def __post_init__(self) -> None:
         unknown = [stage for stage in self.terms if stage not in STAGES]

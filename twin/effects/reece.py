@@ -76,7 +76,7 @@ def _wheel(q: Quantities, share: Any) -> dict[str, Any]:
 REECE = Form(
     "second_terramechanics", "reece", one("", 1.0, 0.0, 1.0), {"ground": _ground, "wheel": _wheel},
     "Reece's pressure, Bekker's on a plate of 50 mm; n = n0 + n1 abs(s); shear j / (K + j)",
-    "Reece 1965; Ding et al. 2010; Kondner 1963",
+    "Reece 1965; Ding et al. 2010; Kondner 1963", candidate=False,
 )  # fmt: skip
 
 

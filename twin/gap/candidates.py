@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.effects.catalogue import catalogue, moves, parameters
+from terrafusion.twin.effects.form import Form
 
 Array = NDArray[np.float64]
 
@@ -51,14 +52,18 @@ class Candidates:
 
     @classmethod
     def of(cls, effects: Iterable[str] | None = None) -> Candidates:
-        """The named effects; None: all of the catalogue, the user's own included."""
+        """The named effects; None: all of the catalogue that are candidates, the user's own included."""
         wanted = None if effects is None else set(effects)
-        known = {k: v for k, v in parameters().items() if wanted is None or v[0].effect in wanted}
+
+        def taken(form: Form) -> bool:
+            return form.candidate if wanted is None else form.effect in wanted
+
+        known = {k: v for k, v in parameters().items() if taken(v[0])}
         keys = tuple(known)
         forms = [
             Hypothesis(f.effect, f.name, tuple(i for i, key in enumerate(keys) if known[key][0].key == f.key))
             for f in catalogue().values()
-            if wanted is None or f.effect in wanted
+            if taken(f)
         ]
         numbers = [p for _, p in known.values()]
         return cls(
