@@ -72,13 +72,13 @@ def gap(
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
 ) -> None:
-    """Tell where runs differ from reference runs, which effect causes it, and how far the gap shrinks with
-    it.
+    """Tell where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
 
     Writes diagnosis.json and report.html. No truth channel is read.
 
     Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
     """
+    from terrafusion.datasets.atomic import check_folder
     from terrafusion.fusion.gap_page.page import write_diagnosis
     from terrafusion.fusion.gap_page.words import sentences
     from terrafusion.twin.gap.diagnosis import diagnose
@@ -87,6 +87,8 @@ def gap(
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
     judged = _opened(runs, options, repair_clock)
     normal = _opened(reference or [], options, repair_clock)
+    for target in (out, *([write_vehicle.parent] if write_vehicle else [])):
+        check_folder(target)
     with progress_bar("comparing") as progress:
         found = diagnose(
             judged, normal, load_vehicle(vehicle), parse_terrain(terrain),

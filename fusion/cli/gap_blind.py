@@ -28,10 +28,12 @@ def gap_blind(
 
     Example: terrafusion gap-blind --quick --out blind
     """
+    from terrafusion.datasets.atomic import check_folder
     from terrafusion.fusion.blind.page import summary, write_blind
     from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.check import run_blind_check
 
+    check_folder(out)
     judged = partial(diagnose, jobs=1) if jobs > 1 else diagnose  # processes, or threads inside
     with progress_bar("diagnosing") as progress:
         scores = run_blind_check(

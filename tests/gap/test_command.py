@@ -47,3 +47,20 @@ def test_gap_refuses_an_unknown_effect_in_one_line(logs: Path, tmp_path: Path, t
     assert done.status == 1
     assert done.err.count("\n") == 1
     assert "wheels_fell_off" in done.err
+
+
+@pytest.mark.parametrize("option", ["--out", "--write-vehicle"])
+def test_what_cannot_be_written_is_refused_before_anything_is_computed(
+    logs: Path, tmp_path: Path, terrafusion, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    monkeypatch.setattr("terrafusion.twin.gap.diagnosis.diagnose", lambda *_, **__: pytest.fail("computed"))
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    targets = {"--out": tmp_path / "out", option: taken if option == "--out" else taken / "vehicle.yaml"}
+    words = [str(word) for pair in targets.items() for word in pair]
+    terrafusion("gap", str(logs / "run300"), *words).refused("cannot be written", "taken")
+
+
+def test_the_blind_check_refuses_a_file_for_a_folder(tmp_path: Path, terrafusion) -> None:
+    (tmp_path / "taken").write_text("mine")
+    terrafusion("gap-blind", "--quick", "--out", str(tmp_path / "taken")).refused("cannot be written")

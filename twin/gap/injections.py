@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -20,6 +21,7 @@ from typing import Any
 
 import numpy as np
 
+from terrafusion.datasets.atomic import check_folder
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.recording import Recording
@@ -197,8 +199,8 @@ def answered(
     return {**told, "runs": len(judged), "references": len(others), "elapsed_s": time.perf_counter() - began}
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Make the table, or go on with it."""
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Make the table, or go on with it; 0, or 1 after a known error."""
     parser = argparse.ArgumentParser(description="Known changes in real logs, and what the diagnosis names.")
     parser.add_argument("--out", type=Path, required=True, help="folder for the answers and the table")
     parser.add_argument("--set", action="append", choices=sorted(SETS), help="logs; default: all")
@@ -206,14 +208,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--suspects", action="store_true", help="only sensors, wheels and ground, see SUSPECTS"
     )
     given = parser.parse_args(arguments)
-    effects = SUSPECTS if given.suspects else None
-    given.out.mkdir(parents=True, exist_ok=True)
-    kept, path = dict[str, dict[str, Any]](), given.out / "injections.jsonl"
+    try:
+        run(given.out, given.set or sorted(SETS), SUSPECTS if given.suspects else None)
+    except TerrafusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def run(out: Path, sets: Sequence[str], effects: Sequence[str] | None) -> None:
+    """The table of some sets, written to `out` row by row.
+
+    Raises:
+        TerrafusionError: a log is not at hand or cannot be read, or the folder cannot be written.
+    """
+    check_folder(out)
+    out.mkdir(parents=True, exist_ok=True)
+    kept, path = dict[str, dict[str, Any]](), out / "injections.jsonl"
     if path.exists():
         kept = {row["case"]: row for row in map(json.loads, path.read_text("utf-8").splitlines())}
     sources = dict[str, Source]()
     with path.open("a", encoding="utf-8") as file:
-        for name, injection, severity, fold in cases(given.set or sorted(SETS)):
+        for name, injection, severity, fold in cases(sets):
             what = "unchanged" if injection is None else injection.name
             case = f"{name}/{what}/{severity:g}/{fold}"
             if case in kept:
@@ -227,7 +243,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print(json.dumps(row), file=file, flush=True)
             print(table([row])[-1], flush=True)
     rows = list(kept.values())
-    (given.out / "injections.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
+    (out / "injections.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
 
 
 HEAD = ("set", "change", "size", "p", "verdict", "first (class)", "rank", "estimated", "right")
@@ -254,4 +270,4 @@ def _told(row: dict[str, Any]) -> list[str]:
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())
