@@ -69,7 +69,7 @@ def test_jobs_whose_parts_another_process_overwrites_meanwhile_are_not_lost(tmp_
     jobs = [Job(Case("mixed", "twin", FIRST_SEED + i), FEW) for i in range(3)]
 
     def job(one: Job) -> tuple[Job, Found]:
-        for file in (tmp_path / parts.FOLDER).iterdir():
+        for file in (tmp_path / parts.FOLDER).glob("*"):
             file.write_text(json.dumps({"sources_sha256": "of other sources", "state": ""}))
         return one, Found((Row("mixed", "twin", one.key, one.key, "fixed", error_m=1.0),), ())
 
