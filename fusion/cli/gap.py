@@ -66,7 +66,7 @@ def gap(
     judge: Annotated[
         bool, typer.Option("--judge", help="Also tell what the estimator makes of these logs and the twin's.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Of permutations and replicates.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
@@ -92,8 +92,8 @@ def gap(
     with progress_bar("comparing") as progress:
         found = diagnose(
             judged, normal, load_vehicle(vehicle), parse_terrain(terrain),
-            effects=split(effects) or None, significance=significance, source=source, seed=seed,
-            progress=progress,
+            effects=None if effects is None else split(effects), significance=significance, source=source,
+            seed=seed, progress=progress,
         )  # fmt: skip
     marks = _judged(found, judged, normal, vehicle, seed) if judge else None
     write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])}, marks)

@@ -58,9 +58,34 @@ def test_what_cannot_be_written_is_refused_before_anything_is_computed(
     taken.write_text("mine")
     targets = {"--out": tmp_path / "out", option: taken if option == "--out" else taken / "vehicle.yaml"}
     words = [str(word) for pair in targets.items() for word in pair]
-    terrafusion("gap", str(logs / "run300"), *words).refused("cannot be written", "taken")
+    done = terrafusion("gap", str(logs / "run300"), *words)
+    done.refused("cannot be written", "taken")
+    assert taken.read_text() == "mine"
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_blind_check_refuses_a_file_for_a_folder(tmp_path: Path, terrafusion) -> None:
-    (tmp_path / "taken").write_text("mine")
-    terrafusion("gap-blind", "--quick", "--out", str(tmp_path / "taken")).refused("cannot be written")
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    done = terrafusion("gap-blind", "--quick", "--out", str(taken))
+    assert done.status == 1
+    assert done.err.startswith("error: ")
+    assert "cannot be written" in done.err
+    assert taken.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "told"),
+    [
+        (("--input", "bogus"), 1, "unknown input 'bogus'"),
+        (("--effects", ","), 1, "no effect is named"),
+        (("--seed", "-1"), 2, "--seed"),
+    ],
+)
+def test_gap_refuses_what_it_cannot_mean(
+    logs: Path, tmp_path: Path, terrafusion, words: tuple[str, ...], status: int, told: str
+) -> None:
+    done = terrafusion("gap", str(logs / "run300"), *words, "--out", str(tmp_path / "out"))
+    assert done.status == status
+    assert told in done.err
+    assert not (tmp_path / "out").exists()

@@ -31,6 +31,7 @@ from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
 from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.gap.verdict import HeldOut, Verdict, floor_of, judge
 from terrafusion.twin.gap.where import Cell, gap_map
+from terrafusion.twin.identify.inputs import check_source
 from terrafusion.twin.vehicle import VehicleParams
 
 Array = NDArray[np.float64]
@@ -120,7 +121,7 @@ def diagnose(
             the twin makes of a drive is computed once.
 
     Raises:
-        ConfigError: an unknown effect or soil, a significance out of range.
+        ConfigError: an unknown effect, soil or source, no effect, a significance out of range.
         DataError: a log without what the diagnosis needs.
         TerrafusionError: the twin diverges on a log.
     """
@@ -129,6 +130,7 @@ def diagnose(
         raise DataError("no run to diagnose was given", remedy="give at least one")
     if not 0.0 < significance < 1.0:
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
+    check_source(source)
     candidates = _candidates(effects)
     bench = gather(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
@@ -171,6 +173,8 @@ def diagnose(
 
 
 def _candidates(effects: Sequence[str] | None) -> Candidates:
+    if effects is not None and not effects:
+        raise ConfigError("no effect is named", remedy="name some, or none at all for the whole catalogue")
     from terrafusion.twin.effects.catalogue import effect_names
 
     unknown = sorted(set(effects or ()) - set(effect_names()))

@@ -15,7 +15,7 @@ from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.identify.coordinates import Coordinate, Prior
 from terrafusion.twin.identify.identifiability import UNTOLD, Identifiability, examine
-from terrafusion.twin.identify.inputs import SOURCES
+from terrafusion.twin.identify.inputs import check_source
 from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model, resolve
 from terrafusion.twin.identify.predict import FOLLOWING
@@ -235,8 +235,7 @@ def assumptions(problem: Problem) -> list[str]:
 def _check(recordings: tuple[Recording, ...], source: str, window_s: float) -> None:
     if not recordings:
         raise DataError("no log was given", remedy="give at least one")
-    if source not in SOURCES:
-        raise ConfigError(f"unknown input '{source}'", remedy=f"give one of {', '.join(SOURCES)}")
+    check_source(source)
     if not 1.0 <= window_s <= 600.0:
         raise ConfigError(f"a window of {window_s:g} s is out of range", remedy="give 1 to 600 s")
 

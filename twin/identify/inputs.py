@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.drive import limit_slew, side_speeds
 from terrafusion.twin.identify.observations import sample_interval_s
@@ -27,6 +27,16 @@ STEP = 4.0
 """Commands that change this many times faster than the robot may accelerate are steps."""
 LONGEST_GAP_S = 0.5
 """A longer gap in measured wheel speeds voids what falls into it."""
+
+
+def check_source(source: str) -> None:
+    """Refuse what is none of `SOURCES`.
+
+    Raises:
+        ConfigError: it is none.
+    """
+    if source not in SOURCES:
+        raise ConfigError(f"unknown input '{source}'", remedy=f"give one of {', '.join(SOURCES)}")
 
 
 @dataclass(frozen=True, eq=False)
