@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.twin.gap import injections
 from terrafusion.twin.gap.diagnosis import diagnose
 from terrafusion.twin.gap.effective_track import blocks_of, effective_track
 from terrafusion.twin.gap.injected import (
@@ -239,6 +241,30 @@ def test_a_crash_is_a_wrong_answer_in_the_table(monkeypatch: pytest.MonkeyPatch)
     row = answered(source, LOGS, GYRO, 1.0, 0)
     assert row["right"] is False
     assert "crash" in table([{"set": "x", "change": "y", "size": 1.0, **row}])[-1]
+
+
+def test_a_stopped_table_goes_on_and_rows_of_other_candidates_do_not_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[float] = []
+
+    def answer(source, logs, injection, severity, fold, effects):
+        asked.append(severity)
+        return {"skipped": "not tried"}
+
+    monkeypatch.setattr(injections, "answered", answer)
+    monkeypatch.setattr(injections, "SETS", {"one": None})
+    monkeypatch.setattr(injections, "cases", lambda _: [("one", None, s, 0) for s in (1.0, 2.0)])
+    monkeypatch.setattr(Source, "of", classmethod(lambda *_: None))
+    injections.run(tmp_path, ["one"], None)
+    injections.run(tmp_path, ["one"], None)
+    assert asked == [1.0, 2.0]
+    path = tmp_path / "injections.jsonl"
+    path.write_text(path.read_text()[:-20])  # stopped in the midst of the last row
+    injections.run(tmp_path, ["one"], None)
+    assert asked == [1.0, 2.0, 2.0]
+    injections.run(tmp_path, ["one"], ("mass",))
+    assert asked == [1.0, 2.0, 2.0, 1.0, 2.0]
 
 
 def test_what_a_log_cannot_show_is_said() -> None:

@@ -30,6 +30,7 @@ from terrafusion.twin.gap.injected import INJECTIONS, Injection, pose_as_gnss
 from terrafusion.twin.gap.pieces import piece, spans
 from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.version import model_sha256
 
 SEVERITIES = (0.5, 1.0, 2.0)
 SUSPECTS = (
@@ -217,18 +218,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def run(out: Path, sets: Sequence[str], effects: Sequence[str] | None) -> None:
-    """The table of some sets, written to `out` row by row.
+    """The table of some sets, written to `out` row by row; rows of other sources or effects are made anew.
 
     Raises:
         TerrafusionError: a log is not at hand or cannot be read, or the folder cannot be written.
     """
     check_folder(out)
     out.mkdir(parents=True, exist_ok=True)
-    kept, path = dict[str, dict[str, Any]](), out / "injections.jsonl"
-    if path.exists():
-        kept = {row["case"]: row for row in map(json.loads, path.read_text("utf-8").splitlines())}
+    path = out / "injections.jsonl"
+    made_by = {"model_sha256": model_sha256(), "effects": list(effects or ())}
+    kept = {row["case"]: row for row in rows_of(path) if row.get("made_by") == made_by}
     sources = dict[str, Source]()
     with path.open("a", encoding="utf-8") as file:
+        if file.tell() and not path.read_text("utf-8").endswith("\n"):  # stopped in the midst of a row
+            file.write("\n")
         for name, injection, severity, fold in cases(sets):
             what = "unchanged" if injection is None else injection.name
             case = f"{name}/{what}/{severity:g}/{fold}"
@@ -239,11 +242,23 @@ def run(out: Path, sets: Sequence[str], effects: Sequence[str] | None) -> None:
             answer = answered(sources[name], SETS[name], injection, severity, fold, effects)
             size = 0.0 if injection is None else severity * injection.size
             row = {"case": case, "set": name, "change": what, "severity": severity, "size": size, **answer}
+            row["made_by"] = made_by
             kept[case] = row
             print(json.dumps(row), file=file, flush=True)
             print(table([row])[-1], flush=True)
     rows = list(kept.values())
     (out / "injections.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
+
+
+def rows_of(path: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a file that may not be there, or end in half a line."""
+    for line in path.read_text("utf-8").splitlines() if path.exists() else []:
+        try:
+            row = json.loads(line)
+        except ValueError:
+            continue
+        if isinstance(row, dict) and "case" in row:
+            yield row
 
 
 HEAD = ("set", "change", "size", "p", "verdict", "first (class)", "rank", "estimated", "right")
