@@ -26,6 +26,7 @@ from terrafusion.datasets.frames import quaternion_to_matrix, yaw_of
 from terrafusion.datasets.recording import Recording
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.fusion.terrain.classifier import UNKNOWN
+from terrafusion.fusion.terrain.external import TRUE_SOURCES
 from terrafusion.fusion.weights.policy_evidence import (
     SLIP_S,
     Evidence,
@@ -112,7 +113,7 @@ def grounds_of(recording: Recording) -> list[tuple[int, str]]:
         DataError: the recording has no label that was there before the estimator.
     """
     terrain = recording.terrain
-    if terrain is not None and len(terrain) and terrain.source in ("annotation", "simulation"):
+    if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
         label = terrain.label.astype(str)
         first = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
         return list(zip(terrain.t_ns[first].tolist(), label[first].tolist(), strict=True))
