@@ -150,8 +150,10 @@ class GnssUpdater:
         return True
 
     def set_heading_right(self, chain: Chain, row: SensorNoise) -> bool:
-        """Turn the whole window where motion and the fixes, the last ones of them taken since the call
-        before, agree on another heading than the filter's; True when it did."""
+        """Turn the whole window where motion and fixes agree on another heading than the filter's.
+
+        Looks only where fixes have been taken since the last call; True when it turned.
+        """
         fix, self._unchecked = self._unchecked, None
         if fix is None:
             return False
@@ -304,7 +306,8 @@ def checked_fix(
     is left out, a height without one is free.
 
     Raises:
-        DataError: no east or north, an unknown class of fix, or neither sigma nor class.
+        DataError: no east or north, an unknown class of fix, neither sigma nor class, or a velocity of
+            other than three axes.
     """
     position = np.asarray(enu_m, dtype=float)
     known = _class_of(fix)
