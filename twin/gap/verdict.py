@@ -36,7 +36,8 @@ MOST_EFFECTS = 3
 
 @dataclass(frozen=True, eq=False)
 class Cause:
-    """One candidate: its class, probability, best columns with their values, and its share of the gap."""
+    """One candidate: its class, probability, best columns, their values (k,) with 1 sigma, in units of
+    `Candidates.scale`, and its share of the gap."""
 
     effect: str
     members: tuple[str, ...]
