@@ -305,12 +305,10 @@ class Estimator:
         gyro, accel = mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
-            link = bridge(k, before, wheels, dt)
             point = carried(before, wheels, dt)
+            link = bridge(k, before, point, dt)
         else:
-            measured = self._preintegrator.integrate(
-                segments, before.bias, row.gyro_inflation, row.accel_inflation
-            )
+            measured = self._preintegrator.integrate(segments, before.bias, row)
             seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)

@@ -63,7 +63,7 @@ class Propagator:
             self._readings += piece.dt_s * np.array([piece.gyro_radps, piece.accel_mps2])
         self._until_ns = newest_ns
         self._count = self._taken(imu)
-        density = row.gyro_inflation * self._preintegrator.spec.gyro_noise_radps_sqrthz
+        density = np.array(row.gyro_axes()) * self._preintegrator.spec.gyro_noise_radps_sqrthz
         interval_s = max(newest_ns - imu.t_ns[-2], 1) * 1e-9 if len(imu.t_ns) > 1 else 1.0
         gyro = np.where(np.isfinite(imu.gyro[-1]), imu.gyro[-1], state.gyro_bias_radps)  # none: no rate
         return self._carried(state, gyro, density / math.sqrt(interval_s))
@@ -82,11 +82,9 @@ class Propagator:
         self._bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
         self._key = KeyState(pose, state.velocity_mps, self._bias, state.linear)
         self._covariance, self._count, self._readings = covariance, 0, np.zeros((2, 3))
-        self._measured = self._preintegrator.integrate(
-            [], self._bias, row.gyro_inflation, row.accel_inflation
-        )
+        self._measured = self._preintegrator.integrate([], self._bias, row)
 
-    def _carried(self, state: State, gyro_radps: Array, gyro_sigma_radps: float) -> State:
+    def _carried(self, state: State, gyro_radps: Array, gyro_sigma_radps: Array) -> State:
         measured = self._measured
         seconds = max(measured.deltaTij(), 1e-9)
         now = measured.predict(self._from, self._key.bias_seen(*(self._readings / seconds)))

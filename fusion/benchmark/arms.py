@@ -24,6 +24,7 @@ SHEET = {
     "wheel_sigma_mps": 0.01,
     "side_slip_sigma": 0.01,
     "gyro_inflation": 1.0,
+    "gyro_yaw_inflation": 1.0,
     "accel_inflation": 1.0,
     "gnss_inflation": 1.0,
 }

@@ -56,13 +56,14 @@ def fit(
     with progress("drives", len(grid.conditions())) as tick:
         fitted = fit_policy(grid, tick, logged)
     write_policy(fitted, out, made_by=made_by(seeds, ground, vehicle, logs))
-    print(f"{'':12s} slip           a grade   time   wheel  side-slip  gyro  accel  GNSS")
-    print(f"{'':12s}                             s     m/s             x      x     x")
+    print(f"{'':12s} slip           a grade   time   wheel  side-slip  gyro   yaw  accel  GNSS")
+    print(f"{'':12s}                             s     m/s             x     x      x     x")
     for name, row in {**fitted.classes, "fixed": fitted.fixed}.items():
         print(
             f"{name:12s} {row.slip_mean:.3f} ± {row.slip_sigma:.3f} {row.slip_per_grade:8.2f}"
             f"  {row.slip_time_s:5.1f}  {row.wheel_sigma_mps:.4f}     {row.side_slip_sigma:.4f}"
-            f"  {row.gyro_inflation:4.1f}  {row.accel_inflation:5.1f}  {row.gnss_inflation:4.2f}"
+            f"  {row.gyro_inflation:4.1f}  {row.gyro_yaw_inflation:4.1f}  {row.accel_inflation:5.1f}"
+            f"  {row.gnss_inflation:4.2f}"
         )
     print(f"inputs {fitted.inputs_sha256[:16]}; written to {out}")
 

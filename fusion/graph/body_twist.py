@@ -35,7 +35,7 @@ def twist_jacobian(R: Array, velocity_mps: Array, dim: int = DIM) -> Array:
     return J
 
 
-def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: float) -> Array:
+def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: Array) -> Array:
     """Covariance (6, 6) of the body twist in ROS order: linear (m/s), then angular (rad/s), body axes.
 
     The velocity of the body is known better than its world components: an error of heading turns
@@ -45,7 +45,7 @@ def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: 
         P: (dim, dim) of the keyframe's tangent.
         R: (3, 3) body to world.
         velocity_mps: (3,) world.
-        gyro_sigma_radps: white noise of the rate, as averaged over a keyframe's interval.
+        gyro_sigma_radps: (3,) white noise of the rates, as averaged over a keyframe's interval.
     """
     J = twist_jacobian(R, velocity_mps, len(P))
     Q = J @ P @ J.T
@@ -53,10 +53,10 @@ def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: 
     return np.asarray(0.5 * (Q + Q.T))
 
 
-def gyro_sigma_radps(config: EstimatorConfig, row: SensorNoise) -> float:
-    """White noise of the gyro's mean over a keyframe's interval: density / sqrt(interval), inflated."""
+def gyro_sigma_radps(config: EstimatorConfig, row: SensorNoise) -> Array:
+    """White noise (3,) of the gyro's mean over a keyframe's interval: density / sqrt(interval), inflated."""
     density = config.rig.sensors.imu.gyro_noise_radps_sqrthz
-    return row.gyro_inflation * density / math.sqrt(config.keyframe_s)
+    return np.array(row.gyro_axes()) * density / math.sqrt(config.keyframe_s)
 
 
 def bias_sigma(P: Array) -> Array:

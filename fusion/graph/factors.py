@@ -70,19 +70,12 @@ def at_rest(k: int) -> gtsam.NonlinearFactor:
     )
 
 
-def bridge(
-    k: int, before: KeyState, wheels: WheelIncrement | None, dt_s: float
-) -> gtsam.NonlinearFactorGraph:
-    """Loose links across a hole in the IMU: wheels or held velocity carry the robot."""
+def bridge(k: int, before: KeyState, carried: KeyState, dt_s: float) -> gtsam.NonlinearFactorGraph:
+    """Loose links across a hole in the IMU, to the state that wheels or a held velocity `carried` there."""
     graph = gtsam.NonlinearFactorGraph()
-    moved = wheels.displacement_m if wheels else before.pose.rotation().matrix().T @ before.velocity * dt_s
     sigmas = np.array([0.05, 0.05, 0.3, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
-    turn = gtsam.Rot3.Rz(wheels.turn_rad if wheels else 0.0)
-    graph.add(
-        gtsam.BetweenFactorPose3(
-            X(k - 1), X(k), gtsam.Pose3(turn, moved), gtsam.noiseModel.Diagonal.Sigmas(sigmas)
-        )
-    )
+    step = before.pose.between(carried.pose)
+    graph.add(gtsam.BetweenFactorPose3(X(k - 1), X(k), step, gtsam.noiseModel.Diagonal.Sigmas(sigmas)))
     graph.add(
         gtsam.BetweenFactorVector(V(k - 1), V(k), np.zeros(3), _isotropic(3, round(2.0 * math.sqrt(dt_s), 6)))
     )

@@ -76,6 +76,11 @@ class KeyState:
         return float((1.0 - self.linear[0]) * (1.0 + self.linear[RADIUS - NAV.stop]))
 
     @property
+    def turning(self) -> float:
+        """Angle turned over what the wheels say."""
+        return float(1.0 + self.linear[YAW_SCALE - NAV.stop])
+
+    @property
     def drift(self) -> Array:
         """Drift of the GNSS position (2,), m."""
         return self.of(DRIFT)

@@ -30,10 +30,8 @@ def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gts
 def carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
     """The state carried over `dt` seconds by the wheels, or by its velocity where they are silent."""
     if wheels is None:
-        moved = before.pose.rotation().matrix().T @ before.velocity * dt
-        turn = 0.0
+        step = gtsam.Pose3(gtsam.Rot3(), before.pose.rotation().matrix().T @ before.velocity * dt)
     else:
-        moved = before.rolling * wheels.displacement_m
-        turn = wheels.turn_rad
-    pose = before.pose.compose(gtsam.Pose3(gtsam.Rot3.Rz(turn), moved))
-    return KeyState(pose, before.velocity, before.bias, before.linear)
+        turn = gtsam.Rot3.Rz(before.turning * wheels.turn_rad)
+        step = gtsam.Pose3(turn, before.rolling * wheels.displacement_m)
+    return KeyState(before.pose.compose(step), before.velocity, before.bias, before.linear)

@@ -25,6 +25,7 @@ from terrafusion.datasets.sensors import ImuSpec
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.preintegration import INTEGRATION_SIGMA_M, Preintegrator
 from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
+from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
@@ -93,22 +94,21 @@ class PlanarPreintegrator(Preintegrator):
         self,
         segments: list[ImuSegment],
         bias: gtsam.imuBias.ConstantBias,
-        gyro_inflation: float,
-        accel_inflation: float,
+        row: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; `accel_inflation` has nothing to act on."""
+        """Preintegrate the segments about `bias`; of the row only the inflation about yaw acts."""
         turned = sum(float(piece.gyro_radps[2]) * piece.dt_s for piece in segments)
         total = sum(piece.dt_s for piece in segments)
-        density = self.yaw_density(turned / total if total > 0.0 else 0.0, gyro_inflation)
+        density = self.yaw_density(turned / total if total > 0.0 else 0.0, row.gyro_yaw_inflation)
         measured = gtsam.PreintegratedCombinedMeasurements(self._planar(density), bias)
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
         return measured
 
-    def yaw_density(self, rate_radps: float, gyro_inflation: float) -> float:
+    def yaw_density(self, rate_radps: float, inflation: float) -> float:
         """Noise density of the yaw rate, rad/s/sqrt(Hz), while turning at `rate_radps`."""
         if self.yaw == "gyro":
-            return self.spec.gyro_noise_radps_sqrthz * gyro_inflation
+            return self.spec.gyro_noise_radps_sqrthz * inflation
         if self.yaw == "nobody":
             return UNKNOWN_YAW_DENSITY_RADPS
         return float(np.hypot(TURN_SHARE * rate_radps * np.sqrt(TURN_TIME_S), WHEEL_YAW_DENSITY_RADPS))

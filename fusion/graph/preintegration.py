@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import math
+
 import gtsam
 import numpy as np
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import ImuSpec
 from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.weights.policy import SensorNoise
 
 INTEGRATION_SIGMA_M = 1e-4
 """Position error of the integration itself, m/sqrt(s): keeps the square root full rank."""
+STEP = math.log(1.05)
 
 
 class Preintegrator:
@@ -21,34 +25,31 @@ class Preintegrator:
 
     def __init__(self, spec: ImuSpec) -> None:
         self.spec = spec
-        self._params: dict[tuple[float, float], gtsam.PreintegrationCombinedParams] = {}
+        self._params: dict[tuple[int, ...], gtsam.PreintegrationCombinedParams] = {}
 
     def integrate(
         self,
         segments: list[ImuSegment],
         bias: gtsam.imuBias.ConstantBias,
-        gyro_inflation: float,
-        accel_inflation: float,
+        row: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; inflations multiply the data sheet's noise."""
-        measured = gtsam.PreintegratedCombinedMeasurements(
-            self._scaled(gyro_inflation, accel_inflation), bias
-        )
+        """Preintegrate the segments about `bias`; the row's inflations multiply the data sheet's noise."""
+        measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(row), bias)
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
         return measured
 
-    def _scaled(self, gyro_inflation: float, accel_inflation: float) -> gtsam.PreintegrationCombinedParams:
+    def _scaled(self, row: SensorNoise) -> gtsam.PreintegrationCombinedParams:
         # Steps of 5 % keep the number of parameter sets small.
-        key = (
-            1.05 ** round(np.log(gyro_inflation) / np.log(1.05)),
-            1.05 ** round(np.log(accel_inflation) / np.log(1.05)),
-        )
+        inflations = *row.gyro_axes(), row.accel_inflation
+        key = tuple(round(math.log(inflation) / STEP) for inflation in inflations)
         if key not in self._params:
             spec, eye = self.spec, np.eye(3)
+            *about, accel = (math.exp(STEP * steps) for steps in key)
+            gyro = spec.gyro_noise_radps_sqrthz * np.array(about)
             params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
-            params.setGyroscopeCovariance(eye * (spec.gyro_noise_radps_sqrthz * key[0]) ** 2)
-            params.setAccelerometerCovariance(eye * (spec.accel_noise_mps2_sqrthz * key[1]) ** 2)
+            params.setGyroscopeCovariance(np.diag(gyro**2))
+            params.setAccelerometerCovariance(eye * (spec.accel_noise_mps2_sqrthz * accel) ** 2)
             params.setBiasOmegaCovariance(eye * spec.gyro_bias_walk_radps2_sqrthz**2)
             params.setBiasAccCovariance(eye * spec.accel_bias_walk_mps3_sqrthz**2)
             params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -34,7 +35,10 @@ LARGE_TURN_RAD = 0.05
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
-"""Share of a fix's variance that is new at every fix; the rest drifts slowly."""
+"""Share of a fix's variance that is new at every fix; the rest drifts slowly. More is taken to be new
+where the fixes scatter more about the dead-reckoned path."""
+LIE = 2.0
+"""Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
 OPTIMISM = 3.0
 """A stand-alone receiver may claim so many times less than its data sheet and drift all the same; one
 that claims even less has fixes of a better class (RTK), which drift in proportion to what they claim."""
@@ -54,6 +58,7 @@ class GnssUpdater:
         rejected, too_late: how many fixes the gate refused, or came after their keyframe was dropped.
         turned: how often the heading was set right from the motion.
         scale: how many times more than it claims the receiver is seen to scatter, 1 for an honest one.
+        white: share of a fix's variance that is taken to be new at every fix.
         last_used_ns: time of the newest fix in the graph.
     """
 
@@ -70,7 +75,7 @@ class GnssUpdater:
         spec = config.rig.sensors.gnss
         self.track = MotionTrack(self.antenna_m)
         self.turned = 0
-        self.scale = 1.0
+        self.scale, self.white = 1.0, WHITE_SHARE
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._best = best_fix(spec)
         self._class: Fix | None = None
@@ -121,7 +126,7 @@ class GnssUpdater:
                 self.too_late += 1
             else:
                 self.track.add(fix)
-                self.scale = self.track.scatter()
+                self._hear(self.track.scatter())
                 renewed = self._change_class(chain, k, fix)
                 if renewed or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
@@ -131,6 +136,11 @@ class GnssUpdater:
         if used:
             self.weighting.revisit(chain)
         return used
+
+    def _hear(self, scatter: float) -> None:
+        """Take in how the fixes scatter about the path, over what they claim."""
+        self.scale = scatter if scatter > LIE else 1.0
+        self.white = WHITE_SHARE if math.isnan(scatter) else min(max(scatter**2, WHITE_SHARE), 1.0)
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Let the drift start anew where the class of fix changes; True when it does.
@@ -215,6 +225,7 @@ class GnssUpdater:
                     sigma[:2] ** 2,
                     fix.sigma_m[:2] * self.scale,
                     drift_m2,
+                    self.white,
                 )
             )
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
@@ -246,14 +257,15 @@ class GnssUpdater:
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
         """How much of the drift state is in this fix: 0 to 1, above 1 for classes worse than the sheet's."""
         claimed = float(np.max(fix.sigma_m[:2])) * inflation
+        slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
         scale = self._class_scale.get(fix.fix, 1.0)
-        return min(scale, OPTIMISM * claimed / self.sheet_sigma_m)
+        return slow * min(scale, OPTIMISM * claimed / self.sheet_sigma_m)
 
     def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
         """1 sigma (3,) of what is new in a fix, beyond the drift that is a state."""
         reported = fix.sigma_m * inflation
         drift_m = share * self.drift_sigma_m
-        level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, WHITE_SHARE * reported[:2] ** 2))
+        level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, self.white * reported[:2] ** 2))
         return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
 
     @staticmethod

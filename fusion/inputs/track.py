@@ -27,8 +27,6 @@ SCATTER_FIXES = 21
 """Fixes over which a receiver's scatter is judged; the median bears ten wild ones."""
 RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
 """Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
-LIE = 2.0
-"""Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
 SLIP_CHANGE = 0.1
 """How far slip may change from fix to fix and so bend the dead-reckoned path (assumed)."""
 LEAST_RATIO, MOST_RATIO = 0.3, 1.7
@@ -99,26 +97,25 @@ class MotionTrack:
         bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
 
     def scatter(self) -> float:
-        """How many times more than they claim the last fixes scatter about the path; 1 if honest.
+        """How many times what they claim the last fixes scatter about the path; NaN if too few tell.
 
-        From second differences of fix minus path: neither an offset, a heading error nor steady slip of
-        the estimate shows in them, white noise of variance s^2 does with 6 s^2.
+        From second differences of fix minus path: neither an offset, a slow drift, a heading error nor
+        steady slip of the estimate shows in them, white noise of variance s^2 does with 6 s^2.
         """
         recent = self.pairs[-SCATTER_FIXES:]
         if len(recent) < 8:
-            return 1.0
+            return math.nan
         z, fix = np.array([p.z for p in recent]), np.array([p.fix for p in recent])
         t = np.array([p.t_ns - recent[0].t_ns for p in recent]) * 1e-9
         gap = np.diff(t)
         even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
         if even.sum() < 6:
-            return 1.0
+            return math.nan
         rest = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
         seen = np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2 / RAYLEIGH_MEDIAN
         bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
         claimed = 6.0 * np.array([p.sigma_m for p in recent])[1:-1] ** 2
-        scatter = math.sqrt(_median(np.maximum(seen - bend, 0.0)[even] / claimed[even]))
-        return scatter if scatter > LIE else 1.0
+        return math.sqrt(_median(np.maximum(seen - bend, 0.0)[even] / claimed[even]))
 
     def wrong_by(self, yaw_sigma_rad: float, scale: float) -> float | None:
         """Angle by which the filter's heading must turn to agree with the motion, once that is sure."""

@@ -251,6 +251,7 @@ _WEIGHTS = (
     ),
     (
         ("gyro_inflation", "gyro", "gyro", "-"),
+        ("gyro_yaw_inflation", "gyro, yaw", "gyro", ":"),
         ("accel_inflation", "accelerometer", "accel", "--"),
         ("gnss_inflation", "GNSS", "gnss", "-"),
     ),

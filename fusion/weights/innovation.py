@@ -27,7 +27,6 @@ from numpy.typing import NDArray
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import WeightChange
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.gnss import WHITE_SHARE
 from terrafusion.fusion.weights.modes import InnovationTuning
 from terrafusion.fusion.weights.terrain_weights import NOTEWORTHY, TerrainWeights
 from terrafusion.fusion.weights.weighting import Surprise, Weighting, tested_wheels, widened
@@ -120,16 +119,17 @@ class InnovationWeighting(Weighting):
         before, unit2 = self._weights.row.gnss_inflation, float(np.mean(tested.unit_m**2))
         white = float(np.mean(tested.noise_m2)) / unit2
         drift = tested.drift_m2 / unit2
-        low, high = (_white(x**2, drift) for x in (self._low, self._high))
+        least = tested.white_share
+        low, high = (_white(x**2, drift, least) for x in (self._low, self._high))
         if not self._gnss_seen:
             self._gnss.start(white)
             self._gnss_seen = True
         self._gnss.low, self._gnss.high = low, high
         self._gnss.update(tested)
-        inflation = math.sqrt(min(self._gnss.value + drift, self._gnss.value / WHITE_SHARE))
+        inflation = math.sqrt(min(self._gnss.value + drift, self._gnss.value / least))
         self._set(tested.t_ns, "gnss", "gnss_inflation", min(max(inflation, self._low), self._high), "")
         now = self._weights.row.gnss_inflation
-        return math.sqrt(_white(now**2, drift) / _white(before**2, drift)), 1.0
+        return math.sqrt(_white(now**2, drift, least) / _white(before**2, drift, least)), 1.0
 
     def _set(self, t_ns: int, sensor: str, name: str, value: float, unit: str) -> None:
         self._weights.row = dataclasses.replace(self._weights.row, **{name: value})
@@ -140,6 +140,6 @@ class InnovationWeighting(Weighting):
             self._noted[name] = value
 
 
-def _white(reported: float, drift: float) -> float:
+def _white(reported: float, drift: float, least: float) -> float:
     """Variance that is new at every fix, of a `reported` one with `drift` in it, as `GnssUpdater` has it."""
-    return max(reported - drift, WHITE_SHARE * reported)
+    return max(reported - drift, least * reported)

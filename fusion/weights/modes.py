@@ -1,4 +1,4 @@
-"""The few numbers of each estimator mode, as `python -m terrafusion.fusion.weights.tuning` finds them."""
+"""The few numbers of each estimator mode, as `python -m terrafusion.fusion.benchmark.tuning` finds them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Annotated, Any, get_type_hints
 
 from terrafusion.datasets.config import Quantity, checked_number, read_yaml
 from terrafusion.datasets.errors import ConfigError
-from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.fusion.weights.policy import Policy, SensorNoise
 
 SCHEMA = "terrafusion.modes/1"
 MODES = ("adaptive", "fixed", "robust", "innovation")
@@ -20,7 +20,7 @@ INNOVATION_METHODS = ("sage_husa", "variational")
 
 @dataclass(frozen=True)
 class RowTuning:
-    """Factors on three standard deviations of the policy's fixed row; 1 leaves it as it was fitted."""
+    """Factors on three standard deviations of a policy's row; 1 leaves it as it was fitted."""
 
     wheel_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
     slip_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
@@ -34,6 +34,11 @@ class RowTuning:
             slip_sigma=row.slip_sigma * self.slip_factor,
             gnss_inflation=row.gnss_inflation * self.gnss_factor,
         )
+
+    def of_all(self, policy: Policy) -> Policy:
+        """`policy` with the factors on every row."""
+        classes = {name: self.of(row) for name, row in policy.classes.items()}
+        return dataclasses.replace(policy, classes=classes, fixed=self.of(policy.fixed))
 
 
 @dataclass(frozen=True)
@@ -56,13 +61,14 @@ class InnovationTuning:
 
 @dataclass(frozen=True)
 class ModeTuning:
-    """What was tuned, mode by mode; `fixed` is also the row from which the others start.
+    """What was tuned, mode by mode.
 
-    The mode "adaptive" has no entry: its policy is fitted to the twin's sensor errors and truth, and
-    no number of it was ever chosen by a position error.
+    `fixed` is also the row from which "robust" and "innovation" start, and that of "adaptive" on a robot
+    that the terrain model does not know, until its slip tells the ground.
     """
 
     fixed: RowTuning = RowTuning()
+    adaptive: RowTuning = RowTuning()
     cauchy: RobustTuning = RobustTuning()
     gnc: RobustTuning = RobustTuning()
     sage_husa: InnovationTuning = InnovationTuning()
@@ -72,6 +78,7 @@ class ModeTuning:
 
 SECTIONS: dict[str, type] = {
     "fixed": RowTuning,
+    "adaptive": RowTuning,
     "cauchy": RobustTuning,
     "gnc": RobustTuning,
     "sage_husa": InnovationTuning,

@@ -21,7 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.config import Quantity, checked_number, read_yaml
 from terrafusion.datasets.errors import ConfigError
 
-SCHEMA = "terrafusion.policy/1"
+SCHEMA = "terrafusion.policy/2"
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class SensorNoise:
     (uphill positive), with the standard deviation and the correlation time
     given here. Yaw scale is true over wheel yaw rate, less one. Side-slip is the lateral over
     the forward displacement. The inflations multiply the standard deviations
-    of the data sheet (IMU) or of the receiver's own report (GNSS).
+    of the data sheet (IMU) or of the receiver's own report (GNSS); the gyro has one about
+    roll and pitch and one about yaw, for rough ground shakes those more.
     """
 
     slip_mean: Annotated[float, Quantity("", -1.0, 1.0)]
@@ -46,8 +47,13 @@ class SensorNoise:
     yaw_scale_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
     side_slip_sigma: Annotated[float, Quantity("", 1e-4, 2.0)]
     gyro_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
+    gyro_yaw_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
     accel_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
     gnss_inflation: Annotated[float, Quantity("", 1.0, 100.0)]
+
+    def gyro_axes(self) -> tuple[float, float, float]:
+        """Inflation of the gyro about roll, pitch and yaw."""
+        return self.gyro_inflation, self.gyro_inflation, self.gyro_yaw_inflation
 
     def slip_at(self, grade: float) -> float:
         """Expected slip at a grade (sine of the pitch, uphill positive)."""

@@ -20,8 +20,9 @@ What counts, ground by ground, and how it is measured against the truth:
 - side-slip: lateral over forward speed of the body origin, above 0.2 m/s, without the part that follows the
   yaw rate (a centre of rotation ahead of the origin is a state of its own).
 - IMU: the mean error over tau less its 60 s running mean (the bias), rms over the
-  axes, as a multiple of the data sheet's density / sqrt(tau). Vibration has a band:
-  its mean falls faster than that of white noise, so the multiple falls with tau, and
+  axes (gyro: roll and pitch, and yaw by itself), as a multiple of the data sheet's
+  density / sqrt(tau). Vibration has a band: its mean falls faster than that of white
+  noise, so the multiple falls with tau, and
   tau must be the time over which the estimator integrates the sensor before another
   corrects it: 2 s for the specific force (wheels and GNSS hold the speed), 5 s for
   the rate (heading is corrected slowly).
@@ -59,8 +60,8 @@ BIAS_S = 60.0
 class Evidence:
     """What one drive, or many, say of a ground: (n,) samples of each quantity.
 
-    `slip_pairs` and `grade_pairs` (n, 2) are slips and grades `LAG_S` apart; `gyro` and `accel` are errors
-    over what the data sheet allows, `gnss` over the reported sigma.
+    `slip_pairs` and `grade_pairs` (n, 2) are slips and grades `LAG_S` apart; `gyro` (roll and pitch),
+    `gyro_yaw` and `accel` are errors over what the data sheet allows, `gnss` over the reported sigma.
     """
 
     slip: Array
@@ -71,6 +72,7 @@ class Evidence:
     yaw_scale: Array
     side_slip: Array
     gyro: Array
+    gyro_yaw: Array
     accel: Array
     gnss: Array
 
@@ -88,7 +90,7 @@ def evidence_of(recording: Recording) -> Evidence:
     assert truth is not None
     assert truth.twist_body is not None
     slip, grade, pairs, grade_pairs, wheel = _slip_evidence(recording)
-    gyro, accel = _imu_evidence(recording)
+    gyro, gyro_yaw, accel = _imu_evidence(recording)
     return Evidence(
         slip,
         grade,
@@ -98,6 +100,7 @@ def evidence_of(recording: Recording) -> Evidence:
         _yaw_scales(recording),
         side_slips_of(truth.twist_body[:, 0], truth.twist_body[:, 1], truth.twist_body[:, 5]),
         gyro,
+        gyro_yaw,
         accel,
         _gnss_evidence(recording),
     )
@@ -182,8 +185,8 @@ def side_slips_of(forward_mps: Array, lateral_mps: Array, rate_radps: Array) -> 
     return np.asarray((lateral_mps + icr * rate_radps)[moving] / forward_mps[moving])
 
 
-def _imu_evidence(recording: Recording) -> tuple[Array, Array]:
-    """Errors of means of gyro and accelerometer over the data sheet's, all axes, (n,) and (m,).
+def _imu_evidence(recording: Recording) -> tuple[Array, Array, Array]:
+    """Errors of means over the data sheet's: gyro about roll and pitch (2 n,), yaw (n,), accelerometer (m,).
 
     Each sample is compared with the rotation and the change of velocity over
     the interval before it. Only while the wheels turn.
@@ -206,13 +209,14 @@ def _imu_evidence(recording: Recording) -> tuple[Array, Array]:
     samples = wheel_samples(recording)
     speed = np.interp(imu_t, samples.t_s, np.abs(samples.sides_mps).mean(axis=1))
     return (
-        _relative(gyro, speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
+        _relative(gyro[:, :2], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
+        _relative(gyro[:, 2:], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
         _relative(accel, speed, step, ACCEL_S, spec.accel_noise_mps2_sqrthz),
     )
 
 
 def _relative(error: Array, speed_mps: Array, step_s: float, tau_s: float, density: float) -> Array:
-    """Means over `tau_s` of errors (n, 3) less bias, over density / sqrt(tau): (m,), while wheels turn."""
+    """Means over `tau_s` of errors (n, axes) less bias, over density / sqrt(tau): (m,), while wheels turn."""
     count = max(round(tau_s / step_s), 1)
     means = _unbiased(_block_means(error, count), count * step_s)
     rolling = _block_means(speed_mps, count) > TURNING_MPS
@@ -232,7 +236,7 @@ def _rotation_vectors(R: Array) -> Array:
 
 
 def _unbiased(error: Array, tau_s: float) -> Array:
-    """Errors (n, 3) less their running mean over `BIAS_S`."""
+    """Errors (n, axes) less their running mean over `BIAS_S`."""
     width = min(max(round(BIAS_S / tau_s), 1), len(error))
     count = np.convolve(np.ones(len(error)), np.ones(width), "same")
     slow = np.stack([np.convolve(e, np.ones(width), "same") / count for e in error.T], axis=1)

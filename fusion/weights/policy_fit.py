@@ -153,6 +153,7 @@ def row_of(grounds: list[Evidence]) -> SensorNoise:
         yaw_scale_sigma=scatter,
         side_slip_sigma=max(_rms([e.side_slip for e in grounds]), 1e-3),
         gyro_inflation=max(_rms([e.gyro for e in grounds]), 1.0),
+        gyro_yaw_inflation=max(_rms([e.gyro_yaw for e in grounds]), 1.0),
         accel_inflation=max(_rms([e.accel for e in grounds]), 1.0),
         gnss_inflation=max(_rms([e.gnss for e in grounds]), 1.0),
     )
@@ -204,7 +205,9 @@ def _spread(row: SensorNoise) -> SensorNoise:
         for name, value in dataclasses.asdict(row).items()
         if name not in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean", "gnss_inflation")
     }
-    return dataclasses.replace(row, **changes)
+    # About which axis strange ground shakes most is not known either.
+    worst = max(changes["gyro_inflation"], changes["gyro_yaw_inflation"])
+    return dataclasses.replace(row, **changes | {"gyro_yaw_inflation": worst})
 
 
 def _rounded(row: SensorNoise) -> SensorNoise:
@@ -219,6 +222,7 @@ def _rounded(row: SensorNoise) -> SensorNoise:
 def fingerprint_of(grid: Grid, logged: Logged = Logged()) -> str:
     """SHA-256 of what a policy fitted on `grid` and logs depends on: parameter files, logs and settings."""
     settings = {
+        "schema": SCHEMA,
         "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
         "side_slip_from_mps": SIDE_SLIP_FROM_MPS, "stuck_mps": STUCK_MPS, "stuck_counts_s": STUCK_COUNTS_S,
         "yawing_radps": YAWING_RADPS, "bias_s": BIAS_S, "gyro_s": GYRO_S, "accel_s": ACCEL_S,

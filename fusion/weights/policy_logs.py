@@ -102,7 +102,7 @@ def logged_evidence(recording: Recording, vehicle: str | None = None) -> dict[st
         yaw = yaw_scales_of(motion.wheel_radps, np.where(here, motion.true_radps, np.nan))
         side = side_slips_of(forward, motion.lateral_mps, motion.true_radps)
         none = np.empty(0)
-        found[ground] = Evidence(*slip, none, yaw, side, none, none, none)
+        found[ground] = Evidence(*slip, none, yaw, side, none, none, none, none)
     return found
 
 

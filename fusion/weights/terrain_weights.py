@@ -36,6 +36,7 @@ _RECORDED = {
     "wheel_sigma_mps": ("wheels", "m/s"),
     "side_slip_sigma": ("wheels", ""),
     "gyro_inflation": ("imu", ""),
+    "gyro_yaw_inflation": ("imu", ""),
     "accel_inflation": ("imu", ""),
     "gnss_inflation": ("gnss", ""),
 }
@@ -54,16 +55,16 @@ class TerrainWeights:
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
-        self.policy = config.policy
+        self.policy = config.tuning.adaptive.of_all(config.policy)
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._told: Array | None = None
-        fixed = config.tuning.fixed.of(self.policy.fixed)
+        fixed = config.tuning.fixed.of(config.policy.fixed)
         if model.slip_only:
             # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
-            classes = {**self.policy.classes, UNKNOWN: self.policy.fixed}
+            classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
         self.row = self.policy.blend(self._probabilities) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)

@@ -29,6 +29,7 @@ class Surprise:
         noise_m2: (d,) variance that the factor gives to the measurement itself.
         drift_m2: GNSS: variance of the part of its error that is a state.
         unit_m: (d,) what the noise is a multiple of: the receiver's sigma, or the time step (s).
+        white_share: GNSS: share of the reported variance that is at least new at every fix.
     """
 
     t_ns: int
@@ -37,6 +38,7 @@ class Surprise:
     noise_m2: Array
     unit_m: Array
     drift_m2: float = 0.0
+    white_share: float = 1.0
 
 
 class Weighting:

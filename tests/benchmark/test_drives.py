@@ -17,13 +17,13 @@ from terrafusion.fusion.benchmark.drives import (
     soils_of,
 )
 from terrafusion.fusion.benchmark.measure import measure
+from terrafusion.fusion.benchmark.tuning import DRIVES, MIXED
 from terrafusion.fusion.scores import twin_consistency
 from terrafusion.fusion.terrain import train, trials
 from terrafusion.fusion.terrain.drives import SOIL_SCATTER
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.fusion.weights.policy import load_policy
 from terrafusion.fusion.weights.policy_fit import default_grid
-from terrafusion.fusion.weights.tuning import DRIVES
 from terrafusion.twin.soil import load_soil
 
 SHORT = Case("outages", "twin", FIRST_SEED + 2)
@@ -31,7 +31,7 @@ SHORT = Case("outages", "twin", FIRST_SEED + 2)
 
 def test_no_seed_of_training_or_of_scores_while_developing_is_used() -> None:
     most = 1000  # seeds that the commands of policy and detector accept
-    trained = [d.seed for d in DRIVES] + [
+    trained = [d.seed for d in (*DRIVES, *MIXED)] + [
         max(default_grid(most).seeds),
         train.CALIBRATION_SEED,
         train.SCORING_SEED,

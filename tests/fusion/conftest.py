@@ -132,6 +132,7 @@ def _estimate(
             "wheel_sigma_mps": 0.02 + 0.08 * sand,
             "side_slip_sigma": 0.02 + 0.05 * sand,
             "gyro_inflation": 2.0 + 3.0 * sand,
+            "gyro_yaw_inflation": 1.5 + 2.0 * sand,
             "accel_inflation": 5.0 + 10.0 * sand,
             "gnss_inflation": 1.0 + 0.5 * sand,
         },

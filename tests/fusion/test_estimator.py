@@ -16,6 +16,7 @@ from terrafusion.fusion.estimate import Estimate
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.replay import choose_vehicle, replay, split_fixes
 from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -170,6 +171,23 @@ def test_a_hole_in_the_imu_is_bridged(mixed: Recording) -> None:
     result = replay(dataclasses.replace(mixed, imu=imu.select((t < 60.0) | (t > 63.0))))
     assert result.scores.ate_m is not None
     assert result.scores.ate_m < 2.0
+
+
+def test_a_turn_in_a_hole_of_the_imu_is_no_greater_than_the_robot_turns() -> None:
+    """A skid-steered robot turns by about half of what its sides tell; the yaw scale has been seen before."""
+    drive = (DriveSegment(3.0), DriveSegment(8.0, 0.8), DriveSegment(60.0, 0.8, 0.25))
+    recording = simulate(Scenario("round", 50.0, drive=drive, route=(RouteLeg("asphalt"),)), seed=4)
+    imu = recording.imu
+    assert imu is not None
+    t = (imu.t_ns - recording.start_ns) * 1e-9
+    result = replay(
+        dataclasses.replace(recording, imu=imu.select((t < 40.0) | (t > 44.0))), outages=[Outage(38.0, 7.0)]
+    )
+    errors = result.scores.errors
+    assert errors is not None
+    behind = (errors.t_ns - recording.start_ns) * 1e-9 > 44.2
+    wrong = wrap_angle(errors.estimate_yaw_rad - errors.reference_yaw_rad)[behind]
+    assert np.abs(wrong[:5]).max() < 0.05
 
 
 def test_late_wheels_do_not_stop_the_estimator(mixed: Recording) -> None:

@@ -17,7 +17,7 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import Innovation, State
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
-from terrafusion.fusion.inputs.gnss import checked_fix
+from terrafusion.fusion.inputs.gnss import WHITE_SHARE, checked_fix
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.inputs.track import MotionTrack, Pair
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
@@ -262,6 +262,22 @@ def test_a_receiver_that_lies_is_weighted_by_its_scatter(claimed_m: float, true_
 
 def test_an_honest_receiver_is_taken_at_its_word(drive: Recording) -> None:
     assert feed(drive, messages(drive)).estimator.gnss.scale == 1.0
+
+
+def test_noise_that_is_new_at_every_fix_is_told_from_a_drift(drive: Recording) -> None:
+    """As much error in all: taken for a drift it would be believed twice over."""
+    truth, gnss = drive.truth, drive.gnss
+    assert truth is not None
+    assert gnss is not None
+    antenna = truth.points_at(gnss.t_ns, load_vehicle("elevate").rig().sensors.gnss.antenna_m)
+    noise = np.random.default_rng(3).normal(0.0, 0.1, antenna.shape)
+    white = with_fixes(drive, antenna + noise, np.full((len(antenna), 1), 0.1))
+    fed = feed(white, messages(white))
+    assert fed.estimator.gnss.white > 0.5
+    late = nis_after(fed, drive.start_ns, 15.0) * fed.estimator.weights.row.gnss_inflation**2
+    assert 0.6 < late.mean() / 2.0 < 1.5
+    slow = with_fixes(drive, antenna + np.array([0.1, -0.07, 0.0]), np.full((len(antenna), 1), 0.1))
+    assert feed(slow, messages(slow)).estimator.gnss.white == WHITE_SHARE
 
 
 def test_one_spike_of_707_m_moves_the_pose_by_less_than_10_cm(drive: Recording) -> None:

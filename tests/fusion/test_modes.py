@@ -13,6 +13,7 @@ from scipy.optimize import minimize_scalar
 
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.benchmark.tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.fusion.scores.metrics import Outage
@@ -20,7 +21,7 @@ from terrafusion.fusion.weights.innovation import SageHusa, Variational
 from terrafusion.fusion.weights.modes import ModeTuning, RowTuning, load_modes, write_modes
 from terrafusion.fusion.weights.policy import load_policy
 from terrafusion.fusion.weights.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
-from terrafusion.fusion.weights.tuning import DRIVES, MODE_OF, Training, fingerprint, loss, tune
+from terrafusion.fusion.weights.terrain_weights import TerrainWeights
 from terrafusion.fusion.weights.weighting import Surprise
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
@@ -179,10 +180,21 @@ def test_untuned_fixed_mode_is_the_policy_row_itself(sand: Recording) -> None:
     assert all(series[0] == getattr(row, name) for name, series in untuned.weights.items())
 
 
-def test_tuning_leaves_the_adaptive_mode_alone(sand: Recording) -> None:
-    other = ModeTuning(fixed=RowTuning(3.0, 3.0, 3.0))
-    a, b = (replay(sand, settings={"tuning": t}).estimate for t in (ModeTuning(), other))
-    assert a.trajectory.position_m.tobytes() == b.trajectory.position_m.tobytes()
+def test_adaptive_has_factors_of_its_own_on_all_rows(sand: Recording) -> None:
+    own, others = ModeTuning(adaptive=RowTuning(2.0, 1.5, 3.0)), ModeTuning(fixed=RowTuning(3.0, 3.0, 3.0))
+    plain, moved, same = (replay(sand, settings={"tuning": t}).estimate for t in (ModeTuning(), own, others))
+    assert plain.trajectory.position_m.tobytes() == same.trajectory.position_m.tobytes()
+    np.testing.assert_allclose(moved.weights["gnss_inflation"], 3.0 * plain.weights["gnss_inflation"])
+    row, tuned = load_policy().blend([0.2] * 5), own.adaptive.of_all(load_policy()).blend([0.2] * 5)
+    assert tuned.wheel_sigma_mps == pytest.approx(2.0 * row.wheel_sigma_mps)
+    assert row.slip_sigma < tuned.slip_sigma < 1.5 * row.slip_sigma  # the spread of the means has no factor
+
+
+def test_a_robot_unknown_to_the_terrain_model_begins_with_the_row_of_fixed() -> None:
+    config = EstimatorConfig(load_vehicle("husky").rig(), "husky")
+    fixed, adaptive = TerrainWeights(dataclasses.replace(config, mode="fixed")), TerrainWeights(config)
+    assert adaptive.policy.classes["unknown"] == fixed.row
+    assert max(adaptive.posterior(), key=adaptive.posterior().__getitem__) == "unknown"
 
 
 def test_the_tuning_file_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -210,10 +222,10 @@ def test_a_wrong_tuning_file_is_refused(tmp_path: Path, old: str, new: str, said
 
 def test_the_shipped_tuning_was_made_from_these_drives() -> None:
     assert load_modes().inputs_sha256 == fingerprint()
-    assert min(drive.seed for drive in DRIVES) >= 1000
+    assert min(drive.seed for drive in (*DRIVES, *MIXED)) >= 1000
 
 
 def test_tuning_never_makes_the_training_loss_worse() -> None:
-    drives = [Training("figure_eight", "mud", 0.0, 1002).recording()]
+    drives = [Training("figure_eight", "mud", 0.0, 1002).lesson()]
     tuned = tune(drives, ModeTuning(), ["fixed"])
     assert loss(drives, "fixed", tuned) <= loss(drives, "fixed", ModeTuning())

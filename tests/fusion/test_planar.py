@@ -22,6 +22,7 @@ from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.weights.policy import load_policy
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -263,7 +264,7 @@ def test_the_link_goes_round_a_circle_and_comes_back() -> None:
     bias = gtsam.imuBias.ConstantBias()
     segment = ImuSegment(dt, np.array([0.0, 0.0, rate]), np.array([0.0, speed * rate, GRAVITY_MPS2]))
     start = gtsam.NavState(gtsam.Pose3(), np.array([speed, 0.0, 0.0]))
-    end = link.integrate([segment] * n, bias, 1.0, 1.0).predict(start, bias)
+    end = link.integrate([segment] * n, bias, load_policy().fixed).predict(start, bias)
     assert np.linalg.norm(end.pose().translation()) < 0.02
     assert abs(float(wrap_angle(end.pose().rotation().yaw()))) < 1e-9
 

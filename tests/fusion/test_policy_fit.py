@@ -62,6 +62,7 @@ def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: in
         noise(0.1) - 0.5,
         noise(0.05),
         noise(7.0),
+        noise(3.0),
         noise(12.0),
         noise(1.4),
     )
@@ -77,6 +78,7 @@ def test_a_known_process_is_found_again() -> None:
     assert row.yaw_scale_sigma == pytest.approx(0.1, rel=0.05)
     assert row.side_slip_sigma == pytest.approx(0.05, rel=0.03)
     assert row.gyro_inflation == pytest.approx(7.0, rel=0.03)
+    assert row.gyro_yaw_inflation == pytest.approx(3.0, rel=0.03)
     assert row.accel_inflation == pytest.approx(12.0, rel=0.03)
     assert row.gnss_inflation == pytest.approx(1.4, rel=0.03)
 
@@ -132,11 +134,12 @@ def test_any_soil_of_the_library_is_covered_by_the_row_of_unknown() -> None:
             assert np.mean(np.abs(away) < 2.0) > 0.95, (soil, condition.slope_deg)
             assert row_of([evidence]).side_slip_sigma < row.side_slip_sigma
             assert row_of([evidence]).gyro_inflation < row.gyro_inflation
+            assert row_of([evidence]).gyro_yaw_inflation < row.gyro_yaw_inflation
 
 
 def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
     nothing = Evidence(
-        *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(6)))
+        *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(7)))
     )
     with pytest.raises(ValueError, match="never turned"):
         row_of([nothing])

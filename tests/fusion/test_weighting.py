@@ -31,6 +31,7 @@ ROWS = st.builds(
     wheel_sigma_mps=st.floats(1e-3, 2.0),
     side_slip_sigma=st.floats(1e-3, 2.0),
     gyro_inflation=st.floats(1.0, 1e3),
+    gyro_yaw_inflation=st.floats(1.0, 1e3),
     accel_inflation=st.floats(1.0, 1e3),
     gnss_inflation=st.floats(1.0, 100.0),
     yaw_scale_mean=st.floats(-0.5, 0.5),
@@ -135,7 +136,7 @@ def rows_with(**changes: object) -> dict[str, object]:
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ({"schema": "terrafusion.policy/9"}, "terrafusion.policy/1"),
+        ({"schema": "terrafusion.policy/9"}, "terrafusion.policy/2"),
         ({"colour": "red"}, "unknown key 'colour'"),
         ({"classes": {"mud": rows_with()}}, "'unknown'"),
         ({"classes": None}, "'classes'"),
