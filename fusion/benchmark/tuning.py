@@ -58,16 +58,17 @@ MOST_STEPS = 3
 HELPS = 1e-3
 """Decrease of the loss (0.1 % of the errors) below which a number stays as it is."""
 
-ROW_STEPS = {"wheel_factor": 2.0, "slip_factor": 1.6, "gnss_factor": 1.6}
 STEPS: dict[str, dict[str, float]] = {
-    "fixed": ROW_STEPS,
-    "adaptive": ROW_STEPS,
+    "fixed": {"wheel_factor": 2.0, "slip_factor": 1.6, "gnss_factor": 1.6},
+    "adaptive": {"wheel_factor": 1.4, "slip_factor": 1.6, "gnss_factor": 1.6},
     "cauchy": {"wheel_c": 2.0, "gnss_c": 2.0, "gate_sigma": 8.0},
     "gnc": {"wheel_c": 2.0, "gnss_c": 1.5, "gate_sigma": 8.0},
     "sage_husa": {"wheel_memory": 3.0, "gnss_memory": 3.0, "wheel_span": 3.0},
     "variational": {"wheel_memory": 3.0, "gnss_memory": 3.0, "wheel_span": 3.0},
 }
 """Numbers tuned of each method, in this order, and the factor of a step."""
+LIMITS = {("adaptive", "wheel_factor"): (0.01, 1.5), ("adaptive", "slip_factor"): (1.0, 100.0)}
+"""Beyond these positions still get better and slip worse: it is an answer of its own (docs/modes.md)."""
 MODE_OF: dict[str, tuple[str, dict[str, str]]] = {
     "fixed": ("fixed", {}),
     "adaptive": ("adaptive", {}),
@@ -199,7 +200,7 @@ def _line(tuning: ModeTuning, method: str, name: str, factor: float) -> Iterator
     """The tuning with one number moved by one step, by two, and so on, while it may have the value."""
     section = getattr(tuning, method)
     value = getattr(section, name)
-    low, high = bounds(type(section), name)
+    low, high = LIMITS.get((method, name)) or bounds(type(section), name)
     for _ in range(MOST_STEPS):
         value = float(f"{value * factor:.4g}")
         if not low <= value <= high:
@@ -213,7 +214,7 @@ def fingerprint() -> str:
     columns: Any = (tuple(dict.fromkeys(column)) for column in _columns())
     grid = Grid(*columns)
     settings = [drives, STEPS, dataclasses.astuple(ModeTuning()), load_policy().inputs_sha256]
-    faults = [FAULTS_FROM_S, OUTLIER_SHARE, OUTLIER_M, OPTIMISM, OUTAGE, MOST_STEPS, HELPS]
+    faults = [FAULTS_FROM_S, OUTLIER_SHARE, OUTLIER_M, OPTIMISM, OUTAGE, MOST_STEPS, HELPS, LIMITS]
     mixed = [MIXED, FAMILIES["mixed"], LEAD_S, TAIL_S, LEG_M, MUD_LEG_M]
     told = grid.fingerprint() + repr(settings) + repr(faults) + repr(mixed)
     return hashlib.sha256(told.encode()).hexdigest()
