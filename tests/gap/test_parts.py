@@ -12,13 +12,14 @@ from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.effects.reece import second_terramechanics
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.channel_noise import first_noise
 from terrafusion.twin.gap.classes import likeness
 from terrafusion.twin.gap.detect import choices
 from terrafusion.twin.gap.discrepancy import FUNCTIONS, modulated
 from terrafusion.twin.gap.evidence import prepared, starting_model
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
-from terrafusion.twin.gap.residuals import first_noise, raw_of, state_sigmas, whitened
+from terrafusion.twin.gap.residuals import raw_of, state_sigmas, whitened
 from terrafusion.twin.gap.score import Score, score
 from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
 from terrafusion.twin.gap.trials import calibration_error, interval
