@@ -61,6 +61,7 @@ class Bench:
         runs, references: evidence of each.
         drives: signatures, shared by runs that were told the same.
         notes: what was assumed, in sentences.
+        jobs: threads.
     """
 
     model: Model
@@ -72,6 +73,7 @@ class Bench:
     raws: list[Raw]
     drives: Drives
     notes: tuple[str, ...]
+    jobs: int = 1
 
 
 def starting_model(
@@ -267,5 +269,5 @@ def gather(
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return Bench(
         model, candidates, channels, noise, judged, normal,
-        raws[: len(runs)], drives, tuple(dict.fromkeys(notes)),
+        raws[: len(runs)], drives, tuple(dict.fromkeys(notes)), jobs,
     )  # fmt: skip
