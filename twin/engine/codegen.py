@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from importlib import resources
+from collections.abc import Collection, Mapping
+from importlib import metadata, resources
 from typing import Any, NamedTuple
 
 from terrafusion.twin.dynamics import rhs
+from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import (
     CALLS,
@@ -29,6 +30,7 @@ from terrafusion.twin.layout import (
     WHEELS,
 )
 from terrafusion.twin.measurement import measurement
+from terrafusion.twin.version import model_sha256
 
 __all__ = ["LANES", "SINGLE", "TANGENT", "UnsupportedOperationError", "Variant", "source", "wheel_of"]
 
@@ -66,6 +68,15 @@ class Variant(NamedTuple):
     effects: tuple[str, ...]
     fixed_ground: bool
     active: frozenset[tuple[str, int]] = frozenset()
+
+
+def follows_from(kind: object, effects: Collection[str]) -> str | None:
+    """What the source of a graph with these effects follows from; None with effects of the user's own, whose
+    names do not tell their laws."""
+    known = {form.parameter_key(p) for form in built_in().values() for p in form.parameters}
+    if not known.issuperset(effects):
+        return None
+    return repr((model_sha256(), metadata.version("casadi"), kind, sorted(effects)))
 
 
 def source(variant: Variant) -> str:

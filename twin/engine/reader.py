@@ -55,7 +55,8 @@ def reader(effects: tuple[str, ...], fixed_ground: bool) -> Reader | None:
         return None
     try:
         with BUILDING:
-            path = compiler.compiled(codegen.reader_source(effects, fixed_ground), command)
+            what = codegen.follows_from(("reader", fixed_ground), effects)
+            path = compiler.remembered(what, lambda: codegen.reader_source(effects, fixed_ground), command)
         return Reader(ctypes.CDLL(str(path)))
     except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
         LOG.warning(

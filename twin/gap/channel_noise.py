@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.residuals import (
     Raw,
-    blocks,
     projected,
     stacked,
     state_sigmas,
     whitened_columns,
     without_probes,
 )
+from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.identify.noise import Noise, autoregressive, clipped, gauss_markov
 
 Array = NDArray[np.float64]
@@ -68,7 +68,7 @@ def _lags(runs: Sequence[Raw]) -> dict[str, int]:
     """Number of lags of the longest window, by channel."""
     out: dict[str, int] = {}
     for run in runs:
-        for i, _, rows in blocks(run.log):
+        for i, _, rows in layout(run.log).blocks:
             observed = run.log.observed[i]
             out[observed.channel] = max(out.get(observed.channel, 1), int(np.ptp(observed.slot[rows])) + 1)
     return out
@@ -117,7 +117,7 @@ def _left_over(run: Raw, noise: Mapping[str, Noise], sigma: Array) -> dict[str, 
     fit = np.linalg.solve(evidence.gram[:K, :K] + np.diag(prior), evidence.gram[:K, -1])
     pose = _best_poses(evidence.window, white[:, -3:], white[:, K] - white[:, :K] @ fit)
     out: dict[str, Series] = {}
-    for i, k, rows in blocks(run.log):
+    for i, k, rows in layout(run.log).blocks:
         observed = run.log.observed[i]
         left = run.error[i][rows] - run.state[i][rows] @ fit[: len(sigma)]
         left -= run.change[i][rows] @ fit[len(sigma) :] + run.pose[i][rows] @ pose[k]

@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
-from terrafusion.twin.identify.log import Log, window_of
+from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 SOIL_STATE = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
 """Columns that vary from run to run as the ground does, and their first 1 sigma in scales (assumed)."""
@@ -211,19 +211,10 @@ def state_sigmas(candidates: Candidates) -> Array:
     return np.array([*soil, *np.ones(len(OFFSETS))])
 
 
-def blocks(log: Log) -> list[tuple[int, int, Rows]]:
-    """Channel, window and rows of each stretch of a channel within one window, in the order of all rows."""
-    out = []
-    for i, observed in enumerate(log.observed):
-        of = window_of(observed, log.windows)
-        out += [(i, int(k), np.flatnonzero(of == k)) for k in np.unique(of)]
-    return out
-
-
 def whitened_columns(log: Log, noise: Mapping[str, Noise], columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, one array a channel, in units and axes in which its noise is white."""
     parts = []
-    for i, _, rows in blocks(log):
+    for i, _, rows in layout(log).blocks:
         observed = log.observed[i]
         parts.append(
             noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], columns[i][rows])
@@ -244,7 +235,7 @@ def stacked(run: Raw) -> list[Array]:
 
 def projected(run: Raw, white: Array) -> Evidence:
     """The evidence of whitened columns (n, T + P + 4), as `stacked` has them: the poses are projected out."""
-    parts = blocks(run.log)
+    parts = layout(run.log).blocks
     channel = np.concatenate([np.full(len(rows), i) for i, _, rows in parts])
     window = np.concatenate([np.full(len(rows), k) for _, k, rows in parts])
     middle = [0.5 * (o.begin_s + o.end_s) for o in run.log.observed]

@@ -19,6 +19,7 @@ from terrafusion.twin.engine.lanes import Fleet, blank_what_diverged
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.rows import samples_of
 from terrafusion.twin.identify.inputs import DT_S
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
@@ -74,11 +75,6 @@ def inputs_of(log: Log, model: Model, sets: Sequence[Effects]) -> list[Array]:
             known[late] = np.ascontiguousarray(told(log.sides, DT_S, late))
         out.append(known[late])
     return out
-
-
-def samples_of(log: Log, every: int) -> Rows:
-    """Grid samples of all windows, one after the other; a border belongs to both."""
-    return np.concatenate([np.arange(first, last + 1, every) for first, last in log.windows])
 
 
 def driven(log: Log, plants: Sequence[Plant], inputs: Sequence[Array], start: Array, every: int = 1) -> Array:

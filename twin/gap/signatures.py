@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
     AS_IT_IS,
     GROUND,
@@ -22,20 +23,14 @@ from terrafusion.twin.gap.side_by_side import (
     groups,
     inputs_of,
     plants_of,
-    samples_of,
 )
-from terrafusion.twin.identify.inputs import DT_S
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
-from terrafusion.twin.identify.observations import Observed
-from terrafusion.twin.identify.predict import averaging
 from terrafusion.twin.layout import INDEX, OUTPUTS
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-EVERY = 5
-"""Derivatives are kept at every so many-th sample of the run: they enter as weights only."""
 STEP = 0.3
 """Step, in scales, of the differences: finite, because a tangent at a wheel that is just about to slide or to
 turn its direction says nothing about an effect of the size that is looked for."""
@@ -86,8 +81,6 @@ def predictions(
     plants = plants_of(log, model, candidates, sets, candidates.moving if beside else ())
     inputs = inputs_of(log, model, sets)
     sensors, out = Sensors(log, model, candidates, samples_of(log, 1)), list[list[Array] | None]()
-    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-    weights = [averaging(o, log, shift) for o in log.observed]
     for states, plant, some, heard in zip(
         driven(log, plants, inputs, start), plants, sets, inputs, strict=True
     ):
@@ -95,10 +88,8 @@ def predictions(
             out.append(None)
             continue
         y = sensors.read(states, plant, heard, some)
-        out.append([
-            np.einsum("nk,nk->n", weight, y[:, _OUTPUTS[o.channel]].mean(axis=1)[at])
-            for o, (at, weight) in zip(log.observed, weights, strict=True)
-        ])  # fmt: skip
+        by_channel = zip(log.observed, layout(log).fine, strict=True)
+        out.append([means(at, _channel(y, o.channel)) for o, at in by_channel])
     return out
 
 
@@ -149,20 +140,13 @@ def _readings(
                 )
             every = Sensors(log, model, candidates, samples_of(log, 1))
             fine = every.read(states[0], plants[0], inputs[0], some[0])
-            states = states[:, _every(log)]
+            states = states[:, among_all(log)]
             coarse, twin = states[0], (plants[0], inputs[0])
         for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
             read[k] = sensors.read(x, plant, u, sets[k])
     for k in sets.keys() - read.keys():  # effects of the sensors alone
         read[k] = sensors.read(coarse, *twin, sets[k])
     return fine, coarse, read
-
-
-def _every(log: Log) -> Rows:
-    """Which of all samples of the windows are the `EVERY`-th ones."""
-    counts = np.diff(log.windows, axis=1).ravel() + 1
-    begins = np.cumsum(counts) - counts
-    return np.concatenate([b + np.arange(0, n, EVERY) for b, n in zip(begins, counts, strict=True)])
 
 
 def placed(found: Drive, log: Log, start: Array) -> Drive:
@@ -176,7 +160,7 @@ def placed(found: Drive, log: Log, start: Array) -> Drive:
     }
     heading = found.heading.copy()
     for name, (values, every) in parts.items():
-        counts = [len(np.arange(first, last + 1, every)) for first, last in log.windows]
+        counts = np.diff(log.windows, axis=1).ravel() // every + 1
         for k, first in enumerate(np.cumsum([0, *counts[:-1]])):
             rows = slice(int(first), int(first) + counts[k])
             turn = start[k, 2] - found.start[k, 2]
@@ -194,7 +178,7 @@ def placed(found: Drive, log: Log, start: Array) -> Drive:
                 heading[rows] += turn
     y = parts["y"][0]
     by_pose = found.by_pose.copy()
-    at = np.repeat(start[:, :2], [len(np.arange(a, b + 1, EVERY)) for a, b in log.windows], axis=0)
+    at = np.repeat(start[:, :2], coarse_counts(log), axis=0)
     (east, north), (v_e, v_n) = _POSITION_AT, _VELOCITY_AT
     by_pose[:, east, 2], by_pose[:, north, 2] = at[:, 1] - y[:, north], y[:, east] - at[:, 0]
     by_pose[:, v_e, 2], by_pose[:, v_n, 2] = -y[:, v_n], y[:, v_e]
@@ -209,17 +193,20 @@ _VELOCITY = slice(_VELOCITY_AT[0], _VELOCITY_AT[1] + 1)
 
 def signatures(log: Log, drive: Drive) -> list[Signature]:
     """Every channel of the log as the twin has it: means over the rows' own intervals."""
-    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-    out = []
-    for observed in log.observed:
-        columns = _OUTPUTS[observed.channel]
-        fine_at, fine_weight = averaging(observed, log, shift)
-        value = np.einsum("nk,nk->n", fine_weight, drive.fine[:, columns].mean(axis=1)[fine_at])
-        at, weight = _coarse(observed, log)
-        change, by_pose = [np.einsum("nk,nkm->nm", weight, part[:, columns].mean(axis=1)[at])
-                for part in (drive.change, drive.by_pose)]  # fmt: skip
-        out.append(Signature(value, change, by_pose, drive.heading[at[:, 2]]))
+    rows, out = layout(log), []
+    for observed, fine, coarse in zip(log.observed, rows.fine, rows.coarse, strict=True):
+        value = means(fine, _channel(drive.fine, observed.channel))
+        change, by_pose = (
+            means(coarse, _channel(part, observed.channel)) for part in (drive.change, drive.by_pose)
+        )
+        out.append(Signature(value, change, by_pose, drive.heading[coarse[0][:, 2]]))
     return out
+
+
+def _channel(outputs: Array, channel: str) -> Array:
+    """A channel (N, ...) of the outputs (N, Y, ...)."""
+    columns = _OUTPUTS[channel]
+    return outputs[:, columns[0]] if len(columns) == 1 else np.asarray(outputs[:, columns].mean(axis=1))
 
 
 def _step(candidates: Candidates, i: int, at: float) -> float:
@@ -235,30 +222,10 @@ def _by_pose(log: Log, states: Array, y: Array) -> Array:
     east, north, v_e, v_n = (
         OUTPUTS.index(n) for n in ("gnss_east_m", "gnss_north_m", "gnss_v_e_mps", "gnss_v_n_mps")
     )
-    counts = [len(np.arange(first, last + 1, EVERY)) for first, last in log.windows]
-    begin = np.repeat(np.cumsum([0, *counts[:-1]]), counts)
+    counts = coarse_counts(log)
+    begin = np.repeat(np.cumsum(counts) - counts, counts)
     out[:, east, 0] = out[:, north, 1] = 1.0
     out[:, east, 2] = states[begin, INDEX["y"]] - y[:, north]
     out[:, north, 2] = y[:, east] - states[begin, INDEX["x"]]
     out[:, v_e, 2], out[:, v_n, 2] = -y[:, v_n], y[:, v_e]
     return out
-
-
-def _coarse(observed: Observed, log: Log) -> tuple[Rows, Array]:
-    """Coarse samples (n, 6) that a row depends on and their weights: a mean of three linear
-    interpolations."""
-    step = EVERY * DT_S
-    counts = np.array([len(np.arange(first, last + 1, EVERY)) for first, last in log.windows])
-    offset = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    middle = 0.5 * (observed.begin_s + observed.end_s)
-    k = np.clip(
-        np.searchsorted(log.windows[:, 0] * DT_S, middle + 1e-9, side="right") - 1, 0, len(log.windows) - 1
-    )
-    ats, weights = [], []
-    for share, weight in ((0.0, 1.0 / 6.0), (0.5, 2.0 / 3.0), (1.0, 1.0 / 6.0)):  # Simpson's rule
-        t_s = observed.begin_s + share * (observed.end_s - observed.begin_s)
-        place = np.clip((t_s - log.windows[k, 0] * DT_S) / step, 0.0, counts[k] - 1.0)
-        low = np.minimum(place.astype(np.int64), np.maximum(counts[k] - 2, 0))
-        ats += [offset[k] + low, offset[k] + np.minimum(low + 1, counts[k] - 1)]
-        weights += [weight * (1.0 - (place - low)), weight * (place - low)]
-    return np.stack(ats, axis=1), np.stack(weights, axis=1)
