@@ -65,6 +65,19 @@ def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
             assert error < 0.12 * np.linalg.norm(true) + 0.02 * np.median(observed.sigma) * len(true) ** 0.5
 
 
+def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> None:
+    log, model = log_and_model
+    keys = ("mass/at_cg", "slope/uniform", "wheel_radius/scale", "gyro_scale/scale")  # of several graphs
+    all_, some = drive(log, model, CANDIDATES, log.start), drive(log, model, CANDIDATES, log.start, keys)
+    assert np.array_equal(all_.fine, some.fine)
+    for i, key in enumerate(CANDIDATES.keys):
+        if key in keys:
+            np.testing.assert_allclose(some.change[:, :, i], all_.change[:, :, i], rtol=0.0, atol=1e-9)
+            assert np.abs(some.change[:, :, i]).max() > 1e-3
+        else:
+            assert not some.change[:, :, i].any()
+
+
 def test_choices_are_all_others_where_there_are_few() -> None:
     assert len(choices(5, 2, 0)) == 9
     assert (0, 1) not in choices(5, 2, 0)
