@@ -41,7 +41,7 @@ TOGETHER = 8
 AS_IT_IS = ""
 """Stands for the twin without a further effect."""
 FAST = {"supply", "command", "motor"}
-"""Stages of the model where effects act that are as fast as a step."""
+"""An effect with a form that acts at one of these stages is as fast as a step."""
 COARSE_S, COARSE_LAGS = 0.005, 2.5
 """Longest coarse step, in seconds and in motor lags (RK4 is stable to 2.78 of them)."""
 TINY = 1e-12
@@ -51,7 +51,9 @@ TINY = 1e-12
 def groups(candidates: Candidates) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]]:
     """The twin as it is and the effects that move the robot, as they share graphs: those driven by full steps
     and those by coarse ones."""
-    fast = [k for k in candidates.moving if FAST & {*lookup(k)[0].terms}]
+    forms = [lookup(k)[0] for k in candidates.moving]
+    effects = {form.effect for form in forms if FAST & {*form.terms}}
+    fast = [k for k, form in zip(candidates.moving, forms, strict=True) if form.effect in effects]
     slow = [k for k in candidates.moving if k not in fast]
     room = -(1 + len(fast)) % TOGETHER
     full, coarse = (AS_IT_IS, *fast, *slow[:room]), (AS_IT_IS, *slow[room:])
