@@ -8,14 +8,12 @@ which they are follows from the candidates alone: graphs are compiled once.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.drive import told
-from terrafusion.twin.effects.catalogue import lookup
 from terrafusion.twin.effects.sensed import DEAD_TIME, as_driven
 from terrafusion.twin.engine.lanes import Fleet, blank_what_diverged
 from terrafusion.twin.engine.plant import Plant
@@ -39,28 +37,14 @@ GROUND = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rol
 TOGETHER = 8
 """Other effects in one graph: as many as vectors hold runs."""
 AS_IT_IS = ""
-"""Stands for the twin without a further effect."""
-FAST = {"supply", "command", "motor"}
-"""An effect with a form that acts at one of these stages is as fast as a step."""
-COARSE_S, COARSE_LAGS = 0.005, 2.5
-"""Longest coarse step, in seconds and in motor lags (RK4 is stable to 2.78 of them)."""
+"""Stands for the twin without a further effect, in the first group."""
 TINY = 1e-12
 """Share of its scale that an absent effect has in a run: all runs of a group share one compiled graph."""
 
 
-def groups(candidates: Candidates) -> tuple[list[tuple[str, ...]], list[tuple[str, ...]]]:
-    """The twin as it is and the effects that move the robot, as they share graphs: those driven by full steps
-    and those by coarse ones."""
-    forms = [lookup(k)[0] for k in candidates.moving]
-    effects = {form.effect for form in forms if FAST & {*form.terms}}
-    fast = [k for k, form in zip(candidates.moving, forms, strict=True) if form.effect in effects]
-    slow = [k for k in candidates.moving if k not in fast]
-    room = -(1 + len(fast)) % TOGETHER
-    full, coarse = (AS_IT_IS, *fast, *slow[:room]), (AS_IT_IS, *slow[room:])
-    return _parts(full), _parts(coarse) if slow[room:] else []
-
-
-def _parts(keys: tuple[str, ...]) -> list[tuple[str, ...]]:
+def groups(candidates: Candidates) -> list[tuple[str, ...]]:
+    """The twin as it is and the effects that move the robot, as they share graphs."""
+    keys = (AS_IT_IS, *candidates.moving)
     return [keys[first : first + TOGETHER] for first in range(0, len(keys), TOGETHER)]
 
 
@@ -93,18 +77,9 @@ def inputs_of(log: Log, model: Model, sets: Sequence[Effects]) -> list[Array]:
     return out
 
 
-def driven(
-    log: Log,
-    plants: Sequence[Plant],
-    inputs: Sequence[Array],
-    start: Array,
-    every: int = 1,
-    substeps: int | None = None,
-) -> Array:
-    """States (B, N, X) at every so many-th sample of all windows, a run a plant; steps a sample as the engine
-    takes them by default."""
-    fleet = Fleet.of(plants, DT_S, substeps=substeps)
-    windows = [(int(a), int(b)) for a, b in log.windows]
+def driven(log: Log, plants: Sequence[Plant], inputs: Sequence[Array], start: Array, every: int = 1) -> Array:
+    """States (B, N, X) at every so many-th sample of all windows, a run a plant."""
+    fleet, windows = Fleet.of(plants, DT_S), [(int(a), int(b)) for a, b in log.windows]
     out = np.empty((len(plants), len(samples_of(log, every)), len(STATES)))
     x = _led_in(log, fleet, inputs)
     pose, done = [INDEX[name] for name in POSE], 0
@@ -117,11 +92,6 @@ def driven(
         x, done = part[:, -1], done + count
     blank_what_diverged(out)
     return out
-
-
-def coarse_steps(model: Model) -> int:
-    """Coarse steps a sample."""
-    return max(1, math.ceil(DT_S / min(COARSE_S, COARSE_LAGS * model.vehicle.drive.lag_s) - 1e-9))
 
 
 def _led_in(log: Log, fleet: Fleet, inputs: Sequence[Array]) -> Array:

@@ -13,14 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
     AS_IT_IS,
     GROUND,
     Sensors,
-    coarse_steps,
     driven,
     groups,
     inputs_of,
@@ -111,87 +109,44 @@ def drive(
     for k, step in steps.items():
         if only is None or k in only:
             sets[k] = {**model.effects, k: model.effects.get(k, 0.0) + step}
-    run = _Run(log, model, candidates, start, sets)
-    full, coarse = groups(candidates)
-    states, read = run.by(full, 1, None)
-    y, kept = read[AS_IT_IS], among_all(log)
-    if not np.isfinite(states).all():
-        raise TerrafusionError(
-            "the twin diverges on this log",
-            file=log.name,
-            remedy="check the vehicle's and the soil's numbers",
-        )
-    moved = {k: value - y for k, value in read.items()} | run.coarsely(coarse, y) | run.seen(states[kept], y)
+    fine, coarse, read = _readings(log, model, candidates, start, sets)
+    y = read[AS_IT_IS]
     change = np.zeros((*y.shape, len(candidates.keys)))
     for i, k in enumerate(candidates.keys):
-        if k in moved:
-            change[:, :, i] = moved[k] * (candidates.scale[i] / steps[k])
+        if k in read:
+            change[:, :, i] = (read[k] - y) * (candidates.scale[i] / steps[k])
     failed = ~np.isfinite(change).all(axis=(0, 1))
     change[:, :, failed] = 0.0  # a step that makes the twin diverge says nothing
-    heading = states[kept, INDEX["yaw"]]
-    return Drive(start, run.fine(states), y, change, _by_pose(log, states[kept], y), heading)
+    return Drive(start, fine, y, change, _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]])
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Run:
-    """A log driven with sets of effects, by the key that each is of; `AS_IT_IS` is the twin's own set."""
-
-    log: Log
-    model: Model
-    candidates: Candidates
-    start: Array
-    sets: Mapping[str, Mapping[str, float]]
-
-    def by(
-        self, some: Sequence[Sequence[str]], every: int, substeps: int | None
-    ) -> tuple[Array, dict[str, Array]]:
-        """States (N, X) of the first run of some groups; outputs (n, Y) of all at every `EVERY`-th sample."""
-        log, model, candidates = self.log, self.model, self.candidates
-        sensors, first, read = Sensors(log, model, candidates, samples_of(log, EVERY)), np.zeros(0), {}
-        for group in some:
-            keys = [k for k in group if k in self.sets]
-            if not keys:
-                continue
-            sets = [self.sets[k] for k in keys]
-            plants, inputs = plants_of(log, model, candidates, sets, group), inputs_of(log, model, sets)
-            states = driven(log, plants, inputs, self.start, every, substeps)
-            first = first if first.size else states[0]
-            states = states if every > 1 else states[:, among_all(log)]
-            for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
-                read[k] = sensors.read(x, plant, u, self.sets[k])
-        return first, read
-
-    def coarsely(self, some: Sequence[Sequence[str]], y: Array) -> dict[str, Array]:
-        """Changes of the outputs by the effects of some groups, driven by coarse steps.
-
-        Where a run does not stand these, all are driven by full ones, and compared with the outputs `y`.
-        """
-        if not self.sets.keys() & {k for group in some for k in group if k != AS_IT_IS}:
-            return {}
-        _, read = self.by(some, EVERY, coarse_steps(self.model))
-        if not all(np.isfinite(value).all() for value in read.values()):
-            _, read = self.by(some, EVERY, None)
-            read[AS_IT_IS] = y
-        return {k: value - read[AS_IT_IS] for k, value in read.items() if k != AS_IT_IS}
-
-    def seen(self, states: Array, y: Array) -> dict[str, Array]:
-        """Changes of the outputs by effects of the sensors alone; states (n, X) of the twin as it is."""
-        sensors = Sensors(self.log, self.model, self.candidates, samples_of(self.log, EVERY))
-        plant, heard = self._as_it_is()
-        keys = self.sets.keys() - {AS_IT_IS, *self.candidates.moving}
-        return {k: sensors.read(states, plant, heard, self.sets[k]) - y for k in keys}
-
-    def fine(self, states: Array) -> Array:
-        """Outputs (N, Y) of the twin as it is."""
-        sensors = Sensors(self.log, self.model, self.candidates, samples_of(self.log, 1))
-        return sensors.read(states, *self._as_it_is(), self.sets[AS_IT_IS])
-
-    def _as_it_is(self) -> tuple[Plant, Array]:
-        """Plant and inputs of the twin as it is."""
-        own = [self.sets[AS_IT_IS]]
-        return plants_of(self.log, self.model, self.candidates, own, ())[0], inputs_of(
-            self.log, self.model, own
-        )[0]
+def _readings(
+    log: Log, model: Model, candidates: Candidates, start: Array, sets: Mapping[str, Mapping[str, float]]
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Outputs of the twin as it is at every grid sample, its states (n, X) at every `EVERY`-th, and there the
+    outputs (n, Y) with each set of effects."""
+    sensors, read = Sensors(log, model, candidates, samples_of(log, EVERY)), dict[str, Array]()
+    for group in groups(candidates):
+        keys = [k for k in group if k in sets]
+        some, whole = [sets[k] for k in keys], AS_IT_IS in keys
+        plants, inputs = plants_of(log, model, candidates, some, group), inputs_of(log, model, some)
+        states = driven(log, plants, inputs, start, 1 if whole else EVERY) if keys else np.zeros(0)
+        if whole:
+            if not np.isfinite(states[0]).all():
+                raise TerrafusionError(
+                    "the twin diverges on this log",
+                    file=log.name,
+                    remedy="check the vehicle's and the soil's numbers",
+                )
+            every = Sensors(log, model, candidates, samples_of(log, 1))
+            fine = every.read(states[0], plants[0], inputs[0], some[0])
+            states = states[:, among_all(log)]
+            coarse, twin = states[0], (plants[0], inputs[0])
+        for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
+            read[k] = sensors.read(x, plant, u, sets[k])
+    for k in sets.keys() - read.keys():  # effects of the sensors alone
+        read[k] = sensors.read(coarse, *twin, sets[k])
+    return fine, coarse, read
 
 
 def placed(found: Drive, log: Log, start: Array) -> Drive:
