@@ -12,13 +12,14 @@ from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.effects.reece import second_terramechanics
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.channel_noise import first_noise
 from terrafusion.twin.gap.classes import likeness
 from terrafusion.twin.gap.detect import choices
 from terrafusion.twin.gap.discrepancy import FUNCTIONS, modulated
 from terrafusion.twin.gap.evidence import prepared, starting_model
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
-from terrafusion.twin.gap.residuals import first_noise, raw_of, state_sigmas, whitened
+from terrafusion.twin.gap.residuals import raw_of, state_sigmas, whitened
 from terrafusion.twin.gap.score import Score, score
 from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
 from terrafusion.twin.gap.trials import calibration_error, interval
@@ -62,6 +63,19 @@ def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
             true = (values[i] - plain[i]) / 0.1
             error = np.linalg.norm(true - found[i].change[:, column])
             assert error < 0.12 * np.linalg.norm(true) + 0.02 * np.median(observed.sigma) * len(true) ** 0.5
+
+
+def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> None:
+    log, model = log_and_model
+    keys = ("mass/at_cg", "slope/uniform", "wheel_radius/scale", "gyro_scale/scale")  # of several graphs
+    all_, some = drive(log, model, CANDIDATES, log.start), drive(log, model, CANDIDATES, log.start, keys)
+    assert np.array_equal(all_.fine, some.fine)
+    for i, key in enumerate(CANDIDATES.keys):
+        if key in keys:
+            np.testing.assert_allclose(some.change[:, :, i], all_.change[:, :, i], rtol=0.0, atol=1e-9)
+            assert np.abs(some.change[:, :, i]).max() > 1e-3
+        else:
+            assert not some.change[:, :, i].any()
 
 
 def test_choices_are_all_others_where_there_are_few() -> None:

@@ -10,7 +10,7 @@ import pytest
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin import simulate
 from terrafusion.twin.dynamics import rhs
-from terrafusion.twin.engine import compiler, integrate, native
+from terrafusion.twin.engine import codegen, compiler, integrate, native
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.layout import INDEX, INPUTS, soil_vector, vehicle_vector
 from terrafusion.twin.scenario import load_scenario
@@ -92,12 +92,21 @@ def test_without_a_compiler_the_virtual_machine_runs_and_is_named(monkeypatch, c
 @needs_compiler
 def test_the_library_is_compiled_once_and_found_again(monkeypatch, tmp_path) -> None:
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
+    written = []
+    source = codegen.source
+    monkeypatch.setattr(codegen, "source", lambda variant: written.append(variant) or source(variant))
     for _ in range(2):
         native.forget()
         assert native.driver(Variant(SINGLE, (), True)) is not None
     native.forget()
-    files = list((tmp_path / "cache").iterdir())
-    assert len(files) == 1
+    assert len(written) == len(list((tmp_path / "cache").glob("*.so"))) == 1
+
+
+def test_a_library_is_not_remembered_by_names_that_do_not_tell_its_laws() -> None:
+    assert codegen.follows_from("single", ["trailer/drag"]) is None
+    known = {codegen.follows_from(kind, effects) for kind in "ab" for effects in ([], ["mass/at_cg"])}
+    assert len(known) == 4
+    assert None not in known
 
 
 @needs_compiler

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from importlib import resources
+from collections.abc import Collection, Mapping
+from importlib import metadata, resources
 from typing import Any, NamedTuple
 
 from terrafusion.twin.dynamics import rhs
+from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import (
     CALLS,
@@ -17,7 +19,18 @@ from terrafusion.twin.engine.graph import (
     with_reciprocals,
 )
 from terrafusion.twin.engine.linear import eliminated
-from terrafusion.twin.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
+from terrafusion.twin.layout import (
+    INDEX,
+    INPUTS,
+    MOUNTING,
+    OUTPUTS,
+    SOIL_PARAMETERS,
+    STATES,
+    VEHICLE_PARAMETERS,
+    WHEELS,
+)
+from terrafusion.twin.measurement import measurement
+from terrafusion.twin.version import model_sha256
 
 __all__ = ["LANES", "SINGLE", "TANGENT", "UnsupportedOperationError", "Variant", "source", "wheel_of"]
 
@@ -35,6 +48,12 @@ _ARGUMENTS = {
     "const tf_wide *vehicle_wide, const tf_wide *effects_wide, const tf_wide *soil_wide, "
     "const tf_wide *held_wide, tf_wide *dx_wide",
 }
+_READER_ARGUMENTS = {
+    "once": "const tf_real *vehicle, const tf_real *effects, const tf_real *soil, const tf_real *mounting, "
+    "tf_real *held",
+    "each": "const tf_real *x, const tf_real *u, const tf_real *vehicle, const tf_real *effects, "
+    "const tf_real *soil, const tf_real *mounting, const tf_real *held, tf_real *local, tf_real *y",
+}
 _WIDE = ("x_wide", "vehicle_wide", "soil_wide", "effects_wide")
 
 
@@ -49,6 +68,15 @@ class Variant(NamedTuple):
     effects: tuple[str, ...]
     fixed_ground: bool
     active: frozenset[tuple[str, int]] = frozenset()
+
+
+def follows_from(kind: object, effects: Collection[str]) -> str | None:
+    """What the source of a graph with these effects follows from; None with effects of the user's own, whose
+    names do not tell their laws."""
+    known = {form.parameter_key(p) for form in built_in().values() for p in form.parameters}
+    if not known.issuperset(effects):
+        return None
+    return repr((model_sha256(), metadata.version("casadi"), kind, sorted(effects)))
 
 
 def source(variant: Variant) -> str:
@@ -67,6 +95,17 @@ def source(variant: Variant) -> str:
     if kind == TANGENT:
         loops.insert(0, _read_states(graph, outputs))
     return "\n".join([_sizes(effects), _prelude(kind), emitter.source(), *loops])
+
+
+def reader_source(effects: tuple[str, ...], fixed_ground: bool) -> str:
+    """C source of the sensors' readings, several samples side by side (see reader.c)."""
+    late = {"x", "u"} if fixed_ground else {"x", "u", "soil"}
+    graph, outputs = with_reciprocals(*read(measurement(effects), _element), late, "y")
+    emitter = Emitter(graph, outputs, late, (), wheel_of, in_vectors=False)
+    sizes = (
+        f"{_sizes(effects, _READER_ARGUMENTS)}#define TF_NM {len(MOUNTING)}\n#define TF_NY {len(OUTPUTS)}\n"
+    )
+    return "\n".join([sizes, _prelude(LANES), emitter.source(), _text("reader.c")])
 
 
 def _with_tangent(f: Any) -> Any:
@@ -116,14 +155,14 @@ def _element(argument: str, i: int) -> int:
     return parameter * len(WHEELS) + wheel
 
 
-def _sizes(effects: tuple[str, ...]) -> str:
+def _sizes(effects: tuple[str, ...], arguments: Mapping[str, str] = _ARGUMENTS) -> str:
     sizes = {"NX": len(STATES), "NU": len(INPUTS), "NV": len(VEHICLE_PARAMETERS), "NP": len(SOIL_PARAMETERS)}
     sizes |= {"NE": len(effects), "WHEELS": len(WHEELS)}
     sizes |= {name.upper(): INDEX[name] for name in ("x", "y", "yaw", "travel")}
     sizes |= {name.upper(): VEHICLE_PARAMETERS.index(f"{name}_m") for name in ("wheelbase", "track")}
     # No output overlaps what it is made of.
-    arguments = {f"{s.upper()}_ARGUMENTS": text.replace("*", "*restrict ") for s, text in _ARGUMENTS.items()}
-    return "".join(f"#define TF_{name} {value}\n" for name, value in {**sizes, **arguments}.items())
+    heads = {f"{s.upper()}_ARGUMENTS": text.replace("*", "*restrict ") for s, text in arguments.items()}
+    return "".join(f"#define TF_{name} {value}\n" for name, value in {**sizes, **heads}.items())
 
 
 def _prelude(kind: str) -> str:

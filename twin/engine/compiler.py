@@ -7,6 +7,7 @@ The cache lies in `$TERRAFUSION_CACHE`, else `$XDG_CACHE_HOME/terrafusion`, else
 from __future__ import annotations
 
 import atexit
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -17,7 +18,11 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
+
+from terrafusion.datasets.atomic import write_atomically
+from terrafusion.datasets.errors import TerrafusionError
 
 LOG = logging.getLogger("terrafusion.twin")
 
@@ -50,15 +55,35 @@ def find_compiler() -> tuple[str, ...] | None:
     return None
 
 
+def remembered(what: str | None, source: Callable[[], str], compiler: tuple[str, ...]) -> Path:
+    """Path of the shared library of a source that follows from `what` (None: from more than can be told).
+
+    Where the library is cached, the source is not even written, which saves building its graph.
+
+    Raises:
+        OSError, subprocess.SubprocessError: as `compiled`.
+    """
+    if what is None:
+        return compiled(source(), compiler)
+    note = cache_folder() / f"{_name(what, compiler)}.is"
+    with contextlib.suppress(OSError, ValueError):
+        target = cache_folder() / note.read_text(encoding="ascii")
+        if target.is_file():
+            return target
+    path = compiled(source(), compiler)
+    if path.parent == note.parent:
+        with contextlib.suppress(TerrafusionError, OSError):
+            write_atomically(note, lambda part: part.write_text(path.name, encoding="ascii"))
+    return path
+
+
 def compiled(source: str, compiler: tuple[str, ...]) -> Path:
     """Path of the shared library, from the cache or freshly compiled (written atomically).
 
     Raises:
         OSError, subprocess.SubprocessError: the compiler cannot be run or fails (the text is its last line).
     """
-    key = "\0".join([source, *FLAGS, *compiler, _version(compiler), sys.platform, processor()])
-    name = f"twin-{hashlib.sha256(key.encode()).hexdigest()[:24]}.so"
-    target = cache_folder() / name
+    target = cache_folder() / f"{_name(source, compiler)}.so"
     if target.is_file():
         return target
     try:
@@ -68,7 +93,12 @@ def compiled(source: str, compiler: tuple[str, ...]) -> Path:
         LOG.info("no cache in %s (%s)", target.parent, error)
         folder = Path(tempfile.mkdtemp(prefix="terrafusion-"))
         atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        return _compile_into(folder / name, source, compiler)
+        return _compile_into(folder / target.name, source, compiler)
+
+
+def _name(text: str, compiler: tuple[str, ...]) -> str:
+    key = "\0".join([text, *FLAGS, *compiler, _version(compiler), sys.platform, processor()])
+    return f"twin-{hashlib.sha256(key.encode()).hexdigest()[:24]}"
 
 
 @functools.cache

@@ -59,7 +59,7 @@ def integrate(
     else:
         states = np.empty((len(inputs), len(STATES)))
         states[0] = x0
-        native.run([plant], [inputs], [states], dt_s, t0_s, steps)
+        native.run(native.held([plant]), [inputs], [states], dt_s, t0_s, steps)
     raise_if_diverged(states, t0_s, dt_s)
     return states
 

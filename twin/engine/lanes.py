@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,7 +18,7 @@ from numpy.typing import NDArray
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import LANES, SINGLE, Variant
 from terrafusion.twin.engine.integrate import chosen, steps_a_sample
-from terrafusion.twin.engine.native import Driver
+from terrafusion.twin.engine.native import CPlant, Driver
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.layout import INPUTS, STATES
 
@@ -61,44 +63,79 @@ def integrate_many(
         raise ValueError(f"inputs {inputs.shape} are misshapen for {count} runs")
     out = np.empty((count, (shape[0] - 1) // every + 1, len(STATES)))
     out[:, 0] = x0
-
-    def drive(native: Driver | None, steps: int, runs: Sequence[int]) -> None:
-        some = [inputs if shared else inputs[i] for i in runs]
-        group = [plants[i] for i in runs]
-        if native is not None:
-            native.run(group, some, [out[i] for i in runs], dt_s, t0_s, steps, every)
-            return
-        for i, u, plant in zip(runs, some, group, strict=True):
-            out[i] = vm.run(out[i, 0], u, dt_s, plant, t0_s, steps)[::every]
-
-    tasks = _tasks(plants, backend, dt_s, substeps)
-    native = all(driver is not None for driver, _, _ in tasks)
-    with ThreadPoolExecutor(jobs if native else 1) as pool:  # CasADi's virtual machine is not safe in threads
-        list(pool.map(lambda task: drive(*task), tasks))
-    _blank_what_diverged(out)
+    fleet = Fleet.of(plants, dt_s, backend, substeps)
+    fleet.drive([inputs] * count if shared else list(inputs), list(out), t0_s, every, jobs)
+    blank_what_diverged(out)
     return out
 
 
-_Task = tuple[Driver | None, int, list[int]]
+class _Task(NamedTuple):
+    """Runs that one call drives (a lane may repeat a run), and their plants as the driver reads them."""
+
+    native: Driver | None
+    held: list[CPlant]
+    steps: int
+    runs: list[int]
 
 
-def _tasks(plants: Sequence[Plant], backend: str, dt_s: float, substeps: int | None) -> list[_Task]:
-    """Runs that share a graph and a step, as many together as a driver has lanes."""
-    alike: dict[tuple[tuple[str, ...], bool, int], list[int]] = defaultdict(list)
-    for i, plant in enumerate(plants):
-        steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
-        alike[plant.effect_names(), plant.route.is_fixed(), steps].append(i)
-    tasks: list[_Task] = []
-    for (effects, fixed, steps), runs in alike.items():
-        native = chosen(backend, Variant(LANES if len(runs) > 1 else SINGLE, effects, fixed))
-        lanes = 1 if native is None else native.lanes
-        for first in range(0, len(runs), lanes):
-            some = runs[first : first + lanes]
-            tasks.append((native, steps, some + some[-1:] * (lanes - len(some))))
-    return tasks
+@dataclass(frozen=True, eq=False)
+class Fleet:
+    """Plants made ready to be driven side by side, as often as is wanted."""
+
+    plants: Sequence[Plant]
+    dt_s: float
+    tasks: list[_Task]
+
+    @classmethod
+    def of(
+        cls, plants: Sequence[Plant], dt_s: float, backend: str = "auto", substeps: int | None = None
+    ) -> Fleet:
+        """Plants that share a graph and a step, as many together as a driver has lanes."""
+        alike: dict[tuple[tuple[str, ...], bool, int], list[int]] = defaultdict(list)
+        for i, plant in enumerate(plants):
+            steps = substeps if substeps is not None else steps_a_sample(dt_s, plant.vehicle)
+            alike[plant.effect_names(), plant.route.is_fixed(), steps].append(i)
+        tasks: list[_Task] = []
+        for (effects, fixed, steps), runs in alike.items():
+            native = chosen(backend, Variant(LANES if len(runs) > 1 else SINGLE, effects, fixed))
+            lanes = 1 if native is None else native.lanes
+            for first in range(0, len(runs), lanes):
+                some = runs[first : first + lanes]
+                some = some + some[-1:] * (lanes - len(some))
+                held = [] if native is None else native.held([plants[i] for i in some])
+                tasks.append(_Task(native, held, steps, some))
+        return cls(plants, dt_s, tasks)
+
+    def drive(
+        self, inputs: Sequence[Array], outs: Sequence[Array], t0_s: float = 0.0, every: int = 1, jobs: int = 1
+    ) -> None:
+        """Fill `outs` (N // every + 1, X), whose first rows hold the starts, by the runs' inputs (N + 1, U).
+
+        All arrays are contiguous; those of several runs may be one.
+        """
+
+        def one(task: _Task) -> None:
+            some = [inputs[i] for i in task.runs]
+            if task.native is not None:
+                task.native.run(
+                    task.held, some, [outs[i] for i in task.runs], self.dt_s, t0_s, task.steps, every
+                )
+                return
+            for i, u in zip(task.runs, some, strict=True):
+                outs[i][:] = vm.run(outs[i][0], u, self.dt_s, self.plants[i], t0_s, task.steps)[::every]
+
+        if jobs > 1 and all(task.native is not None for task in self.tasks):
+            with ThreadPoolExecutor(jobs) as pool:  # CasADi's virtual machine is not safe in threads
+                list(pool.map(one, self.tasks))
+            return
+        for task in self.tasks:
+            one(task)
 
 
-def _blank_what_diverged(out: Array) -> None:
+def blank_what_diverged(out: Array) -> None:
+    """Set runs (B, N, X) to NaN from their first sample that is not finite (none becomes finite again)."""
+    if np.isfinite(out[:, -1]).all():
+        return
     with np.errstate(invalid="ignore", over="ignore"):
         bad = ~np.isfinite(out.sum(axis=2))
     out[np.logical_or.accumulate(bad, axis=1)] = np.nan

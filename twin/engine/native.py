@@ -23,7 +23,7 @@ LOG = logging.getLogger("terrafusion.twin")
 MAX_BLOCKS = 4
 """Blocks of directions a run carries (TF_BLOCKS of tangent.c)."""
 _DOUBLE_P = ctypes.POINTER(ctypes.c_double)
-_BUILDING = threading.RLock()  # CasADi's graphs are not safe in threads
+BUILDING = threading.RLock()  # CasADi's graphs are not safe in threads
 
 
 class _PlantStruct(ctypes.Structure):
@@ -44,7 +44,8 @@ class CPlant:
 
     def __init__(self, plant: Plant, effects: tuple[str, ...]) -> None:
         route, field = plant.route, plant.route.field
-        arrays = [plant.vehicle, plant.effect_values(effects), route.at, route.soil]
+        values = np.array([plant.effects.get(name, 0.0) for name in effects], dtype=float)
+        arrays = [plant.vehicle, values, route.at, route.soil]
         if field is not None:
             arrays += [field.log_gain, field.patch_share, field.response, field.patch_soil]
         self._arrays = [
@@ -78,9 +79,13 @@ class Driver:
             self._simulate_wide.restype = None
             self._simulate_wide.argtypes = [*self._simulate.argtypes, ctypes.c_long, *[ctypes.c_void_p] * 5]
 
+    def held(self, plants: Sequence[Plant]) -> list[CPlant]:
+        """The plants as this driver reads them."""
+        return [CPlant(plant, self.effects) for plant in plants]
+
     def run(
         self,
-        plants: Sequence[Plant],
+        held: Sequence[CPlant],
         inputs: Sequence[Array],
         outs: Sequence[Array],
         dt_s: float,
@@ -92,7 +97,6 @@ class Driver:
 
         All arrays are contiguous; there are as many of each as the driver has lanes.
         """
-        held = [CPlant(plant, self.effects) for plant in plants]
         addresses = (ctypes.c_void_p * self.lanes)(*(ctypes.addressof(h.struct) for h in held))
         self._simulate(
             addresses, len(inputs[0]) - 1, steps, every, t0_s, dt_s,
@@ -135,7 +139,7 @@ def pointer(array: Array) -> Any:
 
 def driver(variant: Variant) -> Driver | None:
     """The driver, None where it cannot be compiled (said once)."""
-    with _BUILDING:
+    with BUILDING:
         return _driver(variant)
 
 
@@ -147,7 +151,8 @@ def _driver(variant: Variant) -> Driver | None:
              "install a compiler or the ziglang package")  # fmt: skip
         return None
     try:
-        path = compiler.compiled(codegen.source(variant), command)
+        what = codegen.follows_from((*variant[:-1], sorted(variant.active)), variant.effects)
+        path = compiler.remembered(what, lambda: codegen.source(variant), command)
         return Driver(ctypes.CDLL(str(path)), variant)
     except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
         _say(f"the twin's C code could not be compiled ({error}): it runs in CasADi's virtual machine")

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
+from terrafusion.twin.gap.posterior import WIDE, Beliefs, Pool, beliefs
 from terrafusion.twin.gap.score import Score
 
 Array = NDArray[np.float64]
@@ -103,5 +103,10 @@ def detect(
 
 def _squares(pool: Pool, found: Beliefs, candidates: Candidates) -> Array:
     """Square of the deviation along every form, and twice the log Bayes factor of an unknown cause."""
-    known = [max(pool.fit(h.columns)[2], 0.0) for h in candidates.hypotheses]
-    return np.array([*known, 2.0 * max(found.unknown, 0.0)])
+    own = pool.gain[: pool.own]
+    information = np.diag(pool.information)[: pool.own]
+    best = own / (information + 1.0 / WIDE**2)
+    alone = best * (2.0 * own - best * information)  # as `Pool.fit`, of each column by itself
+    forms = [h.columns for h in candidates.hypotheses]
+    known = [alone[c[0]] if len(c) == 1 else pool.fit(c)[2] for c in forms]
+    return np.maximum([*known, 2.0 * found.unknown], 0.0)

@@ -29,6 +29,7 @@ from terrafusion.twin.gap.residuals import Evidence, state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
 from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
 from terrafusion.twin.gap.signatures import Drive
+from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.gap.verdict import HeldOut, Verdict, floor_of, judge
 from terrafusion.twin.gap.where import Cell, gap_map
 from terrafusion.twin.identify.inputs import check_source
@@ -90,6 +91,7 @@ class Diagnosis:
         return as_dict(self)
 
 
+@one_blas_thread()
 def diagnose(
     runs: Sequence[Recording],
     references: Sequence[Recording],

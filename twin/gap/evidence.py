@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.channel_noise import learnt_noise
 from terrafusion.twin.gap.outliers import bounded
 from terrafusion.twin.gap.residuals import (
     SOIL_STATE,
@@ -21,10 +22,10 @@ from terrafusion.twin.gap.residuals import (
     Evidence,
     Raw,
     at_own_ground,
-    learnt_noise,
     raw,
     state_sigmas,
     whitened,
+    whitened_error,
     without_probes,
 )
 from terrafusion.twin.gap.signatures import Drive, predictions
@@ -60,6 +61,7 @@ class Bench:
         runs, references: evidence of each.
         drives: signatures, shared by runs that were told the same.
         notes: what was assumed, in sentences.
+        jobs: threads.
     """
 
     model: Model
@@ -71,6 +73,7 @@ class Bench:
     raws: list[Raw]
     drives: Drives
     notes: tuple[str, ...]
+    jobs: int = 1
 
 
 def starting_model(
@@ -158,22 +161,30 @@ def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], job
     names = [name for name in SOIL_STATE if name in keys]
     soil = [keys.index(name) for name in names]
     raws = raws_of(logs[:BASE_RUNS], drives, channels, jobs, lambda: None)
-    noise = learnt_noise(raws, raws, candidates)
-    at = np.zeros(len(soil))
-    best: Sequence[Raw | None] = raws
-    cost = _cost(raws, noise)
-    step = np.clip(_common_step(raws, noise, candidates, soil), -MOST_STEP, MOST_STEP)
-    for _ in range(BASE_STEPS):
-        if np.abs(step).max(initial=0.0) < BASE_MOVED:
-            break
-        tried = at + step
-        moved = [_at_ground(run, drives, _ground(tried, names, candidates, model)) for run in raws]
-        now = _cost(moved, noise)
-        if now < cost:
-            at, best, cost = tried, moved, now
-            step = np.clip(_common_step(best, noise, candidates, soil), -MOST_STEP, MOST_STEP)
-        else:
-            step = 0.4 * step
+    noise = learnt_noise(raws, raws, candidates, jobs)
+    white = [whitened(without_probes(run), noise) for run in raws]
+    at, errors = (
+        np.zeros(len(soil)),
+        [whitened_error(r, w, noise, r.error) for r, w in zip(raws, white, strict=True)],
+    )
+    step = np.clip(_common_step(white, errors, candidates, soil), -MOST_STEP, MOST_STEP)
+
+    def tried(run: Raw, evidence: Evidence, effects: Mapping[str, float]) -> Array | None:
+        error = _error_on(run.log, drives, effects)
+        return None if error is None else whitened_error(run, evidence, noise, error)
+
+    with ThreadPoolExecutor(jobs) as pool:
+        for _ in range(BASE_STEPS):
+            if np.abs(step).max(initial=0.0) < BASE_MOVED:
+                break
+            effects = _ground(at + step, names, candidates, model)
+            moved = list(pool.map(tried, raws, white, [effects] * len(raws)))
+            now = [error for error in moved if error is not None]
+            if len(now) == len(raws) and _square(now) < _square(errors):
+                at, errors = at + step, now
+                step = np.clip(_common_step(white, errors, candidates, soil), -MOST_STEP, MOST_STEP)
+            else:
+                step = 0.4 * step
     return dataclasses.replace(model, effects={**model.effects, **_ground(at, names, candidates, model)})
 
 
@@ -187,38 +198,30 @@ def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Mode
     return out
 
 
-def _at_ground(run: Raw, drives: Drives, effects: Mapping[str, float]) -> Raw | None:
-    """The run against the twin on another ground; None where the twin diverges."""
-    found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
-    if found is None:
-        return None
-    error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]
-    return dataclasses.replace(run, error=error)
+def _error_on(log: Log, drives: Drives, effects: Mapping[str, float]) -> list[Array] | None:
+    """Errors of the log, by channel, against the twin on another ground; None where the twin diverges."""
+    found = predictions(log, drives.model, drives.candidates, [effects], log.start)[0]
+    return None if found is None else [o.value - y for o, y in zip(log.observed, found, strict=True)]
 
 
-def _cost(raws: Sequence[Raw | None], noise: Mapping[str, Noise]) -> float:
-    """Sum of squared whitened errors, the poses fitted."""
-    return sum(
-        np.inf if run is None else float(whitened(without_probes(run), noise).gram[-1, -1]) for run in raws
-    )
+def _square(errors: Sequence[Array]) -> float:
+    return sum(float(e @ e) for e in errors)
 
 
 def _common_step(
-    raws: Sequence[Raw | None], noise: Mapping[str, Noise], candidates: Candidates, soil: Sequence[int]
+    runs: Sequence[Evidence], errors: Sequence[Array], candidates: Candidates, soil: Sequence[int]
 ) -> Array:
-    """Step of the ground that all runs share, in typical sizes."""
+    """Step of the ground that all runs share, in typical sizes, by their whitened errors (n,)."""
     T, K = len(state_sigmas(candidates)), len(candidates.keys)
+    keep = np.arange(len(soil), T)  # offsets are a run's own, the ground is not
+    effect = np.arange(T, T + K)
     H, g = np.zeros((K, K)), np.zeros(K)
-    for run in filter(None, raws):
-        G = whitened(without_probes(run), noise).gram
-        keep, effect = (
-            np.arange(len(soil), T),
-            np.arange(T, T + K),
-        )  # offsets are a run's own, the ground is not
+    for run, error in zip(runs, errors, strict=True):
+        G, gain = run.gram, run.rows[:, :-1].astype(float).T @ error
         inner = np.linalg.inv(G[np.ix_(keep, keep)] + np.eye(len(keep)))
         cross = G[np.ix_(keep, effect)]
         H += G[np.ix_(effect, effect)] - cross.T @ inner @ cross
-        g += G[effect, -1] - cross.T @ inner @ G[keep, -1]
+        g += gain[effect] - cross.T @ inner @ gain[keep]
     prior = np.ones(K)
     prior[list(soil)] = 0.1
     return np.asarray(np.linalg.solve(H + np.diag(prior), g)[list(soil)])
@@ -257,14 +260,14 @@ def gather(
             progress(0.7 * done[0] / len(logs))
 
     raws = raws_of(logs, drives, channels, jobs, told)
-    noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates)
+    first = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
     with ThreadPoolExecutor(jobs) as pool:
-        raws = list(pool.map(lambda run: at_own_ground(run, drives, noise), raws))
-    noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates)
-    evidence = [whitened(run, noise) for run in raws]
+        raws = list(pool.map(lambda run: at_own_ground(run, drives, first), raws))
+        noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
+        evidence = list(pool.map(lambda run: whitened(run, noise), raws))
     judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates))
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return Bench(
         model, candidates, channels, noise, judged, normal,
-        raws[: len(runs)], drives, tuple(dict.fromkeys(notes)),
+        raws[: len(runs)], drives, tuple(dict.fromkeys(notes)), jobs,
     )  # fmt: skip

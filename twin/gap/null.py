@@ -41,8 +41,7 @@ class Null:
 
     def standardised(self, run: Score) -> tuple[Array, Array]:
         """x - mean (P,) of a run, and the change of x by the columns (P, P)."""
-        root = 1.0 / np.sqrt(np.diag(run.A) + 1.0)
-        return root * (run.b - run.A @ self.offset) - self.mean, root[:, None] * run.A
+        return run.root * (run.b - run.A @ self.offset) - self.mean, run.root[:, None] * run.A
 
 
 def learn(references: Sequence[Score], judged: int) -> Null:
@@ -51,10 +50,8 @@ def learn(references: Sequence[Score], judged: int) -> Null:
     total = sum((r.A for r in references), np.zeros((P, P)))
     shared = sum((r.b for r in references), np.zeros(P))
     offset: Array = np.asarray(np.linalg.solve(total + np.eye(P), shared), dtype=np.float64)
-    roots = [1.0 / np.sqrt(np.diag(r.A) + 1.0) for r in references]
-    x = np.array([d * (r.b - r.A @ offset) for d, r in zip(roots, references, strict=True)])
-    fisher = sum((d[:, None] * r.A * d for d, r in zip(roots, references, strict=True)), np.zeros((P, P)))
-    fisher = fisher / count
+    x = np.array([r.root * (r.b - r.A @ offset) for r in references])
+    fisher = sum((r.fisher for r in references), np.zeros((P, P))) / count
     mean: Array = np.asarray(x.mean(axis=0))
     centred = x - mean
     shown = centred.T @ centred

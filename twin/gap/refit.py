@@ -9,7 +9,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -86,7 +88,8 @@ def refit_all(
         if not active:
             break
         sets = [effects_at(bench, fits[i].columns, fits[i].trial) for i in active]
-        errors = [errors_with(bench, run, raw, sets) for run, raw in zip(bench.runs, bench.raws, strict=True)]
+        with ThreadPoolExecutor(bench.jobs) as threads:
+            errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets)))
         still = []
         for n, i in enumerate(active):
             mine = [run[n] for run in errors]

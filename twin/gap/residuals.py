@@ -18,10 +18,11 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
-from terrafusion.twin.identify.log import Log, window_of
+from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
-from terrafusion.twin.identify.noise import Noise, autoregressive, clipped, gauss_markov
+from terrafusion.twin.identify.noise import Noise
 
 Array = NDArray[np.float64]
 
@@ -34,8 +35,6 @@ OFFSETS = {
 """Channels with a turn-on offset, and its first 1 sigma (assumed)."""
 SAME_YAW_RAD = 0.2
 """Runs that were told the same share a signature where they set out within such a sector of headings."""
-LEAST_SCALE = 0.2
-"""No channel is taken as better than this share of what its data sheet and scatter say (assumed)."""
 MOST_SOIL = 4.0
 """A run's own ground is looked for within so many typical sizes."""
 GROUND_STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
@@ -212,31 +211,45 @@ def state_sigmas(candidates: Candidates) -> Array:
     return np.array([*soil, *np.ones(len(OFFSETS))])
 
 
+def whitened_columns(log: Log, noise: Mapping[str, Noise], columns: Sequence[Array]) -> Array:
+    """Columns (n, k) of all channels, one array a channel, in units and axes in which its noise is white."""
+    parts = []
+    for i, _, rows in layout(log).blocks:
+        observed = log.observed[i]
+        parts.append(
+            noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], columns[i][rows])
+        )
+    return np.concatenate(parts)
+
+
 def whitened(run: Raw, noise: Mapping[str, Noise]) -> Evidence:
     """The run in units and axes in which its noise is white."""
-    parts, channels, times, windows = [], [], [], []
-    states = run.state[0].shape[1]
-    for i, observed in enumerate(run.log.observed):
-        of = window_of(observed, run.log.windows)
-        columns = np.column_stack([run.state[i], run.change[i], run.probe[i], run.error[i], run.pose[i]])
-        for k in np.unique(of):
-            rows = np.flatnonzero(of == k)
-            parts.append(
-                noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], columns[rows])
-            )
-            channels.append(np.full(len(rows), i))
-            times.append(0.5 * (observed.begin_s + observed.end_s)[rows])
-            windows.append(np.full(len(rows), k))
-    M, window = np.concatenate(parts), np.concatenate(windows)
-    rows_, frame = M[:, :-3], M[:, -3:].copy()
+    return projected(run, whitened_columns(run.log, noise, stacked(run)))
+
+
+def stacked(run: Raw) -> list[Array]:
+    """State, change, probe, error and pose columns of each channel, side by side."""
+    by_channel = zip(run.state, run.change, run.probe, run.error, run.pose, strict=True)
+    return [np.column_stack(parts) for parts in by_channel]
+
+
+def projected(run: Raw, white: Array) -> Evidence:
+    """The evidence of whitened columns (n, T + P + 4), as `stacked` has them: the poses are projected out."""
+    parts = layout(run.log).blocks
+    channel = np.concatenate([np.full(len(rows), i) for i, _, rows in parts])
+    window = np.concatenate([np.full(len(rows), k) for _, k, rows in parts])
+    middle = [0.5 * (o.begin_s + o.end_s) for o in run.log.observed]
+    rows_, frame = white[:, :-3], white[:, -3:].copy()
+    out = np.empty_like(rows_)
     for k in np.unique(window):
         mine = window == k
-        frame[mine] = _orthonormal(frame[mine])
-        rows_[mine] -= frame[mine] @ (frame[mine].T @ rows_[mine])
+        frame[mine] = Q = _orthonormal(frame[mine])
+        own = rows_[mine]
+        out[mine] = own - Q @ (Q.T @ own)
     return Evidence(
-        run.log.name, run.log, rows_.T @ rows_, rows_.astype(np.float32), frame, np.concatenate(channels),
-        np.concatenate(times), window, run.log.seconds(), states,
-        np.zeros(len(window)), np.full(len(run.log.observed), np.inf),
+        run.log.name, run.log, out.T @ out, out.astype(np.float32), frame, channel,
+        np.concatenate([middle[i][rows] for i, _, rows in parts]), window, run.log.seconds(),
+        run.state[0].shape[1], np.zeros(len(window)), np.full(len(run.log.observed), np.inf),
     )  # fmt: skip
 
 
@@ -250,114 +263,9 @@ def _orthonormal(columns: Array) -> Array:
 
 def whitened_error(run: Raw, evidence: Evidence, noise: Mapping[str, Noise], error: Sequence[Array]) -> Array:
     """Another error (n,) of the run in the evidence's rows, poses projected out, within its limits."""
-    parts = []
-    for observed, e in zip(run.log.observed, error, strict=True):
-        of = window_of(observed, run.log.windows)
-        for k in np.unique(of):
-            rows = np.flatnonzero(of == k)
-            white = noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], e[rows, None])
-            parts.append(white[:, 0])
-    out = np.concatenate(parts)
+    out = whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0]
     for k in np.unique(evidence.window):
         mine = evidence.window == k
         out[mine] -= evidence.frame[mine] @ (evidence.frame[mine].T @ out[mine])
     most = evidence.limit[evidence.channel]
     return np.asarray(evidence.told + np.clip(out - evidence.told, -most, most))
-
-
-def first_noise(runs: Sequence[Raw]) -> dict[str, Noise]:
-    """White noise of the data sheets' sigma, with the correlation they tell, by channel."""
-    out: dict[str, Noise] = {}
-    for run in runs:
-        for observed in run.log.observed:
-            out.setdefault(observed.channel, Noise(1.0, _sheet_rho([run], observed.channel) or (1.0,)))
-    return out
-
-
-def _lags(runs: Sequence[Raw], channel: str) -> int:
-    spans = [0]
-    for run in runs:
-        for observed in run.log.observed:
-            if observed.channel == channel:
-                of = window_of(observed, run.log.windows)
-                spans += [int(np.ptp(observed.slot[of == k])) for k in np.unique(of)]
-    return max(spans) + 1
-
-
-def _sheet_rho(runs: Sequence[Raw], channel: str) -> tuple[float, ...] | None:
-    for run in runs:
-        for observed in run.log.observed:
-            if observed.channel == channel and observed.correlation is not None:
-                share, time_s = observed.correlation
-                return gauss_markov(share, time_s, observed.slot_s, _lags(runs, channel))
-    return None
-
-
-def learnt_noise(runs: Sequence[Raw], every: Sequence[Raw], candidates: Candidates) -> dict[str, Noise]:
-    """Noise by channel, from residuals of reference runs that are fitted with all that could differ.
-
-    What theta, a common set of effects and the poses explain is taken out (ridge, one typical size); what
-    is left is noise, its scale and its correlation in time.
-
-    Args:
-        runs: the references.
-        every: all runs, for the longest window.
-    """
-    noise = first_noise(every)
-    for _ in range(2):
-        series: dict[str, list[tuple[NDArray[np.int64], Array]]] = {}
-        for run in runs:
-            for channel, pairs in _left_over(run, noise, state_sigmas(candidates)).items():
-                series.setdefault(channel, []).extend(pairs)
-        noise = {c: _noise(c, series.get(c, []), every, noise[c]) for c in noise}
-    return noise
-
-
-def _noise(
-    channel: str, series: list[tuple[NDArray[np.int64], Array]], every: Sequence[Raw], before: Noise
-) -> Noise:
-    values = np.concatenate([v for _, v in series]) if series else np.zeros(0)
-    if len(values) < 4:
-        return before
-    rho = _sheet_rho(every, channel)
-    if rho is None:
-        rho = autoregressive([(s, clipped(v)) for s, v in series], _lags(every, channel))
-    white = np.concatenate([Noise(1.0, rho).whiten(s, np.ones(len(v)), v[:, None])[:, 0] for s, v in series])
-    robust = 1.4826 * float(np.median(np.abs(white)))
-    return Noise(max(float(np.sqrt(np.mean(np.minimum(white**2, (4.0 * robust) ** 2)))), LEAST_SCALE), rho)
-
-
-def _left_over(
-    run: Raw, noise: Mapping[str, Noise], sigma: Array
-) -> dict[str, list[tuple[NDArray[np.int64], Array]]]:
-    """Residuals of one run after its own fit, in first-guess sigmas, by channel and window."""
-    evidence = whitened(without_probes(run), noise)
-    G, T = evidence.gram, evidence.states
-    prior = np.concatenate([1.0 / sigma**2, np.ones(run.change[0].shape[1])])
-    K = len(prior)
-    fit = np.linalg.solve(G[:K, :K] + np.diag(prior), G[:K, -1])
-    out: dict[str, list[tuple[NDArray[np.int64], Array]]] = {}
-    lefts = [e - np.hstack([s, c]) @ fit for e, s, c in zip(run.error, run.state, run.change, strict=True)]
-    _project_pose(run, lefts, noise)
-    for observed, left in zip(run.log.observed, lefts, strict=True):
-        of = window_of(observed, run.log.windows)
-        scaled = left / observed.sigma
-        out[observed.channel] = [(observed.slot[of == k], scaled[of == k]) for k in np.unique(of)]
-    assert len(sigma) == T
-    return out
-
-
-def _project_pose(run: Raw, lefts: list[Array], noise: Mapping[str, Noise]) -> None:
-    """Take the best pose of each window out of the residuals, in place."""
-    of = [window_of(o, run.log.windows) for o in run.log.observed]
-    for k in range(len(run.log.windows)):
-        H, g = 1e-6 * np.eye(3), np.zeros(3)
-        for observed, left, pose, w in zip(run.log.observed, lefts, run.pose, of, strict=True):
-            rows = w == k
-            if rows.any():
-                both = np.column_stack([pose[rows], left[rows]])
-                white = noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], both)
-                H, g = H + white[:, :3].T @ white[:, :3], g + white[:, :3].T @ white[:, 3]
-        d = np.linalg.solve(H, g)
-        for left, pose, w in zip(lefts, run.pose, of, strict=True):
-            left[w == k] -= pose[w == k] @ d

@@ -6,6 +6,7 @@ C(alpha) tests; here theta is random with variance Sigma, so it is projected out
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -36,6 +37,16 @@ class Score:
     square: float
     rows: int
     other: Array | None = None
+
+    @functools.cached_property
+    def root(self) -> Array:
+        """(P,) factors that bring b to unit variance, and do not where it says nothing."""
+        return np.asarray(1.0 / np.sqrt(np.diag(self.A) + 1.0))
+
+    @functools.cached_property
+    def fisher(self) -> Array:
+        """(P, P) covariance of `root` times b, were the twin right."""
+        return self.root[:, None] * self.A * self.root
 
 
 def score(run: Evidence, sigma: Array) -> Score:

@@ -7,6 +7,7 @@ out, and theta and poses adapted anew in both arms. One run alone is scored on i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,16 +84,19 @@ def _left_out(
     """Errors of each run with the effect as the other runs have it."""
     if fit is None:
         return was
-    out = []
-    for i, (run, raw) in enumerate(zip(bench.runs, bench.raws, strict=True)):
+    whole, _, _ = Pool.of(scores, null).fit(fit.columns)
+
+    def one(i: int) -> Array:
+        run, raw = bench.runs[i], bench.raws[i]
         others = [s for k, s in enumerate(scores) if k != i] or list(scores)
         value, _, _ = Pool.of(others, null).fit(fit.columns)
-        whole, _, _ = Pool.of(scores, null).fit(fit.columns)
         value = fit.value + (value - whole)  # the linear change on top of what the twin itself was fitted to
         error = errors_with(bench, run, raw, [effects_at(bench, fit.columns, value)])[0]
         common = run.rows[:, run.states : -1].astype(float) @ null.offset
-        out.append(was[i] if error is None else error - common)
-    return out
+        return was[i] if error is None else error - common
+
+    with ThreadPoolExecutor(bench.jobs) as threads:
+        return list(threads.map(one, range(len(bench.runs))))
 
 
 def _share(

@@ -7,35 +7,30 @@ anew in each window. Derivatives are differences of runs that are driven side by
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin.drive import told
-from terrafusion.twin.effects.sensed import DEAD_TIME, as_driven
-from terrafusion.twin.engine.lanes import integrate_many
-from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.identify.inputs import DT_S
+from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
+from terrafusion.twin.gap.side_by_side import (
+    AS_IT_IS,
+    GROUND,
+    Sensors,
+    driven,
+    groups,
+    inputs_of,
+    plants_of,
+)
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
-from terrafusion.twin.identify.observations import Observed
-from terrafusion.twin.identify.pointwise import Pointwise, pointwise
-from terrafusion.twin.identify.predict import LEAD_S, POSE, averaging, plant_of, run_up
-from terrafusion.twin.identify.readings import along
-from terrafusion.twin.layout import INDEX, OUTPUTS, VEHICLE_PARAMETERS, WHEELS, mounting_vector
-from terrafusion.twin.measurement import measured, measurement
+from terrafusion.twin.layout import INDEX, OUTPUTS
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
-EVERY = 5
-"""Derivatives are kept at every so many-th sample of the run: they enter as weights only."""
-TINY = 1e-12
-"""Share of its scale that an absent effect has in a run: all runs share one compiled graph."""
 STEP = 0.3
 """Step, in scales, of the differences: finite, because a tangent at a wheel that is just about to slide or to
 turn its direction says nothing about an effect of the size that is looked for."""
@@ -82,23 +77,19 @@ def predictions(
     None in place of a run that diverged.
     """
     sets = [{**model.effects, **some} for some in effects]
-    plants = [_plant(log, model, candidates, some) for some in sets]
-    inputs = np.stack([_inputs(log, model, some) for some in sets])
-    samples, out = _samples(log, 1), list[list[Array] | None]()
-    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-    weights = [averaging(o, log, shift) for o in log.observed]
-    for states, plant, some, told_ in zip(
-        _runs(log, plants, inputs, start), plants, sets, inputs, strict=True
+    beside = {k for some in sets for k, v in some.items() if v != 0.0} - {*GROUND}
+    plants = plants_of(log, model, candidates, sets, candidates.moving if beside else ())
+    inputs = inputs_of(log, model, sets)
+    sensors, out = Sensors(log, model, candidates, samples_of(log, 1)), list[list[Array] | None]()
+    for states, plant, some, heard in zip(
+        driven(log, plants, inputs, start), plants, sets, inputs, strict=True
     ):
         if not np.isfinite(states).all():
             out.append(None)
             continue
-        sensors = _Sensors(model, candidates, plant, samples.astype(float) * DT_S, told_[samples])
-        y = sensors.read(states, _vector(candidates, some))
-        out.append([
-            np.einsum("nk,nk->n", weight, y[:, _OUTPUTS[o.channel]].mean(axis=1)[at])
-            for o, (at, weight) in zip(log.observed, weights, strict=True)
-        ])  # fmt: skip
+        y = sensors.read(states, plant, heard, some)
+        by_channel = zip(log.observed, layout(log).fine, strict=True)
+        out.append([means(at, _channel(y, o.channel)) for o, at in by_channel])
     return out
 
 
@@ -113,38 +104,49 @@ def drive(
     Raises:
         TerrafusionError: the run diverged.
     """
-    wanted = set(candidates.keys if only is None else only)
-    samples, moving = _samples(log, EVERY), tuple(k for k in candidates.moving if k in wanted)
+    sets = {AS_IT_IS: dict(model.effects)}
     steps = {k: _step(candidates, i, model.effects.get(k, 0.0)) for i, k in enumerate(candidates.keys)}
-    moved = {k: {**model.effects, k: model.effects.get(k, 0.0) + steps[k]} for k in candidates.keys}
-    sets = [dict(model.effects), *(moved[k] for k in moving)]
-    plants = [_plant(log, model, candidates, some) for some in sets]
-    inputs = np.stack([_inputs(log, model, some) for some in sets])
-    fine, coarse = _runs(log, plants[:1], inputs[:1], start)[0], _runs(log, plants, inputs, start, EVERY)
-    if not np.isfinite(fine).all():
-        raise TerrafusionError(
-            "the twin diverges on this log",
-            file=log.name,
-            remedy="check the vehicle's and the soil's numbers",
-        )
-    every = _samples(log, 1)
-    sensors = _Sensors(model, candidates, plants[0], every.astype(float) * DT_S, inputs[0][every])
-    exact = sensors.read(fine, _vector(candidates, model.effects))
-
-    def read(key: str | None) -> Array:
-        lane = 1 + moving.index(key) if key in moving else 0
-        some = model.effects if key is None else moved[key]
-        at = _Sensors(model, candidates, plants[lane], samples.astype(float) * DT_S, inputs[lane][samples])
-        return at.read(coarse[lane], _vector(candidates, some))
-
-    y = read(None)
+    for k, step in steps.items():
+        if only is None or k in only:
+            sets[k] = {**model.effects, k: model.effects.get(k, 0.0) + step}
+    fine, coarse, read = _readings(log, model, candidates, start, sets)
+    y = read[AS_IT_IS]
     change = np.zeros((*y.shape, len(candidates.keys)))
     for i, k in enumerate(candidates.keys):
-        if k in wanted:
-            change[:, :, i] = (read(k) - y) * (candidates.scale[i] / steps[k])
+        if k in read:
+            change[:, :, i] = (read[k] - y) * (candidates.scale[i] / steps[k])
     failed = ~np.isfinite(change).all(axis=(0, 1))
     change[:, :, failed] = 0.0  # a step that makes the twin diverge says nothing
-    return Drive(start, exact, y, change, _by_pose(log, coarse[0], y), coarse[0][:, INDEX["yaw"]])
+    return Drive(start, fine, y, change, _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]])
+
+
+def _readings(
+    log: Log, model: Model, candidates: Candidates, start: Array, sets: Mapping[str, Mapping[str, float]]
+) -> tuple[Array, Array, dict[str, Array]]:
+    """Outputs of the twin as it is at every grid sample, its states (n, X) at every `EVERY`-th, and there the
+    outputs (n, Y) with each set of effects."""
+    sensors, read = Sensors(log, model, candidates, samples_of(log, EVERY)), dict[str, Array]()
+    for group in groups(candidates):
+        keys = [k for k in group if k in sets]
+        some, whole = [sets[k] for k in keys], AS_IT_IS in keys
+        plants, inputs = plants_of(log, model, candidates, some, group), inputs_of(log, model, some)
+        states = driven(log, plants, inputs, start, 1 if whole else EVERY) if keys else np.zeros(0)
+        if whole:
+            if not np.isfinite(states[0]).all():
+                raise TerrafusionError(
+                    "the twin diverges on this log",
+                    file=log.name,
+                    remedy="check the vehicle's and the soil's numbers",
+                )
+            every = Sensors(log, model, candidates, samples_of(log, 1))
+            fine = every.read(states[0], plants[0], inputs[0], some[0])
+            states = states[:, among_all(log)]
+            coarse, twin = states[0], (plants[0], inputs[0])
+        for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
+            read[k] = sensors.read(x, plant, u, sets[k])
+    for k in sets.keys() - read.keys():  # effects of the sensors alone
+        read[k] = sensors.read(coarse, *twin, sets[k])
+    return fine, coarse, read
 
 
 def placed(found: Drive, log: Log, start: Array) -> Drive:
@@ -158,7 +160,7 @@ def placed(found: Drive, log: Log, start: Array) -> Drive:
     }
     heading = found.heading.copy()
     for name, (values, every) in parts.items():
-        counts = [len(np.arange(first, last + 1, every)) for first, last in log.windows]
+        counts = np.diff(log.windows, axis=1).ravel() // every + 1
         for k, first in enumerate(np.cumsum([0, *counts[:-1]])):
             rows = slice(int(first), int(first) + counts[k])
             turn = start[k, 2] - found.start[k, 2]
@@ -176,7 +178,7 @@ def placed(found: Drive, log: Log, start: Array) -> Drive:
                 heading[rows] += turn
     y = parts["y"][0]
     by_pose = found.by_pose.copy()
-    at = np.repeat(start[:, :2], [len(np.arange(a, b + 1, EVERY)) for a, b in log.windows], axis=0)
+    at = np.repeat(start[:, :2], coarse_counts(log), axis=0)
     (east, north), (v_e, v_n) = _POSITION_AT, _VELOCITY_AT
     by_pose[:, east, 2], by_pose[:, north, 2] = at[:, 1] - y[:, north], y[:, east] - at[:, 0]
     by_pose[:, v_e, 2], by_pose[:, v_n, 2] = -y[:, v_n], y[:, v_e]
@@ -191,90 +193,26 @@ _VELOCITY = slice(_VELOCITY_AT[0], _VELOCITY_AT[1] + 1)
 
 def signatures(log: Log, drive: Drive) -> list[Signature]:
     """Every channel of the log as the twin has it: means over the rows' own intervals."""
-    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-    out = []
-    for observed in log.observed:
-        columns = _OUTPUTS[observed.channel]
-        fine_at, fine_weight = averaging(observed, log, shift)
-        value = np.einsum("nk,nk->n", fine_weight, drive.fine[:, columns].mean(axis=1)[fine_at])
-        at, weight = _coarse(observed, log)
-        change, by_pose = [np.einsum("nk,nkm->nm", weight, part[:, columns].mean(axis=1)[at])
-                for part in (drive.change, drive.by_pose)]  # fmt: skip
-        out.append(Signature(value, change, by_pose, drive.heading[at[:, 2]]))
+    rows, out = layout(log), []
+    for observed, fine, coarse in zip(log.observed, rows.fine, rows.coarse, strict=True):
+        value = means(fine, _channel(drive.fine, observed.channel))
+        change, by_pose = (
+            means(coarse, _channel(part, observed.channel)) for part in (drive.change, drive.by_pose)
+        )
+        out.append(Signature(value, change, by_pose, drive.heading[coarse[0][:, 2]]))
     return out
+
+
+def _channel(outputs: Array, channel: str) -> Array:
+    """A channel (N, ...) of the outputs (N, Y, ...)."""
+    columns = _OUTPUTS[channel]
+    return outputs[:, columns[0]] if len(columns) == 1 else np.asarray(outputs[:, columns].mean(axis=1))
 
 
 def _step(candidates: Candidates, i: int, at: float) -> float:
     """Step of one parameter, in its unit, towards where its range leaves room."""
     step = STEP * float(candidates.scale[i])
     return step if at + step <= candidates.high[i] else -step
-
-
-def _plant(log: Log, model: Model, candidates: Candidates, effects: Mapping[str, float]) -> Plant:
-    """The plant with all moving effects, none of them exactly zero."""
-    plant, _ = plant_of(log, dataclasses.replace(model, effects={}), [])
-    vehicle = plant.vehicle.copy()
-    vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] += effects.get(DEAD_TIME, 0.0)
-    scales = dict(zip(candidates.keys, candidates.scale, strict=True))
-    present = {key: effects.get(key, 0.0) or TINY * float(scales[key]) for key in candidates.moving}
-    return Plant(vehicle, plant.route, present)
-
-
-def _inputs(log: Log, model: Model, effects: Mapping[str, float]) -> Array:
-    late = effects.get(DEAD_TIME, 0.0) if log.follows else as_driven(model.vehicle, effects).drive.dead_time_s
-    return told(log.sides, DT_S, late)
-
-
-def _vector(candidates: Candidates, effects: Mapping[str, float]) -> Array:
-    """Values of all parameters in the order of the measurement graph."""
-    return np.array([effects.get(key, 0.0) for key in sorted(candidates.keys)])
-
-
-def _samples(log: Log, every: int) -> Rows:
-    """Grid samples of all windows, one after the other; a border belongs to both."""
-    return np.concatenate([np.arange(first, last + 1, every) for first, last in log.windows])
-
-
-def _runs(log: Log, plants: Sequence[Plant], inputs: Array, start: Array, every: int = 1) -> list[Array]:
-    """States (N, X) at every so many-th sample of all windows, a run a plant."""
-    lead = [run_up(log, plant, each) for plant, each in zip(plants, inputs, strict=True)]
-    before = np.stack([u for _, u in lead])
-    x = integrate_many(
-        np.stack([x for x, _ in lead]), before, DT_S, plants, t0_s=-LEAD_S, every=before.shape[1] - 1
-    )[:, -1]
-    pose, parts = [INDEX[name] for name in POSE], []
-    for (begin, end), guess in zip(log.windows, start, strict=True):
-        x = x.copy()
-        x[:, pose] = guess
-        whole = begin + (end - begin) // every * every
-        parts.append(
-            integrate_many(x, inputs[:, begin : whole + 1], DT_S, plants, t0_s=begin * DT_S, every=every)
-        )
-        x = parts[-1][:, -1]
-    return list(np.concatenate(parts, axis=1))
-
-
-class _Sensors:
-    """The measurement graph with all effects, at the samples of one run."""
-
-    def __init__(self, model: Model, candidates: Candidates, plant: Plant, t_s: Array, inputs: Array) -> None:
-        self.names = tuple(sorted(candidates.keys))
-        self.plant, self.inputs, self.mounting = plant, inputs, mounting_vector(model.vehicle)
-        self.soil = np.tile(along(plant.route, plant.route.soil, t_s), (1, len(WHEELS)))
-
-    def read(self, states: Array, effects: Array) -> Array:
-        """Outputs (N, Y) of the states (N, X) with the effects (E,)."""
-        function = _compiled(self.names)
-        if function is None:
-            named = dict(zip(self.names, effects, strict=True))
-            return measured(states, self.inputs, self.plant.vehicle, self.soil, self.mounting, named)
-        given = (states, self.inputs, self.plant.vehicle, self.soil, effects, self.mounting)
-        return function(len(states), *given)[0][:, :, 0]
-
-
-@functools.cache
-def _compiled(effects: tuple[str, ...]) -> Pointwise | None:
-    return pointwise(measurement(effects))
 
 
 def _by_pose(log: Log, states: Array, y: Array) -> Array:
@@ -284,30 +222,10 @@ def _by_pose(log: Log, states: Array, y: Array) -> Array:
     east, north, v_e, v_n = (
         OUTPUTS.index(n) for n in ("gnss_east_m", "gnss_north_m", "gnss_v_e_mps", "gnss_v_n_mps")
     )
-    counts = [len(np.arange(first, last + 1, EVERY)) for first, last in log.windows]
-    begin = np.repeat(np.cumsum([0, *counts[:-1]]), counts)
+    counts = coarse_counts(log)
+    begin = np.repeat(np.cumsum(counts) - counts, counts)
     out[:, east, 0] = out[:, north, 1] = 1.0
     out[:, east, 2] = states[begin, INDEX["y"]] - y[:, north]
     out[:, north, 2] = y[:, east] - states[begin, INDEX["x"]]
     out[:, v_e, 2], out[:, v_n, 2] = -y[:, v_n], y[:, v_e]
     return out
-
-
-def _coarse(observed: Observed, log: Log) -> tuple[Rows, Array]:
-    """Coarse samples (n, 6) that a row depends on and their weights: a mean of three linear
-    interpolations."""
-    step = EVERY * DT_S
-    counts = np.array([len(np.arange(first, last + 1, EVERY)) for first, last in log.windows])
-    offset = np.concatenate([[0], np.cumsum(counts)[:-1]])
-    middle = 0.5 * (observed.begin_s + observed.end_s)
-    k = np.clip(
-        np.searchsorted(log.windows[:, 0] * DT_S, middle + 1e-9, side="right") - 1, 0, len(log.windows) - 1
-    )
-    ats, weights = [], []
-    for share, weight in ((0.0, 1.0 / 6.0), (0.5, 2.0 / 3.0), (1.0, 1.0 / 6.0)):  # Simpson's rule
-        t_s = observed.begin_s + share * (observed.end_s - observed.begin_s)
-        place = np.clip((t_s - log.windows[k, 0] * DT_S) / step, 0.0, counts[k] - 1.0)
-        low = np.minimum(place.astype(np.int64), np.maximum(counts[k] - 2, 0))
-        ats += [offset[k] + low, offset[k] + np.minimum(low + 1, counts[k] - 1)]
-        weights += [weight * (1.0 - (place - low)), weight * (place - low)]
-    return np.stack(ats, axis=1), np.stack(weights, axis=1)

@@ -156,8 +156,6 @@ def _in_one_time(recording: Recording, after_ns: int) -> None:
 
 def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:
     """Commands (n,) at times (n,) on the grid (N,): a smooth course with steps."""
-    from scipy.interpolate import CubicHermiteSpline
-
     before = np.clip(np.searchsorted(t_s, grid + 1e-6, side="right") - 1, 0, len(t_s) - 1)
     out = wanted[before]
     apart = np.append(np.diff(t_s), np.inf)
@@ -170,8 +168,11 @@ def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:
     )
     smooth = follows[before] & (apart[before] < LONGEST_GAP_S)
     if smooth.any():
-        unique = np.append(True, apart[:-1] > 0.0)
-        out[smooth] = CubicHermiteSpline(t_s[unique], wanted[unique], middle[unique])(grid[smooth])
+        k = before[smooth]
+        h, s = apart[k], (grid[smooth] - t_s[k]) / apart[k]
+        # Cubic by values and slopes at both ends (Hermite's basis).
+        out[smooth] = (1.0 + 2.0 * s) * (1.0 - s) ** 2 * wanted[k] + s * s * (3.0 - 2.0 * s) * wanted[k + 1]
+        out[smooth] += h * s * (1.0 - s) * ((1.0 - s) * middle[k] - s * middle[k + 1])
     return out
 
 

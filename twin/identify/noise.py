@@ -45,13 +45,13 @@ class Noise:
 
     def whiten(self, slots: Rows, sigma: Array, columns: Array) -> Array:
         """`columns` (n, k) in units and axes in which the noise is white with variance one."""
-        from scipy.linalg import solve_triangular
+        from scipy.linalg.lapack import dtrtrs  # `solve_triangular` checks longer than it solves
 
         scaled = columns / (self.scale * sigma)[:, None]
         if len(self.rho) == 1:
             return np.asarray(scaled)
-        lower = _factor(self.rho, tuple(np.diff(slots).tolist()))
-        return np.asarray(solve_triangular(lower, scaled, lower=True, check_finite=False))
+        lower = _factor(self.rho, tuple((slots[1:] - slots[:-1]).tolist()))
+        return np.asarray(dtrtrs(lower, scaled, lower=1)[0])
 
 
 @functools.lru_cache(maxsize=4096)
@@ -64,7 +64,7 @@ def _factor(rho: tuple[float, ...], steps: tuple[int, ...]) -> Array:
     for extra in (NUGGET, 10.0 * NUGGET, 1.0):
         correlation[np.diag_indices_from(correlation)] += extra
         try:
-            return np.asarray(np.linalg.cholesky(correlation))
+            return np.asfortranarray(np.linalg.cholesky(correlation))
         except np.linalg.LinAlgError:
             continue
     return np.eye(len(slots))
