@@ -325,7 +325,7 @@ def key_state_of(state: State) -> KeyState:
     return KeyState(pose, state.velocity_mps, bias, state.linear)
 
 
-def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: float) -> State:
+def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: Array) -> State:
     R = key.pose.rotation().matrix()
     return dataclasses.replace(
         live,
