@@ -12,7 +12,7 @@ import numpy as np
 
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion.report import style
-from terrafusion.fusion.scores.field_summary import OWN, Line, condense, verdicts
+from terrafusion.fusion.scores.field_summary import OWN, Line, condense, in_order, verdicts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -65,7 +65,7 @@ def plot_lines(lines: Sequence[Line]) -> Figure:
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     scored = [line for line in lines if line.error_m is not None]
-    tests = list(dict.fromkeys(line.test for line in scored))
+    tests = sorted({line.test for line in scored}, key=in_order)
     logs = list(dict.fromkeys(line.log for line in scored))
     modes = list(dict.fromkeys(line.mode for line in scored))
     figure = Figure(figsize=(3.2 + 2.0 * len(tests), 1.4 + 0.42 * len(logs)), layout="constrained")

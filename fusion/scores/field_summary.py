@@ -63,7 +63,7 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
         if line.mode == OWN and line.ratio is not None:
             groups.setdefault((line.ground or "not labelled", line.test), []).append(line)
     out: list[dict[str, str | int | float | None]] = []
-    for (ground, test), found in sorted(groups.items()):
+    for (ground, test), found in sorted(groups.items(), key=lambda item: (item[0][0], in_order(item[0][1]))):
         ratios = np.array([line.ratio for line in found], dtype=float)
         row: dict[str, str | int | float | None] = {"ground": ground, "test": test, "logs": len(found)}
         row |= {"better": int((ratios < 1 - EVEN).sum()), "worse": int((ratios > 1 + EVEN).sum())}
@@ -72,6 +72,11 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
         row["percent"] = median([line.percent for line in found])
         out.append(row)
     return out
+
+
+def in_order(test: str) -> tuple[int, str]:
+    """Key by which "whole" comes before outages, and short ones before long ones."""
+    return len(test), test
 
 
 def median(values: Sequence[float | None]) -> float | None:

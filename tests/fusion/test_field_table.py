@@ -20,7 +20,7 @@ from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import Imu, Recording, Terrain, Wheels
 from terrafusion.fusion.scores import field_table, parts
 from terrafusion.fusion.scores.field_page import plot_lines, write
-from terrafusion.fusion.scores.field_summary import condense, verdicts
+from terrafusion.fusion.scores.field_summary import condense, in_order, verdicts
 from terrafusion.fusion.scores.field_table import (
     Refusal,
     Run,
@@ -310,3 +310,8 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
         [*command, "--collect", "--modes", "fixed", "robust"], capture_output=True, text=True, check=False
     )
     assert "2 of 4 logs and modes not run yet" in more.stdout
+
+
+def test_whole_drives_come_before_outages_and_short_outages_before_long_ones() -> None:
+    shuffled = ["outage 120 s", "outage 30 s", "whole", "outage 60 s"]
+    assert sorted(shuffled, key=in_order) == ["whole", "outage 30 s", "outage 60 s", "outage 120 s"]
