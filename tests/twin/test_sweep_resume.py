@@ -101,6 +101,8 @@ def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Pat
     file.write_text(SWEEP.replace("[0, 3, 6, 9]", "{from: 0, to: 20, count: 2000}"))
     call = PROGRAM.replace("sys.argv[2]", "sys.argv[2], jobs=2").replace("; run", "\ntry: run")
     program = f"{call}\nexcept KeyboardInterrupt: print('stopped', file=sys.stderr)"
+    # A child of a suite that was started in the background would inherit that interrupts are ignored.
+    program = f"import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n{program}"
     words = [sys.executable, "-c", program, str(file), str(tmp_path / "out")]
     with subprocess.Popen(words, stderr=subprocess.PIPE, text=True) as child:
         _wait_for_parts(tmp_path / "out", 2, child)
