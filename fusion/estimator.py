@@ -398,7 +398,7 @@ class Estimator:
         if accepted:
             return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
         self.wheels_rejected += not self._silent
-        return None
+        return wheels.doubted(variance, self._wheel_gate.doubt(nis))
 
     def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
         """Zero velocity and rate where the robot has stood for a window."""

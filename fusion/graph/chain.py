@@ -87,10 +87,10 @@ class Chain:
     states, those of a calibration, estimated; without, tangents end before them.
     """
 
-    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 3 + [0.2] * 3 + [0.5] * 3 + [0.05] * 3)
-    """Change of a state (rad, m, m/s, m/s2, rad/s, -) beyond which its factors are linearised again.
+    RELINEARISE = np.array([0.02] * 3 + [np.inf] * 6 + [0.5] * 3 + [0.05] * 3)
+    """Change of a state (rad, m, m/s, m/s2, rad/s) beyond which its factors are linearised again.
 
-    Position and the linear states enter the factors linearly (nearly), so they never ask for it."""
+    Position, velocity and the linear states enter the factors linearly (nearly), so they never ask for it."""
 
     def __init__(self, archive: Chain | None = None, calibrate: bool = False) -> None:
         self.archive = archive

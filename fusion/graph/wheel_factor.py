@@ -65,6 +65,12 @@ class WheelIncrement:
         """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
         return dataclasses.replace(self, sigma=np.append(self.sigma[:3], np.inf))
 
+    def doubted(self, variance_m2: float, times: float) -> WheelIncrement:
+        """The same, so much less sure of distance and turn that an innovation along body x of `variance_m2`
+        has `times` of it; the non-holonomic constraint stays."""
+        scale = float(np.sqrt(1.0 + (times - 1.0) * variance_m2 / self.sigma[0] ** 2))
+        return dataclasses.replace(self, sigma=self.sigma * np.array([scale, 1.0, 1.0, scale]))
+
 
 def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:
     """The residual (4,) of the module's docstring, unwhitened; `linear` (14,) of keyframe j."""

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+FAULT = 3.0
+"""An increment of the wheels that is so many limits off is no measurement at all (a counter that jumps)."""
+
 
 class Verdict(Enum):
     """What a gate says of a fix."""
@@ -70,9 +73,14 @@ class GnssGate:
 class WheelGate:
     """Test of a wheel increment against the IMU's prediction.
 
-    A burst of slip or a jammed wheel shows as an increment the IMU does not
-    confirm. It is left out, for at most `patience` keyframes in a row: the IMU
-    alone must not judge for longer than it can.
+    A burst of slip or a jammed wheel shows as an increment the IMU does not confirm. It counts less
+    (Huber 1964, Ann. Math. Stat. 35(1): what is used must not hang by a hair on what else is known), far
+    beyond the limit not at all; but for at most `patience` keyframes in a row: the IMU alone must not judge
+    for longer than it can.
+
+    Attributes:
+        limit_sigma: normalised innovation up to which an increment is believed.
+        patience: keyframes in a row in which an increment may count less.
     """
 
     limit_sigma: float
@@ -80,10 +88,15 @@ class WheelGate:
     in_a_row: int = 0
 
     def test(self, innovation_m: float, sigma_m: float) -> tuple[bool, float]:
-        """Accept or not, and the normalised innovation squared."""
+        """Believe it or not, and the normalised innovation squared."""
         nis = (innovation_m / sigma_m) ** 2
         if nis <= self.limit_sigma**2 or self.in_a_row >= self.patience:
             self.in_a_row = 0
             return True, nis
         self.in_a_row += 1
         return False, nis
+
+    def doubt(self, nis: float) -> float:
+        """Factor on the variance of an increment that is not believed, from 1 at the limit to infinity."""
+        off = float(np.sqrt(nis))
+        return off / self.limit_sigma if off < FAULT * self.limit_sigma else np.inf

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from scipy.stats import chi2
 
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict, WheelGate
 
 GATE = float(chi2.ppf(0.999, 2))
@@ -46,3 +48,18 @@ def test_wheels_are_not_locked_out_for_ever() -> None:
     answers = [gate.test(1.0, 0.01)[0] for _ in range(22)]
     assert answers.count(True) == 2
     assert answers[10]
+
+
+def test_a_wheel_increment_counts_the_less_the_farther_off_it_is() -> None:
+    gate = WheelGate(limit_sigma=6.0)
+    assert gate.doubt(36.0) == 1.0  # no step at the limit
+    factors = [gate.doubt(off**2) for off in np.linspace(6.0, 17.9, 20)]
+    assert (np.diff(factors) > 0.0).all()
+    assert gate.doubt(18.0**2) == np.inf
+    wheels = WheelIncrement(np.array([0.1, 0.0, 0.0]), np.array([0.01, 0.02, 0.03, 0.04]), 0.1, 0.0)
+    variance_m2 = 0.03**2
+    less = wheels.doubted(variance_m2, 2.5)
+    assert variance_m2 - wheels.sigma[0] ** 2 + less.sigma[0] ** 2 == pytest.approx(2.5 * variance_m2)
+    assert less.sigma[3] / wheels.sigma[3] == pytest.approx(less.sigma[0] / wheels.sigma[0])
+    assert (less.sigma[1:3] == wheels.sigma[1:3]).all()
+    assert np.isinf(wheels.doubted(variance_m2, np.inf).sigma[[0, 3]]).all()
