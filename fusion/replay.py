@@ -32,6 +32,7 @@ from terrafusion.fusion.graph.key_state import (
     quaternion_of,
 )
 from terrafusion.fusion.history import History
+from terrafusion.fusion.inputs.placement import Placement
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.fusion.weights.policy import Policy, load_policy
@@ -168,12 +169,14 @@ def replay(
         estimator, imu, _side_motion(wheels, config.rig.wheel_radius_m), used,
         _others(recording, magnetometer, rows.names()), history, progress,
     )  # fmt: skip
+    placed = estimator.gnss.placed
+    late = () if placed is None else _laid_onto_the_map(history, placed, batch)
     if archive is not None and history.states:
-        _smooth(archive, history, estimator.config)
+        _smooth(archive, history, estimator.config, placed is not None)
     seconds = time.perf_counter() - started
     if not history.states:
         raise _never_started(recording, used)
-    notes = (*recording.notes, *notes, *inputs.notes(recording), *_said(estimator))
+    notes = (*recording.notes, *notes, *inputs.notes(recording), *late, *_said(estimator))
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
     changes = [*history.changes, *estimator.weights.take_changes()]
@@ -303,8 +306,11 @@ def _give_fix(estimator: Estimator, gnss: Gnss, i: int) -> None:
     estimator.add_gnss(int(gnss.t_ns[i]), gnss.enu_m[i], gnss.sigma_enu_m[i], velocity, sigma_v, fix)
 
 
-def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
-    """Replace the live states by the batch solution over the whole drive, which starts from them."""
+def _smooth(chain: Chain, history: History, config: EstimatorConfig, placed: bool) -> None:
+    """Replace the live states by the batch solution over the whole drive, which starts from them.
+
+    Where fixes have `placed` the path, no state of it is local any more.
+    """
     batch = Batch(chain, [key_state_of(state) for state in history.states])
     batch.optimise()
     keys, covariances = batch.states(), batch.covariances()
@@ -315,6 +321,11 @@ def _smooth(chain: Chain, history: History, config: EstimatorConfig) -> None:
             history.states, keys[offset:], covariances[offset:], history.rows, strict=True
         )
     ]
+    if placed:
+        history.states[:] = [
+            dataclasses.replace(state, status="outage") if state.status == "no_gnss" else state
+            for state in history.states
+        ]
 
 
 def key_state_of(state: State) -> KeyState:
@@ -346,10 +357,29 @@ def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: Array) -> State:
     )
 
 
+def _laid_onto_the_map(history: History, placed: Placement, batch: bool) -> tuple[str, ...]:
+    """Put the local states before the first fixes where these show them to have been."""
+    local = [i for i, state in enumerate(history.states) if state.status == "no_gnss"]
+    for i in local:
+        history.states[i] = placed.moved(history.states[i])
+    if not local:
+        return ()
+    begun = (placed.t_ns - history.states[0].t_ns) * 1e-9
+    told = f"{begun:.1f} s after the start GNSS laid the path onto the map, turned by "
+    told += f"{np.degrees(placed.yaw_rad):.0f} degrees"
+    return (told if batch else f"{told}; live, all before was in a local frame: it is not scored",)
+
+
 def _said(estimator: Estimator) -> tuple[str, ...]:
     notes = []
-    if estimator.gnss.local:
+    gnss = estimator.gnss
+    if gnss.local and not gnss.unplaced:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
+    elif gnss.local:
+        notes.append(
+            f"{gnss.unplaced} GNSS fixes came after a start without any and did not show the heading: "
+            "the path is local, its start and heading are arbitrary"
+        )
     if estimator.gnss.too_late:
         notes.append(f"{estimator.gnss.too_late} GNSS fixes came before the start or too late for the lag")
     if estimator.gnss.turned:

@@ -17,6 +17,7 @@ variables; the linear states live in the chain alone.
 from __future__ import annotations
 
 import bisect
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -88,9 +89,8 @@ class Chain:
     """
 
     RELINEARISE = np.array([0.02] * 3 + [np.inf] * 6 + [0.5] * 3 + [0.05] * 3)
-    """Change of a state (rad, m, m/s, m/s2, rad/s) beyond which its factors are linearised again.
-
-    Position, velocity and the linear states enter the factors linearly (nearly), so they never ask for it."""
+    """Change of a state (rad, m, m/s, m/s2, rad/s) beyond which its factors are linearised again. Position,
+    velocity and the linear states enter the factors linearly (nearly), so they never ask for it."""
 
     def __init__(self, archive: Chain | None = None, calibrate: bool = False) -> None:
         self.archive = archive
@@ -229,12 +229,11 @@ class Chain:
             self.nodes.pop(0)
             self.first += 1
 
-    def restart(self, extra_variance: Array, k: int | None = None) -> None:
-        """Drop all before keyframe k (by default the newest); its marginal stays as prior, less sure by
-        `extra_variance` (dim,). The marginal is that of keyframe k and all before it.
+    def restart(self, extra_variance: Array, k: int | None = None, anew: Sequence[int] = ()) -> None:
+        """Drop all before keyframe k (by default the newest); its marginal, of it and all before, stays as
+        prior, less sure by `extra_variance` (dim,). Of the states `anew` that is all that stays.
 
-        For an estimate that has proved wrong: what comes next may move it
-        freely, and does not bend the past to reach it.
+        For an estimate that has proved wrong: what comes next may move it freely, and does not bend the past.
         """
         self._eliminate_all()
         k = self.last if k is None else k
@@ -242,7 +241,9 @@ class Chain:
         known = self._root if k == self.last else triangular(np.vstack([node.prior, self._unary_rows(k)]))
         inverse, _ = lapack.dtrtri(known[:, : self.dim])
         mean = inverse @ known[:, self.dim]
-        root = np.linalg.inv(np.linalg.cholesky(inverse @ inverse.T + np.diag(extra_variance)))
+        stays = ~np.isin(np.arange(self.dim), anew)
+        marginal = inverse @ inverse.T * np.outer(stays, stays)
+        root = np.linalg.inv(np.linalg.cholesky(marginal + np.diag(extra_variance)))
         # Keyframes that follow keep their linearisation, so keyframe k must keep its own, too.
         shift = mean if k == self.last else np.zeros(self.dim)
         point, empty = node.point.retract(shift), gtsam.NonlinearFactorGraph()

@@ -51,8 +51,10 @@ class Aids:
         t_ns = chain.nodes[-1].t_ns
         if gnss.local:
             self.heading.forget_north()
-        height = self.height.active and self.height.update(chain, t_ns, before, after)
-        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, gnss.turned)
+        placed = gnss.placed is not None
+        height = self.height.active and self.height.update(chain, t_ns, before, after, placed)
+        turned = gnss.turned + placed
+        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, turned)
         return height or heading
 
     def start(

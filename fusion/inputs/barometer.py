@@ -64,6 +64,7 @@ class HeightAid:
         self._due_ns: int | None = None
         self._last_ns = 0
         self._datum_m = 0.0
+        self._placed = False
         self._slope = 0.0
         self._row = 0
         self._on_innovation = report
@@ -84,12 +85,16 @@ class HeightAid:
         """Whether a sample has ever come."""
         return bool(self._samples) or self.bias is not None or self._mean[1] > 0.0
 
-    def update(self, chain: Chain, t_ns: int, before: Array, after: Array) -> bool:
+    def update(self, chain: Chain, t_ns: int, before: Array, after: Array, placed: bool = False) -> bool:
         """Use what has come up to the newest keyframe; True where a factor was added.
 
         `before` and `after` (n, n) are the newest keyframe's covariance, without and with the other
-        measurements of this keyframe.
+        measurements of this keyframe; `placed` tells that a local path was laid onto the map, heights too.
         """
+        if placed and not self._placed:
+            self._placed, self._mean, self._due_ns = True, [0.0, 0.0], None
+            if self.bias is not None:
+                self.bias.forget(np.array([UNKNOWN_M**2, 0.0]))
         key = chain.state(chain.last)
         lever = np.array(self.spec.position_m)
         row = height_jacobian(key.pose.rotation().matrix(), lever)

@@ -21,6 +21,7 @@ from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
+from terrafusion.fusion.inputs.placement import Placement, place
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.inputs.track import MotionTrack
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -54,7 +55,8 @@ class GnssUpdater:
 
     Attributes:
         waiting: fixes not yet used, oldest first.
-        local: the graph was started without GNSS; fixes are rejected.
+        local: the graph was started without GNSS, and no fixes have told yet how it lies on the map.
+        placed: how they did, once they have; unplaced: how many came until then.
         rejected, too_late: how many fixes the gate refused, or came after their keyframe was dropped.
         turned: how often the heading was set right from the motion.
         scale: how many times more than it claims the receiver is seen to scatter, 1 for an honest one.
@@ -89,6 +91,8 @@ class GnssUpdater:
         self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
         self.local = False
+        self.placed: Placement | None = None
+        self.unplaced = 0
         self.rejected = 0
         self.too_late = 0
         self.last_used_ns: int | None = None
@@ -120,10 +124,12 @@ class GnssUpdater:
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
             fix = self.waiting.pop(0)
             k = chain.at_or_after(fix.t_ns)
-            if self.local:
-                self.rejected += 1
-            elif k is None:
+            if k is None:
                 self.too_late += 1
+            elif self.local:
+                self.unplaced += 1
+                self.track.add(fix)
+                used |= self._place(chain, fix)
             else:
                 self.track.add(fix)
                 self._hear(self.track.scatter())
@@ -136,6 +142,14 @@ class GnssUpdater:
         if used:
             self.weighting.revisit(chain)
         return used
+
+    def _place(self, chain: Chain, fix: GnssFix) -> bool:
+        """Lay a path that was begun without fixes onto the map; True once they tell how."""
+        self.placed = place(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
+        if self.placed is None:
+            return False
+        self.local, self.last_used_ns = False, fix.t_ns
+        return True
 
     def _hear(self, scatter: float) -> None:
         """Take in how the fixes scatter about the path, over what they claim."""

@@ -37,6 +37,28 @@ CONFIRMED = 3
 """Fixes in a row that must show the same wrong heading."""
 
 
+@dataclass(frozen=True)
+class Fit:
+    """How the dead-reckoned path lies among the fixes.
+
+    Attributes:
+        turn: from the path to the fixes; its size is driven over dead-reckoned distance.
+        sigma_rad: 1 sigma of its angle.
+        middle, fix_middle: the middles of both, which are laid onto each other.
+        rest_m: median distance that is left.
+    """
+
+    turn: complex
+    sigma_rad: float
+    middle: complex
+    fix_middle: complex
+    rest_m: float
+
+    def at(self, z: complex) -> complex:
+        """Where a point of the path lies on the map."""
+        return self.fix_middle + self.turn * (z - self.middle)
+
+
 @dataclass(frozen=True, eq=False)
 class Pair:
     """A fix (east + i north, m) with its claimed sigma, and the dead-reckoned antenna `z` (m) at its time."""
@@ -68,7 +90,9 @@ class MotionTrack:
             self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0)
             return
         dt = (node.t_ns - self._t_ns[-1]) * 1e-9
-        moved = node.wheels.displacement_m if node.wheels is not None else R.T @ state.velocity * dt
+        moved = R.T @ state.velocity * dt
+        if node.wheels is not None and np.isfinite(node.wheels.sigma[0]):
+            moved = node.wheels.displacement_m
         east, north, _ = R @ moved
         turn = float((R @ state.rate(node.gyro_radps))[2]) * dt
         level = complex(east, north) * np.exp(-1j * self._yaw_chain)
@@ -129,6 +153,24 @@ class MotionTrack:
         self._turned = 0
 
     def _heading_error(self, yaw_sigma_rad: float, scale: float) -> float | None:
+        fit = self.fit(scale, TURN_SIGMA_RAD)
+        if fit is None:
+            return None
+        error = self.error_of(fit)
+        limit = max(LEAST_TURN_RAD, 4.0 * math.hypot(fit.sigma_rad, min(yaw_sigma_rad, 0.3)))
+        return error if abs(error) > limit else None
+
+    def error_of(self, fit: Fit) -> float:
+        """Angle, rad, by which the chain's heading must turn to agree with the fit."""
+        return cmath.phase(fit.turn * cmath.exp(-1j * (self._yaw_chain - self._yaw[-1])))
+
+    def antenna(self) -> complex:
+        """The dead-reckoned antenna at the newest keyframe, m."""
+        return self._z[-1] + self._lever * cmath.exp(1j * self._yaw[-1])
+
+    def fit(self, scale: float, yaw_sigma_rad: float) -> Fit | None:
+        """The path laid onto the fixes, whose claims count `scale` times; None until its turn is known to
+        `yaw_sigma_rad`."""
         if len(self.pairs) < 5:
             return None
         z, fix = np.array([p.z for p in self.pairs]), np.array([p.fix for p in self.pairs])
@@ -139,21 +181,20 @@ class MotionTrack:
             if information <= 0.0:
                 return None
             ratio = abs(turn) / information
-            rest = np.abs((fix - fix[keep].mean()) - turn / information * (z - z[keep].mean()))
-            middle = _median(rest)
-            keep = rest <= 5.0 * middle + 1e-6
+            middle, fix_middle = z[keep].mean(), fix[keep].mean()
+            rest = np.abs((fix - fix_middle) - turn / information * (z - middle))
+            left = _median(rest)
+            keep = rest <= 5.0 * left + 1e-6
             if np.count_nonzero(keep) < 5:
                 return None
         kept = z[keep]
         extent = float(np.linalg.norm(kept - kept.mean())) / math.sqrt(len(kept))
         if extent == 0.0:  # all that is left was seen where the robot stood
             return None
-        sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * middle / extent
-        if sigma > TURN_SIGMA_RAD or not LEAST_RATIO < ratio < MOST_RATIO:
+        sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * left / extent
+        if sigma > yaw_sigma_rad or not LEAST_RATIO < ratio < MOST_RATIO:
             return None
-        error = cmath.phase(turn * cmath.exp(-1j * (self._yaw_chain - self._yaw[-1])))
-        limit = max(LEAST_TURN_RAD, 4.0 * math.hypot(sigma, min(yaw_sigma_rad, 0.3)))
-        return error if abs(error) > limit else None
+        return Fit(turn / information, sigma, complex(middle), complex(fix_middle), left)
 
 
 def _median(values: Array) -> float:

@@ -177,16 +177,20 @@ def travelled_m(position_m: ArrayLike, min_step_m: float = MIN_STEP_M) -> Array:
 def known_keyframes(estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
     """The keyframes with a pose, and notes on those left out."""
     path = estimate.trajectory
-    early = np.isin(estimate.status.astype(str), NOT_SCORED)
+    status = estimate.status.astype(str)
+    early, local = np.isin(status, NOT_SCORED), status == "no_gnss"
+    local &= not local.all()  # a drive that stays local is aligned and scored
     sound = np.isfinite(path.position_m[:, :2]).all(axis=1)
     if path.quaternion is not None:
         sound &= np.isfinite(path.quaternion).all(axis=1)
     notes: tuple[str, ...] = ()
     if early.any():
         notes += (f"{int(early.sum())} keyframes before the heading was known are not scored",)
+    if local.any():
+        notes += (f"{int(local.sum())} keyframes before GNSS laid the path onto the map are not scored",)
     if not sound.all():
         notes += (f"{int((~sound).sum())} keyframes are not finite and are not scored",)
-    rows = sound & ~early
+    rows = sound & ~early & ~local
     if rows.all():
         return estimate, notes
     kept = dataclasses.replace(
