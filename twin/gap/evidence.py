@@ -15,6 +15,7 @@ from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.outliers import bounded
+from terrafusion.twin.gap.poses import all_settled
 from terrafusion.twin.gap.residuals import (
     SOIL_STATE,
     Drives,
@@ -189,7 +190,8 @@ def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Mode
 
 def _at_ground(run: Raw, drives: Drives, effects: Mapping[str, float]) -> Raw | None:
     """The run against the twin on another ground; None where the twin diverges."""
-    found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
+    told = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)
+    found = all_settled(run.log, told)[0]
     if found is None:
         return None
     error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]
