@@ -1,0 +1,166 @@
+"""Which effect, and how sure: odds from what each leaves of the gap, calibrated on a plant that is no twin.
+
+A conditional logit (McFadden 1974): the odds between two causes are the exponential of a weighted difference
+of what they leave over, and a cause outside the catalogue is one more alternative, the more likely the less
+of the gap anything explains. Its few weights are fitted to trials of the blind check's plant of other seeds
+than its own (`python -m terrafusion.twin.gap.blind.development`), laws of other forms and causes outside the
+catalogue among them, and kept in `choice.yaml`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.gap.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.channels import Left, Table
+from terrafusion.twin.gap.ladder import Fitted, bounds
+from terrafusion.twin.gap.posterior import Pool
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a cause leaves: over channels inside and outside the candidates' space, and the logarithm of the
+    square that stays beyond the learned null's expectation, in units of it."""
+
+    inside: float
+    outside: float
+    square: float
+
+    @classmethod
+    def of(cls, left: Left, pool: Pool, columns: tuple[int, ...] = ()) -> Told:
+        """Of an explanation by these columns; none: of the gap as it is."""
+        explained = pool.fit(columns)[2] if columns else 0.0
+        return cls(left.inside, left.outside, math.log(max((pool.square - explained) / pool.dims, 1.0)))
+
+    @property
+    def total(self) -> float:
+        """What channels leave."""
+        return self.inside + self.outside
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Of a cause in the catalogue, and of one outside it, by the fields of `Told`; `unknown` is a
+    constant."""
+
+    inside: float
+    outside: float
+    square: float
+    unknown: float
+    unknown_inside: float
+    unknown_outside: float
+    unknown_square: float
+
+    def cause(self, told: Told) -> float:
+        """Log odds of a cause that leaves this, up to a constant."""
+        return -self.inside * told.inside - self.outside * told.outside - self.square * told.square
+
+    def outsider(self, before: Told) -> float:
+        """The same of an unknown cause, by the gap as it is."""
+        return (
+            self.unknown
+            - self.unknown_inside * before.inside
+            - self.unknown_outside * before.outside
+            - self.unknown_square * before.square
+        )
+
+
+@functools.cache
+def weights() -> Weights:
+    """Those that come with the package.
+
+    Raises:
+        ConfigError: the file lacks one.
+    """
+    from terrafusion.datasets.config import read_yaml
+    from terrafusion.datasets.errors import ConfigError
+
+    with resources.as_file(resources.files("terrafusion.twin.gap") / "choice.yaml") as path:
+        read = read_yaml(path)
+        names = [field.name for field in dataclasses.fields(Weights)]
+        if set(read.get("weights", {})) != set(names):
+            raise ConfigError("weights are missing or unknown", file=path, remedy="train them again")
+        return Weights(**{name: float(read["weights"][name]) for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """The odds of all causes.
+
+    Attributes:
+        laws: the best law of each effect.
+        told: what it leaves, by effect.
+        before: the gap as it is.
+        odds: log odds by effect.
+        unknown: of a cause outside the catalogue.
+    """
+
+    laws: dict[str, Hypothesis]
+    told: dict[str, Told]
+    before: Told
+    odds: dict[str, float]
+    unknown: float
+
+    @classmethod
+    def of(
+        cls,
+        pool: Pool,
+        table: Table,
+        told: Mapping[Hypothesis, Told],
+        fitted: Mapping[Hypothesis, Fitted] | None = None,
+        by: Weights | None = None,
+    ) -> Choice:
+        """From what all laws leave to first order, and what those fitted through the twin do."""
+        by = weights() if by is None else by
+        laws: dict[str, Hypothesis] = {}
+        least: dict[str, Told] = {}
+        for law, first in told.items():
+            now = first
+            if fitted is not None and law in fitted:
+                left = fitted[law].left
+                now = Told(left.inside, left.outside, first.square)
+            if law.effect not in laws or by.cause(now) > by.cause(least[law.effect]):
+                laws[law.effect], least[law.effect] = law, now
+        before = Told.of(table.before(), pool)
+        odds = {effect: by.cause(now) for effect, now in least.items()}
+        return cls(laws, least, before, odds, by.outsider(before))
+
+    def first(self) -> str:
+        """The likeliest effect."""
+        return max(self.odds, key=lambda effect: self.odds[effect])
+
+    def with_odds(self, more: Mapping[str, float]) -> Choice:
+        """Some effects at other log odds."""
+        return dataclasses.replace(self, odds={**self.odds, **more})
+
+    def probabilities(self) -> dict[str, float]:
+        """Of the effects, given that one of them is the cause."""
+        values = np.array(list(self.odds.values()))
+        shares = np.exp(values - values.max())
+        return dict(zip(self.odds, (shares / shares.sum()).tolist(), strict=True))
+
+    def p_unknown(self) -> float:
+        """Probability of a cause outside the catalogue, given a gap."""
+        known = float(np.logaddexp.reduce(list(self.odds.values())))
+        return 1.0 / (1.0 + math.exp(min(max(known - self.unknown, -500.0), 500.0)))
+
+
+def linear(
+    table: Table, pool: Pool, candidates: Candidates
+) -> tuple[dict[Hypothesis, Told], dict[Hypothesis, Array]]:
+    """What every law leaves to first order, and its sizes (k,)."""
+    told, sizes = dict[Hypothesis, Told](), dict[Hypothesis, Array]()
+    for law in candidates.hypotheses:
+        sizes[law], left = table.linear(law.columns, *bounds(candidates, law.columns))
+        told[law] = Told.of(left, pool, law.columns)
+    return told, sizes
