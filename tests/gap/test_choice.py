@@ -12,9 +12,9 @@ from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.gap import choice as choice_module
 from terrafusion.twin.gap.blind import plan
 from terrafusion.twin.gap.blind.development import Trial, read, site, specs, train, utilities, write
-from terrafusion.twin.gap.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channels import RIDGE, Block, Products, Table
-from terrafusion.twin.gap.choice import Choice, Told, Weights, weights
+from terrafusion.twin.gap.choice import Told, Weights, probabilities, weights
 from terrafusion.twin.gap.evidence import gather
 from terrafusion.twin.gap.ladder import Fitter, bounds, sizes
 from terrafusion.twin.gap.null import learn
@@ -85,25 +85,32 @@ def test_a_channel_that_nothing_explains_speaks_for_none() -> None:
     assert min(others) > left.total + 1.0
 
 
-def told(inside: float) -> Told:
-    return Told(inside, 0.2 * inside, 0.3 * inside)
+def told(left: float) -> Told:
+    return Told(0.6 * left, 0.1 * left, 0.3 * left)
+
+
+def chances(one: float, other: float, before: float) -> tuple[dict[str, float], float]:
+    """Of two causes that leave so much of a gap, and of the unknown one."""
+    by, gap = Weights(6.0, 0.9, 2.0), told(before)
+    odds = {"one": by.cause(told(one), gap), "other": by.cause(told(other), gap)}
+    return probabilities(odds, by.outsider(gap))
 
 
 def test_odds_follow_what_is_left_and_an_unknown_cause_what_is_unexplained() -> None:
-    by = Weights(1.0, 1.0, 1.0, 0.0, 0.8, 0.8, 0.8)
-    laws = {name: Hypothesis(name, "law", (0,)) for name in ("one", "other")}
-
-    def choice(one: float, other: float, before: float) -> Choice:
-        left = {"one": told(one), "other": told(other)}
-        odds = {name: by.cause(t) for name, t in left.items()}
-        return Choice(laws, left, told(before), odds, by.outsider(told(before)))
-
-    assert choice(3.0, 3.0, 10.0).probabilities() == pytest.approx({"one": 0.5, "other": 0.5})
-    assert choice(3.0, 5.0, 10.0).first() == "one"
-    shares = [choice(left, 9.5, 10.0).p_unknown() for left in (1.0, 5.0, 8.0, 9.0, 9.5)]
+    known, unknown = chances(3.0, 3.0, 10.0)
+    assert known["one"] == pytest.approx(known["other"])
+    assert sum(known.values()) + unknown == pytest.approx(1.0)
+    known, _ = chances(3.0, 5.0, 10.0)
+    assert known["one"] > 2.0 * known["other"] > 0.0
+    shares = [chances(left, 9.8, 10.0)[1] for left in (1.0, 5.0, 8.0, 9.0, 9.8)]
     assert shares == sorted(shares)
-    assert shares[0] < 0.01
+    assert shares[0] < 0.05
     assert shares[-1] > 0.5
+
+
+def test_a_larger_gap_makes_the_same_shares_surer() -> None:
+    small, large = (chances(0.4 * gap, 0.6 * gap, gap)[0] for gap in (2.0, 20.0))
+    assert large["one"] / large["other"] > 2.0 * small["one"] / small["other"]
 
 
 def test_sizes_tried_hold_the_linear_one_and_stay_within_bounds() -> None:
@@ -169,12 +176,13 @@ def test_trials_and_weights_survive_a_file(tmp_path: Path) -> None:
     write(tmp_path / "choice.yaml", found, [trial], [path])
     text = (tmp_path / "choice.yaml").read_text(encoding="utf-8")
     assert "1 trials" in text
-    assert f"inside: {found.inside:.4g}" in text
+    assert f"slope: {found.slope:.4g}" in text
 
 
 def test_weights_of_the_package_are_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert weights().inside + weights().outside + weights().square > 0.0
-    (tmp_path / "choice.yaml").write_text("weights: {inside: 1}\n", encoding="utf-8")
+    assert weights().slope > 0.0
+    assert 0.5 < weights().share < 1.5
+    (tmp_path / "choice.yaml").write_text("weights: {slope: 1}\n", encoding="utf-8")
     monkeypatch.setattr(choice_module.resources, "files", lambda _: tmp_path)
     weights.cache_clear()
     with pytest.raises(ConfigError, match="weights"):

@@ -1,8 +1,10 @@
 """Which effect, and how sure: odds from what each leaves of the gap, calibrated on a plant that is no twin.
 
-A conditional logit (McFadden 1974): the odds between two causes are the exponential of a weighted difference
-of what they leave over, and a cause outside the catalogue is one more alternative, the more likely the less
-of the gap anything explains. Its few weights are fitted to trials of the blind check's plant of other seeds
+A conditional logit (McFadden 1974) on the share of the gap that each leaves: the odds between two causes are
+the exponential of a slope times the difference of their shares, steeper where the gap is large. A cause
+outside the catalogue is one more alternative, the likelier the less of the gap anything explains. A small
+part of the probability, the lapse, is spread evenly: some laws of the robot are nearer to another effect of
+the twin than to their own. Slope and unknown are fitted to trials of the blind check's plant of other seeds
 than its own (`python -m terrafusion.twin.gap.blind.development`), laws of other forms and causes outside the
 catalogue among them, and kept in `choice.yaml`.
 """
@@ -44,35 +46,32 @@ class Told:
 
     @property
     def total(self) -> float:
-        """What channels leave."""
-        return self.inside + self.outside
+        """All three."""
+        return self.inside + self.outside + self.square
+
+
+LEAST = 0.5
+"""A gap counts as no smaller than this (in the units of `Told`)."""
+LAPSE = 0.05
+"""Probability that the odds do not hold (assumed): it is spread evenly over all causes."""
 
 
 @dataclass(frozen=True)
 class Weights:
-    """Of a cause in the catalogue, and of one outside it, by the fields of `Told`; `unknown` is a
-    constant."""
+    """Of the odds: `slope` by the share that is left, times the root of the gap; `share` that an unknown
+    cause is taken to leave, and its log odds, `unknown`, beside one of the catalogue that leaves as much."""
 
-    inside: float
-    outside: float
-    square: float
+    slope: float
+    share: float
     unknown: float
-    unknown_inside: float
-    unknown_outside: float
-    unknown_square: float
 
-    def cause(self, told: Told) -> float:
-        """Log odds of a cause that leaves this, up to a constant."""
-        return -self.inside * told.inside - self.outside * told.outside - self.square * told.square
+    def cause(self, told: Told, before: Told) -> float:
+        """Log odds of a cause that leaves this of a gap, up to a constant."""
+        return -self.slope * told.total / math.sqrt(max(before.total, LEAST))
 
     def outsider(self, before: Told) -> float:
-        """The same of an unknown cause, by the gap as it is."""
-        return (
-            self.unknown
-            - self.unknown_inside * before.inside
-            - self.unknown_outside * before.outside
-            - self.unknown_square * before.square
-        )
+        """The same of an unknown cause."""
+        return self.unknown - self.slope * self.share * math.sqrt(max(before.total, LEAST))
 
 
 @functools.cache
@@ -122,6 +121,7 @@ class Choice:
     ) -> Choice:
         """From what all laws leave to first order, and what those fitted through the twin do."""
         by = weights() if by is None else by
+        before = Told.of(table.before(), pool)
         laws: dict[str, Hypothesis] = {}
         least: dict[str, Told] = {}
         for law, first in told.items():
@@ -129,10 +129,9 @@ class Choice:
             if fitted is not None and law in fitted:
                 left = fitted[law].left
                 now = Told(left.inside, left.outside, first.square)
-            if law.effect not in laws or by.cause(now) > by.cause(least[law.effect]):
+            if law.effect not in laws or now.total < least[law.effect].total:
                 laws[law.effect], least[law.effect] = law, now
-        before = Told.of(table.before(), pool)
-        odds = {effect: by.cause(now) for effect, now in least.items()}
+        odds = {effect: by.cause(now, before) for effect, now in least.items()}
         return cls(laws, least, before, odds, by.outsider(before))
 
     def first(self) -> str:
@@ -143,16 +142,18 @@ class Choice:
         """Some effects at other log odds."""
         return dataclasses.replace(self, odds={**self.odds, **more})
 
-    def probabilities(self) -> dict[str, float]:
-        """Of the effects, given that one of them is the cause."""
-        values = np.array(list(self.odds.values()))
-        shares = np.exp(values - values.max())
-        return dict(zip(self.odds, (shares / shares.sum()).tolist(), strict=True))
+    def probabilities(self) -> tuple[dict[str, float], float]:
+        """Of the effects and of an unknown cause, given that there is a gap."""
+        return probabilities(self.odds, self.unknown)
 
-    def p_unknown(self) -> float:
-        """Probability of a cause outside the catalogue, given a gap."""
-        known = float(np.logaddexp.reduce(list(self.odds.values())))
-        return 1.0 / (1.0 + math.exp(min(max(known - self.unknown, -500.0), 500.0)))
+
+def probabilities(odds: Mapping[str, float], unknown: float) -> tuple[dict[str, float], float]:
+    """Of causes with these log odds and of the unknown one."""
+    values = np.array([*odds.values(), unknown])
+    shares = np.exp(values - values.max())
+    shares = (1.0 - LAPSE) * shares / shares.sum() + LAPSE / len(shares)
+    *known, last = shares.tolist()
+    return dict(zip(odds, known, strict=True)), last
 
 
 def linear(

@@ -21,7 +21,7 @@ def chosen(
     if not detected:
         return Choice.of(fitter.pool, fitter.table, told, by=by), {}
     laws = [law for law in told if law.effect != SOIL]
-    best = sorted(laws, key=lambda law: -by.cause(told[law]))[:BY_ODDS]
+    best = sorted(laws, key=lambda law: told[law].total)[:BY_ODDS]
     best += sorted(laws, key=lambda law: -believed.forms[law.effect, law.form])[:BY_FACTOR]
     best += [law for law in told if law.effect == SOIL]
     fitted = fitter.fits([(law, sizes[law]) for law in dict.fromkeys(best)])

@@ -26,8 +26,9 @@ trials)."""
 SECOND_LEFT, SECOND_ODDS = 0.15, 2.0
 """Share of what the effects found leave in the channels that a further one must take away, and the log odds
 that each further effect costs (assumed)."""
-SAME_ODDS = math.log(3.0)
-"""Effects whose log odds differ by less cannot be told from each other."""
+SAME_ODDS, NEARLY = math.log(3.0), 0.9
+"""Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
+other, either (assumed)."""
 RIDGES = (0.3, 1.0, 3.0)
 """1 sigma of all columns and probes together, in typical sizes."""
 MOST_EFFECTS = 3
@@ -228,10 +229,10 @@ def judge(
     if detected:
         found = search.best(choice, believed, beliefs(pool.plain(), candidates))
         choice = choice.with_odds(_together(found, choice, pool))
-    p_unknown = (1.0 - p_null) * choice.p_unknown() if detected else 0.0
-    weight = choice.probabilities()
+    weight, unknown = choice.probabilities()
+    p_unknown = (1.0 - p_null) * unknown if detected else 0.0
+    known = (1.0 - p_null - p_unknown) / sum(weight.values())
     order = sorted(weight, key=lambda k: -choice.odds[k])
-    known = 1.0 - p_null - p_unknown
     together = found.effects if found is not None else ()
     causes = [
         _cause(name, weight[name] * known, pool, choice, refits, candidates, floor, together)
@@ -247,14 +248,16 @@ def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
     if len(found.forms) < 2:
         return {}
     columns = tuple(i for h in found.forms for i in h.columns)
-    odds = weights().cause(Told.of(found.left, pool, columns)) - SECOND_ODDS * (len(found.forms) - 1)
+    odds = weights().cause(Told.of(found.left, pool, columns), choice.before) - SECOND_ODDS * (
+        len(found.forms) - 1
+    )
     return {name: max(odds, choice.odds[name]) - 1e-6 * i for i, name in enumerate(found.effects)}
 
 
 def _kind(found: Found | None, choice: Choice, first: Cause) -> str:
     if found is None:
         return "no_gap"
-    if choice.p_unknown() > 0.5:
+    if choice.probabilities()[1] > 0.5:
         return "unknown"
     if found.effects == (SOIL,):
         return "parameters"
@@ -281,6 +284,7 @@ def _cause(
     if order.index(name) < CLASSES:
         alike = class_of(pool, candidates, name, columns, order)
         close = [k for k in order if abs(choice.odds[k] - choice.odds[name]) < SAME_ODDS]
+        close = [k for k in class_of(pool, candidates, name, columns, close, NEARLY) if k in close]
         both = set(together) if name in together else set()
         members = (name, *(k for k in order if k not in {name, *both} and (k in alike or k in close)))
     share = share_of(pool, candidates.columns(name), floor, least)
