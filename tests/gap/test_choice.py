@@ -44,7 +44,7 @@ def table(blocks: list[Block]) -> Table:
     """A reference leaves unit variance: so many directions inside, the rest outside."""
     N = STATES + EFFECTS
     inside, outside = np.full(CHANNELS, float(N)), np.full(CHANNELS, float(ROWS - N))
-    return Table((), tuple(blocks), np.ones(STATES), np.zeros(EFFECTS), inside, outside)
+    return Table((), tuple(blocks), np.ones(STATES), np.zeros(EFFECTS), inside, outside, np.ones(STATES))
 
 
 def test_taking_an_effect_out_is_what_it_is_in_full() -> None:
@@ -83,6 +83,21 @@ def test_a_channel_that_nothing_explains_speaks_for_none() -> None:
     assert value[0] == pytest.approx(4.0, abs=0.4)
     others = [table(blocks).linear([i], LOW, HIGH)[1].total for i in (0, 2, 3)]
     assert min(others) > left.total + 1.0
+
+
+def test_what_the_states_take_up_is_not_explained() -> None:
+    """An effect whose signature is that of a state: it leaves less, as the state need not go so far."""
+    rng = np.random.default_rng(4)
+    blocks = []
+    for _ in range(3):
+        J = columns(rng)
+        J[:, :, STATES + 1] = J[:, :, 0]
+        blocks.append(block(J, rng.standard_normal((CHANNELS, ROWS)) + J[:, :, 0] * 6.0))
+    before = table(blocks).before()
+    value, left = table(blocks).linear([1], LOW, HIGH)
+    assert before.total > 2.0
+    assert left.total < 0.5 * before.total
+    assert value[0] == pytest.approx(6.0, abs=1.0)
 
 
 def told(left: float) -> Told:

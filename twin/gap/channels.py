@@ -7,7 +7,9 @@ and one of high precision does not speak for all. (Up to the count of independen
 likelihood of normal errors of unknown variance a channel.)
 
 Each channel's errors fall in two parts: what lies in the space of the candidates' signatures there (few
-directions, so that a weak effect shows), and all the rest.
+directions, so that a weak effect shows), and all the rest. What the states of a run (ground, sensor offsets)
+take up is not explained either: how far they must go, in units of how they scatter, counts as one more
+channel.
 """
 
 from __future__ import annotations
@@ -26,6 +28,8 @@ Array = NDArray[np.float64]
 
 RIDGE = 1.0
 """Directions of a channel in which typical effects make less than a sigma in all are not in its space."""
+LEAST_STATE = 0.5
+"""A state's square in the references counts as no less, in units of its variance."""
 STEPS = 3
 """Rounds of the fit, after each of which channels are weighted anew."""
 WIDE = 30.0
@@ -88,8 +92,8 @@ def _products(run: Evidence, gram: Array, offset: Array, error: Array | None = N
 
 @dataclass(frozen=True, eq=False)
 class Left:
-    """What is left over, as sums of logarithms over channels: `inside` the candidates' space and `outside`;
-    `weight` (C,) is that of each channel in the next fit."""
+    """What is left over, as sums of logarithms over channels: `inside` the candidates' space, with the
+    states, and `outside`; `weight` (C,) is that of each channel in the next fit."""
 
     inside: float
     outside: float
@@ -110,6 +114,7 @@ class Table:
         sigma: (T,) 1 sigma of the states.
         offset: (P,) what all references have in common.
         inside, outside: (C,) what a reference run leaves, on average.
+        states: (T,) squares of its states, in units of their variance.
     """
 
     runs: tuple[Evidence, ...]
@@ -118,6 +123,7 @@ class Table:
     offset: Array
     inside: Array
     outside: Array
+    states: Array
 
     @classmethod
     def of(
@@ -157,11 +163,13 @@ class Table:
         weight = np.ones(len(self.inside))
         best: Left | None = None
         for _ in range(steps):
-            inside, outside = energies(self.blocks, errors, self.sigma, weight)
-            ratio = np.maximum(inside / (len(self.blocks) * self.inside), 1.0)
-            rest = np.maximum(outside / (len(self.blocks) * self.outside), 1.0)
+            inside, outside, states = energies(self.blocks, errors, self.sigma, weight)
+            ratio, rest, far = (
+                np.maximum(now / (len(self.blocks) * floor), 1.0)
+                for now, floor in ((inside, self.inside), (outside, self.outside), (states, self.states))
+            )
             weight = 1.0 / ratio
-            found = Left(float(np.log(ratio).sum()), float(np.log(rest).sum()), weight)
+            found = Left(float(np.log(ratio).sum() + np.log(far.mean())), float(np.log(rest).sum()), weight)
             if best is None or found.total < best.total:
                 best = found
         assert best is not None
@@ -199,9 +207,10 @@ class Table:
 
 def energies(
     blocks: Sequence[Block], errors: Sequence[Products], sigma: Array, weight: Array
-) -> tuple[Array, Array]:
-    """Squares (C,) inside and outside each channel's space, summed over the runs, their states adapted."""
-    inside, outside = np.zeros(len(weight)), np.zeros(len(weight))
+) -> tuple[Array, Array, Array]:
+    """Squares (C,) inside and outside each channel's space once the states are adapted, and those (T,) of the
+    states in units of their variance, summed over the runs."""
+    inside, outside, states = np.zeros(len(weight)), np.zeros(len(weight)), np.zeros(len(sigma))
     for block, error in zip(blocks, errors, strict=True):
         T = block.states
         H = np.einsum("c,cij->ij", weight, block.gram[:, :T, :T]) + np.diag(sigma**-2.0)
@@ -211,15 +220,19 @@ def energies(
         within = np.einsum("ci,cij,cj->c", gain, block.inverse, gain, optimize=True)
         inside += within
         outside += np.maximum(square - within, 0.0)
-    return inside, outside
+        states += (theta / sigma) ** 2
+    return inside, outside, states
 
 
-def floor_of(floors: Sequence[Block], blocks: Sequence[Block], sigma: Array) -> tuple[Array, Array]:
-    """What a reference leaves (C,) inside and outside, on average; without any, what white noise would."""
+def floor_of(floors: Sequence[Block], blocks: Sequence[Block], sigma: Array) -> tuple[Array, Array, Array]:
+    """What a reference leaves inside and outside (C,), and its states (T,), on average; without any, what
+    white noise and the states' own variance would."""
     if floors:
         weight = np.ones(len(floors[0].gram))
-        inside, outside = energies(floors, [f.error for f in floors], sigma, weight)
-        return np.maximum(inside / len(floors), 1e-9), np.maximum(outside / len(floors), 1e-9)
+        inside, outside, states = energies(floors, [f.error for f in floors], sigma, weight)
+        count = len(floors)
+        floor = np.maximum(states / count, LEAST_STATE)
+        return np.maximum(inside / count, 1e-9), np.maximum(outside / count, 1e-9), floor
     directions = np.mean([np.einsum("cij,cji->c", b.inverse, b.gram) for b in blocks], axis=0)
     rows = np.mean([b.rows for b in blocks], axis=0)
-    return np.maximum(directions, 1.0), np.maximum(rows - directions, 1.0)
+    return np.maximum(directions, 1.0), np.maximum(rows - directions, 1.0), np.ones(len(sigma))
