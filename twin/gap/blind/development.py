@@ -39,8 +39,8 @@ FIRST_SEED = 7_001_000
 REFERENCES, RUNS = 14, 3
 SINGLES, OUTSIDERS = 16, 4
 """Trials of a site: effects of the catalogue, half of them shifted, and others."""
-OUTSIDE_COUNTS = 2.5
-"""Trials with a cause outside the catalogue count so often in the training: they are a fifth of all."""
+OUTSIDE_COUNTS = 1.5
+"""Trials with a cause outside the catalogue count so often in the training: a fifth of all are such."""
 SHRINK = 0.002
 """Weight of the squares of the weights, against a log likelihood of one a trial (assumed)."""
 
