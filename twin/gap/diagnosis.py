@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import time
@@ -146,18 +147,14 @@ def diagnose(
     found = detect(scores, normal, candidates, seed)
     null = learn(normal, len(scores))
     pool = Pool.of(scores, null)
-    plain = [dataclasses.replace(s, other=None) for s in scores]
     case = _Case(bench, scores, sigma, null, pool, beliefs(pool, candidates))
     floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
     table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys))
     detected = found.p_value <= significance
     choice, fits = chosen(Fitter(bench, scores, sigma, null, pool, table), case.believed, detected)
     refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}
-
-    def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
-        return _remaining(case, fits, forms)
-
-    search = Search(remaining, HeldOut.of([Pool.of([s], null) for s in plain]), candidates, table)
+    held_out = HeldOut.of([Pool.of([s], null).plain() for s in scores])
+    search = Search(functools.partial(_remaining, case, fits), held_out, candidates, table)
     verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)
     if progress is not None:
         progress(0.9)
