@@ -26,6 +26,7 @@ from terrafusion.twin.vehicle import load_vehicle
 from .drives import runs
 
 CHANNELS, ROWS, STATES, EFFECTS = 3, 400, 1, 4
+NO_REFERENCES = np.zeros((0, 2 * CHANNELS))
 LOW, HIGH = np.full(1, -20.0), np.full(1, 20.0)
 
 
@@ -44,7 +45,9 @@ def table(blocks: list[Block]) -> Table:
     """A reference leaves unit variance: so many directions inside, the rest outside."""
     N = STATES + EFFECTS
     inside, outside = np.full(CHANNELS, float(N)), np.full(CHANNELS, float(ROWS - N))
-    return Table((), tuple(blocks), np.ones(STATES), np.zeros(EFFECTS), inside, outside, np.ones(STATES))
+    return Table(
+        (), tuple(blocks), np.ones(STATES), np.zeros(EFFECTS), inside, outside, np.ones(STATES), NO_REFERENCES
+    )
 
 
 def test_taking_an_effect_out_is_what_it_is_in_full() -> None:
@@ -106,7 +109,7 @@ def told(left: float) -> Told:
 
 def chances(one: float, other: float, before: float) -> tuple[dict[str, float], float]:
     """Of two causes that leave so much of a gap, and of the unknown one."""
-    by, gap = Weights(6.0, 0.9, 2.0), told(before)
+    by, gap = Weights(6.0, 0.9, 2.0, 1.0, 0.7), told(before)
     odds = {"one": by.cause(told(one), gap), "other": by.cause(told(other), gap)}
     return probabilities(odds, by.outsider(gap))
 
@@ -153,7 +156,7 @@ def test_a_large_lag_is_found_through_the_twin_where_its_signature_misleads() ->
     held = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys))
     scale = float(candidates.scale[candidates.keys.index(key)])
     value, _ = held.linear(law.columns, *bounds(candidates, law.columns))
-    best = Fitter(bench, scores, sigma, null, pool, held).fits([(law, value)])[law]
+    best = Fitter(bench, scores, sigma, null, pool, held).fits([(law, value)])[0][law]
     error = abs(float(best.fit.value[0]) * scale - truth)
     assert error < 0.04
     assert error < 0.5 * abs(float(value[0]) * scale - truth)
@@ -168,9 +171,8 @@ def made(rng: np.random.Generator, effect: str | None) -> Trial:
     if effect is not None:
         left[effect] = before * float(rng.uniform(0.1, 0.5))
     parts = {name: (x, 0.2 * x, 0.3 * x) for name, x in left.items()}
-    return Trial(
-        f"{effect}/same", "gentle", "grass", 1.5, effect, 0.01, parts, (before, 0.2 * before, 0.3 * before)
-    )
+    gap, misfit = (before, 0.2 * before, 0.3 * before), float(rng.uniform(-1.0, 0.5))
+    return Trial(f"{effect}/same", "gentle", "grass", 1.5, effect, parts, gap, misfit, {})
 
 
 def test_trained_weights_name_causes_they_were_not_trained_on() -> None:
@@ -197,6 +199,7 @@ def test_trials_and_weights_survive_a_file(tmp_path: Path) -> None:
 def test_weights_of_the_package_are_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert weights().slope > 0.0
     assert 0.5 < weights().share < 1.5
+    assert 0.5 < weights().unfit < 1.0  # the verdict is then unknown
     (tmp_path / "choice.yaml").write_text("weights: {slope: 1}\n", encoding="utf-8")
     monkeypatch.setattr(choice_module.resources, "files", lambda _: tmp_path)
     weights.cache_clear()

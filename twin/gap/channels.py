@@ -78,6 +78,12 @@ class Block:
         square = error.square - (error.gain[:, at] + gain[:, at]) @ value
         return Products(gain, np.maximum(square, 0.0))
 
+    def done_by(self, columns: Sequence[int], value: Array) -> Products:
+        """What effects of such size do, linearly."""
+        at = [self.states + i for i in columns]
+        gain = self.gram[:, :, at] @ value
+        return Products(gain, gain[:, at] @ value)
+
 
 def _products(run: Evidence, gram: Array, offset: Array, error: Array | None = None) -> Products:
     N, T = gram.shape[1], run.states
@@ -115,6 +121,7 @@ class Table:
         offset: (P,) what all references have in common.
         inside, outside: (C,) what a reference run leaves, on average.
         states: (T,) squares of its states, in units of their variance.
+        each: (R, 2C) what every reference run leaves inside, then outside.
     """
 
     runs: tuple[Evidence, ...]
@@ -124,6 +131,7 @@ class Table:
     inside: Array
     outside: Array
     states: Array
+    each: Array
 
     @classmethod
     def of(
@@ -145,7 +153,9 @@ class Table:
             Block.of(run, channels, columns, learn([s for j, s in enumerate(scores) if j != i], 1).offset)
             for i, run in enumerate(references if len(scores) > 1 else ())
         ]
-        return cls(tuple(runs), blocks, sigma, offset, *floor_of(floors, blocks, sigma))
+        each = [energy(floor, floor.error, sigma, np.ones(channels)) for floor in floors]
+        left = floor_of(floors, blocks, sigma)
+        return cls(tuple(runs), blocks, sigma, offset, *left, np.array(each).reshape(-1, 2 * channels))
 
     def before(self) -> Left:
         """Of the gap as it is."""
@@ -155,6 +165,14 @@ class Table:
         """Of other whitened errors of the runs."""
         return [
             _products(run, block.gram, self.offset, error)
+            for run, block, error in zip(self.runs, self.blocks, errors, strict=True)
+        ]
+
+    def done_by(self, errors: Sequence[Array]) -> list[Products]:
+        """What effects do that leave these whitened errors of the runs."""
+        nothing = np.zeros_like(self.offset)
+        return [
+            _products(run, block.gram, nothing, run.rows[:, -1] - error)
             for run, block, error in zip(self.runs, self.blocks, errors, strict=True)
         ]
 
@@ -222,6 +240,12 @@ def energies(
         outside += np.maximum(square - within, 0.0)
         states += (theta / sigma) ** 2
     return inside, outside, states
+
+
+def energy(block: Block, error: Products, sigma: Array, weight: Array) -> Array:
+    """Energies (2C,) of one run's error inside, then outside each channel's space."""
+    inside, outside, _ = energies([block], [error], sigma, weight)
+    return np.maximum(np.concatenate([inside, outside]), 1e-9)
 
 
 def floor_of(floors: Sequence[Block], blocks: Sequence[Block], sigma: Array) -> tuple[Array, Array, Array]:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Table
+from terrafusion.twin.gap.goodness import Goodness
 from terrafusion.twin.gap.ladder import Fitted, bounds
 from terrafusion.twin.gap.posterior import Pool
 
@@ -59,19 +60,24 @@ LAPSE = 0.05
 @dataclass(frozen=True)
 class Weights:
     """Of the odds: `slope` by the share that is left, times the root of the gap; `share` that an unknown
-    cause is taken to leave, and its log odds, `unknown`, beside one of the catalogue that leaves as much."""
+    cause is taken to leave, and its log odds, `unknown`, beside one of the catalogue that leaves as much and
+    just fits; `misfit`, by how far it is from there. `unfit` is the probability of an unknown cause where the
+    likeliest effects do not fit: no less is told then."""
 
     slope: float
     share: float
     unknown: float
+    misfit: float
+    unfit: float
 
     def cause(self, told: Told, before: Told) -> float:
         """Log odds of a cause that leaves this of a gap, up to a constant."""
         return -self.slope * told.total / math.sqrt(max(before.total, LEAST))
 
-    def outsider(self, before: Told) -> float:
-        """The same of an unknown cause."""
-        return self.unknown - self.slope * self.share * math.sqrt(max(before.total, LEAST))
+    def outsider(self, before: Told, misfit: float = 0.0) -> float:
+        """The same of an unknown cause, beside effects of that `Goodness.misfit`."""
+        by_share = self.slope * self.share * math.sqrt(max(before.total, LEAST))
+        return self.unknown + self.misfit * misfit - by_share
 
 
 @functools.cache
@@ -102,6 +108,8 @@ class Choice:
         before: the gap as it is.
         odds: log odds by effect.
         unknown: of a cause outside the catalogue.
+        by: weights.
+        fits: whether the likeliest effects leave what references leave.
     """
 
     laws: dict[str, Hypothesis]
@@ -109,6 +117,8 @@ class Choice:
     before: Told
     odds: dict[str, float]
     unknown: float
+    by: Weights
+    fits: bool = True
 
     @classmethod
     def of(
@@ -132,7 +142,7 @@ class Choice:
             if law.effect not in laws or now.total < least[law.effect].total:
                 laws[law.effect], least[law.effect] = law, now
         odds = {effect: by.cause(now, before) for effect, now in least.items()}
-        return cls(laws, least, before, odds, by.outsider(before))
+        return cls(laws, least, before, odds, by.outsider(before), by)
 
     def first(self) -> str:
         """The likeliest effect."""
@@ -142,16 +152,25 @@ class Choice:
         """Some effects at other log odds."""
         return dataclasses.replace(self, odds={**self.odds, **more})
 
+    def after(self, good: Goodness) -> Choice:
+        """The same once it is known how well the likeliest effects fit."""
+        return dataclasses.replace(self, unknown=self.by.outsider(self.before, good.misfit), fits=good.fits)
+
     def probabilities(self) -> tuple[dict[str, float], float]:
         """Of the effects and of an unknown cause, given that there is a gap."""
-        return probabilities(self.odds, self.unknown)
+        return probabilities(self.odds, self.unknown, 0.0 if self.fits else self.by.unfit)
 
 
-def probabilities(odds: Mapping[str, float], unknown: float) -> tuple[dict[str, float], float]:
-    """Of causes with these log odds and of the unknown one."""
+def probabilities(
+    odds: Mapping[str, float], unknown: float, least: float = 0.0
+) -> tuple[dict[str, float], float]:
+    """Of causes with these log odds and of the unknown one, which has no less than `least`."""
     values = np.array([*odds.values(), unknown])
     shares = np.exp(values - values.max())
     shares = (1.0 - LAPSE) * shares / shares.sum() + LAPSE / len(shares)
+    if shares[-1] < least:
+        shares *= (1.0 - least) / (1.0 - shares[-1])
+        shares[-1] = least
     *known, last = shares.tolist()
     return dict(zip(odds, known, strict=True)), last
 

@@ -6,6 +6,7 @@ from terrafusion.twin.gap.candidates import SOIL, Hypothesis
 from terrafusion.twin.gap.choice import Choice, Weights, linear, weights
 from terrafusion.twin.gap.ladder import Fitted, Fitter
 from terrafusion.twin.gap.posterior import Beliefs
+from terrafusion.twin.gap.refit import Refit
 
 BY_ODDS, BY_FACTOR = 8, 5
 """Laws that are fitted: the best by what channels leave to first order, and by Bayes factor."""
@@ -13,16 +14,17 @@ BY_ODDS, BY_FACTOR = 8, 5
 
 def chosen(
     fitter: Fitter, believed: Beliefs, detected: bool, by: Weights | None = None
-) -> tuple[Choice, dict[Hypothesis, Fitted]]:
-    """The odds of all causes, and the fits of the likeliest laws; without a gap nothing is fitted."""
+) -> tuple[Choice, dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
+    """The odds of all causes, the fits of the likeliest laws, and fits that failed; without a gap nothing is
+    fitted."""
     by = weights() if by is None else by
     candidates = fitter.bench.candidates
     told, sizes = linear(fitter.table, fitter.pool, candidates)
     if not detected:
-        return Choice.of(fitter.pool, fitter.table, told, by=by), {}
+        return Choice.of(fitter.pool, fitter.table, told, by=by), {}, {}
     laws = [law for law in told if law.effect != SOIL]
     best = sorted(laws, key=lambda law: told[law].total)[:BY_ODDS]
     best += sorted(laws, key=lambda law: -believed.forms[law.effect, law.form])[:BY_FACTOR]
     best += [law for law in told if law.effect == SOIL]
-    fitted = fitter.fits([(law, sizes[law]) for law in dict.fromkeys(best)])
-    return Choice.of(fitter.pool, fitter.table, told, fitted, by), fitted
+    fitted, failed = fitter.fits([(law, sizes[law]) for law in dict.fromkeys(best)])
+    return Choice.of(fitter.pool, fitter.table, told, fitted, by), fitted, failed

@@ -19,6 +19,7 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.answer import as_dict
 from terrafusion.twin.gap.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Table
+from terrafusion.twin.gap.choice import Choice
 from terrafusion.twin.gap.choosing import chosen
 from terrafusion.twin.gap.detect import Detection, detect
 from terrafusion.twin.gap.discrepancy import modulated
@@ -57,6 +58,7 @@ class Diagnosis:
         significance: threshold of its p-value.
         uncalibrated: whether twin replicates stood in for references.
         where: cells of the gap map, most important first.
+        choice: what each cause leaves of the gap, and its odds.
         verdict: causes and the judgement.
         shrinking: how far the gap shrinks on runs left out.
         next_run: drive that would separate look-alikes.
@@ -74,6 +76,7 @@ class Diagnosis:
     significance: float
     uncalibrated: bool
     where: list[Cell]
+    choice: Choice
     verdict: Verdict
     shrinking: Shrink | None
     next_run: NextRun | None
@@ -138,6 +141,20 @@ def diagnose(
     bench = gather(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
     )
+    found = diagnosed(bench, vehicle.name, significance=significance, seed=seed, progress=progress)
+    return dataclasses.replace(found, elapsed_s=time.perf_counter() - began)
+
+
+def diagnosed(
+    bench: Bench,
+    vehicle: str,
+    *,
+    significance: float = SIGNIFICANCE,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> Diagnosis:
+    """The diagnosis of gathered evidence; arguments as those of `diagnose`."""
+    began, candidates, runs = time.perf_counter(), bench.candidates, bench.runs
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
     scores = [_with_other_forms(bench, sigma, run) for run in bench.runs]
     normal = [score(run, sigma) for run in bench.references]
@@ -153,8 +170,9 @@ def diagnose(
     floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
     table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys))
     detected = found.p_value <= significance
-    choice, fits = chosen(Fitter(bench, scores, sigma, null, pool, table), case.believed, detected)
+    choice, fits, failed = chosen(Fitter(bench, scores, sigma, null, pool, table), case.believed, detected)
     refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}
+    refits |= {name: failed[law] for name, law in choice.laws.items() if law in failed}
     held_out = HeldOut.of([Pool.of([s], null).plain() for s in scores])
     search = Search(functools.partial(_remaining, case, fits), held_out, candidates, table)
     verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)
@@ -164,11 +182,13 @@ def diagnose(
     errors = [adapted(r, sigma, own_error(r, null)) for r in [*bench.runs, *bench.references]]
     where = gap_map(bench.runs, bench.references, bench.model, errors, seed)
     following = _next_run(bench, sigma, verdict)
-    failed = [f"{name}: {r.failure}" for name, r in refits.items() if r.failure]
+    notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
+    if verdict.fit is not None and verdict.fit.failure:
+        notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")
     return Diagnosis(
-        tuple(r.name for r in runs), tuple(r.name for r in references), vehicle.name,
-        sum(r.seconds for r in bench.runs), found, significance, uncalibrated, where, verdict, shrinking,
-        following, refits, bench, (*notes, *failed), time.perf_counter() - began,
+        tuple(r.name for r in runs), tuple(r.name for r in bench.references), vehicle,
+        sum(r.seconds for r in runs), found, significance, uncalibrated, where, choice, verdict, shrinking,
+        following, refits, bench, tuple(notes), time.perf_counter() - began,
     )  # fmt: skip
 
 

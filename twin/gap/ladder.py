@@ -9,7 +9,9 @@ along the signature.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +34,9 @@ WITHIN = 0.98
 """Share of an effect's range that is tried."""
 ROUNDS, IMPROVED = 2, 4
 """Rounds of improvement, and how many laws, the best ones, take part in them."""
+
+
+DIVERGED = "the twin diverges at every size tried, its linear value stands"
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,9 +77,11 @@ class Fitter:
     pool: Pool
     table: Table
 
-    def fits(self, laws: Sequence[tuple[Hypothesis, Array]]) -> dict[Hypothesis, Fitted]:
-        """Laws with their linear fits (k,), side by side; a law with which the twin diverges at all sizes is
-        left out."""
+    def fits(
+        self, laws: Sequence[tuple[Hypothesis, Array]]
+    ) -> tuple[dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
+        """Laws with their linear fits (k,), side by side; and those with which the twin diverges at all
+        sizes, as failures with their linear value."""
         ladder = [
             (law, point)
             for law, value in laws
@@ -88,14 +95,15 @@ class Fitter:
             if not tried:
                 break
             best = self._better(best, tried)
-        return best
+        return best, {law: self._failed(law, value) for law, value in laws if law not in best}
 
     def _better(
         self, best: dict[Hypothesis, Fitted], points: Sequence[tuple[Hypothesis, Array]]
     ) -> dict[Hypothesis, Fitted]:
         sets = [effects_at(self.bench, law.columns, point) for law, point in points]
-        runs = zip(self.bench.runs, self.bench.raws, strict=True)
-        errors = [errors_with(self.bench, run, raw, sets) for run, raw in runs]
+        bench = self.bench
+        with ThreadPoolExecutor(bench.jobs) as threads:
+            errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets)))
         out = dict(best)
         for i, (law, point) in enumerate(points):
             own = [mine[i] for mine in errors]
@@ -106,6 +114,10 @@ class Fitter:
             if law not in out or left.total < out[law].left.total:
                 out[law] = Fitted(self._fit(law, point, whole), left)
         return out
+
+    def _failed(self, law: Hypothesis, value: Array) -> Refit:
+        _, covariance, _ = self.pool.fit(law.columns)
+        return Refit(law.columns, value, value, covariance, 0.0, [], DIVERGED)
 
     def _next(self, law: Hypothesis, found: Fitted) -> Array:
         low, high = bounds(self.bench.candidates, law.columns)

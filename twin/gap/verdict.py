@@ -13,6 +13,7 @@ from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Table
 from terrafusion.twin.gap.choice import Choice, Told, weights
 from terrafusion.twin.gap.classes import class_of
+from terrafusion.twin.gap.goodness import Goodness, goodness
 from terrafusion.twin.gap.ladder import bounds
 from terrafusion.twin.gap.posterior import WIDE, Beliefs, Pool, beliefs
 from terrafusion.twin.gap.refit import Refit
@@ -39,7 +40,7 @@ CLASSES = 5
 @dataclass(frozen=True, eq=False)
 class Cause:
     """One candidate: its class, probability, best columns, their values (k,) with 1 sigma, in units of
-    `Candidates.scale`, and its share of the gap."""
+    `Candidates.scale`, and its share of the gap. Where the fit failed sigma is NaN, and there is no share."""
 
     effect: str
     members: tuple[str, ...]
@@ -52,7 +53,8 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The judgement, its named effects and all causes, most probable first."""
+    """The judgement, its named effects and all causes, most probable first; `goodness` is that of the
+    likeliest effects, where there is a gap."""
 
     kind: str
     named: tuple[str, ...]
@@ -60,6 +62,7 @@ class Verdict:
     p_null: float
     p_unknown: float
     fit: Refit | None
+    goodness: Goodness | None = None
 
 
 def null_probability(p_value: float) -> float:
@@ -131,6 +134,7 @@ class Found:
         fit: of all together.
         explained: what they explain of the gap on runs left out.
         left: what they leave in the channels.
+        goodness: whether that is like what references leave.
         factor: their log Bayes factor.
         beside: those of further effects.
     """
@@ -139,6 +143,7 @@ class Found:
     fit: Refit | None
     explained: float
     left: Left
+    goodness: Goodness
     factor: float
     beside: Beliefs
 
@@ -176,12 +181,17 @@ class Search:
         pool, fit = self.remaining(forms)
         given = [i for h in forms for i in self.candidates.columns(h.effect)]
         columns = [i for h in forms for i in h.columns]
+        table = self.table
         if fit is not None and fit.errors:
-            left = self.table.left(self.table.products(fit.errors))
+            errors, done = table.products(fit.errors), table.done_by(fit.errors)
+            left = table.left(errors)
         else:
-            left = self.table.linear(columns, *bounds(self.candidates, columns))[1]
+            value, left = table.linear(columns, *bounds(self.candidates, columns))
+            errors = [block.moved(block.error, columns, value) for block in table.blocks]
+            done = [block.done_by(columns, value) for block in table.blocks]
         mine = self.held_out.explained(columns, _explained(fit))
-        return Found(forms, fit, mine, left, factor, beliefs(pool.plain(), self.candidates, given))
+        good = goodness(table, errors, done, left.weight)
+        return Found(forms, fit, mine, left, good, factor, beliefs(pool.plain(), self.candidates, given))
 
     def _extended(self, found: Found, alone: float) -> Found:
         """Further effects beside those found, as long as they are called for; `alone` is the log Bayes factor
@@ -228,7 +238,7 @@ def judge(
     found: Found | None = None
     if detected:
         found = search.best(choice, believed, beliefs(pool.plain(), candidates))
-        choice = choice.with_odds(_together(found, choice, pool))
+        choice = choice.with_odds(_together(found, choice, pool)).after(found.goodness)
     weight, unknown = choice.probabilities()
     p_unknown = (1.0 - p_null) * unknown if detected else 0.0
     known = (1.0 - p_null - p_unknown) / sum(weight.values())
@@ -240,7 +250,8 @@ def judge(
     ]
     kind = _kind(found, choice, causes[0])
     named = found.effects if found is not None and kind != "unknown" else ()
-    return Verdict(kind, named, causes, p_null, p_unknown, found.fit if found is not None and named else None)
+    fit = found.fit if found is not None and named else None
+    return Verdict(kind, named, causes, p_null, p_unknown, fit, found.goodness if found is not None else None)
 
 
 def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
@@ -257,7 +268,7 @@ def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
 def _kind(found: Found | None, choice: Choice, first: Cause) -> str:
     if found is None:
         return "no_gap"
-    if choice.probabilities()[1] > 0.5:
+    if not found.goodness.fits or choice.probabilities()[1] > 0.5:
         return "unknown"
     if found.effects == (SOIL,):
         return "parameters"
@@ -277,7 +288,8 @@ def _cause(
     columns = choice.laws[name].columns
     value, covariance, _ = pool.fit(columns)
     fit, least = refits.get(name), 0.0
-    if fit is not None and not fit.failure:
+    failed = fit is not None and bool(fit.failure)
+    if fit is not None and not failed:
         columns, value, covariance, least = fit.columns, fit.value, fit.covariance, fit.explained
     order = sorted(choice.odds, key=lambda k: -choice.odds[k])
     members: tuple[str, ...] = (name,)
@@ -287,5 +299,6 @@ def _cause(
         close = [k for k in class_of(pool, candidates, name, columns, close, NEARLY) if k in close]
         both = set(together) if name in together else set()
         members = (name, *(k for k in order if k not in {name, *both} and (k in alike or k in close)))
-    share = share_of(pool, candidates.columns(name), floor, least)
-    return Cause(name, members, max(probability, 0.0), columns, value, np.sqrt(np.diag(covariance)), share)
+    share = None if failed else share_of(pool, candidates.columns(name), floor, least)
+    sigma = np.full(len(columns), np.nan) if failed else np.sqrt(np.diag(covariance))
+    return Cause(name, members, max(probability, 0.0), columns, value, sigma, share)
