@@ -81,7 +81,7 @@ def test_runs_like_the_references_seldom_fail() -> None:
 
 def test_a_large_effect_may_leave_a_share_of_itself() -> None:
     rng = np.random.default_rng(2)
-    good = judged(rng, sizes(8, 8, 8), sizes(40, 40, 40))
+    good = judged(rng, sizes(16, 16, 16), sizes(40, 40, 40))
     assert good.beyond > 0.0
     assert good.fits
 
