@@ -125,12 +125,14 @@ def make(number: int, jobs: int) -> list[Trial]:
     from terrafusion.twin.gap.blind.plant.run import record
     from terrafusion.twin.gap.candidates import Candidates
     from terrafusion.twin.gap.evidence import gather
+    from terrafusion.twin.gap.threads import one_blas_thread
 
     _, _, trials = site(number)
     recordings, split = record(specs(number)), RUNS * len(trials)
     vehicle = load_vehicle(VEHICLE)
-    bench = gather(recordings[:split], recordings[split:], vehicle, None, Candidates.of(), jobs=jobs)
-    return diagnosed_trials(number, bench)
+    with one_blas_thread():
+        bench = gather(recordings[:split], recordings[split:], vehicle, None, Candidates.of(), jobs=jobs)
+        return diagnosed_trials(number, bench)
 
 
 def diagnosed_trials(number: int, bench: Bench) -> list[Trial]:
@@ -190,10 +192,10 @@ def train(trials: Sequence[Trial]) -> Weights:
 
     some = [trial for trial in trials if trial.teaches()]
     unfit = [trial.effect is None for trial in some if trial.misfit > 0.0]
-    share = max((sum(unfit) + 1) / (len(unfit) + 2), LEAST_UNFIT)
+    share: float = max((sum(unfit) + 1) / (len(unfit) + 2), LEAST_UNFIT)
 
     def weights(w: Array) -> Weights:
-        return Weights(*w.tolist(), unfit=share)
+        return Weights(*w.tolist(), share)
 
     def cost(w: Array) -> float:
         return surprise(some, weights(w)) + SHRINK * float(w @ w)
