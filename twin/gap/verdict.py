@@ -248,7 +248,7 @@ def judge(
         _cause(name, weight[name] * known, pool, choice, refits, candidates, floor, together)
         for name in order
     ]
-    kind = _kind(found, choice, causes[0])
+    kind = _kind(found, causes, p_unknown)
     named = found.effects if found is not None and kind != "unknown" else ()
     fit = found.fit if found is not None and named else None
     return Verdict(kind, named, causes, p_null, p_unknown, fit, found.goodness if found is not None else None)
@@ -265,14 +265,15 @@ def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
     return {name: max(odds, choice.odds[name]) - 1e-6 * i for i, name in enumerate(found.effects)}
 
 
-def _kind(found: Found | None, choice: Choice, first: Cause) -> str:
+def _kind(found: Found | None, causes: Sequence[Cause], p_unknown: float) -> str:
     if found is None:
         return "no_gap"
-    if not found.goodness.fits or choice.probabilities()[1] > 0.5:
+    members = causes[0].members
+    if not found.goodness.fits or p_unknown > sum(c.probability for c in causes if c.effect in members):
         return "unknown"
     if found.effects == (SOIL,):
         return "parameters"
-    return "ambiguous" if len(first.members) > 1 else "effect"
+    return "ambiguous" if len(members) > 1 else "effect"
 
 
 def _cause(
