@@ -126,6 +126,18 @@ def test_odds_follow_what_is_left_and_an_unknown_cause_what_is_unexplained() -> 
     assert shares[-1] > 0.5
 
 
+def test_the_less_the_best_fits_the_likelier_is_an_unknown_cause() -> None:
+    by, gap = Weights(6.0, 0.9, 2.0, 1.0, 0.7), told(8.0)
+    odds = {"one": by.cause(told(5.0), gap), "other": by.cause(told(6.0), gap)}
+    shares = [probabilities(odds, by.outsider(gap, misfit))[1] for misfit in (-1.0, 0.0, 1.0)]
+    assert shares == sorted(shares)
+    assert shares[0] < shares[-1]
+    known, unknown = probabilities(odds, by.outsider(gap, -1.0), by.unfit)
+    assert unknown == pytest.approx(0.7)
+    assert sum(known.values()) == pytest.approx(0.3)
+    assert known["one"] > known["other"]
+
+
 def test_a_larger_gap_makes_the_same_shares_surer() -> None:
     small, large = (chances(0.4 * gap, 0.6 * gap, gap)[0] for gap in (2.0, 20.0))
     assert large["one"] / large["other"] > 2.0 * small["one"] / small["other"]

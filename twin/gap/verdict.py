@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Table
-from terrafusion.twin.gap.choice import Choice, Told, weights
+from terrafusion.twin.gap.choice import Choice, Told
 from terrafusion.twin.gap.classes import class_of
 from terrafusion.twin.gap.goodness import Goodness, goodness
 from terrafusion.twin.gap.ladder import bounds
@@ -259,7 +259,7 @@ def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
     if len(found.forms) < 2:
         return {}
     columns = tuple(i for h in found.forms for i in h.columns)
-    odds = weights().cause(Told.of(found.left, pool, columns), choice.before) - SECOND_ODDS * (
+    odds = choice.by.cause(Told.of(found.left, pool, columns), choice.before) - SECOND_ODDS * (
         len(found.forms) - 1
     )
     return {name: max(odds, choice.odds[name]) - 1e-6 * i for i, name in enumerate(found.effects)}
