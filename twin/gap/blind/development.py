@@ -195,7 +195,8 @@ def train(trials: Sequence[Trial]) -> Weights:
     share: float = max((sum(unfit) + 1) / (len(unfit) + 2), LEAST_UNFIT)
 
     def weights(w: Array) -> Weights:
-        return Weights(*w.tolist(), share)
+        slope, left, unknown, misfit = w.tolist()
+        return Weights(slope, left, unknown, misfit, share)
 
     def cost(w: Array) -> float:
         return surprise(some, weights(w)) + SHRINK * float(w @ w)
