@@ -202,7 +202,7 @@ def test_trials_and_weights_survive_a_file(tmp_path: Path) -> None:
     path.write_text(json.dumps([dataclasses.asdict(trial)]), encoding="utf-8")
     assert read([path]) == [trial]
     found = train([trial])
-    write(tmp_path / "choice.yaml", found, [trial], [path])
+    write(tmp_path / "choice.yaml", found, [trial], 1)
     text = (tmp_path / "choice.yaml").read_text(encoding="utf-8")
     assert "1 trials" in text
     assert f"slope: {found.slope:.4g}" in text
