@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
@@ -83,7 +84,7 @@ def _causes(d: Diagnosis) -> str:
     c, rows = d.bench.candidates, []
     for cause in d.verdict.causes[:MOST_CAUSES]:
         told = "; ".join(
-            f"{c.keys[i]} = {v * c.scale[i]:.3g} &plusmn; {s * c.scale[i]:.2g} {escape(c.units[i])}"
+            f"{c.keys[i]} = {v * c.scale[i]:.3g} {_within(s * c.scale[i])} {escape(c.units[i])}"
             for i, v, s in zip(cause.columns, cause.value, cause.sigma, strict=True)
         )
         share = "" if cause.share is None else f"{100.0 * cause.share:.0f}"
@@ -94,6 +95,10 @@ def _causes(d: Diagnosis) -> str:
     heads = ("effect", "probability, %", "explains, %", "parameters (1 sigma)", "cannot be told from")
     caption = "Probability of each cause; blue: judged present."
     return f"<h2>Causes</h2>\n{figure(fig, caption)}\n{table(heads, rows, (1, 2))}"
+
+
+def _within(sigma: float) -> str:
+    return f"&plusmn; {sigma:.2g}" if math.isfinite(sigma) else "(fit failed)"
 
 
 def _shrink(d: Diagnosis) -> str:

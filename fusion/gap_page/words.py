@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from terrafusion.twin.gap.diagnosis import Diagnosis
 from terrafusion.twin.gap.next_run import BY_HAND
 
@@ -63,7 +65,10 @@ def numbers(d: Diagnosis) -> str:
     parts = []
     for i, value, sigma in zip(first.columns, first.value, first.sigma, strict=True):
         unit = f" {c.units[i]}" if c.units[i] else ""
-        parts.append(f"{c.keys[i]} = {value * c.scale[i]:.3g} +- {sigma * c.scale[i]:.2g}{unit}")
+        within = (
+            f"+- {sigma * c.scale[i]:.2g}{unit}" if math.isfinite(sigma) else f"{unit} (fit failed)".strip()
+        )
+        parts.append(f"{c.keys[i]} = {value * c.scale[i]:.3g} {within}")
     return ", ".join(parts)
 
 

@@ -119,6 +119,23 @@ def _with_crosstalk(run: Recording) -> Recording:
     return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
 
 
+def test_unknown_a_gyro_that_swings_by_itself(references: list[Recording]) -> None:
+    """An effect that no catalogue has, and that looks like none in it."""
+    odd = [_swinging(run) for run in runs(600, 2)]
+    answer = checked(diagnose(odd, references, VEHICLE))
+    assert answer["verdict"] == "unknown"
+    assert answer["named"] == []
+    assert answer["p_unknown"] > 0.5
+
+
+def _swinging(run: Recording) -> Recording:
+    """50 mrad/s at 0.4 Hz on the yaw rate."""
+    assert run.imu is not None
+    gyro = run.imu.gyro_radps.copy()
+    gyro[:, 2] += 0.05 * np.sin(2.0 * np.pi * 0.4 * 1e-9 * (run.imu.t_ns - run.start_ns))
+    return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
+
+
 def test_the_gap_shrinks_on_runs_left_out(wide: Diagnosis) -> None:
     s = wide.to_json()["shrink"]
     assert s["after"] < s["before"]

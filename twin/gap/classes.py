@@ -36,9 +36,15 @@ def likeness(pool: Pool, one: Sequence[int], coefficients: Array, other: Sequenc
 
 
 def class_of(
-    pool: Pool, candidates: Candidates, effect: str, columns: Sequence[int], others: Sequence[str]
+    pool: Pool,
+    candidates: Candidates,
+    effect: str,
+    columns: Sequence[int],
+    others: Sequence[str],
+    same: float = ALIKE,
 ) -> tuple[str, ...]:
-    """The effect and those of `others` that it cannot be told from."""
+    """The effect and those of `others` that it cannot be told from; `same` is the correlation from which
+    it cannot."""
     coefficients, _, _ = pool.fit(columns)
     a = np.asarray(columns)
     signal = float(coefficients @ pool.information[np.ix_(a, a)] @ coefficients)
@@ -51,6 +57,6 @@ def class_of(
             for h in candidates.hypotheses
             if h.effect == other
         )
-        if alike >= ALIKE or signal * (1.0 - alike**2) < TELLING**2:
+        if alike >= same or signal * (1.0 - alike**2) < TELLING**2:
             members.append(other)
     return tuple(members)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -16,10 +17,14 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.answer import as_dict
-from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
+from terrafusion.twin.gap.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.channels import Table
+from terrafusion.twin.gap.choice import Choice
+from terrafusion.twin.gap.choosing import chosen
 from terrafusion.twin.gap.detect import Detection, detect
 from terrafusion.twin.gap.discrepancy import modulated
 from terrafusion.twin.gap.evidence import Bench, Soils, gather
+from terrafusion.twin.gap.ladder import Fitted, Fitter
 from terrafusion.twin.gap.next_run import NextRun, propose
 from terrafusion.twin.gap.null import Null, learn
 from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
@@ -30,7 +35,7 @@ from terrafusion.twin.gap.score import Score, learnt_sigma, score
 from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
 from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.gap.threads import one_blas_thread
-from terrafusion.twin.gap.verdict import HeldOut, Verdict, floor_of, judge
+from terrafusion.twin.gap.verdict import HeldOut, Search, Verdict, floor_of, judge
 from terrafusion.twin.gap.where import Cell, gap_map
 from terrafusion.twin.identify.inputs import check_source
 from terrafusion.twin.vehicle import VehicleParams
@@ -38,9 +43,6 @@ from terrafusion.twin.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-REFITTED = 6
-"""Forms that are refitted, the most probable ones: with the soil and the twin as it is, one vector of
-runs."""
 FLOORS = 20
 """Choices of references by which the floor of the gap is learnt."""
 
@@ -56,6 +58,7 @@ class Diagnosis:
         significance: threshold of its p-value.
         uncalibrated: whether twin replicates stood in for references.
         where: cells of the gap map, most important first.
+        choice: what each cause leaves of the gap, and its odds.
         verdict: causes and the judgement.
         shrinking: how far the gap shrinks on runs left out.
         next_run: drive that would separate look-alikes.
@@ -73,6 +76,7 @@ class Diagnosis:
     significance: float
     uncalibrated: bool
     where: list[Cell]
+    choice: Choice
     verdict: Verdict
     shrinking: Shrink | None
     next_run: NextRun | None
@@ -137,6 +141,20 @@ def diagnose(
     bench = gather(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
     )
+    found = diagnosed(bench, vehicle.name, significance=significance, seed=seed, progress=progress)
+    return dataclasses.replace(found, elapsed_s=time.perf_counter() - began)
+
+
+def diagnosed(
+    bench: Bench,
+    vehicle: str,
+    *,
+    significance: float = SIGNIFICANCE,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> Diagnosis:
+    """The diagnosis of gathered evidence; arguments as those of `diagnose`."""
+    began, candidates, runs = time.perf_counter(), bench.candidates, bench.runs
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
     scores = [_with_other_forms(bench, sigma, run) for run in bench.runs]
     normal = [score(run, sigma) for run in bench.references]
@@ -148,29 +166,29 @@ def diagnose(
     found = detect(scores, normal, candidates, seed)
     null = learn(normal, len(scores))
     pool = Pool.of(scores, null)
-    plain = [dataclasses.replace(s, other=None) for s in scores]
     case = _Case(bench, scores, sigma, null, pool, beliefs(pool, candidates))
     floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
-    refits = _refits(case)
-
-    def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
-        return _remaining(case, refits, forms)
-
-    verdict = judge(
-        found.p_value <= significance, found.tail(), pool, case.believed, _corrected(case, refits), refits,
-        remaining, HeldOut.of([Pool.of([s], null) for s in plain]), candidates, floor,
-    )  # fmt: skip
+    table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys))
+    detected = found.p_value <= significance
+    choice, fits, failed = chosen(Fitter(bench, scores, sigma, null, pool, table), case.believed, detected)
+    refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}
+    refits |= {name: failed[law] for name, law in choice.laws.items() if law in failed}
+    held_out = HeldOut.of([Pool.of([s], null).plain() for s in scores])
+    search = Search(functools.partial(_remaining, case, fits), held_out, candidates, table)
+    verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)
     if progress is not None:
         progress(0.9)
     shrinking = shrink(bench, scores, sigma, null, verdict.fit)
     errors = [adapted(r, sigma, own_error(r, null)) for r in [*bench.runs, *bench.references]]
     where = gap_map(bench.runs, bench.references, bench.model, errors, seed)
     following = _next_run(bench, sigma, verdict)
-    failed = [f"{name}: {r.failure}" for name, r in refits.items() if r.failure]
+    notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
+    if verdict.fit is not None and verdict.fit.failure:
+        notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")
     return Diagnosis(
-        tuple(r.name for r in runs), tuple(r.name for r in references), vehicle.name,
-        sum(r.seconds for r in bench.runs), found, significance, uncalibrated, where, verdict, shrinking,
-        following, refits, bench, (*notes, *failed), time.perf_counter() - began,
+        tuple(r.name for r in runs), tuple(r.name for r in bench.references), vehicle,
+        sum(r.seconds for r in runs), found, significance, uncalibrated, where, choice, verdict, shrinking,
+        following, refits, bench, tuple(notes), time.perf_counter() - began,
     )  # fmt: skip
 
 
@@ -233,36 +251,12 @@ def _with_other_forms(bench: Bench, sigma: Array, run: Evidence) -> Score:
     return dataclasses.replace(score(run, sigma), other=modulated(run, bench.model, sigma, columns))
 
 
-def _refits(case: _Case) -> dict[str, Refit]:
-    forms, candidates = case.believed.forms, case.bench.candidates
-    ranked = sorted((k for k in forms if k[0] != SOIL), key=lambda k: -forms[k])[:REFITTED]
-    columns = {(h.effect, h.form): h.columns for h in candidates.hypotheses}
-    chosen = [(effect, columns[effect, form]) for effect, form in ranked]
-    if SOIL in candidates.effects:  # both of its parameters, whatever its rank
-        chosen.append((SOIL, candidates.columns(SOIL)))
-    best: dict[str, Refit] = {}
-    for (effect, _), fit in zip(chosen, case.refitted([columns for _, columns in chosen]), strict=True):
-        if effect not in best or (fit.errors and fit.explained > best[effect].explained):
-            best[effect] = fit
-    return best
-
-
-def _corrected(case: _Case, refits: dict[str, Refit]) -> dict[str, float]:
-    """Log Bayes factors, by what an effect explains in the twin itself where it was refitted."""
-    out = dict(case.believed.effects)
-    for name, fit in refits.items():
-        if fit.errors:
-            linear = case.pool.fit(case.believed.best[name].columns)[2]
-            out[name] += 0.5 * (fit.explained - linear)
-    return out
-
-
 def _remaining(
-    case: _Case, refits: dict[str, Refit], forms: Sequence[Hypothesis]
+    case: _Case, fits: Mapping[Hypothesis, Fitted], forms: Sequence[Hypothesis]
 ) -> tuple[Pool, Refit | None]:
     """What is left of the gap with some effects in the twin, and their fit; the gap itself where that
     fails."""
-    fit = refits.get(forms[0].effect) if len(forms) == 1 else None
+    fit = fits[forms[0]].fit if len(forms) == 1 and forms[0] in fits else None
     if fit is None:
         fit = case.refitted([tuple(i for h in forms for i in h.columns)])[0]
     if not fit.errors:

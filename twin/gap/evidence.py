@@ -16,6 +16,7 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channel_noise import learnt_noise
 from terrafusion.twin.gap.outliers import bounded
+from terrafusion.twin.gap.poses import all_settled
 from terrafusion.twin.gap.residuals import (
     SOIL_STATE,
     Drives,
@@ -200,7 +201,8 @@ def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Mode
 
 def _error_on(log: Log, drives: Drives, effects: Mapping[str, float]) -> list[Array] | None:
     """Errors of the log, by channel, against the twin on another ground; None where the twin diverges."""
-    found = predictions(log, drives.model, drives.candidates, [effects], log.start)[0]
+    told = predictions(log, drives.model, drives.candidates, [effects], log.start)
+    found = all_settled(log, told)[0]
     return None if found is None else [o.value - y for o, y in zip(log.observed, found, strict=True)]
 
 

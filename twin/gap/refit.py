@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.null import Null
+from terrafusion.twin.gap.poses import all_settled
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.residuals import SOIL_STATE, Evidence, Raw, whitened_error
 from terrafusion.twin.gap.score import Score
@@ -128,7 +129,8 @@ def errors_with(
     c, base = bench.candidates, bench.model.effects
     soil = [name for name in SOIL_STATE if name in c.keys]
     driven = [{k: v for k, v in some.items() if k not in soil} for some in sets]
-    plain, *found = predictions(run.log, bench.model, c, [{}, *driven], run.log.start)
+    told = predictions(run.log, bench.model, c, [{}, *driven], run.log.start)
+    plain, *found = all_settled(run.log, told)
     out: list[Array | None] = []
     for some, y in zip(sets, found, strict=True):
         if y is None or plain is None:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.poses import all_settled, settled_start
 from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
 from terrafusion.twin.identify.log import Log
@@ -128,7 +129,9 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
     Raises:
         TerrafusionError: the twin diverges.
     """
-    return raw_of(log, drives.of(log), drives.model, drives.candidates, channels)
+    found = drives.of(log)
+    start = settled_start(log, [s.value for s in signatures(log, found)], log.start)
+    return raw_of(log, placed(found, log, start), drives.model, drives.candidates, channels)
 
 
 def raw_of(log: Log, found: Drive, model: Model, candidates: Candidates, channels: Sequence[str]) -> Raw:
@@ -164,7 +167,8 @@ def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
         step = _soil_step(evidence, gain, drives.candidates, len(names))
         tried = np.clip(own + step, -MOST_SOIL, MOST_SOIL)
         effects = _soil_at(tried, names, drives)
-        found = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)[0]
+        told = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)
+        found = all_settled(run.log, told)[0]
         if found is None:
             break
         error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]

@@ -22,15 +22,17 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
+from terrafusion.twin.gap.channels import Block, Table
+from terrafusion.twin.gap.choice import Choice, linear
 from terrafusion.twin.gap.detect import choices, detect, judged
 from terrafusion.twin.gap.discrepancy import modulated
 from terrafusion.twin.gap.evidence import gather
 from terrafusion.twin.gap.null import Null, learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
 from terrafusion.twin.gap.refit import Refit
-from terrafusion.twin.gap.residuals import state_sigmas
+from terrafusion.twin.gap.residuals import Evidence, state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
-from terrafusion.twin.gap.verdict import HeldOut, Verdict, floor_of, judge
+from terrafusion.twin.gap.verdict import HeldOut, Search, Verdict, floor_of, judge
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
@@ -61,8 +63,25 @@ def null_run(seed: int) -> Recording:
     return dataclasses.replace(simulate(DRIVE, seed=seed, effects=own), name=f"null{seed}", truth=None)
 
 
-def null_scores(seed: int, jobs: int) -> tuple[list[Score], Candidates]:
-    """Scores of all null runs."""
+@dataclasses.dataclass(frozen=True, eq=False)
+class Run:
+    """A run: its evidence, score, and errors by channel (None where the null is not learnt yet)."""
+
+    evidence: Evidence
+    score: Score
+    block: Block | None = None
+
+    def with_effect(self, columns: Sequence[int], size: Array) -> Run:
+        """The run with an effect of this size (k,), to first order."""
+        at, block = list(columns), self.block
+        score = dataclasses.replace(self.score, b=self.score.b + self.score.A[:, at] @ size)
+        if block is not None:
+            block = dataclasses.replace(block, error=block.moved(block.error, at, -size))
+        return Run(self.evidence, score, block)
+
+
+def null_runs(seed: int, jobs: int) -> tuple[list[Run], Array, Candidates]:
+    """All null runs, and 1 sigma of their states."""
     seeds = range(1000 * seed + 1, 1000 * seed + 1 + REFERENCES + HELD)
     with ProcessPoolExecutor(jobs) as pool:
         recordings = list(pool.map(null_run, seeds))
@@ -72,11 +91,11 @@ def null_scores(seed: int, jobs: int) -> tuple[list[Score], Candidates]:
     )
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
     columns = len(candidates.keys)
-    scores = [
-        dataclasses.replace(score(run, sigma), other=modulated(run, bench.model, sigma, columns))
+    runs = [
+        Run(run, dataclasses.replace(score(run, sigma), other=modulated(run, bench.model, sigma, columns)))
         for run in [*bench.references, *bench.runs]
     ]
-    return scores, candidates
+    return runs, sigma, candidates
 
 
 def interval(hits: int, count: int) -> tuple[float, float]:
@@ -122,12 +141,21 @@ class Trial:
 class Trials:
     """Trials against one split of null runs into references and held-out ones."""
 
-    def __init__(self, scores: Sequence[Score], candidates: Candidates, rng: np.random.Generator) -> None:
-        order = rng.permutation(len(scores))
-        self.references = [scores[i] for i in order[:REFERENCES]]
-        self.held = [scores[i] for i in order[REFERENCES:]]
+    def __init__(
+        self, runs: Sequence[Run], sigma: Array, candidates: Candidates, rng: np.random.Generator
+    ) -> None:
+        order = rng.permutation(len(runs))
+        normal, held = [runs[i] for i in order[:REFERENCES]], [runs[i] for i in order[REFERENCES:]]
+        self.references = [run.score for run in normal]
         self.candidates, self.rng = candidates, rng
         self.null: Null = learn(self.references, JUDGED)
+        columns, evidence = len(candidates.keys), [run.evidence for run in normal]
+        self.table = Table.of(evidence[:1], evidence, self.references, sigma, columns)
+        channels = len(self.table.inside)
+        self.held = [
+            dataclasses.replace(run, block=Block.of(run.evidence, channels, columns, self.null.offset))
+            for run in held
+        ]
         picks = choices(REFERENCES, JUDGED, 0)[:20]
         rest = [[r for i, r in enumerate(self.references) if i not in c] for c in picks]
         mine = [[self.references[i] for i in c] for c in picks]
@@ -146,7 +174,7 @@ class Trials:
         withheld = {"shifted": [law], "outside": forms}.get(family, [])
         kept = tuple(h for h in self.candidates.hypotheses if h not in withheld)
         candidates = dataclasses.replace(self.candidates, hypotheses=kept)
-        runs: list[Score] | None = [
+        runs: list[Run] | None = [
             self.held[i] for i in self.rng.choice(len(self.held), JUDGED, replace=False)
         ]
         truth = [law]
@@ -159,31 +187,35 @@ class Trials:
         if runs is None:
             return None
         names = tuple(h.effect for h in truth)
-        if judged(runs, self.references, candidates)[1].statistic() <= self.threshold:
+        scores = [run.score for run in runs]
+        if judged(scores, self.references, candidates)[1].statistic() <= self.threshold:
             return Trial(family, ratio, names, None)
-        pool = Pool.of(runs, self.null)
-        believed = beliefs(pool, candidates)
+        return Trial(family, ratio, names, self._verdict(runs, scores, candidates))
+
+    def _verdict(self, runs: Sequence[Run], scores: Sequence[Score], candidates: Candidates) -> Verdict:
+        pool = Pool.of(scores, self.null)
+        blocks = tuple(run.block for run in runs if run.block is not None)
+        table = dataclasses.replace(self.table, runs=(), blocks=blocks)
+        choice = Choice.of(pool, table, linear(table, pool, candidates)[0])
 
         def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
             return pool, None
 
-        each = HeldOut.of([Pool.of([dataclasses.replace(r, other=None)], self.null) for r in runs])
-        verdict = judge(
-            True, 0.01, pool, believed, believed.effects, {}, remaining, each, candidates, self.floor
-        )
-        return Trial(family, ratio, names, verdict)
+        each = HeldOut.of([Pool.of([dataclasses.replace(s, other=None)], self.null) for s in scores])
+        search = Search(remaining, each, candidates, table)
+        return judge(True, 0.01, pool, beliefs(pool, candidates), choice, {}, search, self.floor)
 
-    def _with(self, runs: list[Score], law: Hypothesis, ratio: float) -> list[Score] | None:
+    def _with(self, runs: list[Run], law: Hypothesis, ratio: float) -> list[Run] | None:
         at = list(law.columns)
         way = self.rng.standard_normal(len(at))
         if self.candidates.low[at[0]] >= 0.0:
             way = np.abs(way)
-        plain = [dataclasses.replace(r, other=None) for r in runs]
+        plain = [dataclasses.replace(r.score, other=None) for r in runs]
         information = Pool.of(plain, self.null).information[np.ix_(at, at)]
         size = ratio / math.sqrt(max(float(way @ information @ way), 1e-12))
         if np.abs(size * way).max() > MOST_UNITS:
             return None
-        return [dataclasses.replace(r, b=r.b + r.A[:, at] @ (size * way)) for r in runs]
+        return [run.with_effect(at, size * way) for run in runs]
 
 
 def line(trials: Sequence[Trial]) -> str:
@@ -216,14 +248,14 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
     rng = np.random.default_rng(given.seed)
-    scores, candidates = null_scores(given.seed, given.jobs)
-    alarms = false_alarms(scores, candidates, given.nulls, rng)
+    runs, sigma, candidates = null_runs(given.seed, given.jobs)
+    alarms = false_alarms([run.score for run in runs], candidates, given.nulls, rng)
     low, high = interval(alarms, given.nulls)
     print(f"false alarms {alarms} of {given.nulls} (95 %: {100 * low:.1f} to {100 * high:.1f} %)")
     print("| family | signal | trials | seen | first | of three | ECE | unknown | all named | extras |")
     print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
     cell = max(1, given.trials // (len(FAMILIES) * len(RATIOS)))
-    bench = Trials(scores, candidates, rng)
+    bench = Trials(runs, sigma, candidates, rng)
     for family in FAMILIES:
         for ratio in RATIOS:
             found: list[Trial] = []

@@ -1,4 +1,4 @@
-"""From Bayes factors, refits and shares to a verdict."""
+"""From odds, refits and shares to a verdict."""
 
 from __future__ import annotations
 
@@ -10,34 +10,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
+from terrafusion.twin.gap.channels import Left, Table
+from terrafusion.twin.gap.choice import Choice, Told
 from terrafusion.twin.gap.classes import class_of
+from terrafusion.twin.gap.goodness import Goodness, goodness
+from terrafusion.twin.gap.ladder import bounds
 from terrafusion.twin.gap.posterior import WIDE, Beliefs, Pool, beliefs
 from terrafusion.twin.gap.refit import Refit
 
 Array = NDArray[np.float64]
 
-TEMPER, LEFT_OVER = 0.2, 40.0
-"""Power of the Bayes factors in the posterior, and the square left over that halves it (a quasi-likelihood:
-where the candidates' laws do not fit, the evidence between them is worth less). Tuned on twin trials."""
-ENOUGH, ENOUGH_WIDTH = 0.6, 0.1
-"""An unknown cause is as likely as not where all effects named explain this share of the gap on runs left
-out; and the width of that judgement (tuned on twin trials)."""
-UNKNOWN_PART = 0.1
-"""It is also one where the log Bayes factor of a dependence on the input, beside all effects named, is above
-this part of theirs (tuned on twin trials)."""
 SECOND_FACTOR, SECOND_SHARE = 20.0, 0.08
 """Log Bayes factor that a further effect must have beside those found, and all together over one effect with
 a law of another form; and the share of the gap on runs left out that it must explain more (tuned on twin
 trials)."""
+SECOND_LEFT, SECOND_ODDS = 0.15, 2.0
+"""Share of what the effects found leave in the channels that a further one must take away, and the log odds
+that each further effect costs (assumed)."""
+SAME_ODDS, NEARLY = math.log(3.0), 0.9
+"""Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
+other, either (assumed)."""
 RIDGES = (0.3, 1.0, 3.0)
 """1 sigma of all columns and probes together, in typical sizes."""
 MOST_EFFECTS = 3
+CLASSES = 5
+"""Causes, the first ones, of which the class is told."""
 
 
 @dataclass(frozen=True, eq=False)
 class Cause:
     """One candidate: its class, probability, best columns, their values (k,) with 1 sigma, in units of
-    `Candidates.scale`, and its share of the gap."""
+    `Candidates.scale`, and its share of the gap. Where the fit failed sigma is NaN, and there is no share."""
 
     effect: str
     members: tuple[str, ...]
@@ -50,7 +53,8 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """The judgement, its named effects and all causes, most probable first."""
+    """The judgement, its named effects and all causes, most probable first; `goodness` is that of the
+    likeliest effects, where there is a gap."""
 
     kind: str
     named: tuple[str, ...]
@@ -58,6 +62,7 @@ class Verdict:
     p_null: float
     p_unknown: float
     fit: Refit | None
+    goodness: Goodness | None = None
 
 
 def null_probability(p_value: float) -> float:
@@ -76,25 +81,12 @@ def floor_of(pools: Sequence[Pool], every: Sequence[int]) -> tuple[float, float]
     return float(np.mean(explained)), float(np.std(explained)) + 1e-9
 
 
-@dataclass(frozen=True)
-class Explained:
-    """What some effects explain of the gap: its share, and what is left over in standard deviations and as
-    it is."""
-
-    share: float
-    left_sd: float
-    left: float
-
-
-def explained(
-    pool: Pool, columns: Sequence[int], floor: tuple[float, float], least: float = 0.0
-) -> Explained:
-    """What some columns explain, of what all columns and probes together do; `least` is what they are known
-    to."""
+def share_of(pool: Pool, columns: Sequence[int], floor: tuple[float, float], least: float = 0.0) -> float:
+    """Share of the gap that some columns explain, of what all columns and probes together do; `least` is what
+    they are known to."""
     whole = pool.fit(range(pool.own))[2] - floor[0]
     mine = max(pool.fit(columns)[2] - len(columns), least)
-    left = max(whole - mine, 0.0)
-    return Explained(float(np.clip(mine / max(whole, floor[1], 1e-9), 0.0, 1.0)), left / floor[1], left)
+    return float(np.clip(mine / max(whole, floor[1], 1e-9), 0.0, 1.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,17 +132,18 @@ class Found:
     Attributes:
         forms: one of each effect.
         fit: of all together.
-        explained, share: what they explain of the gap on runs left out, and its share.
-        unknown: log Bayes factor by which an unknown dependence beside them is called for.
-        factor: their own.
+        explained: what they explain of the gap on runs left out.
+        left: what they leave in the channels.
+        goodness: whether that is like what references leave.
+        factor: their log Bayes factor.
         beside: those of further effects.
     """
 
     forms: tuple[Hypothesis, ...]
     fit: Refit | None
     explained: float
-    share: float
-    unknown: float
+    left: Left
+    goodness: Goodness
     factor: float
     beside: Beliefs
 
@@ -158,15 +151,6 @@ class Found:
     def effects(self) -> tuple[str, ...]:
         """Their names."""
         return tuple(h.effect for h in self.forms)
-
-    def is_unknown(self) -> bool:
-        """Whether something else must be at work."""
-        return self.share < ENOUGH or self.unknown > 0.0
-
-    def p_unknown(self) -> float:
-        """Probability of that, given that there is a gap."""
-        by_share = (ENOUGH - self.share) / ENOUGH_WIDTH
-        return 1.0 / (1.0 + math.exp(-min(max(by_share, 0.1 if self.unknown > 0.0 else -50.0), 50.0)))
 
 
 Remaining = Callable[[Sequence[Hypothesis]], tuple[Pool, Refit | None]]
@@ -180,30 +164,34 @@ class Search:
     remaining: Remaining
     held_out: HeldOut
     candidates: Candidates
+    table: Table
 
-    def best(self, believed: Beliefs, factors: Mapping[str, float], linear: Beliefs) -> Found:
-        """One effect, its law perhaps of another form, or several by the catalogue's laws.
+    def best(self, choice: Choice, believed: Beliefs, linear: Beliefs) -> Found:
+        """The likeliest effect, and others beside it by the catalogue's laws.
 
         Args:
-            believed, linear: with laws of another form and without.
-            factors: by effect, those of `believed` corrected by refits.
+            believed, linear: Bayes factors with laws of another form and without.
         """
-        alone = max(factors, key=lambda k: factors[k])
-        plain = {k: linear.effects[k] + factors[k] - believed.effects[k] for k in factors}
-        first = max(plain, key=lambda k: plain[k])
-        several = self._extended(self._with((linear.best[first],), plain[first]), factors[alone])
-        if len(several.forms) > 1 or alone == first:
-            return several
-        return self._with((believed.best[alone],), plain[alone])
+        first = choice.first()
+        alone = max(believed.effects.values())
+        return self._extended(self._with((choice.laws[first],), linear.effects[first]), alone)
 
     def _with(self, forms: tuple[Hypothesis, ...], factor: float) -> Found:
         """Effects of this log Bayes factor, with all that is judged of them."""
         pool, fit = self.remaining(forms)
         given = [i for h in forms for i in self.candidates.columns(h.effect)]
-        beside = beliefs(pool.plain(), self.candidates, given)
-        mine = self.held_out.explained([i for h in forms for i in h.columns], _explained(fit))
-        unknown = beside.unknown - UNKNOWN_PART * max(factor, 0.0)
-        return Found(forms, fit, mine, mine / max(self.held_out.total, mine, 1e-9), unknown, factor, beside)
+        columns = [i for h in forms for i in h.columns]
+        table = self.table
+        if fit is not None and fit.errors:
+            errors, done = table.products(fit.errors), table.done_by(fit.errors)
+            left = table.left(errors)
+        else:
+            value, left = table.linear(columns, *bounds(self.candidates, columns))
+            errors = [block.moved(block.error, columns, value) for block in table.blocks]
+            done = [block.done_by(columns, value) for block in table.blocks]
+        mine = self.held_out.explained(columns, _explained(fit))
+        good = goodness(table, errors, done, left.weight)
+        return Found(forms, fit, mine, left, good, factor, beliefs(pool.plain(), self.candidates, given))
 
     def _extended(self, found: Found, alone: float) -> Found:
         """Further effects beside those found, as long as they are called for; `alone` is the log Bayes factor
@@ -216,6 +204,8 @@ class Search:
             more = self._with((*found.forms, found.beside.best[name]), found.factor + gain)
             if more.explained < found.explained + SECOND_SHARE * max(self.held_out.total, found.explained):
                 break
+            if more.left.total > (1.0 - SECOND_LEFT) * found.left.total:
+                break
             found = more
         return found
 
@@ -225,83 +215,91 @@ def _explained(fit: Refit | None) -> float:
     return fit.explained - 2.0 * len(fit.columns) if fit is not None and fit.errors else -math.inf
 
 
-def posterior(found: Mapping[str, float], left: float) -> dict[str, float]:
-    """Probabilities of the effects, given that one of them is the cause and leaves `left` unexplained."""
-    values = np.array(list(found.values())) * TEMPER / (1.0 + left / LEFT_OVER)
-    weights = np.exp(values - values.max())
-    return dict(zip(found, (weights / weights.sum()).tolist(), strict=True))
-
-
 def judge(
     detected: bool,
     p_value: float,
     pool: Pool,
     believed: Beliefs,
-    factors: Mapping[str, float],
+    choice: Choice,
     refits: Mapping[str, Refit],
-    remaining: Remaining,
-    held_out: HeldOut,
-    candidates: Candidates,
+    search: Search,
     floor: tuple[float, float],
 ) -> Verdict:
     """The verdict.
 
     Args:
-        factors: log Bayes factors by effect, those refitted corrected by what the twin itself explains.
+        choice: the odds of all effects by themselves.
         refits: by effect.
-        remaining: what is left of the gap beside some effects.
-        held_out: the gap run by run.
+        search: for several.
         floor: mean and standard deviation of what is explained where nothing is wrong.
     """
     p_null = null_probability(p_value)
-    linear = beliefs(pool.plain(), candidates)
-    first = max(factors, key=lambda k: factors[k])
-    found = Found((believed.best[first],), None, 0.0, 1.0, -math.inf, 0.0, believed)
+    candidates = search.candidates
+    found: Found | None = None
     if detected:
-        found = Search(remaining, held_out, candidates).best(believed, factors, linear)
-    ranking = dict(factors)
-    if len(found.forms) > 1:
-        ranking = {k: linear.effects[k] + factors[k] - believed.effects[k] for k in factors}
-    order = sorted(ranking, key=lambda k: -ranking[k])
-    columns = [i for name in found.effects for i in candidates.columns(name)]
-    least = found.fit.explained if found.fit is not None and found.fit.errors else 0.0
-    told = explained(pool, columns, floor, least)
-    p_unknown = (1.0 - p_null) * found.p_unknown() if detected else 0.0
-    weight = posterior(ranking, told.left)
-    known = 1.0 - p_null - p_unknown
+        found = search.best(choice, believed, beliefs(pool.plain(), candidates))
+        choice = choice.with_odds(_together(found, choice, pool)).after(found.goodness)
+    weight, unknown = choice.probabilities()
+    p_unknown = (1.0 - p_null) * unknown if detected else 0.0
+    known = (1.0 - p_null - p_unknown) / sum(weight.values())
+    order = sorted(weight, key=lambda k: -choice.odds[k])
+    together = found.effects if found is not None else ()
     causes = [
-        _cause(name, weight[name] * known, pool, believed, refits, candidates, order, floor) for name in order
+        _cause(name, weight[name] * known, pool, choice, refits, candidates, floor, together)
+        for name in order
     ]
-    kind = _kind(detected, found, causes[0])
-    named = found.effects if kind not in ("no_gap", "unknown") else ()
-    return Verdict(kind, named, causes, p_null, p_unknown, found.fit if named else None)
+    kind = _kind(found, causes, p_unknown)
+    named = found.effects if found is not None and kind != "unknown" else ()
+    fit = found.fit if found is not None and named else None
+    return Verdict(kind, named, causes, p_null, p_unknown, fit, found.goodness if found is not None else None)
 
 
-def _kind(detected: bool, found: Found, first: Cause) -> str:
-    if not detected:
+def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
+    """Log odds of several effects found, each as what all of them leave, in the order in which they were."""
+    if len(found.forms) < 2:
+        return {}
+    columns = tuple(i for h in found.forms for i in h.columns)
+    odds = choice.by.cause(Told.of(found.left, pool, columns), choice.before) - SECOND_ODDS * (
+        len(found.forms) - 1
+    )
+    return {name: max(odds, choice.odds[name]) - 1e-6 * i for i, name in enumerate(found.effects)}
+
+
+def _kind(found: Found | None, causes: Sequence[Cause], p_unknown: float) -> str:
+    if found is None:
         return "no_gap"
-    if found.is_unknown():
+    members = causes[0].members
+    if not found.goodness.fits or p_unknown > sum(c.probability for c in causes if c.effect in members):
         return "unknown"
     if found.effects == (SOIL,):
         return "parameters"
-    return "ambiguous" if len(first.members) > 1 else "effect"
+    return "ambiguous" if len(members) > 1 else "effect"
 
 
 def _cause(
     name: str,
     probability: float,
     pool: Pool,
-    believed: Beliefs,
+    choice: Choice,
     refits: Mapping[str, Refit],
     candidates: Candidates,
-    order: Sequence[str],
     floor: tuple[float, float],
+    together: Sequence[str],
 ) -> Cause:
-    columns = believed.best[name].columns
+    columns = choice.laws[name].columns
     value, covariance, _ = pool.fit(columns)
-    fit = refits.get(name)
-    if fit is not None and not fit.failure:
-        columns, value, covariance = fit.columns, fit.value, fit.covariance
-    members = class_of(pool, candidates, name, columns, order) if order.index(name) < 5 else (name,)
-    share = explained(pool, candidates.columns(name), floor).share
-    return Cause(name, members, max(probability, 0.0), columns, value, np.sqrt(np.diag(covariance)), share)
+    fit, least = refits.get(name), 0.0
+    failed = fit is not None and bool(fit.failure)
+    if fit is not None and not failed:
+        columns, value, covariance, least = fit.columns, fit.value, fit.covariance, fit.explained
+    order = sorted(choice.odds, key=lambda k: -choice.odds[k])
+    members: tuple[str, ...] = (name,)
+    if order.index(name) < CLASSES:
+        alike = class_of(pool, candidates, name, columns, order)
+        close = [k for k in order if abs(choice.odds[k] - choice.odds[name]) < SAME_ODDS]
+        close = [k for k in class_of(pool, candidates, name, columns, close, NEARLY) if k in close]
+        both = set(together) if name in together else set()
+        members = (name, *(k for k in order if k not in {name, *both} and (k in alike or k in close)))
+    share = None if failed else share_of(pool, candidates.columns(name), floor, least)
+    sigma = np.full(len(columns), np.nan) if failed else np.sqrt(np.diag(covariance))
+    return Cause(name, members, max(probability, 0.0), columns, value, sigma, share)

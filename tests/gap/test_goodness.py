@@ -1,0 +1,138 @@
+"""Whether the best explanation fits: against what references leave, with what a law may miss."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap import diagnose, refit
+from terrafusion.twin.gap.channels import RIDGE, Block, Products, Table, energy
+from terrafusion.twin.gap.goodness import FACTOR, FEWEST, LEVEL, Goodness, goodness
+from terrafusion.twin.gap.ladder import DIVERGED
+from terrafusion.twin.vehicle import load_vehicle
+
+from .drives import runs
+
+CHANNELS, ROWS, STATES, EFFECTS, RUNS, REFERENCES = 3, 300, 1, 4, 3, 14
+SIGMA, WEIGHT = np.ones(STATES), np.ones(CHANNELS)
+SCHEMA = json.loads((Path(__file__).parents[2] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
+
+
+def signatures(rng: np.random.Generator) -> np.ndarray:
+    """Of the states and effects (C, n, N); the second effect (index 1) does nothing in channel 2."""
+    J = 0.3 * rng.standard_normal((CHANNELS, ROWS, STATES + EFFECTS))
+    J[2, :, STATES + 1] = 0.0
+    return J
+
+
+def block(J: np.ndarray, error: np.ndarray) -> Block:
+    gram = np.einsum("cni,cnj->cij", J, J)
+    made = Products(np.einsum("cni,cn->ci", J, error), (error**2).sum(axis=1))
+    inverse = np.linalg.inv(gram + RIDGE * np.eye(J.shape[2]))
+    return Block(gram, inverse, made, STATES, np.full(CHANNELS, float(ROWS)))
+
+
+def noise(rng: np.random.Generator) -> np.ndarray:
+    return rng.standard_normal((CHANNELS, ROWS))
+
+
+def judged(
+    rng: np.random.Generator,
+    left: np.ndarray,
+    done: np.ndarray,
+    quiet: float = 1.0,
+    references: int = REFERENCES,
+) -> Goodness:
+    """Of runs that leave noise and `left` (C, N) times the signatures, of effects that do `done` (C, N) times
+    them; channel 0 has `quiet` times the noise."""
+    each = []
+    for _ in range(references):
+        b = block(signatures(rng), noise(rng))
+        each.append(energy(b, b.error, SIGMA, WEIGHT))
+    blocks, moved = [], []
+    for _ in range(RUNS):
+        J, e = signatures(rng), noise(rng)
+        e[0] *= quiet
+        blocks.append(block(J, e + np.einsum("cni,ci->cn", J, left)))
+        moved.append(block(J, np.einsum("cni,ci->cn", J, done)).error)
+    floor = np.ones(CHANNELS)
+    table = Table(
+        (), tuple(blocks), SIGMA, np.zeros(EFFECTS), floor, floor, SIGMA, np.reshape(each, (-1, 2 * CHANNELS))
+    )
+    return goodness(table, [b.error for b in blocks], moved, WEIGHT)
+
+
+def sizes(*values: float) -> np.ndarray:
+    """The second effect, of this size in each channel."""
+    out = np.zeros((CHANNELS, STATES + EFFECTS))
+    out[:, STATES + 1] = values
+    return out
+
+
+def test_runs_like_the_references_seldom_fail() -> None:
+    rng = np.random.default_rng(1)
+    failed = sum(not judged(rng, sizes(0, 0, 0), sizes(0, 0, 0)).fits for _ in range(200))
+    assert failed <= 2 * LEVEL * 200
+
+
+def test_a_large_effect_may_leave_a_share_of_itself() -> None:
+    rng = np.random.default_rng(2)
+    good = judged(rng, sizes(16, 16, 16), sizes(40, 40, 40))
+    assert good.beyond > 0.0
+    assert good.fits
+
+
+@pytest.mark.parametrize("share", [0.8, 1.5])
+def test_it_may_not_leave_most_of_itself(share: float) -> None:
+    rng = np.random.default_rng(3)
+    good = judged(rng, share * sizes(40, 40, 0), sizes(40, 40, 0))
+    assert not good.fits
+    assert good.channel in (0, 1)
+
+
+def test_an_error_where_the_effect_does_nothing_has_another_cause() -> None:
+    rng = np.random.default_rng(4)
+    elsewhere = np.zeros((CHANNELS, STATES + EFFECTS))
+    elsewhere[2, STATES + 3] = 8.0
+    good = judged(rng, elsewhere, sizes(40, 40, 40))
+    assert not good.fits
+    assert good.channel == 2
+    assert good.misfit > 0.0
+
+
+def test_a_channel_that_became_quiet_has_another_cause() -> None:
+    good = judged(np.random.default_rng(5), sizes(0, 0, 0), sizes(40, 0, 0), quiet=0.6)
+    assert not good.fits
+    assert good.channel == 0
+
+
+def test_without_references_nothing_is_called_unfit() -> None:
+    good = judged(np.random.default_rng(6), sizes(40, 40, 40), sizes(0, 0, 0), references=FEWEST - 1)
+    assert good == Goodness(0.0, None)
+    assert good.fits
+    assert good.misfit == pytest.approx(-np.log(FACTOR))
+
+
+def test_a_law_with_which_the_twin_diverges_is_told_as_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It stays a cause, without sigma and share, and the notes say why."""
+    whole = refit.predictions
+
+    def diverging(log, model, candidates, effects, start):  # type: ignore[no-untyped-def]
+        found = whole(log, model, candidates, effects, start)
+        return [None if "wheel_radius/scale" in some else y for some, y in zip(effects, found, strict=True)]
+
+    monkeypatch.setattr(refit, "predictions", diverging)
+    given = runs(300, 2, {"wheel_radius/scale": 0.03})
+    found = diagnose(given, runs(100, 6), load_vehicle("elevate"), effects=["wheel_radius", "track_width"])
+    answer = found.to_json()
+    jsonschema.validate(answer, SCHEMA)
+    assert any(note.startswith("wheel_radius") and DIVERGED in note for note in found.notes)
+    assert found.refits["wheel_radius"].failure == DIVERGED
+    causes = {cause["effect"]: cause for cause in answer["causes"]}
+    assert causes["wheel_radius"]["explained_share"] is None
+    assert causes["wheel_radius"]["parameters"]["wheel_radius/scale"]["sigma"] is None
+    assert causes["track_width"]["explained_share"] is not None

@@ -1,0 +1,134 @@
+"""Fits through the twin itself, from several sizes up.
+
+What an effect of real size does is not its signature times that size: a delay of a third of a second is no
+multiple of one of 15 ms. A fit that starts where the signature suggests often ends there, at a loss. So each
+law is driven at a ladder of sizes, the best of them is kept by what it leaves in each channel, and improved
+along the signature.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import repeat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.gap.candidates import Candidates, Hypothesis
+from terrafusion.twin.gap.channels import Left, Table
+from terrafusion.twin.gap.evidence import Bench
+from terrafusion.twin.gap.null import Null
+from terrafusion.twin.gap.posterior import Pool
+from terrafusion.twin.gap.refit import Refit, effects_at, errors_with, scored
+from terrafusion.twin.gap.score import Score
+
+Array = NDArray[np.float64]
+
+LADDER = (0.4, 1.0, 2.0, 4.0)
+"""Sizes tried, in that of the linear fit."""
+SMALL, SIZES = 0.7, (1.0, 3.0, 8.0)
+"""Below that size of the linear fit, in typical ones, those tried beside it."""
+WITHIN = 0.98
+"""Share of an effect's range that is tried."""
+ROUNDS, IMPROVED = 2, 4
+"""Rounds of improvement, and how many laws, the best ones, take part in them."""
+
+
+DIVERGED = "the twin diverges at every size tried, its linear value stands"
+
+
+@dataclass(frozen=True, eq=False)
+class Fitted:
+    """One law at its best: the fit, and what it leaves."""
+
+    fit: Refit
+    left: Left
+
+
+def bounds(candidates: Candidates, columns: Sequence[int]) -> tuple[Array, Array]:
+    """Least and greatest sizes (k,) of some columns, in typical ones."""
+    at = np.asarray(columns)
+    scale = candidates.scale[at]
+    return WITHIN * candidates.low[at] / scale, WITHIN * candidates.high[at] / scale
+
+
+def sizes(value: Array, low: Array, high: Array) -> list[Array]:
+    """Points (k,) to try for a linear fit (k,), within bounds."""
+    length = float(np.linalg.norm(value))
+    if length > SMALL:
+        points = [share * value for share in LADDER]
+    else:
+        way = value / length if length > 0.05 else np.eye(len(value))[0]
+        points = [length * way, *(size * way for size in SIZES)]
+    inside = [np.clip(point, low, high) for point in points]
+    return [p for i, p in enumerate(inside) if not any(np.array_equal(p, q) for q in inside[:i])]
+
+
+@dataclass(frozen=True, eq=False)
+class Fitter:
+    """Fits laws to the judged runs."""
+
+    bench: Bench
+    scores: Sequence[Score]
+    sigma: Array
+    null: Null
+    pool: Pool
+    table: Table
+
+    def fits(
+        self, laws: Sequence[tuple[Hypothesis, Array]]
+    ) -> tuple[dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
+        """Laws with their linear fits (k,), side by side; and those with which the twin diverges at all
+        sizes, as failures with their linear value."""
+        ladder = [
+            (law, point)
+            for law, value in laws
+            for point in sizes(value, *bounds(self.bench.candidates, law.columns))
+        ]
+        best = self._better({}, ladder)
+        for _ in range(ROUNDS):
+            first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
+            steps = [(law, self._next(law, best[law])) for law in first]
+            tried = [(law, point) for law, point in steps if np.abs(point - best[law].fit.value).max() > 1e-3]
+            if not tried:
+                break
+            best = self._better(best, tried)
+        return best, {law: self._failed(law, value) for law, value in laws if law not in best}
+
+    def _better(
+        self, best: dict[Hypothesis, Fitted], points: Sequence[tuple[Hypothesis, Array]]
+    ) -> dict[Hypothesis, Fitted]:
+        sets = [effects_at(self.bench, law.columns, point) for law, point in points]
+        bench = self.bench
+        with ThreadPoolExecutor(bench.jobs) as threads:
+            errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets)))
+        out = dict(best)
+        for i, (law, point) in enumerate(points):
+            own = [mine[i] for mine in errors]
+            whole = [error for error in own if error is not None]
+            if len(whole) < len(own):
+                continue
+            left = self.table.left(self.table.products(whole))
+            if law not in out or left.total < out[law].left.total:
+                out[law] = Fitted(self._fit(law, point, whole), left)
+        return out
+
+    def _failed(self, law: Hypothesis, value: Array) -> Refit:
+        _, covariance, _ = self.pool.fit(law.columns)
+        return Refit(law.columns, value, value, covariance, 0.0, [], DIVERGED)
+
+    def _next(self, law: Hypothesis, found: Fitted) -> Array:
+        low, high = bounds(self.bench.candidates, law.columns)
+        at = found.fit.value
+        step, _ = self.table.linear(law.columns, low - at, high - at, self.table.products(found.fit.errors))
+        return np.asarray(np.clip(at + step, low, high))
+
+    def _fit(self, law: Hypothesis, value: Array, errors: list[Array]) -> Refit:
+        square = 0.0
+        for run, first, error in zip(self.bench.runs, self.scores, errors, strict=True):
+            x, _ = self.null.standardised(scored(run, self.sigma, error, first.A))
+            square += float(x @ self.null.inverse @ x)
+        _, covariance, _ = self.pool.fit(law.columns)
+        return Refit(law.columns, value, value, covariance, self.pool.square - square, errors, "")
