@@ -17,7 +17,7 @@ STATUS = {
     "aligning": "heading is unknown until the robot has moved far enough for GNSS to show it",
     "running": "position, heading and slip are estimated",
     "outage": "no GNSS fix for more than two seconds; wheels and IMU carry the position",
-    "no_gnss": "no GNSS fix has told where the path lies; it is local, its start and heading are arbitrary",
+    "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
 }
 """Values of a status and the sentence that explains each."""
 
