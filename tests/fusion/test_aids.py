@@ -224,8 +224,9 @@ def test_a_disturbed_field_is_not_like_the_drives() -> None:
     assert all(slow), "a field that changes slowly, from place to place, is followed"
 
 
-def stand(aid: HeightAid, heights: list[float]) -> None:
-    """Pressures of a robot that stands, one a second, through the aid's own test."""
+def stand(aid: HeightAid, heights: list[float], placed_from: int | None = None) -> None:
+    """Pressures of a robot that stands, one a second, through the aid's own test; its path is laid onto the
+    map before that of number `placed_from`."""
     from terrafusion.fusion.graph.chain import Chain
     from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 
@@ -238,7 +239,8 @@ def stand(aid: HeightAid, heights: list[float]) -> None:
     for i, height in enumerate(heights, 1):
         chain.nodes[-1].t_ns = i * 1_100_000_000
         aid.add(chain.nodes[-1].t_ns, float(pressure_at(height)))
-        if aid.update(chain, chain.nodes[-1].t_ns, P, P):
+        placed = placed_from is not None and i >= placed_from
+        if aid.update(chain, chain.nodes[-1].t_ns, P, P, placed):
             chain.solve(1)
             P = chain.covariance()
 
@@ -254,6 +256,16 @@ def test_a_pressure_that_jumps_is_refused_then_taken_for_a_new_reference() -> No
         aid.note()
         == "barometer: height differences of 14 s were used, 10 refused, taken to have jumped 1 times"
     )
+
+
+def test_a_path_laid_onto_the_map_takes_the_barometer_along() -> None:
+    """Heights shift by 30 m beside the pressures, once: nothing is refused, and the new reference holds."""
+    seen: list[Innovation] = []
+    aid = HeightAid(None, seen.append)
+    stand(aid, [100.0] * 10 + [130.0] * 15, placed_from=11)
+    assert aid.refused == aid.jumps == 0
+    assert all(i.accepted for i in seen)
+    assert max(abs(float(i.value[0])) for i in seen[-5:]) < 1.0
 
 
 def test_pressures_that_are_none_are_refused() -> None:
