@@ -64,13 +64,21 @@ def field_runs(name: str, recordings: Sequence[Recording]) -> list[FieldRun]:
     Raises:
         DataError: the log has no wheels or no gyro, or does not say which vehicle it is.
     """
+    chains = chains_of(recordings)
+    return [
+        field_run(f"{name}#{k}" if len(chains) > 1 else name, name, chain) for k, chain in enumerate(chains)
+    ]
+
+
+def chains_of(recordings: Sequence[Recording]) -> list[list[Recording]]:
+    """The recordings, in their order, as chains of those that go on from each other."""
     chains: list[list[Recording]] = []
     for recording in recordings:
         if chains and _goes_on(chains[-1][-1], recording):
             chains[-1].append(recording)
         else:
             chains.append([recording])
-    return [_run(f"{name}#{k}" if len(chains) > 1 else name, name, chain) for k, chain in enumerate(chains)]
+    return chains
 
 
 def _goes_on(before: Recording, after: Recording) -> bool:
@@ -81,14 +89,15 @@ def _goes_on(before: Recording, after: Recording) -> bool:
     return turn < JOIN_RADPS and spin < JOIN_WHEEL_RADPS
 
 
-def _run(name: str, recording: str, chain: Sequence[Recording]) -> FieldRun:
+def field_run(name: str, recording: str, chain: Sequence[Recording]) -> FieldRun:
+    """One stretch from the recordings of its chain."""
     first = chain[0]
     if first.imu is None or first.wheels is None or first.vehicle is None:
         raise DataError(
             "has no gyro, no wheels or no vehicle", file=recording, remedy="compare logs that have all three"
         )
     vehicle = load_vehicle(first.vehicle)
-    starts, end = _starts(chain)
+    starts, end = chain_starts(chain)
     t = np.arange(0.0, end, DT_S)
     gyro = _joined(chain, starts, lambda r: (r.imu.t_ns, r.imu.gyro_radps[:, 2]) if r.imu else None)
     rate = _means(t, *gyro)
@@ -106,7 +115,7 @@ def _run(name: str, recording: str, chain: Sequence[Recording]) -> FieldRun:
     )  # fmt: skip
 
 
-def _starts(chain: Sequence[Recording]) -> tuple[list[float], float]:
+def chain_starts(chain: Sequence[Recording]) -> tuple[list[float], float]:
     """When each recording of a chain begins, s from the first, and when the last one ends."""
     starts, at = [], 0.0
     for recording in chain:
