@@ -30,7 +30,6 @@ from terrafusion.fusion.graph.factors import bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
-from terrafusion.fusion.graph.slow_states import Thrust
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.aids import Aids
 from terrafusion.fusion.inputs.alignment import (
@@ -296,9 +295,8 @@ class Estimator:
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
         row, drift = self.weights.row, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
-        share = self.weights.traction_share
         if switch > SWITCHED:
-            slow_states.open_slip(self.chain, t_ns - SEEN_LATE_NS, dt, row, *drift, switch, share)
+            slow_states.open_slip(self.chain, t_ns - SEEN_LATE_NS, dt, row, *drift, switch)
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
             segments = in_a_turn(segments, before)
@@ -319,8 +317,7 @@ class Estimator:
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, dt, switch)
         up = before.pose.rotation().matrix()[2]
-        thrust = slow_states.thrust(self.chain, k - 1, dt, share), Thrust.of(up, dt, rolled, share)
-        markov = slow_states.step(dt, row, *thrust, *drift, switch, rolled)
+        markov = slow_states.step(dt, row, up, *drift, switch, rolled)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
@@ -371,6 +368,8 @@ class Estimator:
         increment = wheel_increment(
             travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row, change
         )
+        if self.gnss.slide.rate_m2ps:
+            increment = increment.loosened(self.gnss.slide.rate_m2ps * (t_ns - before_ns) * 1e-9)
         inputs = self.config.inputs
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 

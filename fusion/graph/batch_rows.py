@@ -164,9 +164,9 @@ class _Markov:
         n = dim - NAV.stop
         known = [step for step in steps if step is not None]
         self._at = np.array([step is not None for step in steps], dtype=bool)
-        self._decay, self._mean, self._sigma, self._mean_before = (
+        self._decay, self._mean, self._sigma = (
             np.array([getattr(step, name)[:n] for step in known]).reshape(-1, n)
-            for name in ("decay", "mean", "sigma", "mean_before")
+            for name in ("decay", "mean", "sigma")
         )
         self._n, self._dim = n, dim
 
@@ -175,7 +175,7 @@ class _Markov:
         i, own = np.arange(self._n), np.zeros((len(self._decay), *rows.shape[1:]))
         own[:, i, NAV.stop + i] = -self._decay / self._sigma
         own[:, i, self._dim + NAV.stop + i] = 1.0 / self._sigma
-        wandered = self._decay * (before[self._at, : self._n] - self._mean_before)
+        wandered = self._decay * (before[self._at, : self._n] - self._mean)
         own[:, :, -1] = -(now[self._at, : self._n] - self._mean - wandered) / self._sigma
         rows[self._at] = own
 

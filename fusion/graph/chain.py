@@ -278,6 +278,13 @@ class Chain:
         if self.archive is not None:
             self.archive.set_markov(k, step)
 
+    def set_wheels(self, k: int, wheels: WheelIncrement) -> None:
+        """Another increment of the wheels into keyframe k, which must not be the first."""
+        self.nodes[k - self.first].wheels = wheels
+        self._dirty = min(self._dirty, k - 1)
+        if self.archive is not None:
+            self.archive.set_wheels(k, wheels)
+
     def rebuild(self) -> None:
         """Make the variables of GTSAM anew from the keyframes, which hold the same."""
         self.values = gtsam.Values()

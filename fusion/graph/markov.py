@@ -19,57 +19,43 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class MarkovStep:
-    """From one keyframe to the next: x_j = mean + decay (x_i - mean_before) + noise of `sigma`, each (n,).
-
-    `mean_before` is what `mean` was at the first keyframe: what is left of a state moves with its mean.
-    """
+    """From one keyframe to the next: x_j = mean + decay (x_i - mean) + noise of `sigma`, each (n,)."""
 
     decay: Array
     mean: Array
     sigma: Array
-    mean_before: Array
 
     def residual(self, before: Array, now: Array) -> Array:
         """Noise (n,) that leads from `before` to `now`, unwhitened."""
-        return np.asarray(now - self.mean - self.decay * (before - self.mean_before))
+        return np.asarray(now - self.mean - self.decay * (before - self.mean))
 
     def renewed(self, states: slice) -> MarkovStep:
         """The same step, but `states` start anew: from their mean, with their stationary spread."""
         decay, sigma = self.decay.copy(), self.sigma.copy()
         sigma[states] /= np.sqrt(1.0 - decay[states] ** 2)
         decay[states] = 0.0
-        return MarkovStep(decay, self.mean, sigma, self.mean_before)
+        return MarkovStep(decay, self.mean, sigma)
 
     def opened(self, other: MarkovStep, states: Array) -> MarkovStep:
         """The same step, but `states` (indices) go as in `other` where that forgets more of them."""
         taken = states[other.decay[states] < self.decay[states]]
-        mine = self.decay, self.mean, self.sigma, self.mean_before
-        others = other.decay, other.mean, other.sigma, other.mean_before
-        parts = [part.copy() for part in mine]
-        for part, theirs in zip(parts, others, strict=True):
-            part[taken] = theirs[taken]
-        return MarkovStep(*parts)
+        decay, mean, sigma = self.decay.copy(), self.mean.copy(), self.sigma.copy()
+        decay[taken], mean[taken], sigma[taken] = other.decay[taken], other.mean[taken], other.sigma[taken]
+        return MarkovStep(decay, mean, sigma)
 
 
 def markov_step(
-    dt_s: float,
-    mean: ArrayLike,
-    sigma: ArrayLike,
-    time_s: ArrayLike,
-    forget: ArrayLike = 0.0,
-    mean_before: ArrayLike | None = None,
+    dt_s: float, mean: ArrayLike, sigma: ArrayLike, time_s: ArrayLike, forget: ArrayLike = 0.0
 ) -> MarkovStep:
     """Exact step over `dt_s` of processes with the given moments and correlation times.
 
     `forget` in [0, 1] is the probability that the process has just started
-    anew, as slip does where the ground changes. `mean_before`, if it is not `mean`, was the mean at the
-    step's beginning.
+    anew, as slip does where the ground changes.
     """
     means, sigmas = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
     kept = 1.0 - np.clip(np.asarray(forget, dtype=float), 0.0, 1.0)
     decay = kept * np.exp(-dt_s / np.asarray(time_s, dtype=float))
-    earlier = means if mean_before is None else np.asarray(mean_before, dtype=float)
-    return MarkovStep(decay, means, sigmas * np.sqrt(1.0 - decay * decay), earlier)
+    return MarkovStep(decay, means, sigmas * np.sqrt(1.0 - decay * decay))
 
 
 def as_gtsam_factor(step: MarkovStep, key_i: int, key_j: int) -> gtsam.CustomFactor:

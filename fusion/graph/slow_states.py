@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, YAW_SCALE
 from terrafusion.fusion.graph.markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
@@ -60,29 +58,6 @@ _WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
 """Walk of the calibration, per sqrt(s): hardly any, but what is certain for ever cannot be whitened."""
 
 
-@dataclass(frozen=True)
-class Thrust:
-    """What the ground must push with, as the slope (a sine) that asks for it at steady speed.
-
-    `along` is positive where the ground drives the wheels on in the way they roll: a hill, or speeding up
-    by a, which asks for what a hill of a / g asks. `across` is how much higher the side is that would be
-    left if the robot rolled forwards.
-    """
-
-    along: float = 0.0
-    across: float = 0.0
-
-    @classmethod
-    def of(cls, up: Array, dt_s: float, wheels: WheelIncrement | None, share: float) -> Thrust:
-        """Thrust of a robot whose wheels did `wheels` in the last `dt_s`; `up` (3,) is the world's up in
-        body axes, `share` how much of the speeding up counts."""
-        if wheels is None:
-            return cls(float(up[0]), float(up[1]))
-        way = -1.0 if wheels.distance_m < 0.0 else 1.0
-        rise = float(up[0]) + share * wheels.speed_change_mps / (dt_s * GRAVITY_MPS2)
-        return cls(way * rise, way * float(up[1]))
-
-
 def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
     """Mean and 1 sigma (14,) of the linear states before any data, on the ground of `row`."""
     mean, sigma = np.zeros(len(LINEAR)), np.empty(len(LINEAR))
@@ -95,24 +70,24 @@ def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, 
 def step(
     dt_s: float,
     row: SensorNoise,
-    before: Thrust,
-    now: Thrust,
+    up: Array,
     drift_sigma_m: float,
     drift_time_s: float,
     switch: float,
     wheels: WheelIncrement | None = None,
 ) -> MarkovStep:
-    """The step of all linear states over `dt_s`; `switch` is the share of the ground that just changed.
+    """The step of all linear states over `dt_s`.
 
-    Slip moves with its mean, which is that of the thrust at each end.
+    `up` (3,) is the world's up in body axes, `switch` the share of the ground that just changed.
     """
-    downhill = -SIDE_SLIP_PER_GRADE * row.slip_per_grade * now.across
+    backwards = wheels is not None and wheels.distance_m < 0.0
+    downhill = -SIDE_SLIP_PER_GRADE * row.slip_per_grade * float(up[1]) * (-1.0 if backwards else 1.0)
     sigma = _stationary(row, drift_sigma_m)
     sigma[-1] = float(np.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill))
     renewed = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     wandering = markov_step(
         dt_s,
-        mean=[row.slip_at(now.along), 0.0, 0.0, row.yaw_scale_mean, 0.0, downhill],
+        mean=[row.slip_at(float(up[0])), 0.0, 0.0, row.yaw_scale_mean, 0.0, downhill],
         sigma=sigma,
         time_s=[
             SLIP_STEADY * row.slip_time_s,
@@ -123,15 +98,12 @@ def step(
             SIDE_SLIP_TIME_S,
         ],
         forget=[renewed, 0.0, 0.0, switch, 0.0, switch],
-        mean_before=[row.slip_at(before.along), 0.0, 0.0, row.yaw_scale_mean, 0.0, downhill],
     )
     walk = np.array(list(_WALK.values())) * np.sqrt(dt_s)
-    none = np.zeros(len(walk))
     return MarkovStep(
         np.append(wandering.decay, np.ones(len(walk))),
-        np.append(wandering.mean, none),
+        np.append(wandering.mean, np.zeros(len(walk))),
         np.append(wandering.sigma, walk),
-        np.append(wandering.mean_before, none),
     )
 
 
@@ -143,7 +115,6 @@ def open_slip(
     drift_sigma_m: float,
     drift_time_s: float,
     switch: float,
-    share: float,
 ) -> None:
     """Let the share `switch` of the slip start anew at the keyframe of `t_ns`, or the oldest that still can.
 
@@ -154,15 +125,9 @@ def open_slip(
     k = chain.first + 1 if k is None else max(k, chain.first + 1)
     if k <= chain.last:
         node = chain.nodes[k - chain.first]
-        before, now = thrust(chain, k - 1, dt_s, share), thrust(chain, k, dt_s, share)
-        anew = step(dt_s, row, before, now, drift_sigma_m, drift_time_s, switch, node.wheels)
+        up = node.point.pose.rotation().matrix()[2]
+        anew = step(dt_s, row, up, drift_sigma_m, drift_time_s, switch, node.wheels)
         chain.set_markov(k, anew if node.markov is None else node.markov.opened(anew, OF_THE_GROUND))
-
-
-def thrust(chain: Chain, k: int, dt_s: float, share: float) -> Thrust:
-    """Thrust at keyframe k, which is one of the window's."""
-    node = chain.nodes[k - chain.first]
-    return Thrust.of(node.point.pose.rotation().matrix()[2], dt_s, node.wheels, share)
 
 
 def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:

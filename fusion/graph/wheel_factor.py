@@ -71,6 +71,12 @@ class WheelIncrement:
         scale = float(np.sqrt(1.0 + (times - 1.0) * variance_m2 / self.sigma[0] ** 2))
         return dataclasses.replace(self, sigma=self.sigma * np.array([scale, 1.0, 1.0, scale]))
 
+    def loosened(self, variance_m2: float) -> WheelIncrement:
+        """The same, less sure of the way along body x and y by `variance_m2` each."""
+        sigma = self.sigma.copy()
+        sigma[:2] = np.sqrt(sigma[:2] ** 2 + variance_m2)
+        return dataclasses.replace(self, sigma=sigma)
+
 
 def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:
     """The residual (4,) of the module's docstring, unwhitened; `linear` (14,) of keyframe j."""

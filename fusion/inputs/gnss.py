@@ -22,6 +22,7 @@ from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residu
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.placement import Placement, place
+from terrafusion.fusion.inputs.slide import Slide
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.inputs.track import MotionTrack
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -77,6 +78,7 @@ class GnssUpdater:
         spec = config.rig.sensors.gnss
         self.track = MotionTrack(self.antenna_m)
         self.turned = 0
+        self.slide = Slide()
         self.scale, self.white = 1.0, WHITE_SHARE
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._best = best_fix(spec)
@@ -205,7 +207,9 @@ class GnssUpdater:
         self.turned += 1
         return True
 
-    def _add(self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise) -> bool:
+    def _add(
+        self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise, again: bool = False
+    ) -> bool:
         node, state = chain.nodes[k - chain.first], chain.state(k)
         offset_s = (fix.t_ns - node.t_ns) * 1e-9
         R = state.pose.rotation().matrix()
@@ -244,8 +248,17 @@ class GnssUpdater:
             )
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
         if verdict is Verdict.REJECT:
+            refused = [off for off, _ in self.gate.rejected]
+            if (
+                not again
+                and self.track.smooth_at(fix.t_ns)
+                and self.slide.refuted(chain, k, self.last_used_ns, refused, float(np.max(fix.sigma_m[:2])))
+            ):
+                self.gate.rejected.clear()
+                return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
             self.rejected += 1
             return False
+        self.slide.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
         P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
         cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
@@ -266,6 +279,17 @@ class GnssUpdater:
             chain.restart(np.zeros(chain.dim), k)
         if weight > UNUSED_WEIGHT:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
+        return True
+
+    def _slid(self, chain: Chain, k: int, fix: GnssFix) -> bool:
+        """Whether the fixes just refused show that the wheels did not roll where the robot went."""
+        refused = [off for off, _ in self.gate.rejected]
+        sigma_m = float(np.max(fix.sigma_m[:2]))
+        if not self.track.smooth_at(fix.t_ns):
+            return False
+        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m):
+            return False
+        self.gate.rejected.clear()
         return True
 
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:

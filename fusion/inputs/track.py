@@ -33,6 +33,8 @@ LEAST_RATIO, MOST_RATIO = 0.3, 1.7
 """Driven over dead-reckoned distance between which a path says something about heading."""
 TURN_SIGMA_RAD = 0.15
 LEAST_TURN_RAD = 0.35
+MOST_JERK_MPS3, SMOOTH_SIGMA = 10.0, 3.0
+"""A wheeled robot changes its acceleration no faster than by 2 m/s2 in a fifth of a second (assumed)."""
 CONFIRMED = 3
 """Fixes in a row that must show the same wrong heading."""
 
@@ -140,6 +142,29 @@ class MotionTrack:
         bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
         claimed = 6.0 * np.array([p.sigma_m for p in recent])[1:-1] ** 2
         return math.sqrt(_median(np.maximum(seen - bend, 0.0)[even] / claimed[even]))
+
+    def smooth_at(self, t_ns: int) -> bool:
+        """Whether the fix of `t_ns` lies where the three before it lead, as they claim; False with fewer.
+
+        A parabola through the three is carried on; a robot leaves it by no more than `MOST_JERK_MPS3` makes.
+        Fixes of a receiver that scatters beyond its claims do not follow each other so.
+        """
+        last = bisect.bisect_right(self.pairs, t_ns, key=lambda p: p.t_ns)
+        recent = self.pairs[max(last - 4, 0) : last]
+        if len(recent) < 4:
+            return False
+        a, b, c, t = ((p.t_ns - recent[0].t_ns) * 1e-9 for p in recent)
+        if not a < b < c < t:
+            return False
+        weights = (
+            (t - b) * (t - c) / ((a - b) * (a - c)),
+            (t - a) * (t - c) / ((b - a) * (b - c)),
+            (t - a) * (t - b) / ((c - a) * (c - b)),
+        )
+        led = sum(w * p.fix for w, p in zip(weights, recent, strict=False))
+        claimed = [w * p.sigma_m for w, p in zip((*weights, 1.0), recent, strict=True)]
+        jerk = MOST_JERK_MPS3 / 6.0 * (t - a) * (t - b) * (t - c)
+        return abs(recent[3].fix - led) <= SMOOTH_SIGMA * math.hypot(*claimed) + jerk
 
     def wrong_by(self, yaw_sigma_rad: float, scale: float) -> float | None:
         """Angle by which the filter's heading must turn to agree with the motion, once that is sure."""

@@ -20,15 +20,11 @@ INNOVATION_METHODS = ("sage_husa", "variational")
 
 @dataclass(frozen=True)
 class RowTuning:
-    """Factors on three standard deviations of a policy's row; 1 leaves it as it was fitted.
-
-    `traction_share` is how much of the wheels' speeding up counts as a hill of the same thrust.
-    """
+    """Factors on three standard deviations of a policy's row; 1 leaves it as it was fitted."""
 
     wheel_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
     slip_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
     gnss_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
-    traction_share: Annotated[float, Quantity("", 0.0, 4.0)] = 1.0
 
     def of(self, row: SensorNoise) -> SensorNoise:
         """`row` with the factors on it."""

@@ -57,8 +57,6 @@ class TerrainWeights:
     def __init__(self, config: EstimatorConfig) -> None:
         self.policy = config.tuning.adaptive.of_all(config.policy)
         self.adaptive = config.mode == "adaptive"
-        tuning = config.tuning.adaptive if self.adaptive else config.tuning.fixed
-        self.traction_share = tuning.traction_share
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels

@@ -31,8 +31,7 @@ def rolling(speed_mps: float, change_mps: float = 0.0) -> WheelIncrement:
 def step(
     wheels: WheelIncrement | None, up: np.ndarray = LEVEL, switch: float = 0.0, dt_s: float = 0.1
 ) -> MarkovStep:
-    thrust = slow_states.Thrust.of(up, dt_s, wheels, 1.0)
-    return slow_states.step(dt_s, SAND, thrust, thrust, 0.02, 100.0, switch, wheels)
+    return slow_states.step(dt_s, SAND, up, 0.02, 100.0, switch, wheels)
 
 
 def test_slip_lasts_while_the_wheels_keep_their_speed() -> None:

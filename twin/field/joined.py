@@ -97,7 +97,9 @@ def _path(run: FieldRun) -> Trajectory | None:
     along, across = (np.interp(t, run.t_s[known], run.velocity_mps[known, i]) for i in (0, 1))
     psi = heading(run.t_s, run.yaw_rate_radps)[rows]
     psi = psi - psi[0]
-    world = np.stack([np.cos(psi) * along - np.sin(psi) * across, np.sin(psi) * along + np.cos(psi) * across], 1)
+    world = np.stack(
+        [np.cos(psi) * along - np.sin(psi) * across, np.sin(psi) * along + np.cos(psi) * across], 1
+    )
     steps = 0.5 * DT_S * (world[1:] + world[:-1])
     position = np.zeros((len(t), 3))
     position[1:, :2] = np.cumsum(steps, axis=0)
