@@ -271,19 +271,15 @@ class Chain:
         self._anchor, self._dirty = None, self.first
         self._eliminate_all()
 
-    def set_markov(self, k: int, step: MarkovStep) -> None:
-        """Another step of slip and drift into keyframe k, which must not be the first."""
-        self.nodes[k - self.first].markov = step
+    def revise(
+        self, k: int, markov: MarkovStep | None = None, wheels: WheelIncrement | None = None
+    ) -> None:
+        """Another step of slip and drift, or increment of the wheels, into keyframe k, not the first."""
+        node = self.nodes[k - self.first]
+        node.markov, node.wheels = markov or node.markov, wheels or node.wheels
         self._dirty = min(self._dirty, k - 1)
         if self.archive is not None:
-            self.archive.set_markov(k, step)
-
-    def set_wheels(self, k: int, wheels: WheelIncrement) -> None:
-        """Another increment of the wheels into keyframe k, which must not be the first."""
-        self.nodes[k - self.first].wheels = wheels
-        self._dirty = min(self._dirty, k - 1)
-        if self.archive is not None:
-            self.archive.set_wheels(k, wheels)
+            self.archive.revise(k, markov, wheels)
 
     def rebuild(self) -> None:
         """Make the variables of GTSAM anew from the keyframes, which hold the same."""

@@ -127,7 +127,7 @@ def open_slip(
         node = chain.nodes[k - chain.first]
         up = node.point.pose.rotation().matrix()[2]
         anew = step(dt_s, row, up, drift_sigma_m, drift_time_s, switch, node.wheels)
-        chain.set_markov(k, anew if node.markov is None else node.markov.opened(anew, OF_THE_GROUND))
+        chain.revise(k, anew if node.markov is None else node.markov.opened(anew, OF_THE_GROUND))
 
 
 def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:

@@ -172,7 +172,7 @@ class GnssUpdater:
         step = chain.nodes[k - chain.first].markov
         if first or step is None:
             return False
-        chain.set_markov(k, step.renewed(slice(1, 3)))
+        chain.revise(k, step.renewed(slice(1, 3)))
         return True
 
     def set_heading_right(self, chain: Chain, row: SensorNoise) -> bool:
