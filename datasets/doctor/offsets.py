@@ -33,6 +33,9 @@ Array = NDArray[np.float64]
 
 LEAST_LAG_S = dict.fromkeys(YAW_PAIRS, 0.1) | dict.fromkeys(SPEED_PAIRS, 0.2)
 """Smaller lags are no finding; slip bends the speed of wheels, so that theirs may be larger."""
+SURELY_S = 0.5
+"""An interval that is all beyond this is an error. A robot that slides follows its wheels about a second
+late, but not by the same time in every turn: its interval is wide."""
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
 
 
@@ -77,7 +80,7 @@ def _finding(recording: Recording, off: dict[Pair, Lag], told: set[Pair]) -> Fin
 
     return Finding(
         "clock-offset",
-        "error" if abs(lag.seconds) > 0.5 else "warning",
+        "error" if _clear_s(lag) > SURELY_S else "warning",
         name,
         f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} beside {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",
@@ -92,10 +95,14 @@ def _reversed(lag: Lag) -> Lag:
 
 def _matters(pair: Pair, lag: Lag, one: Signal, other: Signal) -> bool:
     """Whether a lag is large, and its interval clear of what half a sample and slip may do."""
-    clear = min(abs(lag.low_s), abs(lag.high_s)) if lag.low_s * lag.high_s > 0.0 else 0.0
     least = LEAST_LAG_S[pair]
     sample_s = max(period_s(one[0]), period_s(other[0]))
-    return abs(lag.seconds) >= least and clear > 0.5 * max(sample_s, least)
+    return abs(lag.seconds) >= least and _clear_s(lag) > 0.5 * max(sample_s, least)
+
+
+def _clear_s(lag: Lag) -> float:
+    """How far its interval keeps from zero."""
+    return min(abs(lag.low_s), abs(lag.high_s)) if lag.low_s * lag.high_s > 0.0 else 0.0
 
 
 def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:

@@ -271,9 +271,7 @@ class Chain:
         self._anchor, self._dirty = None, self.first
         self._eliminate_all()
 
-    def revise(
-        self, k: int, markov: MarkovStep | None = None, wheels: WheelIncrement | None = None
-    ) -> None:
+    def revise(self, k: int, markov: MarkovStep | None = None, wheels: WheelIncrement | None = None) -> None:
         """Another step of slip and drift, or increment of the wheels, into keyframe k, not the first."""
         node = self.nodes[k - self.first]
         node.markov, node.wheels = markov or node.markov, wheels or node.wheels

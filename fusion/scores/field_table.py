@@ -38,11 +38,15 @@ from terrafusion.fusion.scores.health import examine_estimate, rolled_until_m
 from terrafusion.fusion.scores.metrics import Outage
 from terrafusion.fusion.scores.outage_plan import aided_by_truth, lead_s, plan_outages, until
 from terrafusion.fusion.scores.parts import FOLDER, log_state, read_part, write_part
+from terrafusion.twin.field.joined import joined_drives
+from terrafusion.twin.field.sources import CUT, WHOLE
 from terrafusion.twin.pools import open_pool
 
 OUTAGES_S = (30.0, 60.0, 120.0)
 LEAST_DRIVE_S = 10.0
-"""Shorter recordings, such as windows cut from a drive, are listed and not run."""
+"""Shorter recordings are windows cut from a drive: those that go on from each other are joined."""
+LEAST_JOINED_S = 25.0
+"""Shorter drives joined from windows hold no outage, and little driving after a start."""
 LEAD_ROLLED_M = 5.0
 """The wheels must have rolled so far before an outage: fixes show no heading of a robot that stands."""
 LEAST_ROLLED_M = 3.0
@@ -59,9 +63,10 @@ SET_GROUND = {"husky_parkinglot": "firm"}
 
 @dataclass(frozen=True)
 class Run:
-    """One replay: of the whole log (`test` "whole"), or with one outage ("outage 60 s" from `start_s`).
+    """One replay: of the whole log (`test` "whole"; "aided" with fixes made from its truth), or with one
+    outage ("outage 60 s" from `start_s`).
 
-    `error_m` is, whole: the root mean square against truth, or the median
+    `error_m` is, whole and aided: the root mean square against truth, or the median
     distance from fixes kept back; in an outage: the error at its end.
     """
 
@@ -167,13 +172,15 @@ def collect(
 
 
 def catalogued() -> list[str]:
-    """Names of the catalogue's recordings whose files are all at hand."""
+    """Names of the catalogue's recordings whose files are all at hand, but windows cut from one of them."""
     folders = data_folders()
 
     def complete(files: list[CatalogFile]) -> bool:
         return all(at_hand(entry, folders) is not None for entry in files)
 
-    return [name for name, files in load_catalog().recordings().items() if complete(files)]
+    names = [name for name, files in load_catalog().recordings().items() if complete(files)]
+    cut = {f"{name.removesuffix(WHOLE)}{CUT}" for name in names if name.endswith(f"/{WHOLE}")}
+    return [name for name in names if name not in cut]
 
 
 def run_task(task: Task) -> tuple[Task, list[Run | Refusal]]:
@@ -185,14 +192,11 @@ def each_drive(log: str, run: Callable[[str, Recording], Iterable[Found | Refusa
     """What `run` gives for name and recording of every drive of a log; what stops it becomes a refusal."""
     out: list[Found | Refusal] = []
     try:
-        recordings = _recordings(log)
-        longest = max(r.duration_s() for r in recordings)
-        if len(recordings) > 1 and longest < LEAST_DRIVE_S:
-            raise DataError(f"holds {len(recordings)} pieces of at most {longest:.1f} s, no drive")
+        recordings, joined = _drives(log)
     except (TerrafusionError, *UNFORESEEN) as error:
         return [_refusal(log, error)]
     for i, recording in enumerate(recordings):
-        name = log if len(recordings) == 1 else f"{log}#{i}"
+        name = log if joined or len(recordings) == 1 else f"{log}#{i}"
         try:
             with errors_of(name):
                 out += run(name, recording)
@@ -207,9 +211,17 @@ def _refusal(name: str, error: Exception) -> Refusal:
 
 
 @functools.lru_cache(maxsize=1)
-def _recordings(log: str) -> list[Recording]:
-    """The log, read once for modes that follow each other."""
-    return open_recordings(log)
+def _drives(log: str) -> tuple[list[Recording], bool]:
+    """The drives of a log, read once for modes that follow each other, and whether they had to be joined."""
+    recordings = open_recordings(log)
+    if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= LEAST_DRIVE_S:
+        return recordings, False
+    drives = [d for d in joined_drives(log, recordings) if d.duration_s() >= LEAST_JOINED_S]
+    drives = [d for d in drives if d.truth is not None]
+    if not drives:
+        told = f"holds {len(recordings)} pieces that make no drive of {LEAST_JOINED_S:g} s with a truth"
+        raise DataError(told)
+    return drives, True
 
 
 def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
@@ -220,6 +232,7 @@ def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
         return
     if reference == "truth" and recording.gnss is None:
         recording, reference = aided_by_truth(recording, task.seed), "truth, fixes made from it"
+        yield _tried(task, recording, reference, "aided", None)
     for outage in outages_of(recording, task.most_starts):
         part, test = until(recording, outage.start_s + outage.seconds + 0.5), f"outage {outage.seconds:g} s"
         yield _tried(task, part, reference, test, outage)

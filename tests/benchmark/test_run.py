@@ -115,14 +115,14 @@ def test_an_unforeseen_error_in_a_log_becomes_a_refusal(place, monkeypatch) -> N
     def fail(what: object) -> None:
         raise ValueError("from a reader or planner")
 
-    field_table._recordings.cache_clear()
+    field_table._drives.cache_clear()
     monkeypatch.setattr(
         field_table, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)]
     )
     monkeypatch.setattr(*place, fail)
     _, found = run.run_job(Job(Log("one", 1), ("fixed",)))
     assert found == Found((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
-    field_table._recordings.cache_clear()
+    field_table._drives.cache_clear()
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(

@@ -296,7 +296,8 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
     assert done.returncode == 0, done.stderr
     with (tmp_path / "runs.csv").open(encoding="utf-8", newline="") as file:
         rows = {row["test"]: row for row in csv.DictReader(file)}
-    assert set(rows) == {"whole", "outage 30 s"}
+    assert set(rows) == {"whole", "aided", "outage 30 s"}
+    assert 0.0 < float(rows["aided"]["error_m"]) < 0.2
     assert all(row["diverged"] == "" and row["log"] == logs[0] for row in rows.values())
     assert 0.0 < float(rows["outage 30 s"]["percent"]) < 20.0
     with (tmp_path / "refused.csv").open(encoding="utf-8", newline="") as file:

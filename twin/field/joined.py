@@ -30,8 +30,11 @@ LONGEST_HOLE_S = 1.0
 def joined_drives(name: str, recordings: Sequence[Recording]) -> list[Recording]:
     """The drives of two windows and more that `recordings`, in their order, make.
 
-    Each starts at time 0, heading along x from the origin; commands, motors and commissioning channels are
+    Each starts at time 0, heading along x from the origin, and has wheels, IMU and truth; other channels are
     left out. A drive whose truth has a hole of more than `LONGEST_HOLE_S` comes without truth.
+
+    Raises:
+        DataError: the windows have no wheels or no gyro, or do not say which vehicle it is.
     """
     chains = [chain for chain in chains_of(recordings) if len(chain) > 1]
     return [_joined(f"{name}#{k}", name, chain) for k, chain in enumerate(chains)]
@@ -54,8 +57,11 @@ def _joined(name: str, recording: str, chain: Sequence[Recording]) -> Recording:
         wheels=Wheels(wheels["t_ns"], wheels["speed"], first.wheels.names, first.wheels.unit),
         imu=Imu(imu["t_ns"], imu["gyro_radps"], imu["accel_mps2"]),
         command=None,
+        gnss=None,
         motor=None,
         terrain=None,
+        barometer=None,
+        magnetometer=None,
         truth=truth,
         truth_channels=("position", "yaw"),
         description="",

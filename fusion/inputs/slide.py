@@ -1,0 +1,95 @@
+"""Wheels that fixes refute: a robot that slides goes where its wheels do not roll.
+
+On ice, or in a skid, slip and side-slip leave what the ground's row allows within a second. The wheels
+then keep good fixes out, and after each that is let in lead the estimate astray again. But how far a robot
+can have slid is known: no further than its wheels rolled and its speed carried it since the last fix that
+was used. Fixes that are refused, lie on one side of the estimate and no further off than that, refute
+the wheels, not the receiver: the wheels' way since then is taken to be as wrong as the fixes say, and how
+fast it goes wrong (a random walk, m2 a second) is remembered, as the noise of an adaptive filter (Mehra 1972,
+IEEE T-AC 17(5), covariance matching), until accepted fixes tell that they are to be trusted again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.graph.chain import Chain
+
+Array = NDArray[np.float64]
+
+SAME_SIDE = 0.5
+"""Cosine between the offsets of two refused fixes from which they lie on one side."""
+REACH_SIGMA = 3.0
+"""Sigmas of a fix by which it may lie beyond the robot's reach."""
+LEAST_M2PS = 1e-4
+"""A centimetre after a second: a slide is over."""
+MEMORY_S = 10.0
+"""How long a slide is remembered while fixes are accepted (assumed: a few turns or stops)."""
+
+
+class Slide:
+    """How wrong the wheels are beyond their noise.
+
+    Attributes:
+        rate_m2ps: variance of the wheels' way, each axis, per second.
+    """
+
+    def __init__(self) -> None:
+        self.rate_m2ps = 0.0
+        self._last_ns: int | None = None
+
+    def refuted(
+        self, chain: Chain, k: int, since_ns: int | None, refused: list[Array], sigma_m: float
+    ) -> bool:
+        """Whether refused fixes, the last at keyframe k, refute the wheels; loosens them if so.
+
+        Args:
+            chain: as it is; its wheels from `since_ns` to k are loosened.
+            k: keyframe of the newest refused fix.
+            since_ns: time of the last fix used.
+            refused: offsets (2,), m, of the fixes refused in a row from the estimate.
+            sigma_m: 1 sigma of the newest fix.
+        """
+        if since_ns is None or (len(refused) < 2 and not self.rate_m2ps) or not _on_one_side(refused[-2:]):
+            return False
+        begin = chain.at_or_after(since_ns)
+        begin = chain.first if begin is None else begin
+        passed = range(begin + 1, k + 1)
+        nodes = [chain.nodes[i - chain.first] for i in passed]
+        rolled_m = [abs(node.wheels.distance_m) for node in nodes if node.wheels is not None]
+        if not rolled_m:
+            return False
+        time_s = (nodes[-1].t_ns - chain.nodes[begin - chain.first].t_ns) * 1e-9
+        fastest_mps = max(float(np.linalg.norm(node.point.velocity)) for node in nodes)
+        off_m = float(np.linalg.norm(refused[-1]))
+        more_m2ps = 0.5 * off_m**2 / time_s - self.rate_m2ps
+        if off_m > sum(rolled_m) + fastest_mps * time_s + REACH_SIGMA * sigma_m or more_m2ps <= 0.0:
+            return False
+        self.rate_m2ps += more_m2ps
+        for i, node in zip(passed, nodes, strict=True):
+            if node.wheels is not None:
+                dt = (node.t_ns - chain.nodes[i - 1 - chain.first].t_ns) * 1e-9
+                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * dt))
+        chain.smooth(chain.last - begin + 1)
+        return True
+
+    def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
+        """Learn from a fix that was used: `innovation_m` (2,) and the variances (2,) predicted for it."""
+        before_ns = self._last_ns
+        if before_ns is not None and t_ns <= before_ns:
+            return
+        self._last_ns = t_ns
+        if self.rate_m2ps and before_ns is not None:
+            dt = (t_ns - before_ns) * 1e-9
+            beyond = 0.5 * float(np.sum(innovation_m**2 - predicted_m2)) / dt
+            rate = self.rate_m2ps + (1.0 - math.exp(-dt / MEMORY_S)) * beyond
+            self.rate_m2ps = rate if rate > LEAST_M2PS else 0.0
+
+
+def _on_one_side(refused: list[Array]) -> bool:
+    """Whether offsets (2,), one or two, point the same way."""
+    first, last = refused[0], refused[-1]
+    return float(first @ last) >= SAME_SIDE * float(np.linalg.norm(first) * np.linalg.norm(last))
