@@ -384,6 +384,8 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"{estimator.gnss.too_late} GNSS fixes came before the start or too late for the lag")
     if estimator.gnss.turned:
         notes.append(f"the heading was wrong and was set right from the motion {estimator.gnss.turned} times")
+    if gnss.slide.refutations:
+        notes.append(f"fixes showed {gnss.slide.refutations} times that the robot slid beside its wheels")
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.too_late:
             notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")

@@ -185,9 +185,8 @@ class Chain:
     def solve(self, window: int) -> None:
         """Bring the newest keyframe up to date; if that moves it far, the newest `window` of them.
 
-        Keyframes are linearised again together or not at all: a factor between
-        one that has moved and one that has not would be linearised about a
-        motion that nobody believes in.
+        Keyframes are linearised again together or not at all: a factor between one that has moved and
+        one that has not would be linearised about a motion that nobody believes in.
         """
         self._eliminate_all()
         if (np.abs(self.nodes[-1].delta[NAV]) > self.RELINEARISE).any():
@@ -446,6 +445,6 @@ def _covariance_before(node: Node, following: Array) -> Array:
     """Marginal covariance (dim, dim) of a keyframe from that of the one after it."""
     assert node.conditional is not None
     dim = len(node.conditional)
-    inverse, _ = lapack.dtrtri(node.conditional[:, :dim])
+    inverse = lapack.dtrtri(node.conditional[:, :dim])[0]
     gain = inverse @ node.conditional[:, dim : 2 * dim]
     return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)

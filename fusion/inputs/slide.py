@@ -35,10 +35,12 @@ class Slide:
 
     Attributes:
         rate_m2ps: variance of the wheels' way, each axis, per second.
+        refutations: how often fixes refuted the wheels.
     """
 
     def __init__(self) -> None:
         self.rate_m2ps = 0.0
+        self.refutations = 0
         self._last_ns: int | None = None
 
     def refuted(
@@ -69,6 +71,7 @@ class Slide:
         if off_m > sum(rolled_m) + fastest_mps * time_s + REACH_SIGMA * sigma_m or more_m2ps <= 0.0:
             return False
         self.rate_m2ps += more_m2ps
+        self.refutations += 1
         for i, node in zip(passed, nodes, strict=True):
             if node.wheels is not None:
                 dt = (node.t_ns - chain.nodes[i - 1 - chain.first].t_ns) * 1e-9
