@@ -248,14 +248,10 @@ class GnssUpdater:
             )
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
         if verdict is Verdict.REJECT:
-            refused = [off for off, _ in self.gate.rejected]
-            if (
-                not again
-                and self.track.smooth_at(fix.t_ns)
-                and self.slide.refuted(chain, k, self.last_used_ns, refused, float(np.max(fix.sigma_m[:2])))
-            ):
-                self.gate.rejected.clear()
+            if not again and self._slid(chain, k, fix):
                 return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
+            if again:
+                self.slide.put_back(chain)
             self.rejected += 1
             return False
         self.slide.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
@@ -289,7 +285,7 @@ class GnssUpdater:
             return False
         if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m):
             return False
-        self.gate.rejected.clear()
+        self.gate.rejected.pop()  # it is tested again
         return True
 
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 Array = NDArray[np.float64]
 
@@ -41,12 +42,15 @@ class Slide:
     def __init__(self) -> None:
         self.rate_m2ps = 0.0
         self.refutations = 0
+        self._before: tuple[float, list[tuple[int, WheelIncrement | None]]] = (0.0, [])
         self._last_ns: int | None = None
 
     def refuted(
         self, chain: Chain, k: int, since_ns: int | None, refused: list[Array], sigma_m: float
     ) -> bool:
         """Whether refused fixes, the last at keyframe k, refute the wheels; loosens them if so.
+
+        It takes two refused fixes in a row, in a slide one.
 
         Args:
             chain: as it is; its wheels from `since_ns` to k are loosened.
@@ -55,7 +59,7 @@ class Slide:
             refused: offsets (2,), m, of the fixes refused in a row from the estimate.
             sigma_m: 1 sigma of the newest fix.
         """
-        if since_ns is None or (len(refused) < 2 and not self.rate_m2ps) or not _on_one_side(refused[-2:]):
+        if since_ns is None or len(refused) < (1 if self.rate_m2ps else 2) or not _on_one_side(refused[-2:]):
             return False
         begin = chain.at_or_after(since_ns)
         begin = chain.first if begin is None else begin
@@ -72,12 +76,21 @@ class Slide:
             return False
         self.rate_m2ps += more_m2ps
         self.refutations += 1
+        self._before = more_m2ps, [(i, node.wheels) for i, node in zip(passed, nodes, strict=True)]
         for i, node in zip(passed, nodes, strict=True):
             if node.wheels is not None:
                 dt = (node.t_ns - chain.nodes[i - 1 - chain.first].t_ns) * 1e-9
                 chain.revise(i, wheels=node.wheels.loosened(more_m2ps * dt))
         chain.smooth(chain.last - begin + 1)
         return True
+
+    def put_back(self, chain: Chain) -> None:
+        """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
+        more_m2ps, wheels = self._before
+        self.rate_m2ps -= more_m2ps
+        self.refutations -= 1
+        for i, increment in wheels:
+            chain.revise(i, wheels=increment)
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
         """Learn from a fix that was used: `innovation_m` (2,) and the variances (2,) predicted for it."""

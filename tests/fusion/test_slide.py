@@ -11,6 +11,7 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.benchmark.tuning import DRIVES
 from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.slide import Slide
@@ -160,3 +161,14 @@ def test_fixes_that_scatter_beyond_their_claims_do_not() -> None:
     assert np.mean(followed) < 0.05
     honest = [track_of(rng.normal(0.0, 0.5, (4, 2)), 0.5).smooth_at(round(0.6e9)) for _ in range(400)]
     assert np.mean(honest) > 0.98
+
+
+def test_a_refutation_that_does_not_help_keeps_no_fix_out() -> None:
+    """Wheels dig in at the start; the IMU, not the wheels, holds the estimate. Once, 35 fixes were refused."""
+    mud = next(drive for drive in DRIVES if drive.ground == "mud").lesson().recording
+    found = replay(mud, mode="fixed")
+    accepted = [i.accepted for i in found.estimate.innovations if i.sensor == "gnss"]
+    runs = "".join("x" if yes else "." for yes in accepted).split("x")
+    assert max(map(len, runs)) <= 8  # each fix is told of twice, where it was tested again
+    assert found.rejected_gnss <= 16
+    assert rms_m(found) < 0.1
