@@ -164,7 +164,7 @@ def test_fixes_that_scatter_beyond_their_claims_do_not() -> None:
 
 
 def test_a_refutation_that_does_not_help_keeps_no_fix_out() -> None:
-    """Wheels dig in at the start; the IMU, not the wheels, holds the estimate. Once, 35 fixes were refused."""
+    """Wheels dig in at the start; the IMU, not the wheels, holds the estimate. Once, 35 were refused."""
     mud = next(drive for drive in DRIVES if drive.ground == "mud").lesson().recording
     found = replay(mud, mode="fixed")
     accepted = [i.accepted for i in found.estimate.innovations if i.sensor == "gnss"]
