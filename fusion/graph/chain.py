@@ -27,7 +27,7 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from terrafusion.fusion.graph import gnss_factor
+from terrafusion.fusion.graph import gnss_factor, velocity_factor
 from terrafusion.fusion.graph.batch_rows import Block
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
@@ -42,6 +42,7 @@ from terrafusion.fusion.graph.key_state import (
 )
 from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
@@ -71,6 +72,7 @@ class Node:
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     unary_keys: set[str] = field(default_factory=set)
     fixes: list[GnssPosition] = field(default_factory=list)
+    velocities: list[GnssVelocity] = field(default_factory=list)
     conditional: Array | None = None
 
 
@@ -147,6 +149,13 @@ class Chain:
         self._dirty = min(self._dirty, k)
         if self.archive is not None:
             self.archive.add_fix(k, fix)
+
+    def add_velocity(self, k: int, told: GnssVelocity) -> None:
+        """Add a GNSS velocity to keyframe k; without a calibration it is a prior of the velocity instead."""
+        self.nodes[k - self.first].velocities.append(told)
+        self._dirty = min(self._dirty, k)
+        if self.archive is not None:
+            self.archive.add_velocity(k, told)
 
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
         """Put another weight on a GNSS position of keyframe k."""
@@ -349,12 +358,8 @@ class Chain:
         """Whitened rows over keyframe k alone, shape (m, dim + 1)."""
         node = self.nodes[k - self.first]
         blocks = [self._gtsam_rows(k)] if node.unary_keys else []
-        for fix in node.fixes:
-            rows = np.zeros((3, self.dim + 1))
-            H_pose, H_linear = gnss_factor.jacobians(fix, node.point.pose, node.point.linear)
-            rows[:, POSE], rows[:, 15 : self.dim] = H_pose, H_linear[:, : self.dim - 15]
-            rows[:, self.dim] = -gnss_factor.residual(fix, node.point.pose, node.point.linear)
-            blocks.append(rows / fix.sigma_m[:, None])
+        blocks += [gnss_factor.rows(fix, node.point, self.dim) for fix in node.fixes]
+        blocks += [velocity_factor.rows(told, node.point, self.dim) for told in node.velocities]
         return np.vstack(blocks) if blocks else np.zeros((0, self.dim + 1))
 
     def _gtsam_rows(self, k: int) -> Array:
