@@ -346,7 +346,7 @@ def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: Array) -> State:
         angular_velocity_radps=key.rate(key_state_of(live).reading(live.angular_velocity_radps)),
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
-        slip=key.slip,
+        slip=key.slip + (live.slip - float(live.linear[0])),
         linear=key.linear,
         linear_sigma=linear_sigma(P),
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),

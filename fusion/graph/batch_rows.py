@@ -29,6 +29,7 @@ from terrafusion.fusion.graph.key_state import (
     RADIUS,
     SIDE_SLIP,
     SLIP,
+    SURGE_SLIP,
     VELOCITY,
     WHEEL_DELAY,
     YAW_SCALE,
@@ -89,7 +90,7 @@ class Block:
 
         Args:
             values: poses, velocities and biases at which to linearise, of all keyframes of the chain.
-            linear: (n, 14) their linear states.
+            linear: (n, 15) their linear states.
             poses: `extractPose3` of `values`, where the caller has it.
         """
         poses = gtsam.utilities.extractPose3(values) if poses is None else poses
@@ -193,8 +194,8 @@ class _Wheels:
         self._at = np.array([w is not None for w in increments], dtype=bool)
         self._moved = np.array([w.displacement_m for w in known]).reshape(-1, 3)
         self._sigma = np.array([w.sigma for w in known]).reshape(-1, 4)
-        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps")
-        self._distance, self._turn, self._yaw, self._change = (
+        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps", "surge")
+        self._distance, self._turn, self._yaw, self._change, self._surge = (
             np.array([getattr(w, name) for w in known], dtype=float) for name in names
         )
 
@@ -229,12 +230,15 @@ class _Wheels:
         own[:, 3, dim + 2] = (T[:, 0, 0] * T[:, 1, 1] - T[:, 1, 0] * T[:, 0, 1]) / level
 
     def _by_linear(self, H: Array, moved: Array, T: Array, linear: Array) -> Array:
-        """Derivatives (n, 4, 14) into H; the residuals (n, 4)."""
-        s, k, i, b, r, t = (n - NAV.stop for n in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY))
+        """Derivatives (n, 4, 15) into H; the residuals (n, 4)."""
+        s, k, i, b, r, t, a = (
+            n - NAV.stop for n in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY, SURGE_SLIP)
+        )
         rolled = self._moved.copy()
         rolled[:, 0] += linear[:, t] * self._change
-        slip, radius = 1.0 - linear[:, [s]], 1.0 + linear[:, [r]]
-        H[:, :3, s], H[:, :3, r] = radius * rolled, -slip * rolled
+        surge, radius = self._surge[:, None], 1.0 + linear[:, [r]]
+        slip = 1.0 - linear[:, [s]] - linear[:, [a]] * surge
+        H[:, :3, s], H[:, :3, r], H[:, :3, a] = radius * rolled, -slip * rolled, radius * surge * rolled
         H[:, 0, t] = -(slip * radius)[:, 0] * self._change
         H[:, 1, b], H[:, 1, i] = -self._distance, self._yaw
         H[:, 3, k] = -self._turn
@@ -246,7 +250,7 @@ class _Wheels:
 
 
 def _placed(told: list[list[T]], used: Places) -> tuple[list[T], Places, Places]:
-    """Measurements of three rows each: all, their keyframes, and the first row of each, which are then used."""
+    """Measurements of three rows each: all, their keyframes, their first rows; `used` moves on."""
     keyframes: list[int] = []
     first_row: list[int] = []
     for i, here in enumerate(told):

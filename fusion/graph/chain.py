@@ -41,7 +41,7 @@ from terrafusion.fusion.graph.key_state import (
     skew,
 )
 from terrafusion.fusion.graph.markov import MarkovStep
-from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
+from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
@@ -188,7 +188,8 @@ class Chain:
         """Marginal covariance (dim, dim) of keyframe k, as of the last `solve` or `smooth`."""
         covariance = self.covariance()
         for node in self.nodes[-2 : k - self.last - 2 : -1]:
-            covariance = _covariance_before(node, covariance)
+            assert node.conditional is not None
+            covariance = covariance_before(node.conditional, covariance)
         return covariance
 
     def solve(self, window: int) -> None:
@@ -444,12 +445,3 @@ def carried_prior(rows: Array, offset: Array) -> Array:
     out[:, dim] -= rows[:, :dim] @ offset[:dim]
     out[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
     return out
-
-
-def _covariance_before(node: Node, following: Array) -> Array:
-    """Marginal covariance (dim, dim) of a keyframe from that of the one after it."""
-    assert node.conditional is not None
-    dim = len(node.conditional)
-    inverse, _ = lapack.dtrtri(node.conditional[:, :dim])
-    gain = inverse @ node.conditional[:, dim : 2 * dim]
-    return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)

@@ -10,6 +10,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
+from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import ImuSegment
@@ -37,11 +38,13 @@ def wheel_increment(
     quantum_m: float,
     noise: SensorNoise,
     speed_change_mps: float = 0.0,
+    surging: bool = False,
 ) -> WheelIncrement:
     """Displacement of the body origin and turn as the wheels and the gyro tell them.
 
     The travelled distance is spread evenly over the interval and turned by the
-    yaw integrated from the gyro (bias removed), exactly for constant rates.
+    yaw integrated from the gyro (bias removed), exactly for constant rates. Only with `surging`
+    does the increment hold its acceleration.
     """
     left, right = travelled_m
     distance = 0.5 * (left + right)
@@ -60,7 +63,9 @@ def wheel_increment(
     turn = (right - left) / track_m
     turn_sigma = YAW_SIGMA_RADPS * total + YAW_SIGMA_SHARE * abs(turn) + quantum_m / track_m
     sigma = np.array([forward, across, up, turn_sigma])
-    return WheelIncrement(np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps)
+    surge = math.copysign(speed_change_mps, distance * speed_change_mps) / (GRAVITY_MPS2 * total)
+    moved = np.array([x, y, 0.0])
+    return WheelIncrement(moved, sigma, distance, turn, yaw, speed_change_mps, surge if surging else 0.0)
 
 
 def at_rest(k: int) -> gtsam.NonlinearFactor:

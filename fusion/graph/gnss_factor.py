@@ -58,7 +58,7 @@ class GnssPosition:
 
 
 def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:
-    """The residual of the module's docstring, unwhitened; `linear` (14,) of the keyframe."""
+    """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
     lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
     late_m = (linear[_DELAY] - fix.delay_s) * fix.velocity_mps
     antenna = pose.translation() + pose.rotation().matrix() @ lever - late_m
@@ -66,7 +66,7 @@ def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:
 
 
 def jacobians(fix: GnssPosition, pose: Any, linear: Array) -> tuple[Array, Array]:
-    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 14)."""
+    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 15)."""
     R = pose.rotation().matrix()
     lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
     H = np.zeros((3, MARKOV.stop - MARKOV.start))

@@ -6,8 +6,8 @@ Residual (3,), world frame, m/s::
 
 `v` and R are those of the keyframe, `swing` is what the turning body makes of a place on it. Without a
 calibration the antenna is where the vehicle file says, and the velocity of the body origin is a prior
-(`factors.gnss_velocity`). With one such a prior would hold the velocity to where the antenna was thought to be
-when it came: hundreds of them would confirm one and the same error, and the antenna could never be found.
+(`factors.gnss_velocity`). With one, such priors would hold the velocity to where the antenna was thought to
+be when they came: hundreds would confirm one and the same error, and the antenna never reach its place.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ def swing(rate_radps: Array, offset_s: float) -> Array:
 
 
 def residual(told: GnssVelocity, pose: Any, velocity_mps: Array, linear: Array) -> Array:
-    """The residual of the module's docstring, unwhitened; `linear` (14,) of the keyframe."""
+    """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
     lever = told.lever_m + np.append(linear[_ANTENNA], 0.0)
     swung = pose.rotation().matrix() @ told.swing_radps @ lever
     return np.asarray(velocity_mps + swung - told.velocity_mps)
 
 
 def jacobians(told: GnssVelocity, pose: Any, linear: Array) -> tuple[Array, Array, Array]:
-    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent), the velocity (3, 3) and `linear` (3, 14)."""
+    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent), velocity (3, 3) and `linear` (3, 15)."""
     R = pose.rotation().matrix()
     lever = told.lever_m + np.append(linear[_ANTENNA], 0.0)
     H_pose, H = np.zeros((3, 6)), np.zeros((3, MARKOV.stop - MARKOV.start))

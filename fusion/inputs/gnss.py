@@ -19,8 +19,8 @@ from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
-from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.placement import Placement, place
 from terrafusion.fusion.inputs.streams import GnssFix
@@ -259,13 +259,11 @@ class GnssUpdater:
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
             sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
-            if chain.dim > GNSS_DELAY:  # the antenna is a state; what doubt is left in the delay is noise
-                doubt = float(np.linalg.norm(accel_world)) * float(np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
+            if chain.dim > GNSS_DELAY:
+                doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
                 at_keyframe = fix.velocity_mps - accel_world * offset_s
-                told = GnssVelocity(
-                    at_keyframe, math.hypot(sigma_v, doubt), self.antenna_m, swing(rate, offset_s)
-                )
-                chain.add_velocity(k, told)
+                sigma_v, turned = math.hypot(sigma_v, doubt), swing(rate, offset_s)
+                chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
             else:
                 body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
                 chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
