@@ -194,7 +194,7 @@ class _Wheels:
         self._at = np.array([w is not None for w in increments], dtype=bool)
         self._moved = np.array([w.displacement_m for w in known]).reshape(-1, 3)
         self._sigma = np.array([w.sigma for w in known]).reshape(-1, 4)
-        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps", "surge")
+        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps", "surge_m")
         self._distance, self._turn, self._yaw, self._change, self._surge = (
             np.array([getattr(w, name) for w in known], dtype=float) for name in names
         )
@@ -236,14 +236,14 @@ class _Wheels:
         )
         rolled = self._moved.copy()
         rolled[:, 0] += linear[:, t] * self._change
-        surge, radius = self._surge[:, None], 1.0 + linear[:, [r]]
-        slip = 1.0 - linear[:, [s]] - linear[:, [a]] * surge
-        H[:, :3, s], H[:, :3, r], H[:, :3, a] = radius * rolled, -slip * rolled, radius * surge * rolled
+        slip, radius = 1.0 - linear[:, [s]], 1.0 + linear[:, [r]]
+        H[:, :3, s], H[:, :3, r], H[:, 0, a] = radius * rolled, -slip * rolled, self._surge
         H[:, 0, t] = -(slip * radius)[:, 0] * self._change
         H[:, 1, b], H[:, 1, i] = -self._distance, self._yaw
         H[:, 3, k] = -self._turn
         out = np.empty((len(moved), 4))
         out[:, :3] = moved - slip * radius * rolled
+        out[:, 0] += linear[:, a] * self._surge
         out[:, 1] -= linear[:, b] * self._distance - linear[:, i] * self._yaw
         out[:, 3] = np.arctan2(T[:, 1, 0], T[:, 0, 0]) - (1.0 + linear[:, k]) * self._turn
         return out

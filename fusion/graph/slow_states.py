@@ -42,9 +42,9 @@ SIDE_SLIP_PER_GRADE, SIDE_SLIP_DOUBT = 0.7, 0.3
 """One shear law carries the robot along and across: on a cross slope it slips downhill by so much of the slip
 it has on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69 on medium sand across 15 deg), give
 or take a share of it (assumed)."""
-SURGE_TIME_S, SURGE_DOUBT = 20.0, 0.5
+SURGE_TIME_S, SURGE_DOUBT = 60.0, 0.5
 """An acceleration asks for the thrust of a grade as steep as it is over gravity, and so for its slip, give or
-take a share of it for as long as a manoeuvre lasts (assumed; the twin slips more so in turns)."""
+take a share of it (assumed; in turns the twin slips more)."""
 CALIBRATION_SIGMA = {
     "radius_scale": 0.02,
     "antenna_x_m": 0.05,
