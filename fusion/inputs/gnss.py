@@ -124,7 +124,7 @@ class GnssUpdater:
         self.track.step(chain)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
             fix = self.waiting.pop(0)
-            k = _keyframe_of(fix, chain)
+            k = keyframe_of(fix, chain)
             if k is None:
                 self.too_late += 1
             elif self.local:
@@ -314,7 +314,7 @@ class GnssUpdater:
         return True
 
 
-def _keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
+def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
     """The keyframe at or after a fix, once its stamp is corrected by the delay as far as that is known."""
     if chain.dim <= GNSS_DELAY:
         return chain.at_or_after(fix.t_ns)

@@ -156,7 +156,7 @@ def calibrated(recording: Recording) -> Replay:
 def report(seeds: int) -> Iterator[str]:
     """The tables, line by line."""
     drives = {ground: _driven(exciting(ground), seeds) for ground in GROUNDS}
-    yield f"{seeds} seeds: expected; found; sigma; root mean square and largest error over sigma; sigma if dull"
+    yield f"{seeds} seeds: expected; found; sigma; r.m.s. and largest error over sigma; sigma if dull"
     straight = simulate(dull(), vehicle=load_vehicle(VEHICLE), seed=0)
     for fault in faults():
         left, sigma = found(calibrated(fault.made(straight)), fault.state)
@@ -165,7 +165,7 @@ def report(seeds: int) -> Iterator[str]:
     yield "other grounds, likewise"
     for ground in GROUNDS[1:]:
         for fault in faults():
-            if fault.state in ("antenna_x_m", "wheel_delay_s"):
+            if fault.state in ("antenna_x_m", "wheel_delay_s", "gnss_delay_s"):
                 yield f"  {ground}{_sought(fault, drives[ground])}"
     yield "slip that an acceleration of one gravity asks for; v0, m/s (straight on, exact sensors)"
     for ground in GROUNDS:
