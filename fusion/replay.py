@@ -33,6 +33,7 @@ from terrafusion.fusion.graph.key_state import (
 )
 from terrafusion.fusion.history import History
 from terrafusion.fusion.inputs.placement import Placement
+from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.fusion.weights.policy import Policy, load_policy
@@ -384,6 +385,11 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"{estimator.gnss.too_late} GNSS fixes came before the start or too late for the lag")
     if estimator.gnss.turned:
         notes.append(f"the heading was wrong and was set right from the motion {estimator.gnss.turned} times")
+    if estimator.imu.spikes:
+        notes.append(
+            f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "
+            "believed: the mean of those before stands for each"
+        )
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.too_late:
             notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
