@@ -30,7 +30,7 @@ from terrafusion.fusion.graph.factors import bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
-from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.aids import Aids
 from terrafusion.fusion.inputs.alignment import (
     GivenStart,
@@ -365,11 +365,9 @@ class Estimator:
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         bias_z = float(before.bias.gyroscope()[2])
         change = self.wheels.speed_change_mps(before_ns, t_ns)
-        increment = wheel_increment(
-            travelled, segments, bias_z, rig.track_m, quantum_m, self.weights.row, change
-        )
-        if self.gnss.slide.rate_m2ps:
-            increment = increment.loosened(self.gnss.slide.rate_m2ps * (t_ns - before_ns) * 1e-9)
+        row, surging = self.weights.row, self.config.calibrate
+        increment = wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, row, change, surging)
+        increment = self.gnss.slide.loosened(increment, (t_ns - before_ns) * 1e-9)
         inputs = self.config.inputs
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
@@ -413,7 +411,7 @@ class Estimator:
             hold(self.chain, k, link)
 
     def _emitted(self, t_ns: int, gyro: Array) -> State:
-        key = self.chain.state(self.chain.last)
+        key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
         P = self._covariance
         R = key.pose.rotation().matrix()
         silent = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
@@ -426,7 +424,7 @@ class Estimator:
             angular_velocity_radps=key.rate(gyro),
             gyro_bias_radps=np.asarray(key.bias.gyroscope()),
             accel_bias_mps2=np.asarray(key.bias.accelerometer()),
-            slip=key.slip,
+            slip=key.slip if wheels is None else slip_of(key.linear, wheels),
             linear=key.linear,
             linear_sigma=linear_sigma(P),
             slip_sigma=float(np.sqrt(P[SLIP, SLIP])),

@@ -33,6 +33,7 @@ from terrafusion.fusion.graph.key_state import (
 )
 from terrafusion.fusion.history import History
 from terrafusion.fusion.inputs.placement import Placement
+from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.fusion.weights.policy import Policy, load_policy
@@ -346,7 +347,7 @@ def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: Array) -> State:
         angular_velocity_radps=key.rate(key_state_of(live).reading(live.angular_velocity_radps)),
         gyro_bias_radps=np.asarray(key.bias.gyroscope()),
         accel_bias_mps2=np.asarray(key.bias.accelerometer()),
-        slip=key.slip,
+        slip=key.slip + (live.slip - float(live.linear[0])),
         linear=key.linear,
         linear_sigma=linear_sigma(P),
         slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
@@ -386,6 +387,11 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"the heading was wrong and was set right from the motion {estimator.gnss.turned} times")
     if gnss.slide.refutations:
         notes.append(f"fixes showed {gnss.slide.refutations} times that the robot slid beside its wheels")
+    if estimator.imu.spikes:
+        notes.append(
+            f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "
+            "believed: the mean of those before stands for each"
+        )
     for stream in (estimator.imu.late, estimator.wheels.late):
         if stream.too_late:
             notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")

@@ -33,7 +33,7 @@ class Batch:
 
     Attributes:
         values: poses, velocities and biases of all keyframes.
-        linear: (n, 14) their linear states, as `key_state.LINEAR`.
+        linear: (n, 15) their linear states, as `key_state.LINEAR`.
         iterations: linearisations so far.
     """
 

@@ -9,10 +9,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import V
 from numpy.typing import NDArray
 
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
@@ -28,11 +29,13 @@ from terrafusion.fusion.graph.key_state import (
     RADIUS,
     SIDE_SLIP,
     SLIP,
+    SURGE_SLIP,
     VELOCITY,
     WHEEL_DELAY,
     YAW_SCALE,
 )
 from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 if TYPE_CHECKING:
@@ -40,6 +43,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]
+T = TypeVar("T")
 
 _PLACES = {ord("x"): POSE, ord("v"): VELOCITY, ord("b"): BIAS}
 
@@ -69,6 +73,7 @@ class Block:
         self._wheels = _Wheels([node.wheels for node in after])
         used = np.full(len(own), self.dim + (self.dim - NAV.stop) + 4)
         self._fixes = _Fixes([node.fixes for node in own], used)
+        self._velocities = _Velocities([node.velocities for node in own], used)
         self._graph = gtsam.NonlinearFactorGraph()
         self._groups = self._grouped([node.unary for node in own], [node.link for node in after], used)
         # A small rotation of the IMU acts on what is preintegrated only.
@@ -85,7 +90,7 @@ class Block:
 
         Args:
             values: poses, velocities and biases at which to linearise, of all keyframes of the chain.
-            linear: (n, 14) their linear states.
+            linear: (n, 15) their linear states.
             poses: `extractPose3` of `values`, where the caller has it.
         """
         poses = gtsam.utilities.extractPose3(values) if poses is None else poses
@@ -98,6 +103,7 @@ class Block:
             wheels = rows[:n, self.dim + states : self.dim + states + 4]
             self._wheels.fill(wheels, R[own], p[own], R[after], p[after], linear[after])
         self._fixes.fill(rows, R[self._at], p[self._at], linear[self._at])
+        self._velocities.fill(rows, values, self.begin, R[self._at], linear[self._at])
         self._fill_graph(rows, values, linear[own])
         return rows, self._counts
 
@@ -188,8 +194,8 @@ class _Wheels:
         self._at = np.array([w is not None for w in increments], dtype=bool)
         self._moved = np.array([w.displacement_m for w in known]).reshape(-1, 3)
         self._sigma = np.array([w.sigma for w in known]).reshape(-1, 4)
-        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps")
-        self._distance, self._turn, self._yaw, self._change = (
+        names = ("distance_m", "turn_rad", "yaw_rad", "speed_change_mps", "surge_m")
+        self._distance, self._turn, self._yaw, self._change, self._surge = (
             np.array([getattr(w, name) for w in known], dtype=float) for name in names
         )
 
@@ -224,40 +230,50 @@ class _Wheels:
         own[:, 3, dim + 2] = (T[:, 0, 0] * T[:, 1, 1] - T[:, 1, 0] * T[:, 0, 1]) / level
 
     def _by_linear(self, H: Array, moved: Array, T: Array, linear: Array) -> Array:
-        """Derivatives (n, 4, 14) into H; the residuals (n, 4)."""
-        s, k, i, b, r, t = (n - NAV.stop for n in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY))
+        """Derivatives (n, 4, 15) into H; the residuals (n, 4)."""
+        s, k, i, b, r, t, a = (
+            n - NAV.stop for n in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY, SURGE_SLIP)
+        )
         rolled = self._moved.copy()
         rolled[:, 0] += linear[:, t] * self._change
         slip, radius = 1.0 - linear[:, [s]], 1.0 + linear[:, [r]]
-        H[:, :3, s], H[:, :3, r] = radius * rolled, -slip * rolled
+        H[:, :3, s], H[:, :3, r], H[:, 0, a] = radius * rolled, -slip * rolled, self._surge
         H[:, 0, t] = -(slip * radius)[:, 0] * self._change
         H[:, 1, b], H[:, 1, i] = -self._distance, self._yaw
         H[:, 3, k] = -self._turn
         out = np.empty((len(moved), 4))
         out[:, :3] = moved - slip * radius * rolled
+        out[:, 0] += linear[:, a] * self._surge
         out[:, 1] -= linear[:, b] * self._distance - linear[:, i] * self._yaw
         out[:, 3] = np.arctan2(T[:, 1, 0], T[:, 0, 0]) - (1.0 + linear[:, k]) * self._turn
         return out
+
+
+def _placed(told: list[list[T]], used: Places) -> tuple[list[T], Places, Places]:
+    """Measurements of three rows each: all, their keyframes, their first rows; `used` moves on."""
+    keyframes: list[int] = []
+    first_row: list[int] = []
+    for i, here in enumerate(told):
+        for _ in here:
+            keyframes.append(i)
+            first_row.append(int(used[i]))
+            used[i] += 3
+    flat = [one for here in told for one in here]
+    return flat, np.array(keyframes, dtype=np.intp), np.array(first_row, dtype=np.intp)
 
 
 class _Fixes:
     """`gnss_factor.residual` and `jacobians` of many fixes."""
 
     def __init__(self, fixes: list[list[GnssPosition]], used: Places) -> None:
-        keyframes: list[int] = []
-        first_row: list[int] = []
-        for i, here in enumerate(fixes):
-            for _ in here:
-                keyframes.append(i)
-                first_row.append(int(used[i]))
-                used[i] += 3
-        flat = [fix for here in fixes for fix in here]
-        self._at, self._row = np.array(keyframes, dtype=np.intp), np.array(first_row, dtype=np.intp)
+        flat, self._at, self._row = _placed(fixes, used)
         self._enu, self._lever, self._sigma, self._velocity = (
             np.array([getattr(fix, name) for fix in flat]).reshape(-1, 3)
             for name in ("enu_m", "lever_m", "sigma_m", "velocity_mps")
         )
-        self._share = np.array([fix.drift_share for fix in flat])
+        self._share, self._allowed = (
+            np.array([getattr(fix, name) for fix in flat]) for name in ("drift_share", "delay_s")
+        )
 
     def fill(self, rows: Array, R: Array, p: Array, linear: Array) -> None:
         """Into rows (n, m, 2 dim + 1)."""
@@ -274,7 +290,8 @@ class _Fixes:
         states[:, 0, drift.start] = states[:, 1, drift.start + 1] = self._share
         states[:, :, antenna] = R[:, :, :2]
         states[:, :, delay] = -self._velocity
-        right = self._enu - p[at] - np.einsum("kij,kj->ki", R, lever) + x[:, [delay]] * self._velocity
+        late = (x[:, delay] - self._allowed)[:, None]
+        right = self._enu - p[at] - np.einsum("kij,kj->ki", R, lever) + late * self._velocity
         right[:, :2] -= self._share[:, None] * x[:, drift]
         H[:, :, -1] = right
         H /= self._sigma[:, :, None]
@@ -282,3 +299,34 @@ class _Fixes:
         pick = np.r_[0:6, 6 : 6 + dim - NAV.stop, H.shape[2] - 1]
         columns = np.r_[0:6, NAV.stop : dim, 2 * dim]
         rows[at[:, None, None], place, columns] = H[:, :, pick]
+
+
+class _Velocities:
+    """`velocity_factor.residual` and `jacobians` of many velocities; only a calibration has them."""
+
+    def __init__(self, told: list[list[GnssVelocity]], used: Places) -> None:
+        flat, self._at, self._row = _placed(told, used)
+        self._velocity, self._lever = (
+            np.array([getattr(one, name) for one in flat]).reshape(-1, 3)
+            for name in ("velocity_mps", "lever_m")
+        )
+        self._swing = np.array([one.swing_radps for one in flat]).reshape(-1, 3, 3)
+        self._sigma = np.array([one.sigma_mps for one in flat]).reshape(-1, 1, 1)
+
+    def fill(self, rows: Array, values: gtsam.Values, begin: int, R: Array, linear: Array) -> None:
+        """Into rows (n, m, 2 dim + 1) of the keyframes from `begin` on."""
+        if not len(self._at):
+            return
+        at, dim = self._at, (rows.shape[2] - 1) // 2
+        R, antenna = R[at], slice(ANTENNA.start - NAV.stop, ANTENNA.stop - NAV.stop)
+        lever = self._lever.copy()
+        lever[:, :2] += linear[at][:, antenna]
+        swung = np.einsum("kij,kj->ki", self._swing, lever)
+        velocity = np.array([values.atVector(V(begin + int(i))) for i in at])
+        H = np.zeros((len(at), 3, dim + 1))
+        H[:, :, :3] = np.cross(R, swung[:, None, :]) * -1.0  # -R skew(s), row by row
+        H[:, :, VELOCITY] = np.eye(3)
+        H[:, :, ANTENNA] = (R @ self._swing)[:, :, :2]
+        H[:, :, -1] = self._velocity - velocity - np.einsum("kij,kj->ki", R, swung)
+        place = (self._row[:, None] + np.arange(3))[:, :, None]
+        rows[at[:, None, None], place, np.r_[0:dim, 2 * dim]] = H / self._sigma

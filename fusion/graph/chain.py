@@ -27,7 +27,7 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from terrafusion.fusion.graph import gnss_factor
+from terrafusion.fusion.graph import gnss_factor, velocity_factor
 from terrafusion.fusion.graph.batch_rows import Block
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
@@ -41,7 +41,8 @@ from terrafusion.fusion.graph.key_state import (
     skew,
 )
 from terrafusion.fusion.graph.markov import MarkovStep
-from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
+from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
@@ -71,6 +72,7 @@ class Node:
     unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
     unary_keys: set[str] = field(default_factory=set)
     fixes: list[GnssPosition] = field(default_factory=list)
+    velocities: list[GnssVelocity] = field(default_factory=list)
     conditional: Array | None = None
 
 
@@ -148,6 +150,13 @@ class Chain:
         if self.archive is not None:
             self.archive.add_fix(k, fix)
 
+    def add_velocity(self, k: int, told: GnssVelocity) -> None:
+        """Add a GNSS velocity to keyframe k; without a calibration it is a prior of the velocity instead."""
+        self.nodes[k - self.first].velocities.append(told)
+        self._dirty = min(self._dirty, k)
+        if self.archive is not None:
+            self.archive.add_velocity(k, told)
+
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
         """Put another weight on a GNSS position of keyframe k."""
         fixes = self.nodes[k - self.first].fixes
@@ -179,7 +188,8 @@ class Chain:
         """Marginal covariance (dim, dim) of keyframe k, as of the last `solve` or `smooth`."""
         covariance = self.covariance()
         for node in self.nodes[-2 : k - self.last - 2 : -1]:
-            covariance = _covariance_before(node, covariance)
+            assert node.conditional is not None
+            covariance = covariance_before(node.conditional, covariance)
         return covariance
 
     def solve(self, window: int) -> None:
@@ -349,12 +359,8 @@ class Chain:
         """Whitened rows over keyframe k alone, shape (m, dim + 1)."""
         node = self.nodes[k - self.first]
         blocks = [self._gtsam_rows(k)] if node.unary_keys else []
-        for fix in node.fixes:
-            rows = np.zeros((3, self.dim + 1))
-            H_pose, H_linear = gnss_factor.jacobians(fix, node.point.pose, node.point.linear)
-            rows[:, POSE], rows[:, 15 : self.dim] = H_pose, H_linear[:, : self.dim - 15]
-            rows[:, self.dim] = -gnss_factor.residual(fix, node.point.pose, node.point.linear)
-            blocks.append(rows / fix.sigma_m[:, None])
+        blocks += [gnss_factor.rows(fix, node.point, self.dim) for fix in node.fixes]
+        blocks += [velocity_factor.rows(told, node.point, self.dim) for told in node.velocities]
         return np.vstack(blocks) if blocks else np.zeros((0, self.dim + 1))
 
     def _gtsam_rows(self, k: int) -> Array:
@@ -439,12 +445,3 @@ def carried_prior(rows: Array, offset: Array) -> Array:
     out[:, dim] -= rows[:, :dim] @ offset[:dim]
     out[:, POSE] = rows[:, POSE] @ gtsam.Pose3.LogmapDerivative(offset[POSE])
     return out
-
-
-def _covariance_before(node: Node, following: Array) -> Array:
-    """Marginal covariance (dim, dim) of a keyframe from that of the one after it."""
-    assert node.conditional is not None
-    dim = len(node.conditional)
-    inverse = lapack.dtrtri(node.conditional[:, :dim])[0]
-    gain = inverse @ node.conditional[:, dim : 2 * dim]
-    return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)

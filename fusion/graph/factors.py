@@ -10,6 +10,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
+from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import ImuSegment
@@ -27,6 +28,9 @@ robot by 0.03 rad/s for a minute (assumed), which weighs like white noise of 0.0
 tell the yaw scale; with 0.05 they also bent the gyro's bias, and a drive without GNSS by 0.45 rad."""
 FLOOR_M = 2e-3
 """Least sigma of a wheel displacement across the rolling direction, m a keyframe."""
+SURGE_SPEED_MPS = 0.3
+"""Wheels that accelerate slip as if they were so much faster (assumed; in the twin straight on 0.07 m/s on
+asphalt, 0.44 on loose sand: `scores.calibration_trials`)."""
 
 
 def wheel_increment(
@@ -37,11 +41,13 @@ def wheel_increment(
     quantum_m: float,
     noise: SensorNoise,
     speed_change_mps: float = 0.0,
+    surging: bool = False,
 ) -> WheelIncrement:
     """Displacement of the body origin and turn as the wheels and the gyro tell them.
 
     The travelled distance is spread evenly over the interval and turned by the
-    yaw integrated from the gyro (bias removed), exactly for constant rates.
+    yaw integrated from the gyro (bias removed), exactly for constant rates. What the acceleration asks for
+    is in the increment only with `surging`.
     """
     left, right = travelled_m
     distance = 0.5 * (left + right)
@@ -60,7 +66,9 @@ def wheel_increment(
     turn = (right - left) / track_m
     turn_sigma = YAW_SIGMA_RADPS * total + YAW_SIGMA_SHARE * abs(turn) + quantum_m / track_m
     sigma = np.array([forward, across, up, turn_sigma])
-    return WheelIncrement(np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps)
+    asking_m = abs(distance) + SURGE_SPEED_MPS * total if surging else 0.0
+    surge_m = asking_m * speed_change_mps / (GRAVITY_MPS2 * total)
+    return WheelIncrement(np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps, surge_m)
 
 
 def at_rest(k: int) -> gtsam.NonlinearFactor:

@@ -2,7 +2,7 @@
 
 Residual (3,), world frame, metres::
 
-    r = p + R (lever + antenna) - delay v + share (drift, 0) - fix
+    r = p + R (lever + antenna) - (delay - allowed) v + share (drift, 0) - fix
 
 A receiver repeats its error for tens of seconds (atmosphere, multipath). Were
 its fixes taken for independent, their average would turn the heading and the
@@ -22,7 +22,16 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph.key_state import ANTENNA, DRIFT, GNSS_DELAY, MARKOV, NAV, skew
+from terrafusion.fusion.graph.key_state import (
+    ANTENNA,
+    DRIFT,
+    GNSS_DELAY,
+    MARKOV,
+    NAV,
+    POSE,
+    KeyState,
+    skew,
+)
 
 Array = NDArray[np.float64]
 
@@ -35,7 +44,8 @@ class GnssPosition:
     """A fix at a keyframe: antenna `enu_m`, `lever_m` in the body frame, white 1 `sigma_m`, each (3,).
 
     `velocity_mps` (3,) of the antenna in the world, `drift_share` of the receiver's drift in this fix;
-    `weight` is what a robust loss leaves of its horizontal part; `sigma_m` holds it already.
+    `delay_s` is the delay of its stamp that `lever_m` allows for already; `weight` is what a robust loss
+    leaves of its horizontal part; `sigma_m` holds it already.
     """
 
     enu_m: Array
@@ -44,17 +54,19 @@ class GnssPosition:
     drift_share: float = 1.0
     velocity_mps: Array = field(default_factory=lambda: np.zeros(3))
     weight: float = 1.0
+    delay_s: float = 0.0
 
 
 def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:
-    """The residual of the module's docstring, unwhitened; `linear` (14,) of the keyframe."""
+    """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
     lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
-    antenna = pose.translation() + pose.rotation().matrix() @ lever - linear[_DELAY] * fix.velocity_mps
+    late_m = (linear[_DELAY] - fix.delay_s) * fix.velocity_mps
+    antenna = pose.translation() + pose.rotation().matrix() @ lever - late_m
     return np.asarray(antenna + np.append(fix.drift_share * linear[_DRIFT], 0.0) - fix.enu_m)
 
 
 def jacobians(fix: GnssPosition, pose: Any, linear: Array) -> tuple[Array, Array]:
-    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 14)."""
+    """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 15)."""
     R = pose.rotation().matrix()
     lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
     H = np.zeros((3, MARKOV.stop - MARKOV.start))
@@ -62,6 +74,15 @@ def jacobians(fix: GnssPosition, pose: Any, linear: Array) -> tuple[Array, Array
     H[:, _ANTENNA] = R[:, :2]
     H[:, _DELAY] = -fix.velocity_mps
     return np.hstack([-R @ skew(lever), R]), H
+
+
+def rows(fix: GnssPosition, point: KeyState, dim: int) -> Array:
+    """Whitened rows (3, dim + 1) at a keyframe's state, the last column being the right-hand side."""
+    out = np.zeros((3, dim + 1))
+    H_pose, H_linear = jacobians(fix, point.pose, point.linear)
+    out[:, POSE], out[:, NAV.stop : dim] = H_pose, H_linear[:, : dim - NAV.stop]
+    out[:, dim] = -residual(fix, point.pose, point.linear)
+    return out / fix.sigma_m[:, None]
 
 
 def as_gtsam_factor(fix: GnssPosition, pose_key: int, linear_key: int) -> gtsam.CustomFactor:

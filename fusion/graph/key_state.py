@@ -25,6 +25,7 @@ LINEAR = (
     "imu_yaw_rad",
     "wheel_delay_s",
     "gnss_delay_s",
+    "surge_slip",
 )
 """States that live in a vector space, in the order of the tangent:
 
@@ -37,22 +38,25 @@ LINEAR = (
 - antenna: place of the GNSS antenna beyond the vehicle file's.
 - imu: small rotation that brings the IMU's axes onto the body's, beyond the vehicle file's.
 - wheel_delay, gnss_delay: how much later than the IMU's the stamps of a sensor are.
+- surge_slip: slip beside `slip` while the wheels accelerate by one gravity.
 """
-CALIBRATION = LINEAR[LINEAR.index("radius_scale") :]
-"""The states that stay as they are: what a calibration of the robot would tell."""
+ON_DEMAND = LINEAR[LINEAR.index("radius_scale") :]
+"""The states that only a calibration estimates."""
+CALIBRATION = ON_DEMAND[: ON_DEMAND.index("surge_slip")]
+"""Those of them that stay as they are: what a calibration of the robot would tell."""
 
 DIM = 15 + len(LINEAR)
-"""Length of the whole tangent; without calibration it ends before `CALIBRATION`."""
+"""Length of the whole tangent; without calibration it ends before `ON_DEMAND`."""
 POSE, VELOCITY, BIAS = slice(0, 6), slice(6, 9), slice(9, 15)
 NAV, MARKOV = slice(0, 15), slice(15, DIM)
 """The states that GTSAM holds, and the linear ones."""
 SLIP, DRIFT, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS = 15, slice(16, 18), 18, 19, 20, 21
-ANTENNA, IMU_ROTATION, WHEEL_DELAY, GNSS_DELAY = slice(22, 24), slice(24, 27), 27, 28
+ANTENNA, IMU_ROTATION, WHEEL_DELAY, GNSS_DELAY, SURGE_SLIP = slice(22, 24), slice(24, 27), 27, 28, 29
 
 
 @dataclass(frozen=True, eq=False)
 class KeyState:
-    """State of a keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `linear` (14,) as `LINEAR`."""
+    """State of a keyframe: `pose` Pose3, `velocity` (3,), `bias` ConstantBias, `linear` (15,) as `LINEAR`."""
 
     pose: gtsam.Pose3
     velocity: Array
@@ -86,7 +90,7 @@ class KeyState:
         return self.of(DRIFT)
 
     def retract(self, delta: Array) -> KeyState:
-        """The state moved by a tangent vector (DIM,) or (DIM - len(CALIBRATION),)."""
+        """The state moved by a tangent vector (DIM,) or (DIM - len(ON_DEMAND),)."""
         linear = self.linear.copy()
         linear[: len(delta) - NAV.stop] += delta[NAV.stop :]
         bias = gtsam.imuBias.ConstantBias(
@@ -136,7 +140,7 @@ class KeyState:
 
 
 def linear_sigma(P: Array) -> Array:
-    """1 sigma (14,) of the linear states from a covariance (dim, dim); NaN where they are not estimated."""
+    """1 sigma (15,) of the linear states from a covariance (dim, dim); NaN where they are not estimated."""
     out = np.full(len(LINEAR), np.nan)
     estimated = np.diag(P)[NAV.stop :]
     out[: len(estimated)] = np.sqrt(estimated)
@@ -145,7 +149,7 @@ def linear_sigma(P: Array) -> Array:
 
 def dim_of(calibrate: bool) -> int:
     """Length of the tangent, with or without the states of a calibration."""
-    return DIM if calibrate else DIM - len(CALIBRATION)
+    return DIM if calibrate else DIM - len(ON_DEMAND)
 
 
 def skew(v: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import gtsam
@@ -15,6 +16,8 @@ from terrafusion.fusion.weights.policy import SensorNoise
 INTEGRATION_SIGMA_M = 1e-4
 """Position error of the integration itself, m/sqrt(s): keeps the square root full rank."""
 STEP = math.log(1.05)
+HELD_INFLATION = 5.0
+"""Noise of a keyframe's IMU over its usual, where a sample is missing (assumed)."""
 
 
 class Preintegrator:
@@ -33,7 +36,12 @@ class Preintegrator:
         bias: gtsam.imuBias.ConstantBias,
         row: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; the row's inflations multiply the data sheet's noise."""
+        """Preintegrate the segments about `bias`; the row's inflations multiply the data sheet's noise.
+
+        With a spike that another sample stands for, the whole is `HELD_INFLATION` times less certain.
+        """
+        if any(piece.held for piece in segments):
+            row = _less_sure(row)
         measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(row), bias)
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
@@ -56,3 +64,8 @@ class Preintegrator:
             params.setBodyPSensor(gtsam.Pose3(gtsam.Rot3(), np.array(spec.position_m)))
             self._params[key] = params
         return self._params[key]
+
+
+def _less_sure(row: SensorNoise) -> SensorNoise:
+    names = ("gyro_inflation", "gyro_yaw_inflation", "accel_inflation")
+    return dataclasses.replace(row, **{name: HELD_INFLATION * getattr(row, name) for name in names})

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, YAW_SCALE
+from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, SURGE_SLIP, YAW_SCALE
 from terrafusion.fusion.graph.markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.weights.policy import SensorNoise
@@ -25,7 +25,7 @@ SLIP_RENEWAL = 1.1
 """Slip is what traction asks for, and traction changes with speed: where the wheels change theirs by a
 share x, `SLIP_RENEWAL x^2` of the slip is new. Tuned likewise,
 as 2 of an x that was seen a quarter too small."""
-OF_THE_GROUND = np.array([SLIP, YAW_SCALE, SIDE_SLIP]) - NAV.stop
+OF_THE_GROUND = np.array([SLIP, YAW_SCALE, SIDE_SLIP, SURGE_SLIP]) - NAV.stop
 """What another ground changes; the receiver's drift and the calibration stay."""
 CRAWL_MPS = 0.1
 """Below this wheel speed any change of it is a start or a stop."""
@@ -42,6 +42,9 @@ SIDE_SLIP_PER_GRADE, SIDE_SLIP_DOUBT = 0.7, 0.3
 """One shear law carries the robot along and across: on a cross slope it slips downhill by so much of the slip
 it has on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69 on medium sand across 15 deg), give
 or take a share of it (assumed)."""
+SURGE_TIME_S, SURGE_DOUBT = 60.0, 0.5
+"""An acceleration asks for the thrust of a grade as steep as it is over gravity, and so for its slip, give or
+take a share of it (assumed; in turns the twin slips more)."""
 CALIBRATION_SIGMA = {
     "radius_scale": 0.02,
     "antenna_x_m": 0.05,
@@ -59,11 +62,12 @@ _WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
 
 
 def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
-    """Mean and 1 sigma (14,) of the linear states before any data, on the ground of `row`."""
+    """Mean and 1 sigma (15,) of the linear states before any data, on the ground of `row`."""
     mean, sigma = np.zeros(len(LINEAR)), np.empty(len(LINEAR))
     mean[0], mean[3] = row.slip_at(grade), row.yaw_scale_mean
     sigma[:6] = _stationary(row, drift_sigma_m)
-    sigma[6:] = list(CALIBRATION_SIGMA.values())
+    sigma[6:-1] = list(CALIBRATION_SIGMA.values())
+    mean[-1], sigma[-1] = row.slip_per_grade, _surge_sigma(row)
     return mean, sigma
 
 
@@ -100,10 +104,11 @@ def step(
         forget=[renewed, 0.0, 0.0, switch, 0.0, switch],
     )
     walk = np.array(list(_WALK.values())) * np.sqrt(dt_s)
+    surge = markov_step(dt_s, [row.slip_per_grade], [_surge_sigma(row)], [SURGE_TIME_S], [switch])
     return MarkovStep(
-        np.append(wandering.decay, np.ones(len(walk))),
-        np.append(wandering.mean, np.zeros(len(walk))),
-        np.append(wandering.sigma, walk),
+        np.concatenate([wandering.decay, np.ones(len(walk)), surge.decay]),
+        np.concatenate([wandering.mean, np.zeros(len(walk)), surge.mean]),
+        np.concatenate([wandering.sigma, walk, surge.sigma]),
     )
 
 
@@ -136,6 +141,10 @@ def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:
         return 0.0
     speed_mps = max(abs(wheels.distance_m) / dt_s, CRAWL_MPS)
     return min(1.0, SLIP_RENEWAL * (wheels.speed_change_mps / speed_mps) ** 2)
+
+
+def _surge_sigma(row: SensorNoise) -> float:
+    return SURGE_DOUBT * abs(row.slip_per_grade) + 1e-3
 
 
 def _stationary(row: SensorNoise, drift_sigma_m: float) -> list[float]:

@@ -10,7 +10,7 @@ Array = NDArray[np.float64]
 
 
 _UPPER = np.triu(np.ones((64, 65)))
-"""Keeps the upper triangle; for two states of 29 at most."""
+"""Keeps the upper triangle; for two states of 30 at most."""
 
 
 def eliminated(stacked: Array, known: Array) -> tuple[Array, Array]:
@@ -49,3 +49,11 @@ def back_substitute(R: Array, rhs: Array) -> Array:
     if info or not np.isfinite(solution).all():
         raise ArithmeticError("a keyframe is not determined by its factors")
     return np.asarray(solution)
+
+
+def covariance_before(conditional: Array, following: Array) -> Array:
+    """Marginal covariance (d, d) of a state from that of the one after it, and `eliminated`'s first rows."""
+    dim = len(conditional)
+    inverse, _ = lapack.dtrtri(conditional[:, :dim])
+    gain = inverse @ conditional[:, dim : 2 * dim]
+    return np.asarray(inverse @ inverse.T + gain @ following @ gain.T)

@@ -2,15 +2,17 @@
 
 Residual (4,): three in the body frame of keyframe i, metres, and the turn, radians::
 
-    r[:3] = R_i' (p_j - p_i) - (1 - slip) (1 + radius) (d + delay dv e_x) - lateral e_y
+    r[:3] = R_i' (p_j - p_i) - (1 - slip) (1 + radius) (d + delay dv e_x) + surge_slip surge e_x - lateral e_y
     r[3]  = yaw(R_i' R_j) - (1 + yaw_scale) turn
     lateral = side_slip distance - icr_x yaw
 
 `d` is what the wheels say: their travelled distance turned by the gyro while
 it was travelled; `dv` is how much their speed changed meanwhile, which tells a
-delay of their clock. The first row is odometry with slip, the second and third
-are the non-holonomic constraint (Dissanayake et al. 2001, IEEE T-RA 17(5)), freed
-of what a skid-steered robot does in every turn (instantaneous centres of rotation:
+delay of their clock; `surge` is a / g (|d| + v0 dt) of wheels that accelerate by a. They
+ask for the thrust, and so the slip, of a grade as steep as a / g: left out, that would
+look like a delay of surge_slip v / g. The first row is odometry with slip, the second
+and third are the non-holonomic constraint (Dissanayake et al. 2001, IEEE T-RA 17(5)),
+freed of what a skid-steered robot does in every turn (instantaneous centres of rotation:
 Martinez et al. 2005, IJRR 24(10); Pentzer, Brennan, Reichard 2014, J. Field Robotics
 31(3)). Slip is v = (1 - slip) omega R (Wong 2008, Theory of Ground Vehicles).
 """
@@ -32,13 +34,19 @@ from terrafusion.fusion.graph.key_state import (
     RADIUS,
     SIDE_SLIP,
     SLIP,
+    SURGE_SLIP,
     WHEEL_DELAY,
     YAW_SCALE,
 )
 
 Array = NDArray[np.float64]
 
-_S, _K, _I, _B, _R, _T = (i - NAV.stop for i in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY))
+_S, _K, _I, _B, _R, _T, _A = (
+    i - NAV.stop for i in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY, SURGE_SLIP)
+)
+
+MOVED_M = 0.01
+"""A keyframe's distance below which slip is not asked what acceleration adds to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +60,7 @@ class WheelIncrement:
         turn_rad: right minus left distance over the track, signed.
         yaw_rad: turn by the gyro, bias removed.
         speed_change_mps: wheel speed at the end less that at the start.
+        surge_m: a / g (|distance| + v0 dt) of wheels that accelerate by a; 0 unless calibrated.
     """
 
     displacement_m: Array
@@ -60,6 +69,7 @@ class WheelIncrement:
     turn_rad: float
     yaw_rad: float = 0.0
     speed_change_mps: float = 0.0
+    surge_m: float = 0.0
 
     def without_turn(self) -> WheelIncrement:
         """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
@@ -78,14 +88,21 @@ class WheelIncrement:
         return dataclasses.replace(self, sigma=sigma)
 
 
+def slip_of(linear: Array, wheels: WheelIncrement) -> float:
+    """Slip over the interval of `wheels`, what their acceleration asks for included."""
+    asked_m = float(linear[_A]) * wheels.surge_m
+    return float(linear[_S]) + (asked_m / wheels.distance_m if abs(wheels.distance_m) > MOVED_M else 0.0)
+
+
 def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:
-    """The residual (4,) of the module's docstring, unwhitened; `linear` (14,) of keyframe j."""
+    """The residual (4,) of the module's docstring, unwhitened; `linear` (15,) of keyframe j."""
     R = pose_i.rotation().matrix()
     out = np.empty(4)
     out[:3] = R.T @ (pose_j.translation() - pose_i.translation())
     rolled = wheels.displacement_m.copy()
     rolled[0] += linear[_T] * wheels.speed_change_mps
     out[:3] -= (1.0 - linear[_S]) * (1.0 + linear[_R]) * rolled
+    out[0] += linear[_A] * wheels.surge_m
     out[1] -= linear[_B] * wheels.distance_m - linear[_I] * wheels.yaw_rad
     turned = R.T @ pose_j.rotation().matrix()
     out[3] = np.arctan2(turned[1, 0], turned[0, 0]) - (1.0 + linear[_K]) * wheels.turn_rad
@@ -93,7 +110,7 @@ def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) ->
 
 
 def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> tuple[Array, Array, Array]:
-    """Derivatives of `residual` by pose i (4, 6), pose j (4, 6) and the linear states (4, 14).
+    """Derivatives of `residual` by pose i (4, 6), pose j (4, 6) and the linear states (4, 15).
 
     Pose tangents are GTSAM's: rotation first, both parts in the body frame.
     """
@@ -116,6 +133,7 @@ def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -
     rolled[0] += linear[_T] * wheels.speed_change_mps
     slip, radius = 1.0 - linear[_S], 1.0 + linear[_R]
     H_linear[:3, _S], H_linear[:3, _R] = radius * rolled, -slip * rolled
+    H_linear[0, _A] = wheels.surge_m
     H_linear[0, _T] = -slip * radius * wheels.speed_change_mps
     H_linear[1, _B], H_linear[1, _I] = -wheels.distance_m, wheels.yaw_rad
     H_linear[3, _K] = -wheels.turn_rad

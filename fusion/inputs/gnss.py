@@ -20,6 +20,7 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
 from terrafusion.fusion.inputs.gates import GnssGate, Verdict
 from terrafusion.fusion.inputs.placement import Placement, place
 from terrafusion.fusion.inputs.slide import Slide
@@ -125,7 +126,7 @@ class GnssUpdater:
         self.track.step(chain)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
             fix = self.waiting.pop(0)
-            k = chain.at_or_after(fix.t_ns)
+            k = keyframe_of(fix, chain)
             if k is None:
                 self.too_late += 1
             elif self.local:
@@ -211,7 +212,8 @@ class GnssUpdater:
         self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise, again: bool = False
     ) -> bool:
         node, state = chain.nodes[k - chain.first], chain.state(k)
-        offset_s = (fix.t_ns - node.t_ns) * 1e-9
+        delay_s = float(state.of(GNSS_DELAY))
+        offset_s = (fix.t_ns - node.t_ns) * 1e-9 - delay_s
         R = state.pose.rotation().matrix()
         rate = state.rate(node.gyro_radps)
         accel_world = R @ state.specific_force(node.accel_mps2) - np.array([0.0, 0.0, GRAVITY_MPS2])
@@ -221,7 +223,7 @@ class GnssUpdater:
         inflation = row.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
         sigma = self._white_sigma(fix, inflation, share)
-        position = GnssPosition(fix.enu_m, lever, sigma, share, velocity)
+        position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
         innovation = -residual(position, state.pose, state.linear)
         H_pose, H_linear = jacobians(position, state.pose, state.linear)
         J = np.hstack([H_pose, np.zeros((3, 9)), H_linear])[:, : chain.dim]
@@ -265,11 +267,15 @@ class GnssUpdater:
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
-            late_s = offset_s - float(state.of(GNSS_DELAY))
-            body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * late_s
-            doubt = _calibration_doubt_mps(covariance, rate, accel_world)
-            sigma_v = round(float(np.hypot(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), doubt)), 4)
-            chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
+            sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
+            if chain.dim > GNSS_DELAY:
+                doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
+                at_keyframe = fix.velocity_mps - accel_world * offset_s
+                sigma_v, turned = math.hypot(sigma_v, doubt), swing(rate, offset_s)
+                chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
+            else:
+                body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
+                chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
             chain.smooth(chain.last - k + 1)
             chain.restart(np.zeros(chain.dim), k)
@@ -328,13 +334,12 @@ class GnssUpdater:
         return True
 
 
-def _calibration_doubt_mps(covariance: Array, rate_radps: Array, accel_mps2: Array) -> float:
-    """What doubt about the antenna's place and the receiver's delay does to its velocity, 1 sigma."""
-    if len(covariance) <= GNSS_DELAY:  # not calibrated: the file's numbers stand
-        return 0.0
-    antenna_m = float(np.sqrt(covariance[ANTENNA, ANTENNA].trace()))
-    delay_s = float(np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
-    return float(np.hypot(np.linalg.norm(rate_radps) * antenna_m, np.linalg.norm(accel_mps2) * delay_s))
+def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
+    """The keyframe at or after a fix, once its stamp is corrected by the delay as far as that is known."""
+    if chain.dim <= GNSS_DELAY:
+        return chain.at_or_after(fix.t_ns)
+    delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
+    return chain.at_or_after(min(fix.t_ns - round(delay_s * 1e9), chain.nodes[-1].t_ns))
 
 
 def checked_fix(

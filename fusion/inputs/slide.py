@@ -84,6 +84,10 @@ class Slide:
         chain.smooth(chain.last - begin + 1)
         return True
 
+    def loosened(self, wheels: WheelIncrement, dt_s: float) -> WheelIncrement:
+        """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
+        return wheels.loosened(self.rate_m2ps * dt_s) if self.rate_m2ps else wheels
+
     def put_back(self, chain: Chain) -> None:
         """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
         more_m2ps, wheels = self._before

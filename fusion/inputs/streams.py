@@ -18,11 +18,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ImuSegment:
-    """A piece of time (s) with constant angular rate (3,) and specific force (3,)."""
+    """A piece of time (s) with constant angular rate (3,) and specific force (3,); `held` where samples
+    before stand for a spike."""
 
     dt_s: float
     gyro_radps: Array
     accel_mps2: Array
+    held: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +42,13 @@ class GnssFix:
     fix: Fix | None = None
 
 
+SPIN_RADPS, SHOCK_MPS2 = 10.0, 50.0
+"""Beyond these, on any axis, a sample tells more of the sensor than of a wheeled robot (assumed): a shock
+lasts for less than a sample, and taken for all of it, at 100 Hz, it is half a metre a second."""
+CALM_NS = 500_000_000
+"""Where half the samples of so long a time are like that, they are believed all the same."""
+RECENT = 10
+"""So many samples before a spike stand for it: fewer would still hold much of the robot's shaking."""
 LATEST_S = 5.0
 """A sample so much older than its stream's newest is no late message: the clock has jumped."""
 LONGEST_WAIT_S = 0.5
@@ -91,10 +100,16 @@ class ImuStream:
     With `six_axis` False the stream is declared to tell the yaw rate alone: any
     other axis may be NaN, and `segments` has in their place, present or not,
     what a robot reads that drives straight on level ground.
+
+    A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is not believed: the mean of the samples
+    before stands for it. `spikes` counts them.
     """
 
     def __init__(self, six_axis: bool = True) -> None:
         self.six_axis = six_axis
+        self.spikes = 0
+        self._wild_ns: list[int] = []
+        self._held_ns: list[int] = []
         self.late = Lateness("imu")
         self.t_ns: list[int] = []
         self.gyro: list[Array] = []
@@ -114,9 +129,23 @@ class ImuStream:
             )
         i = self.late.place(t_ns, self.t_ns)
         if i is not None:
+            wild = _beyond(gyro, SPIN_RADPS), _beyond(accel, SHOCK_MPS2)
+            if any(wild):
+                if self._alone(i, t_ns):
+                    recent = slice(max(i - RECENT, 0), i)
+                    gyro = np.mean(self.gyro[recent], axis=0) if wild[0] else gyro
+                    accel = np.mean(self.accel[recent], axis=0) if wild[1] else accel
+                    self._held_ns.append(t_ns)
+                    self.spikes += 1
+                self._wild_ns.append(t_ns)
             self.t_ns.insert(i, t_ns)
             self.gyro.insert(i, gyro)
             self.accel.insert(i, accel)
+
+    def _alone(self, i: int, t_ns: int) -> bool:
+        """Whether most samples before a wild one, which goes to place i, are not like it."""
+        since = bisect.bisect_left(self.t_ns, t_ns - CALM_NS, hi=i)
+        return 2 * sum(t_ns - CALM_NS <= t < t_ns for t in self._wild_ns) < i - since
 
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
@@ -128,7 +157,9 @@ class ImuStream:
         while t < end_ns:
             until = min(self.t_ns[i], end_ns)
             if until > t:
-                pieces.append(ImuSegment((until - t) * 1e-9, *self._for_graph(self.gyro[i], self.accel[i])))
+                held = bool(self._held_ns) and self.t_ns[i] in self._held_ns
+                readings = self._for_graph(self.gyro[i], self.accel[i])
+                pieces.append(ImuSegment((until - t) * 1e-9, *readings, held))
             t = until
             i += 1
         return pieces
@@ -162,6 +193,12 @@ class ImuStream:
         i = bisect.bisect_left(self.t_ns, before_ns)
         if i > 256:
             del self.t_ns[:i], self.gyro[:i], self.accel[:i]
+            for times in (self._wild_ns, self._held_ns):
+                times[:] = [t for t in times if t >= before_ns]
+
+
+def _beyond(reading: Array, limit: float) -> bool:
+    return any(abs(x) > limit for x in reading.tolist())
 
 
 class WheelStream:

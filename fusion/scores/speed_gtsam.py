@@ -1,8 +1,8 @@
 """The graph of a drive in GTSAM's own optimisers, for `speed`.
 
 `FULL` is the same graph as ours; wheels, fixes and linear states are Python `CustomFactor`s there. `NATIVE`
-has C++ factors alone: the wheels as a `BetweenFactorPose3`, fixes as `GPSFactorArm`, no slip, no drift of
-the receiver, no yaw scale. It is the floor of what GTSAM needs, and not the same problem.
+has C++ factors alone: the wheels as a `BetweenFactorPose3`, fixes as `GPSFactorArm`, velocities as priors, no
+slip, no drift of the receiver, no yaw scale. It is the floor of what GTSAM needs, and not the same problem.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ import numpy as np
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gnss_factor, markov, wheel_factor
+from terrafusion.fusion.graph import gnss_factor, markov, velocity_factor, wheel_factor
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import BIAS, MARKOV, POSE, VELOCITY, KeyState
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 Array = NDArray[np.float64]
@@ -104,6 +105,8 @@ def factors(chain: Chain, k: int, kind: Graph) -> gtsam.NonlinearFactorGraph:
         graph.add(markov.as_gtsam_factor(node.markov, M(k - 1), M(k)))
     for fix in node.fixes:
         graph.add(_fix(fix, k, kind))
+    for told in node.velocities:
+        graph.add(_velocity(told, k, kind))
     return graph
 
 
@@ -136,3 +139,10 @@ def _fix(fix: GnssPosition, k: int, kind: Graph) -> gtsam.NonlinearFactor:
     if kind is Graph.FULL:
         return gnss_factor.as_gtsam_factor(fix, X(k), M(k))
     return gtsam.GPSFactorArm(X(k), fix.enu_m, fix.lever_m, gtsam.noiseModel.Diagonal.Sigmas(fix.sigma_m))
+
+
+def _velocity(told: GnssVelocity, k: int, kind: Graph) -> gtsam.NonlinearFactor:
+    if kind is Graph.FULL:
+        return velocity_factor.as_gtsam_factor(told, X(k), V(k), M(k))
+    noise = gtsam.noiseModel.Isotropic.Sigma(3, told.sigma_mps)
+    return gtsam.PriorFactorVector(V(k), told.velocity_mps, noise)

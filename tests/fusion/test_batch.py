@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import gtsam
 import numpy as np
 import pytest
@@ -11,7 +13,8 @@ from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.batch_rows import Block
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import IMU_ROTATION, KeyState
+from terrafusion.fusion.graph.key_state import ANTENNA, IMU_ROTATION, LINEAR, KeyState
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
 from tests.fusion.test_chain import SIGMAS, STEP, drive, iso
 
 NS = 100_000_000
@@ -23,12 +26,12 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
     points, links, wheels, fixes = drive(n, seed=2)
     rng = np.random.default_rng(0)
     for k, point in enumerate(points):
-        point = KeyState(point.pose, point.velocity, point.bias, rng.normal(0.0, 0.05, 14))
+        point = KeyState(point.pose, point.velocity, point.bias, rng.normal(0.0, 0.05, len(LINEAR)))
         if k == 0:
             chain.append(0, point)
             chain.set_prior(SIGMAS[: chain.dim])
             continue
-        increment = None if k == 3 else wheels[k - 1]
+        increment = None if k == 3 else dataclasses.replace(wheels[k - 1], surge_m=0.02 * calibrate)
         rates = np.array([0.01, 0.02, 0.2]), np.array([0.1, 0.2, 9.8])
         chain.append(k * NS, point, links[k - 1], STEP, increment, *rates, k != 4)
         if k == 5:
@@ -37,7 +40,11 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
             chain.add(k, gtsam.PriorFactorVector(V(k), np.zeros(3), iso(3, 0.5)), "V")
         for i in range(k % 3):
             lever, velocity = np.array([0.2, 0.1 * i, 0.3]), np.array([0.9, 0.3, 0.0])
-            chain.add_fix(k, GnssPosition(fixes[k], lever, np.array([0.3, 0.4, 1.0]), 0.7, velocity))
+            fix = GnssPosition(fixes[k], lever, np.array([0.3, 0.4, 1.0]), 0.7, velocity, delay_s=0.02)
+            chain.add_fix(k, fix)
+            if calibrate:
+                turned = swing(np.array([0.1, -0.2, 0.3 * k]), -0.05)
+                chain.add_velocity(k, GnssVelocity(velocity, 0.1, lever, turned))
     return chain
 
 
@@ -60,6 +67,7 @@ def test_rows_are_those_of_the_chain(calibrate: bool) -> None:
         assert not rows[k, counts[k] :].any()
     if calibrate:
         assert rows[0, :, IMU_ROTATION].any()
+        assert rows[1, :, ANTENNA].any()
 
 
 def test_blocks_hand_on_what_they_know(monkeypatch: pytest.MonkeyPatch) -> None:

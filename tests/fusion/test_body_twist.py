@@ -9,13 +9,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.fusion.graph.body_twist import bias_sigma, twist_covariance, twist_jacobian
-from terrafusion.fusion.graph.key_state import DIM, KeyState
+from terrafusion.fusion.graph.key_state import DIM, LINEAR, KeyState
 
 
 def key_state(rng: np.random.Generator) -> KeyState:
     pose = gtsam.Pose3(gtsam.Rot3.Expmap(rng.normal(size=3)), rng.normal(size=3))
     bias = gtsam.imuBias.ConstantBias(rng.normal(size=3) * 0.1, rng.normal(size=3) * 0.1)
-    return KeyState(pose, rng.normal(size=3), bias, rng.normal(size=14) * 0.1)
+    return KeyState(pose, rng.normal(size=3), bias, rng.normal(size=len(LINEAR)) * 0.1)
 
 
 def body_twist(key: KeyState, gyro: np.ndarray) -> np.ndarray:

@@ -10,12 +10,13 @@ import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gnss_factor, markov, wheel_factor
+from terrafusion.fusion.graph import gnss_factor, markov, velocity_factor, wheel_factor
 from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
 from terrafusion.fusion.graph.markov import markov_step
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ STEP = markov_step(
     sigma=[0.1, 0.5, 0.5, 0.3, 0.1, 0.05, *[0.02] * (N - 6)],
     time_s=[5.0, *[30.0] * (N - 1)],
 )
+RATE = np.array([0.0, 0.0, 0.2])
 SIGMAS = np.array(
     [0.05] * 2 + [0.3] + [2.0] * 3 + [0.5] * 3 + [0.1] * 3 + [0.01] * 3 + [0.1, 0.5, 0.5] + [0.1] * (N - 3)
 )
@@ -65,7 +67,7 @@ def drive(n: int, seed: int, heading: float = 0.4) -> tuple[list[KeyState], list
         links.append(link)
         moved = np.array([speed * dt / 0.95, 0.001, 0.0]) + rng.normal(0, 0.002, 3)
         wheels.append(
-            WheelIncrement(moved, np.array([0.003, 0.005, 0.005, 0.01]), moved[0], 0.03, 0.02, 0.01)
+            WheelIncrement(moved, np.array([0.003, 0.005, 0.005, 0.01]), moved[0], 0.03, 0.02, 0.01, 0.002)
         )
     return points, links, wheels, fixes
 
@@ -94,6 +96,9 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
             )
             chain.add_fix(k, fix)
             graph.add(gnss_factor.as_gtsam_factor(fix, X(k), M(k)))
+            told = GnssVelocity(points[k].velocity, 0.1, np.array([0.2, 0.0, 0.3]), swing(RATE, -0.05))
+            chain.add_velocity(k, told)
+            graph.add(velocity_factor.as_gtsam_factor(told, X(k), V(k), M(k)))
     return graph
 
 
@@ -179,6 +184,8 @@ def test_forgetting_keeps_the_information() -> None:
                     fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3), 1.0, np.array([0.9, 0.3, 0.0])
                 ),
             )
+            for told in whole.nodes[k].velocities:
+                short.add_velocity(k, told)
         short._eliminate_all()
         short.forget(8)
     whole._eliminate_all()
@@ -227,7 +234,7 @@ def test_wheel_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     a = gtsam.Pose3.Expmap(rng.normal(0, 1, 6))
     b = a.compose(gtsam.Pose3.Expmap(rng.normal(0, 0.4, 6)))
-    wheels = WheelIncrement(rng.normal(0, 0.2, 3), np.ones(4), 0.3, 0.2, -0.1, 0.4)
+    wheels = WheelIncrement(rng.normal(0, 0.2, 3), np.ones(4), 0.3, 0.2, -0.1, 0.4, 0.05)
     linear = rng.uniform(-0.2, 0.4, N)
     H_a, H_b, H_linear = jacobians(a, b, linear, wheels)
     for H, function, n in (
@@ -243,7 +250,7 @@ def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose, linear = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), rng.normal(0, 1, N)
     place, lever, speed = rng.normal(0, 5, 3), rng.normal(0, 0.5, 3), rng.normal(0, 1, 3)
-    fix = GnssPosition(place, lever, np.ones(3), 0.3, speed)
+    fix = GnssPosition(place, lever, np.ones(3), 0.3, speed, delay_s=0.4)
     H_pose, H_linear = gnss_factor.jacobians(fix, pose, linear)
     np.testing.assert_allclose(
         H_pose, numeric(lambda s: gnss_factor.residual(fix, pose.retract(s), linear), 6), atol=1e-6
@@ -251,6 +258,28 @@ def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
     np.testing.assert_allclose(
         H_linear, numeric(lambda s: gnss_factor.residual(fix, pose, linear + s), N), atol=1e-6
     )
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_velocity_jacobians_match_finite_differences(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose, linear, v = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), rng.normal(0, 1, N), rng.normal(0, 1, 3)
+    told = GnssVelocity(rng.normal(0, 1, 3), 0.1, rng.normal(0, 0.5, 3), swing(rng.normal(0, 1, 3), -0.1))
+    H_pose, H_velocity, H_linear = velocity_factor.jacobians(told, pose, linear)
+    for H, function, n in (
+        (H_pose, lambda s: velocity_factor.residual(told, pose.retract(s), v, linear), 6),
+        (H_velocity, lambda s: velocity_factor.residual(told, pose, v + s, linear), 3),
+        (H_linear, lambda s: velocity_factor.residual(told, pose, v, linear + s), N),
+    ):
+        np.testing.assert_allclose(H, numeric(function, n), atol=1e-6)
+
+
+def test_an_antenna_swings_as_a_point_of_the_body_does() -> None:
+    """Its velocity some time before the keyframe, from its places then, in the axes of the keyframe."""
+    rate, lever, offset, h = np.array([0.2, -0.3, 0.9]), np.array([0.4, 0.1, 0.6]), -0.1, 1e-5
+    ahead, behind = (gtsam.Rot3.Expmap(rate * (offset + s)).matrix() @ lever for s in (h, -h))
+    assert swing(rate, offset) @ lever == pytest.approx((ahead - behind) / (2 * h), abs=5e-3)
+    assert swing(rate, 0.0) @ lever == pytest.approx(np.cross(rate, lever))
 
 
 def test_a_turned_imu_acts_as_its_rows_say() -> None:

@@ -16,7 +16,7 @@ from typer.testing import CliRunner
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.estimate import Estimate
-from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR
+from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.report.linear_states import QUANTITIES, calibration, cells, series
 from terrafusion.fusion.report.outputs import build_metrics, estimate_columns, final_status, to_json
@@ -38,7 +38,9 @@ def with_states(estimate: Estimate, calibrated: bool) -> Estimate:
     sigma = np.full((n, len(LINEAR)), 0.05)
     for name, prior in CALIBRATION_SIGMA.items():
         share = 0.4 if name.startswith("antenna") else 0.9
-        sigma[:, LINEAR.index(name)] = share * prior if calibrated else np.nan
+        sigma[:, LINEAR.index(name)] = share * prior
+    if not calibrated:
+        sigma[:, LINEAR.index(ON_DEMAND[0]) :] = np.nan
     return dataclasses.replace(estimate, linear=value, linear_sigma=sigma, bias_sigma=np.full((n, 6), 0.003))
 
 
@@ -79,7 +81,7 @@ def test_columns_of_the_states_come_after_those_of_the_contract(drive: Any, cali
     names = list(table)
     more = names[names.index("immobilised") + 1 :]
     biases = [f"sigma_gyro_bias_{a}_radps" for a in "xyz"] + [f"sigma_accel_bias_{a}_mps2" for a in "xyz"]
-    states = (*WANDERING, *(CALIBRATION if calibrated else ()))
+    states = (*WANDERING, *(ON_DEMAND if calibrated else ()))
     assert more == biases + [part for state in states for part in (state, f"sigma_{state}")]
     assert names[: len(names) - len(more)][-3:] == ["status", "slipping", "immobilised"]
     assert {float(cell) for cell in table["sigma_gyro_bias_z_radps"]} == {0.003}

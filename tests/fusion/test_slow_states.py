@@ -17,7 +17,7 @@ from terrafusion.fusion.weights.policy import load_policy
 
 ROWS = load_policy().classes
 SAND = ROWS["loose_sand"]
-SLIP, SIDE = LINEAR.index("slip"), LINEAR.index("side_slip")
+SLIP, SIDE, SURGE = (LINEAR.index(name) for name in ("slip", "side_slip", "surge_slip"))
 LEVEL = np.array([0.0, 0.0, 1.0])
 
 
@@ -69,6 +69,18 @@ def test_on_a_cross_slope_the_robot_slips_downhill_whichever_way_it_drives(roll:
     assert forwards.sigma[SIDE] == mirrored.sigma[SIDE] >= step(rolling(1.0)).sigma[SIDE]
 
 
+@pytest.mark.parametrize("row", ROWS.values(), ids=ROWS)
+def test_acceleration_is_expected_to_slip_as_a_grade_does_and_the_ground_to_change_it(row) -> None:
+    mean, sigma = slow_states.prior(row, 0.0, 0.02)
+    assert mean[SURGE] == row.slip_per_grade
+    assert sigma[SURGE] == pytest.approx(slow_states.SURGE_DOUBT * abs(row.slip_per_grade), abs=2e-3)
+    for switch, kept in ((0.0, np.exp(-0.1 / slow_states.SURGE_TIME_S)), (1.0, 0.0)):
+        taken = slow_states.step(0.1, row, LEVEL, 0.02, 100.0, switch)
+        assert taken.decay[SURGE] == pytest.approx(kept)
+        assert taken.mean[SURGE] == row.slip_per_grade
+        assert np.hypot(taken.sigma[SURGE], kept * sigma[SURGE]) == pytest.approx(sigma[SURGE])
+
+
 def test_slip_is_expected_uphill_and_side_slip_is_not() -> None:
     pitch = 0.1
     uphill = step(rolling(1.0), np.array([np.sin(pitch), 0.0, np.cos(pitch)]))
@@ -80,7 +92,7 @@ def test_slip_is_expected_uphill_and_side_slip_is_not() -> None:
 def test_what_a_robot_keeps_hardly_moves_in_an_hour(row) -> None:
     _, prior = slow_states.prior(row, 0.0, 0.02)
     hour = slow_states.step(3600.0, row, LEVEL, 0.02, 100.0, 0.0)
-    kept = slice(LINEAR.index("radius_scale"), None)
+    kept = slice(LINEAR.index("radius_scale"), LINEAR.index("surge_slip"))
     assert hour.decay[kept] == pytest.approx(1.0)
     assert np.all(hour.sigma[kept] < 0.02 * prior[kept])
 
