@@ -367,7 +367,7 @@ class Estimator:
         change = self.wheels.speed_change_mps(before_ns, t_ns)
         row, surging = self.weights.row, self.config.calibrate
         increment = wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, row, change, surging)
-        increment = self.gnss.slide.loosened(increment, (t_ns - before_ns) * 1e-9)
+        increment = self.gnss.slide.loosened(increment, before, (t_ns - before_ns) * 1e-9)
         inputs = self.config.inputs
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 

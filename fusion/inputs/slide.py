@@ -5,8 +5,9 @@ then keep good fixes out, and after each that is let in lead the estimate astray
 can have slid is known: no further than its wheels rolled and its speed carried it since the last fix that
 was used. Fixes that are refused, lie on one side of the estimate and no further off than that, refute
 the wheels, not the receiver: the wheels' way since then is taken to be as wrong as the fixes say, and how
-fast it goes wrong (a random walk, m2 a second) is remembered, as the noise of an adaptive filter (Mehra 1972,
-IEEE T-AC 17(5), covariance matching), until accepted fixes tell that they are to be trusted again.
+fast it goes wrong (a random walk, m2 a second of driving) is remembered, as the noise of an adaptive
+filter (Mehra 1972, IEEE T-AC 17(5), covariance matching), until accepted fixes tell that they are to be
+trusted again.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 Array = NDArray[np.float64]
@@ -28,14 +30,16 @@ REACH_SIGMA = 3.0
 LEAST_M2PS = 1e-4
 """A centimetre after a second: a slide is over."""
 MEMORY_S = 10.0
-"""How long a slide is remembered while fixes are accepted (assumed: a few turns or stops)."""
+"""How long a slide is remembered while the robot drives and fixes are accepted (assumed: a few turns)."""
+DRIVING_MPS = 0.3
+"""At this speed, of the robot or its wheels, half a second counts as driven in a second; at rest none."""
 
 
 class Slide:
     """How wrong the wheels are beyond their noise.
 
     Attributes:
-        rate_m2ps: variance of the wheels' way, each axis, per second.
+        rate_m2ps: variance of the wheels' way, each axis, per second of driving.
         refutations: how often fixes refuted the wheels.
     """
 
@@ -43,6 +47,7 @@ class Slide:
         self.rate_m2ps = 0.0
         self.refutations = 0
         self._before: tuple[float, list[tuple[int, WheelIncrement | None]]] = (0.0, [])
+        self._driven_s = 0.0
         self._last_ns: int | None = None
 
     def refuted(
@@ -68,25 +73,26 @@ class Slide:
         rolled_m = [abs(node.wheels.distance_m) for node in nodes if node.wheels is not None]
         if not rolled_m:
             return False
-        time_s = (nodes[-1].t_ns - chain.nodes[begin - chain.first].t_ns) * 1e-9
+        ends_ns = [chain.nodes[i - 1 - chain.first].t_ns for i in passed] + [nodes[-1].t_ns]
+        steps_s = np.diff(ends_ns) * 1e-9
+        driven_s = [
+            dt * driving(node.point, node.wheels, dt) for dt, node in zip(steps_s, nodes, strict=True)
+        ]
         fastest_mps = max(float(np.linalg.norm(node.point.velocity)) for node in nodes)
         off_m = float(np.linalg.norm(refused[-1]))
-        more_m2ps = 0.5 * off_m**2 / time_s - self.rate_m2ps
-        if off_m > sum(rolled_m) + fastest_mps * time_s + REACH_SIGMA * sigma_m or more_m2ps <= 0.0:
+        if off_m > sum(rolled_m) + fastest_mps * float(sum(steps_s)) + REACH_SIGMA * sigma_m:
+            return False
+        more_m2ps = 0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps
+        if more_m2ps <= 0.0:
             return False
         self.rate_m2ps += more_m2ps
         self.refutations += 1
         self._before = more_m2ps, [(i, node.wheels) for i, node in zip(passed, nodes, strict=True)]
-        for i, node in zip(passed, nodes, strict=True):
+        for i, node, driven in zip(passed, nodes, driven_s, strict=True):
             if node.wheels is not None:
-                dt = (node.t_ns - chain.nodes[i - 1 - chain.first].t_ns) * 1e-9
-                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * dt))
+                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * driven))
         chain.smooth(chain.last - begin + 1)
         return True
-
-    def loosened(self, wheels: WheelIncrement, dt_s: float) -> WheelIncrement:
-        """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
-        return wheels.loosened(self.rate_m2ps * dt_s) if self.rate_m2ps else wheels
 
     def put_back(self, chain: Chain) -> None:
         """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
@@ -96,17 +102,29 @@ class Slide:
         for i, increment in wheels:
             chain.revise(i, wheels=increment)
 
+    def loosened(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
+        """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
+        driven_s = dt_s * driving(before, wheels, dt_s)
+        self._driven_s += driven_s
+        return wheels.loosened(self.rate_m2ps * driven_s) if self.rate_m2ps else wheels
+
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
-        """Learn from a fix that was used: `innovation_m` (2,) and the variances (2,) predicted for it."""
+        """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it."""
         before_ns = self._last_ns
         if before_ns is not None and t_ns <= before_ns:
             return
-        self._last_ns = t_ns
-        if self.rate_m2ps and before_ns is not None:
-            dt = (t_ns - before_ns) * 1e-9
-            beyond = 0.5 * float(np.sum(innovation_m**2 - predicted_m2)) / dt
-            rate = self.rate_m2ps + (1.0 - math.exp(-dt / MEMORY_S)) * beyond
+        self._last_ns, driven_s, self._driven_s = t_ns, self._driven_s, 0.0
+        if self.rate_m2ps and driven_s > 0.0:
+            beyond = 0.5 * float(np.sum(innovation_m**2 - predicted_m2)) / driven_s
+            rate = self.rate_m2ps + (1.0 - math.exp(-driven_s / MEMORY_S)) * beyond
             self.rate_m2ps = rate if rate > LEAST_M2PS else 0.0
+
+
+def driving(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> float:
+    """Share in [0, 1) of a time in which a robot drives: 0 where neither it nor its wheels move."""
+    rolled_mps = 0.0 if wheels is None else abs(wheels.distance_m) / dt_s
+    square = max(rolled_mps, float(np.linalg.norm(before.velocity))) ** 2
+    return square / (square + DRIVING_MPS**2)
 
 
 def _on_one_side(refused: list[Array]) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator
 
+import gtsam
 import numpy as np
 import pytest
 from hypothesis import given as drawn
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.benchmark.tuning import DRIVES
 from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.slide import Slide
 from terrafusion.fusion.inputs.streams import GnssFix
@@ -115,11 +117,30 @@ def test_loosened_wheels_know_less_of_the_way_and_as_much_of_the_turn(
     assert np.allclose(twice.sigma, loose.sigma)
 
 
+def moving(speed_mps: float) -> KeyState:
+    """A state at the origin that moves along x."""
+    velocity = np.array([speed_mps, 0.0, 0.0])
+    return KeyState(gtsam.Pose3(), velocity, gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
+
+
+def test_a_robot_at_rest_does_not_slide() -> None:
+    slide = Slide()
+    slide.rate_m2ps = 0.5
+    still = WheelIncrement(np.zeros(3), np.full(4, 0.01), 0.0, 0.0)
+    assert (slide.loosened(still, moving(0.0), 0.1).sigma == still.sigma).all()
+    sliding, spinning = slide.loosened(still, moving(3.0), 0.1), dataclasses.replace(still, distance_m=0.3)
+    assert sliding.sigma[0] == pytest.approx(np.hypot(0.01, np.sqrt(0.05)), rel=0.02)
+    assert slide.loosened(spinning, moving(0.0), 0.1).sigma[0] == pytest.approx(sliding.sigma[0])
+
+
 def test_a_slide_is_forgotten_when_fixes_agree_with_the_wheels_and_only_then() -> None:
     slide = Slide()
     slide.rate_m2ps = 0.5
+    state = moving(3.0)
+    wheels = WheelIncrement(np.array([3.0, 0.0, 0.0]), np.full(4, 0.01), 3.0, 0.0)
 
     def told(k: int, innovation_m: float) -> float:
+        slide.loosened(wheels, state, 1.0)
         slide.accepted(k * 10**9, np.full(2, innovation_m), np.full(2, 0.02 + slide.rate_m2ps))
         return slide.rate_m2ps
 
