@@ -20,7 +20,7 @@ from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.poses import all_settled, settled_start
 from terrafusion.twin.gap.rows import layout
-from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
+from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures, values
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
@@ -130,7 +130,7 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
         TerrafusionError: the twin diverges.
     """
     found = drives.of(log)
-    start = settled_start(log, [s.value for s in signatures(log, found)], log.start)
+    start = settled_start(log, values(log, found), log.start)
     return raw_of(log, placed(found, log, start), drives.model, drives.candidates, channels)
 
 

@@ -17,12 +17,13 @@ from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
     AS_IT_IS,
-    GROUND,
     Sensors,
     driven,
+    graphs,
     groups,
     inputs_of,
     plants_of,
+    what_moves,
 )
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
@@ -77,19 +78,21 @@ def predictions(
     None in place of a run that diverged.
     """
     sets = [{**model.effects, **some} for some in effects]
-    beside = {k for some in sets for k, v in some.items() if v != 0.0} - {*GROUND}
-    plants = plants_of(log, model, candidates, sets, candidates.moving if beside else ())
-    inputs = inputs_of(log, model, sets)
-    sensors, out = Sensors(log, model, candidates, samples_of(log, 1)), list[list[Array] | None]()
-    for states, plant, some, heard in zip(
-        driven(log, plants, inputs, start), plants, sets, inputs, strict=True
-    ):
-        if not np.isfinite(states).all():
-            out.append(None)
-            continue
-        y = sensors.read(states, plant, heard, some)
-        by_channel = zip(log.observed, layout(log).fine, strict=True)
-        out.append([means(at, _channel(y, o.channel)) for o, at in by_channel])
+    alike: dict[tuple[tuple[str, float], ...], list[int]] = {}
+    for i, some in enumerate(sets):
+        alike.setdefault(what_moves(candidates, some), []).append(i)
+    sensors = Sensors(log, model, candidates, samples_of(log, 1))
+    out: list[list[Array] | None] = [None] * len(sets)
+    for group, runs in graphs(candidates, sets).items():
+        twin = [dict(run) for run in runs]
+        twin += twin[: len(group) > 0 and len(twin) == 1]  # one alone would have a graph compiled for one
+        plants, inputs = plants_of(log, model, candidates, twin, group), inputs_of(log, model, twin)
+        states = driven(log, plants, inputs, start, [1] * len(twin))
+        for run, x, plant, heard in zip(runs, states, plants, inputs, strict=False):
+            for i in alike[run] if np.isfinite(x).all() else ():
+                y = sensors.read(x, plant, heard, sets[i], group)
+                by_channel = zip(log.observed, layout(log).fine, strict=True)
+                out[i] = [means(at, _channel(y, o.channel)) for o, at in by_channel]
     return out
 
 
@@ -130,7 +133,8 @@ def _readings(
         keys = [k for k in group if k in sets]
         some, whole = [sets[k] for k in keys], AS_IT_IS in keys
         plants, inputs = plants_of(log, model, candidates, some, group), inputs_of(log, model, some)
-        states = driven(log, plants, inputs, start, 1 if whole else EVERY) if keys else np.zeros(0)
+        steps = [1 if k == AS_IT_IS else EVERY for k in keys]
+        states = driven(log, plants, inputs, start, steps) if keys else []
         if whole:
             if not np.isfinite(states[0]).all():
                 raise TerrafusionError(
@@ -140,10 +144,10 @@ def _readings(
                 )
             every = Sensors(log, model, candidates, samples_of(log, 1))
             fine = every.read(states[0], plants[0], inputs[0], some[0])
-            states = states[:, among_all(log)]
-            coarse, twin = states[0], (plants[0], inputs[0])
+            states[0] = coarse = states[0][among_all(log)]
+            twin = plants[0], inputs[0]
         for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
-            read[k] = sensors.read(x, plant, u, sets[k])
+            read[k] = sensors.read(x, plant, u, sets[k], group)
     for k in sets.keys() - read.keys():  # effects of the sensors alone
         read[k] = sensors.read(coarse, *twin, sets[k])
     return fine, coarse, read
@@ -191,11 +195,16 @@ _POSITION = slice(_POSITION_AT[0], _POSITION_AT[1] + 1)
 _VELOCITY = slice(_VELOCITY_AT[0], _VELOCITY_AT[1] + 1)
 
 
+def values(log: Log, drive: Drive) -> list[Array]:
+    """Every channel (n,) of the log as the twin has it: means over the rows' own intervals."""
+    by_channel = zip(log.observed, layout(log).fine, strict=True)
+    return [means(fine, _channel(drive.fine, o.channel)) for o, fine in by_channel]
+
+
 def signatures(log: Log, drive: Drive) -> list[Signature]:
-    """Every channel of the log as the twin has it: means over the rows' own intervals."""
-    rows, out = layout(log), []
-    for observed, fine, coarse in zip(log.observed, rows.fine, rows.coarse, strict=True):
-        value = means(fine, _channel(drive.fine, observed.channel))
+    """The same with derivatives."""
+    out = []
+    for observed, value, coarse in zip(log.observed, values(log, drive), layout(log).coarse, strict=True):
         change, by_pose = (
             means(coarse, _channel(part, observed.channel)) for part in (drive.change, drive.by_pose)
         )
