@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.late import in_time, late_layout
 from terrafusion.twin.gap.poses import PAIRS
 from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
@@ -91,8 +92,8 @@ def predictions(
         states = driven(log, plants, inputs, start, [1] * len(twin))
         for run, x, plant, heard in zip(runs, states, plants, inputs, strict=False):
             for i in alike[run] if np.isfinite(x).all() else ():
-                y = sensors.read(x, plant, heard, sets[i], group)
-                by_channel = zip(log.observed, layout(log).fine, strict=True)
+                y = sensors.read(x, plant, heard, in_time(sets[i]), group)
+                by_channel = zip(log.observed, late_layout(log, sets[i], layout(log)), strict=True)
                 out[i] = [means(at, _channel(y, o.channel)) for o, at in by_channel]
     return out
 
