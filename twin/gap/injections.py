@@ -288,10 +288,10 @@ def sums(rows: Sequence[dict[str, Any]]) -> list[str]:
         missing = dict.fromkeys(row["change"] for row in mine if "skipped" in row)
         told = [row for row in mine if "skipped" not in row]
         still, judged = ([r for r in told if (r["change"] == "unchanged") == same] for same in (True, False))
-        counts = [
-            f"{sum(not r['right'] for r in still)} of {len(still)}", len(judged), sum(map(_seen, judged)),
-            sum(r["right"] for r in judged), f"{_ranked(judged, 1)}; {_ranked(judged, 3)}", ", ".join(missing),
-        ]  # fmt: skip
+        alarms = f"{sum(not r['right'] for r in still)} of {len(still)}"
+        first = f"{_ranked(judged, 1)}; {_ranked(judged, 3)}"
+        right = sum(r["right"] for r in judged)
+        counts = [alarms, len(judged), sum(map(_seen, judged)), right, first, ", ".join(missing)]
         lines.append("| " + " | ".join([f"`{name}`", *map(str, counts)]) + " |")
     changed = [row for row in rows if row["change"] != "unchanged" and "skipped" not in row]
     heads = [f"severity {severity:g}: seen, first, right" for severity in SEVERITIES]
