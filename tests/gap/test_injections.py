@@ -243,6 +243,24 @@ def test_a_crash_is_a_wrong_answer_in_the_table(monkeypatch: pytest.MonkeyPatch)
     assert "crash" in table([{"set": "x", "change": "y", "size": 1.0, **row}])[-1]
 
 
+def test_sums_count_what_was_judged() -> None:
+    def row(change: str, severity: float, **more: object) -> dict[str, object]:
+        return {"set": "x", "change": change, "severity": severity, "size": 0.0, **more}
+
+    rows = [
+        row("unchanged", 0.0, verdict="no_gap", right=True),
+        row("unchanged", 0.0, verdict="effect", right=False),
+        row("GNSS late", 1.0, skipped="no GNSS"),
+        row("gyro biased", 1.0, verdict="effect", rank=1, right=True),
+        row("gyro biased", 1.0, verdict="no_gap", rank=3, right=False),
+        row("gyro biased", 2.0, crash="ZeroDivisionError: x", right=False),
+    ]
+    lines = injections.sums(rows)
+    assert "| `x` | 1 of 2 | 3 | 1 | 1 | 1; 2 | GNSS late |" in lines
+    gyro = next(line for line in lines if line.startswith("| gyro biased"))
+    assert gyro == "| gyro biased (0.005 rad/s) | 0, 0, 0 of 0 | 1, 1, 1 of 2 | 0, 0, 0 of 1 |"
+
+
 def test_a_stopped_table_goes_on_and_rows_of_other_candidates_do_not_count(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -21,6 +21,7 @@ from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
 from terrafusion.twin.gap.residuals import raw_of, state_sigmas, whitened
 from terrafusion.twin.gap.score import Score, score
+from terrafusion.twin.gap.side_by_side import graphs, groups, what_moves
 from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
 from terrafusion.twin.gap.trials import calibration_error, interval
 from terrafusion.twin.gap.verdict import HeldOut, null_probability
@@ -41,10 +42,14 @@ def log_and_model():
 def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model) -> None:
     log, model = log_and_model
     moved = log.start + np.array([2.0, -1.0, 0.3])
-    here = placed(drive(log, model, CANDIDATES, log.start, ()), log, moved)
-    there = drive(log, model, CANDIDATES, moved, ())
-    for name in ("fine", "y", "by_pose", "heading"):
-        np.testing.assert_allclose(getattr(here, name), getattr(there, name), atol=1e-8)
+    keys = ("gnss_lever_arm/offset/x", "wheel_radius/scale")
+    first, there = (signatures(log, drive(log, model, CANDIDATES, at, keys)) for at in (log.start, moved))
+    here = placed(log, first, log.start, moved)
+    for mine, its in zip(here, there, strict=True):
+        for name in ("value", "change", "by_pose", "heading"):
+            np.testing.assert_allclose(getattr(mine, name), getattr(its, name), atol=1e-8)
+    east = [o.channel for o in log.observed].index("gnss_east_m")
+    assert np.abs(here[east].change - first[east].change).max() > 1e-3
 
 
 def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
@@ -76,6 +81,39 @@ def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> No
             assert np.abs(some.change[:, :, i]).max() > 1e-3
         else:
             assert not some.change[:, :, i].any()
+
+
+def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model) -> None:
+    """Whatever graphs drive them, and though those of the sensors alone share a run."""
+    log, model = log_and_model
+    alone = {
+        "gyro_bias/constant": 0.01, "mass/at_cg": 0.1, "wheel_radius/scale": 0.02, "dead_time/transport": 0.1,
+        "slip_sinkage/linear": 0.5, "soil_strength/shear": 0.1,
+    }  # fmt: skip
+    sets = [{}, *({k: v} for k, v in alone.items()), {"mass/at_cg": 0.1, "gyro_bias/constant": 0.01}]
+    sets += [{"wheel_radius/scale": 0.002 * k} for k in range(1, 9)]
+    together = predictions(log, model, CANDIDATES, sets, log.start)
+    for some, found in zip(sets, together, strict=True):
+        (by_itself,) = predictions(log, model, CANDIDATES, [some], log.start)
+        for observed, a, b in zip(log.observed, found, by_itself, strict=True):
+            np.testing.assert_allclose(a, b, atol=1e-3 * np.median(observed.sigma), err_msg=f"{some}")
+    plain, biased, heavy = together[0], together[1], together[2]
+    rate = [o.channel for o in log.observed].index("yaw_rate_radps")
+    np.testing.assert_allclose(biased[rate] - plain[rate], 0.01, rtol=1e-9)
+    np.testing.assert_allclose(together[7][rate] - heavy[rate], 0.01, rtol=1e-9)
+
+
+def test_graphs_hold_what_their_runs_need_and_every_run_once() -> None:
+    sets = [{}, {"gyro_bias/constant": 0.1}, *({"mass/at_cg": 0.01 * k} for k in range(1, 5))]
+    few = graphs(CANDIDATES, sets)
+    assert list(few) == [next(g for g in groups(CANDIDATES) if "mass/at_cg" in g)]
+    assert sorted(run for runs in few.values() for run in runs) == sorted(
+        {what_moves(CANDIDATES, some) for some in sets}
+    )
+    apart = [{k: 0.01} for k in ("mass/at_cg", "wheel_radius/scale", "slip_sinkage/linear", "slope/uniform")]
+    assert list(graphs(CANDIDATES, [{}, *apart])) == [CANDIDATES.moving]  # one vector of the whole graph
+    assert list(graphs(CANDIDATES, [{}, {"soil_strength/shear": 0.1}])) == [()]
+    assert list(graphs(CANDIDATES, [{"mass/at_cg": 0.1, "slope/uniform": 0.1}])) == [CANDIDATES.moving]
 
 
 def test_choices_are_all_others_where_there_are_few() -> None:
@@ -171,7 +209,8 @@ def test_scores_of_other_forms_are_those_of_the_whole_covariance(log_and_model) 
     log, model = log_and_model
     keys = ("gyro_scale/scale", "wheel_radius/scale")
     channels = tuple(o.channel for o in log.observed)
-    raw = raw_of(log, drive(log, model, CANDIDATES, log.start, keys), model, CANDIDATES, channels)
+    seen = signatures(log, drive(log, model, CANDIDATES, log.start, keys))
+    raw = raw_of(log, seen, model, CANDIDATES, channels)
     run, sigma = whitened(raw, first_noise([raw])), state_sigmas(CANDIDATES)
     T, K = run.states, len(CANDIDATES.keys)
     rows = run.rows.astype(float)

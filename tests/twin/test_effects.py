@@ -201,11 +201,11 @@ def jets():
 @pytest.mark.parametrize("which", ["scale", "high"])
 @pytest.mark.parametrize("form", [form for form in FORMS if not form.senses_only()], ids=named)
 def test_no_form_is_stiffer_than_the_integrator_allows(form, which) -> None:
-    """RK4 is stable to 2.78 / step on the real axis."""
+    """RK4 is stable to 2.78 / step on the real axis, RK3 to 2.51."""
     states, inputs = samples()
     for x, u in zip(states[::4], inputs[::4], strict=True):
         jacobian = by_state()(x, u, plant().vehicle, soil(), vector(at(form, which))).full()
-        assert np.abs(np.linalg.eigvals(jacobian)).max() < 2.78 / MAX_STEP_S
+        assert np.abs(np.linalg.eigvals(jacobian)).max() < 2.51 / MAX_STEP_S
 
 
 @functools.cache

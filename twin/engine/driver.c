@@ -1,4 +1,4 @@
-/* Fixed-step RK4 around the generated right-hand side, for TF_RUNS runs at a time.
+/* Fixed-step Runge-Kutta around the generated right-hand side, for TF_RUNS runs at a time.
  *
  * Inputs are linear between samples. Each wheel has its own soil: at the coordinate
  * c = time_weight * t + travel_weight * (travel + its distance ahead of the body origin) the
@@ -138,20 +138,28 @@ static void tf_slope(tf_runs *runs, double t, const tf_real *x, const tf_real *u
   tf_each(x, u, runs->vehicle, runs->effects, runs->soil, runs->held, runs->local, dx);
 }
 
-/* The four stages of RK4: how far ahead of the step's start they lie and which input they take. */
-static const double tf_stage_at[4] = {0.0, 0.5, 0.5, 1.0};
-static const int tf_stage_input[4] = {0, 1, 1, 2};
+/* Where the stages of a step lie ahead of its start, and which input they take: RK4, and RK3 with three of them. */
+static const double tf_stage_at[4] = {0.0, 0.5, 0.5, 1.0}, tf_third_at[3] = {0.0, 0.5, 1.0};
+static const int tf_stage_input[4] = {0, 1, 1, 2}, tf_third_input[3] = {0, 1, 2};
 
-static void tf_rk4(tf_runs *runs, double t, double h, tf_real *x, tf_real u[3][TF_NU]) {
+/* A step of the classical method of fourth order, or of Kutta's of third (1901). */
+static void tf_step(tf_runs *runs, double t, double h, long order, tf_real *x, tf_real u[3][TF_NU]) {
   tf_real k[4][TF_NX], y[TF_NX];
+  const double *at = order == 3 ? tf_third_at : tf_stage_at;
+  const int *input = order == 3 ? tf_third_input : tf_stage_input;
   if (runs->changing) tf_fields(runs, x);
-  for (int stage = 0; stage < 4; ++stage) {
-    const double ahead = tf_stage_at[stage] * h;
-    if (stage)
+  for (int stage = 0; stage < order; ++stage) {
+    const double ahead = at[stage] * h;
+    if (stage == 2 && order == 3)
+      for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + h * (2.0 * k[1][i] - k[0][i]);
+    else if (stage)
       for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + ahead * k[stage - 1][i];
-    tf_slope(runs, t + ahead, stage ? y : x, u[tf_stage_input[stage]], k[stage]);
+    tf_slope(runs, t + ahead, stage ? y : x, u[input[stage]], k[stage]);
   }
-  for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
+  if (order == 3)
+    for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k[0][i] + 4.0 * k[1][i] + k[2][i]);
+  else
+    for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
 }
 
 /* Inputs at the start, middle and end of step j of `substeps` after a sample. */
@@ -178,9 +186,9 @@ TF_EXPORT const int tf_lanes = TF_RUNS;
 #endif
 
 /* Samples x(t0 + i dt), i = 0..n, of TF_RUNS runs; every `every`-th into outs[run] ((n / every + 1, TF_NX)),
- * whose first row holds x(t0) on entry. Two lanes may name the same run. */
-TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long substeps, long every, double t0, double dt,
-                           const double *const *inputs, double *const *outs) {
+ * whose first row holds x(t0) on entry, by Runge-Kutta steps of `order` 4 or 3. Two lanes may name the same run. */
+TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long substeps, long order, long every, double t0,
+                           double dt, const double *const *inputs, double *const *outs) {
   tf_runs runs;
   tf_real x[TF_NX], u[3][TF_NU];
   const double h = dt / (double)substeps;
@@ -190,7 +198,7 @@ TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long substeps,
   for (long i = 0; i < n; ++i) {
     for (long j = 0; j < substeps; ++j) {
       tf_inputs(inputs, i, j, substeps, u);
-      tf_rk4(&runs, t0 + (double)i * dt + (double)j * h, h, x, u);
+      tf_step(&runs, t0 + (double)i * dt + (double)j * h, h, order, x, u);
     }
     if ((i + 1) % every == 0)
       for (int k = 0; k < TF_RUNS; ++k)

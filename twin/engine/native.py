@@ -71,13 +71,16 @@ class Driver:
         self._simulate = library.tf_simulate
         self._simulate.restype = None
         self._simulate.argtypes = [
-            ctypes.c_void_p, ctypes.c_long, ctypes.c_long, ctypes.c_long, ctypes.c_double, ctypes.c_double,
-            ctypes.c_void_p, ctypes.c_void_p,
+            ctypes.c_void_p, *[ctypes.c_long] * 4, ctypes.c_double, ctypes.c_double, ctypes.c_void_p,
+            ctypes.c_void_p,
         ]  # fmt: skip
         if variant.kind == codegen.TANGENT:
             self._simulate_wide = library.tf_simulate_wide
             self._simulate_wide.restype = None
-            self._simulate_wide.argtypes = [*self._simulate.argtypes, ctypes.c_long, *[ctypes.c_void_p] * 5]
+            self._simulate_wide.argtypes = [
+                ctypes.c_void_p, *[ctypes.c_long] * 3, ctypes.c_double, ctypes.c_double, ctypes.c_void_p,
+                ctypes.c_void_p, ctypes.c_long, *[ctypes.c_void_p] * 5,
+            ]  # fmt: skip
 
     def held(self, plants: Sequence[Plant]) -> list[CPlant]:
         """The plants as this driver reads them."""
@@ -92,14 +95,16 @@ class Driver:
         t0_s: float,
         steps: int,
         every: int = 1,
+        order: int = 4,
     ) -> None:
         """Fill each of `outs` (N // every + 1, X), whose first row holds the start, by its inputs (N + 1, U).
 
-        All arrays are contiguous; there are as many of each as the driver has lanes.
+        All arrays are contiguous; there are as many of each as the driver has lanes. The Runge-Kutta steps
+        are of `order` 4 or 3.
         """
         addresses = (ctypes.c_void_p * self.lanes)(*(ctypes.addressof(h.struct) for h in held))
         self._simulate(
-            addresses, len(inputs[0]) - 1, steps, every, t0_s, dt_s,
+            addresses, len(inputs[0]) - 1, steps, order, every, t0_s, dt_s,
             (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in inputs)),
             (ctypes.c_void_p * self.lanes)(*(a.ctypes.data for a in outs)),
         )  # fmt: skip

@@ -20,9 +20,11 @@ _AHEAD, _LEFT = (0.5, 0.5, -0.5, -0.5), (0.5, -0.5, 0.5, -0.5)
 _ARGUMENTS = ("x", "t", "ua", "ub", "constants", "effects", "at", "table")
 
 
-def run(x0: Array, inputs: Array, dt_s: float, plant: Plant, t0_s: float, steps: int) -> Array:
+def run(
+    x0: Array, inputs: Array, dt_s: float, plant: Plant, t0_s: float, steps: int, order: int = 4
+) -> Array:
     """States (N + 1, X), as `integrate.integrate` returns them; not finite once they diverge."""
-    one = _sample(len(plant.route.at), steps, plant.effect_names(), _Held(plant.route.field))
+    one = _sample(len(plant.route.at), steps, plant.effect_names(), _Held(plant.route.field), order)
     return _accumulate(one, x0, inputs, dt_s, t0_s, _constants(plant, dt_s, plant.effect_values()))
 
 
@@ -95,8 +97,8 @@ class _Held:
 
 
 @functools.lru_cache(maxsize=16)
-def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held) -> Any:
-    """CasADi `Function`: the state one sample later, by `steps` RK4 steps."""
+def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held, order: int) -> Any:
+    """CasADi `Function`: the state one sample later, by `steps` Runge-Kutta steps (see driver.c)."""
     import casadi as ca
 
     f = rhs(effects)
@@ -120,6 +122,10 @@ def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held) -> An
         vary = _field(held.field, x, vehicle)
         k1 = slope(t, x, u[0], vary)
         k2 = slope(t + 0.5 * h, x + 0.5 * h * k1, u[1], vary)
+        if order == 3:
+            k3 = slope(t + h, x + h * (2.0 * k2 - k1), u[2], vary)
+            x = x + h / 6.0 * (k1 + 4.0 * k2 + k3)
+            continue
         k3 = slope(t + 0.5 * h, x + 0.5 * h * k2, u[1], vary)
         k4 = slope(t + h, x + h * k3, u[2], vary)
         x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + k4)
@@ -131,7 +137,7 @@ def _sample_with_tangents(knots: int, steps: int, effects: tuple[str, ...], held
     """CasADi `Function`: state and tangents (X (1 + M),) one sample later."""
     import casadi as ca
 
-    one = _sample(knots, steps, effects, held)
+    one = _sample(knots, steps, effects, held, 4)
     forward = one.forward(count)
     nx = len(STATES)
     z = ca.MX.sym("z", nx * (1 + count))

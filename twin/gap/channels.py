@@ -15,12 +15,13 @@ channel.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.null import learn
+from terrafusion.twin.gap.null import common_offset
 from terrafusion.twin.gap.residuals import Evidence
 from terrafusion.twin.gap.score import Score
 
@@ -141,18 +142,22 @@ class Table:
         scores: Sequence[Score],
         sigma: Array,
         columns: int,
+        jobs: int = 1,
     ) -> Table:
         """Of judged runs; `scores` are those of the references, of which each is held against the others.
 
         Without two references the floor is what white noise would leave.
         """
         channels = len(runs[0].limit)
-        offset = learn(scores, len(runs)).offset
+        offset = common_offset(scores)
         blocks = tuple(Block.of(run, channels, columns, offset) for run in runs)
-        floors = [
-            Block.of(run, channels, columns, learn([s for j, s in enumerate(scores) if j != i], 1).offset)
-            for i, run in enumerate(references if len(scores) > 1 else ())
-        ]
+
+        def against_others(i: int) -> Block:
+            others = [s for j, s in enumerate(scores) if j != i]
+            return Block.of(references[i], channels, columns, common_offset(others))
+
+        with ThreadPoolExecutor(jobs) as pool:
+            floors = list(pool.map(against_others, range(len(references) if len(scores) > 1 else 0)))
         each = [energy(floor, floor.error, sigma, np.ones(channels)) for floor in floors]
         left = floor_of(floors, blocks, sigma)
         return cls(tuple(runs), blocks, sigma, offset, *left, np.array(each).reshape(-1, 2 * channels))
@@ -235,7 +240,7 @@ def energies(
         theta = np.linalg.solve(H, weight @ error.gain[:, :T])
         gain = error.gain - block.gram[:, :, :T] @ theta
         square = error.square - (error.gain[:, :T] + gain[:, :T]) @ theta
-        within = np.einsum("ci,cij,cj->c", gain, block.inverse, gain, optimize=True)
+        within = ((gain[:, None] @ block.inverse)[:, 0] * gain).sum(axis=1)
         inside += within
         outside += np.maximum(square - within, 0.0)
         states += (theta / sigma) ** 2

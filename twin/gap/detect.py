@@ -14,6 +14,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -85,16 +86,21 @@ def choices(total: int, size: int, seed: int) -> list[tuple[int, ...]]:
 
 
 def detect(
-    runs: Sequence[Score], references: Sequence[Score], candidates: Candidates, seed: int
+    runs: Sequence[Score], references: Sequence[Score], candidates: Candidates, seed: int, jobs: int = 1
 ) -> Detection:
-    """The permutation test."""
+    """The permutation test, in so many threads."""
     pool, found = judged(runs, references, candidates)
-    every, squares, others = [*runs, *references], [_squares(pool, found, candidates)], list[float]()
-    for choice in choices(len(every), len(runs), seed):
+    every = [*runs, *references]
+
+    def other(choice: tuple[int, ...]) -> tuple[Array, float]:
         rest = [r for i, r in enumerate(every) if i not in choice]
-        other, believed = judged([every[i] for i in choice], rest, candidates)
-        squares.append(_squares(other, believed, candidates))
-        others.append(believed.statistic())
+        some, believed = judged([every[i] for i in choice], rest, candidates)
+        return _squares(some, believed, candidates), believed.statistic()
+
+    with ThreadPoolExecutor(jobs) as threads:
+        tried = list(threads.map(other, choices(len(every), len(runs), seed)))
+    squares = [_squares(pool, found, candidates), *(square for square, _ in tried)]
+    others = [statistic for _, statistic in tried]
     usual = np.maximum(np.mean(squares, axis=0), LEAST_SQUARE)
     greatest = np.sqrt(np.array(squares) / usual).max(axis=1)
     p_value = float(np.mean(greatest >= greatest[0] * (1.0 - EXACT)))

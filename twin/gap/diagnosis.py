@@ -163,12 +163,12 @@ def diagnosed(
     if uncalibrated:
         notes.append(_too_few(len(normal), len(runs), significance))
         normal = _filled(bench, sigma, normal, seed)
-    found = detect(scores, normal, candidates, seed)
+    found = detect(scores, normal, candidates, seed, bench.jobs)
     null = learn(normal, len(scores))
     pool = Pool.of(scores, null)
     case = _Case(bench, scores, sigma, null, pool, beliefs(pool, candidates))
     floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
-    table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys))
+    table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys), bench.jobs)
     detected = found.p_value <= significance
     choice, fits, failed = chosen(Fitter(bench, scores, sigma, null, pool, table), case.believed, detected)
     refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}

@@ -136,7 +136,7 @@ def raws_of(
     logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int, told: Callable[[], None]
 ) -> list[Raw]:
     """Errors and derivatives of each run. The first run of each drive makes its signature, whichever thread
-    is faster; the very first alone, as it compiles."""
+    is faster."""
 
     def one(log: Log) -> Raw:
         found = raw(log, drives, channels)
@@ -144,9 +144,9 @@ def raws_of(
         return found
 
     first = list({drives.name(log): log for log in reversed(logs)}.values())[::-1]
-    made = {id(log): one(log) for log in first[:1]}
+    made = dict[int, Raw]()
     with ThreadPoolExecutor(jobs) as pool:
-        for part in (first[1:], [log for log in logs if not any(log is other for other in first)]):
+        for part in (first, [log for log in logs if not any(log is other for other in first)]):
             made.update(zip(map(id, part), pool.map(one, part), strict=True))
     return [made[id(log)] for log in logs]
 
@@ -267,7 +267,7 @@ def gather(
         raws = list(pool.map(lambda run: at_own_ground(run, drives, first), raws))
         noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
         evidence = list(pool.map(lambda run: whitened(run, noise), raws))
-    judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates))
+    judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return Bench(
         model, candidates, channels, noise, judged, normal,

@@ -208,9 +208,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--suspects", action="store_true", help="only sensors, wheels and ground, see SUSPECTS"
     )
+    parser.add_argument("--sum", action="store_true", help="print the sums of the answers that are there")
     given = parser.parse_args(arguments)
     try:
-        run(given.out, given.set or sorted(SETS), SUSPECTS if given.suspects else None)
+        if given.sum:
+            print("\n".join(sums(list(rows_of(given.out / "injections.jsonl")))))
+        else:
+            run(given.out, given.set or sorted(SETS), SUSPECTS if given.suspects else None)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
@@ -247,7 +251,8 @@ def run(out: Path, sets: Sequence[str], effects: Sequence[str] | None) -> None:
             print(json.dumps(row), file=file, flush=True)
             print(table([row])[-1], flush=True)
     rows = list(kept.values())
-    (out / "injections.md").write_text("\n".join(table(rows)) + "\n", encoding="utf-8")
+    text = "\n".join([*sums(rows), "", *table(rows)])
+    (out / "injections.md").write_text(text + "\n", encoding="utf-8")
 
 
 def rows_of(path: Path) -> Iterator[dict[str, Any]]:
@@ -270,6 +275,45 @@ def table(rows: Sequence[dict[str, Any]]) -> list[str]:
     for row in rows:
         lines.append("| " + " | ".join([row["set"], row["change"], f"{row['size']:g}", *_told(row)]) + " |")
     return lines
+
+
+def sums(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """By set, then by change with a column a severity: Markdown tables."""
+    lines = [
+        "| logs | unchanged: alarms | changes | seen | right | change first; of three | no channel for |",
+        "|" + " --- |" * 7,
+    ]
+    for name in dict.fromkeys(row["set"] for row in rows):
+        mine = [row for row in rows if row["set"] == name]
+        missing = dict.fromkeys(row["change"] for row in mine if "skipped" in row)
+        told = [row for row in mine if "skipped" not in row]
+        still, judged = ([r for r in told if (r["change"] == "unchanged") == same] for same in (True, False))
+        alarms = f"{sum(not r['right'] for r in still)} of {len(still)}"
+        first = f"{_ranked(judged, 1)}; {_ranked(judged, 3)}"
+        right = sum(r["right"] for r in judged)
+        counts = [alarms, len(judged), sum(map(_seen, judged)), right, first, ", ".join(missing)]
+        lines.append("| " + " | ".join([f"`{name}`", *map(str, counts)]) + " |")
+    changed = [row for row in rows if row["change"] != "unchanged" and "skipped" not in row]
+    heads = [f"severity {severity:g}: seen, first, right" for severity in SEVERITIES]
+    lines += ["", "| change (size at 1) | " + " | ".join(heads) + " |", "|" + " --- |" * (1 + len(heads))]
+    for injection in INJECTIONS:
+        cells = []
+        for severity in SEVERITIES:
+            some = [r for r in changed if (r["change"], r["severity"]) == (injection.name, severity)]
+            right = sum(r["right"] for r in some)
+            cells.append(f"{sum(map(_seen, some))}, {_ranked(some, 1)}, {right} of {len(some)}")
+        size = f"{injection.name} ({injection.size:g} {injection.unit})".replace(" )", ")")
+        lines.append(f"| {size} | " + " | ".join(cells) + " |")
+    return lines
+
+
+def _seen(row: dict[str, Any]) -> bool:
+    return bool(row.get("verdict", "no_gap") != "no_gap")
+
+
+def _ranked(rows: Sequence[dict[str, Any]], within: int) -> int:
+    """Rows in which the change, or one it cannot be told from, is among the first causes."""
+    return sum(row.get("rank") is not None and row["rank"] <= within for row in rows)
 
 
 def _told(row: dict[str, Any]) -> list[str]:

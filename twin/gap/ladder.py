@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from terrafusion.twin.gap.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Table
 from terrafusion.twin.gap.evidence import Bench
+from terrafusion.twin.gap.late import DELAYS
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.refit import Refit, effects_at, errors_with, scored
@@ -34,6 +35,11 @@ WITHIN = 0.98
 """Share of an effect's range that is tried."""
 ROUNDS, IMPROVED = 2, 4
 """Rounds of improvement, and how many laws, the best ones, take part in them."""
+LATE = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Sizes of a delay that are tried on both sides, in that of its range: what fits beyond half a swing of the
+drive has nothing to do with a signature, and no further run of the twin is needed."""
+CLOSER = (0.2, 0.1, 0.05, 0.025)
+"""Shares of the best delay by which others are tried on both sides of it, one after the other."""
 
 
 DIVERGED = "the twin diverges at every size tried, its linear value stands"
@@ -87,7 +93,15 @@ class Fitter:
             for law, value in laws
             for point in sizes(value, *bounds(self.bench.candidates, law.columns))
         ]
+        delays = [law for law, _ in laws if self._is_delay(law)]
+        for law in delays:
+            low, high = bounds(self.bench.candidates, law.columns)
+            ladder += [(law, share * end) for share in LATE for end in (low, high)]
         best = self._better({}, ladder)
+        for share in CLOSER:
+            found = {law: best[law].fit.value for law in delays if law in best}
+            closer = [(law, (1.0 + way * share) * at) for law, at in found.items() for way in (-1.0, 1.0)]
+            best = self._better(best, [(law, self._inside(law, point)) for law, point in closer])
         for _ in range(ROUNDS):
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
             steps = [(law, self._next(law, best[law])) for law in first]
@@ -97,9 +111,17 @@ class Fitter:
             best = self._better(best, tried)
         return best, {law: self._failed(law, value) for law, value in laws if law not in best}
 
+    def _is_delay(self, law: Hypothesis) -> bool:
+        return all(self.bench.candidates.keys[i] in DELAYS for i in law.columns)
+
+    def _inside(self, law: Hypothesis, point: Array) -> Array:
+        return np.asarray(np.clip(point, *bounds(self.bench.candidates, law.columns)))
+
     def _better(
         self, best: dict[Hypothesis, Fitted], points: Sequence[tuple[Hypothesis, Array]]
     ) -> dict[Hypothesis, Fitted]:
+        if not points:
+            return best
         sets = [effects_at(self.bench, law.columns, point) for law, point in points]
         bench = self.bench
         with ThreadPoolExecutor(bench.jobs) as threads:
@@ -123,7 +145,7 @@ class Fitter:
         low, high = bounds(self.bench.candidates, law.columns)
         at = found.fit.value
         step, _ = self.table.linear(law.columns, low - at, high - at, self.table.products(found.fit.errors))
-        return np.asarray(np.clip(at + step, low, high))
+        return self._inside(law, at + step)
 
     def _fit(self, law: Hypothesis, value: Array, errors: list[Array]) -> Refit:
         square = 0.0

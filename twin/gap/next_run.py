@@ -19,7 +19,7 @@ from terrafusion.twin.gap.null import JITTER, Null
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.residuals import SOIL_STATE, Evidence, raw_of, whitened
 from terrafusion.twin.gap.score import score
-from terrafusion.twin.gap.signatures import drive
+from terrafusion.twin.gap.signatures import drive, signatures
 from terrafusion.twin.identify.inputs import DT_S
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.observations import Observed
@@ -134,7 +134,8 @@ def _forecast(bench: Bench, name: str, effects: set[str]) -> Evidence:
     )  # fmt: skip
     keys = {k for k in bench.candidates.keys if k.split("/")[0] in effects or k in SOIL_STATE}
     found = drive(log, model, bench.candidates, log.start, keys)
-    return whitened(raw_of(log, found, model, bench.candidates, bench.channels), bench.noise)
+    seen = signatures(log, found)
+    return whitened(raw_of(log, seen, model, bench.candidates, bench.channels), bench.noise)
 
 
 def _no_ground() -> SoilParams:

@@ -44,12 +44,18 @@ class Null:
         return run.root * (run.b - run.A @ self.offset) - self.mean, run.root[:, None] * run.A
 
 
+def common_offset(references: Sequence[Score]) -> Array:
+    """Offset (P,) that all references have in common, in the columns' units (ridge, one unit)."""
+    P = len(references[0].b)
+    total = sum((r.A for r in references), np.zeros((P, P)))
+    shared = sum((r.b for r in references), np.zeros(P))
+    return np.asarray(np.linalg.solve(total + np.eye(P), shared), dtype=np.float64)
+
+
 def learn(references: Sequence[Score], judged: int) -> Null:
     """The null of the references, for a judgement of so many runs together."""
     count, P = len(references), len(references[0].b)
-    total = sum((r.A for r in references), np.zeros((P, P)))
-    shared = sum((r.b for r in references), np.zeros(P))
-    offset: Array = np.asarray(np.linalg.solve(total + np.eye(P), shared), dtype=np.float64)
+    offset = common_offset(references)
     x = np.array([r.root * (r.b - r.A @ offset) for r in references])
     fisher = sum((r.fisher for r in references), np.zeros((P, P))) / count
     mean: Array = np.asarray(x.mean(axis=0))

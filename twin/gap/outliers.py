@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,15 +33,19 @@ NORMAL = 1.4826
 
 
 def bounded(
-    runs: Sequence[Evidence], references: Sequence[Evidence], sigma: Array
+    runs: Sequence[Evidence], references: Sequence[Evidence], sigma: Array, jobs: int = 1
 ) -> tuple[list[Evidence], list[Evidence]]:
     """Judged runs and references, their errors within the limits of each channel.
 
     Args:
         sigma: (T,) first 1 sigma of the states (ground, offsets): what these explain is no outlier.
+        jobs: threads.
     """
     channels = range(len(references[0].limit) if references else 0)
-    left = {id(run): _adapted(run, sigma, STEPS) for run in (*runs, *references)}
+    every = (*runs, *references)
+    with ThreadPoolExecutor(jobs) as pool:
+        adapted = pool.map(lambda run: _adapted(run, sigma, STEPS), every)
+        left = dict(zip(map(id, every), adapted, strict=True))
 
     def errors(group: Sequence[Evidence], channel: int) -> Array:
         parts = [left[id(run)][1][run.channel == channel] for run in group]

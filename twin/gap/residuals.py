@@ -20,7 +20,14 @@ from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.poses import all_settled, settled_start
 from terrafusion.twin.gap.rows import layout
-from terrafusion.twin.gap.signatures import Drive, drive, placed, predictions, signatures
+from terrafusion.twin.gap.signatures import (
+    Drive,
+    Signature,
+    drive,
+    placed,
+    predictions,
+    signatures,
+)
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
@@ -109,7 +116,7 @@ class Drives:
         return key.hexdigest()
 
     def of(self, log: Log) -> Drive:
-        """The drive of a log, from the poses that the log itself suggests."""
+        """The drive of a log, from the poses of the first run that was told the same."""
         name = self.name(log)
         with self.lock:
             known = self.kept.get(name)
@@ -117,7 +124,7 @@ class Drives:
             known = drive(log, self.model, self.candidates, log.start)
             with self.lock:
                 self.kept[name] = known
-        return placed(known, log, log.start)
+        return known
 
 
 def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
@@ -130,16 +137,19 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
         TerrafusionError: the twin diverges.
     """
     found = drives.of(log)
-    start = settled_start(log, [s.value for s in signatures(log, found)], log.start)
-    return raw_of(log, placed(found, log, start), drives.model, drives.candidates, channels)
+    own = placed(log, signatures(log, found), found.start, log.start)
+    start = settled_start(log, [s.value for s in own], log.start)
+    return raw_of(log, placed(log, own, log.start, start), drives.model, drives.candidates, channels)
 
 
-def raw_of(log: Log, found: Drive, model: Model, candidates: Candidates, channels: Sequence[str]) -> Raw:
-    """Errors and derivatives of a run, from its signature."""
+def raw_of(
+    log: Log, found: Sequence[Signature], model: Model, candidates: Candidates, channels: Sequence[str]
+) -> Raw:
+    """Errors and derivatives of a run, from its signatures."""
     keys = candidates.keys
     soil = [keys.index(name) for name in SOIL_STATE if name in keys]
     error, state, change, probe, pose = [], [], [], [], []
-    for observed, s in zip(log.observed, signatures(log, found), strict=True):
+    for observed, s in zip(log.observed, found, strict=True):
         offsets = np.zeros((len(s.value), len(OFFSETS)))
         if observed.channel in OFFSETS:
             offsets[:, list(OFFSETS).index(observed.channel)] = OFFSETS[observed.channel]

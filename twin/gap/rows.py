@@ -42,7 +42,7 @@ def layout(log: Log) -> Layout:
     known = _KNOWN.get(log)
     if known is None:
         shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-        fine = [averaging(o, log, shift) for o in log.observed]
+        fine = [weighty(*averaging(o, log, shift)) for o in log.observed]
         known = _KNOWN[log] = Layout(_blocks(log), fine, [_coarse(o, log) for o in log.observed])
     return known
 
@@ -72,6 +72,13 @@ def means(of: tuple[Rows, Array], values: Array) -> Array:
     for k in range(1, at.shape[1]):
         out += weight[:, k].reshape(lead) * values[at[:, k]]
     return np.asarray(out)
+
+
+def weighty(at: Rows, weight: Array) -> tuple[Rows, Array]:
+    """The same samples without those of weight zero, as far as every row has some."""
+    order = np.argsort(weight == 0.0, axis=1, kind="stable")
+    order = order[:, : max(1, int((weight != 0.0).sum(axis=1).max(initial=1)))]
+    return np.take_along_axis(at, order, axis=1), np.take_along_axis(weight, order, axis=1)
 
 
 def _blocks(log: Log) -> list[tuple[int, int, Rows]]:

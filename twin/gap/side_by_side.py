@@ -38,6 +38,11 @@ TOGETHER = 8
 """Other effects in one graph: as many as vectors hold runs."""
 AS_IT_IS = ""
 """Stands for the twin without a further effect, in the first group."""
+ORDER = 3
+"""Of the integrator's steps: on loose sand, where all is most sensitive, answers differ from those with steps
+of fourth order by no more than these do from those with half the step (docs/gap.md)."""
+WHOLE = 1.8
+"""Time of a run in the graph of all effects, in that of one of a group (measured)."""
 TINY = 1e-12
 """Share of its scale that an absent effect has in a run: all runs of a group share one compiled graph."""
 
@@ -46,6 +51,34 @@ def groups(candidates: Candidates) -> list[tuple[str, ...]]:
     """The twin as it is and the effects that move the robot, as they share graphs."""
     keys = (AS_IT_IS, *candidates.moving)
     return [keys[first : first + TOGETHER] for first in range(0, len(keys), TOGETHER)]
+
+
+def graphs(
+    candidates: Candidates, sets: Sequence[Effects]
+) -> dict[tuple[str, ...], list[tuple[tuple[str, float], ...]]]:
+    """Runs by the group of effects whose graph drives them: `what_moves` of all sets, each once.
+
+    A graph of all effects takes all runs together, those of groups cost less a run: what is cheaper, counted
+    in vectors of `TOGETHER` runs.
+    """
+    runs = list(dict.fromkeys(what_moves(candidates, some) for some in sets))
+    named = {run: {k for k, _ in run} - {*GROUND} for run in runs}
+    if not any(named.values()):
+        return {(): runs}
+    apart: dict[tuple[str, ...], list[tuple[tuple[str, float], ...]]] = {}
+    for run in sorted(runs, key=lambda run: not named[run]):
+        of = [g for g in (groups(candidates) if named[run] else apart) if named[run] <= {*g}]
+        group = max(of, key=lambda g: -len(apart.get(g, ())) % TOGETHER, default=candidates.moving)
+        apart.setdefault(group, []).append(run)
+    vectors = sum(
+        -(-len(some) // TOGETHER) * (WHOLE if g == candidates.moving else 1.0) for g, some in apart.items()
+    )
+    return apart if vectors < WHOLE * -(-len(runs) // TOGETHER) else {candidates.moving: runs}
+
+
+def what_moves(candidates: Candidates, effects: Effects) -> tuple[tuple[str, float], ...]:
+    """The effects of a set that move the robot: sets that differ in the sensors alone share a run."""
+    return tuple((k, v) for k, v in sorted(effects.items()) if v != 0.0 and k in candidates.moving)
 
 
 def plants_of(
@@ -77,25 +110,40 @@ def inputs_of(log: Log, model: Model, sets: Sequence[Effects]) -> list[Array]:
     return out
 
 
-def driven(log: Log, plants: Sequence[Plant], inputs: Sequence[Array], start: Array, every: int = 1) -> Array:
-    """States (B, N, X) at every so many-th sample of all windows, a run a plant."""
-    fleet, windows = Fleet.of(plants, DT_S), [(int(a), int(b)) for a, b in log.windows]
-    out = np.empty((len(plants), len(samples_of(log, every)), len(STATES)))
+def driven(
+    log: Log, plants: Sequence[Plant], inputs: Sequence[Array], start: Array, every: Sequence[int]
+) -> list[Array]:
+    """States (N, X) of each plant's run at every so many-th sample of all windows, a number a run: the least
+    of them, or a multiple of it."""
+    fleet = Fleet.of(plants, DT_S, order=ORDER)
+    windows = [(int(a), int(b)) for a, b in log.windows]
+    least = min(every)
+    out = [np.empty((len(samples_of(log, step)), len(STATES))) for step in every]
+    kept = [0] * len(plants)
     x = _led_in(log, fleet, inputs)
-    pose, done = [INDEX[name] for name in POSE], 0
+    pose = [INDEX[name] for name in POSE]
     for (begin, end), guess in zip(windows, start, strict=True):
-        count = (end - begin) // every + 1
-        part = out[:, done : done + count]
-        part[:, 0], part[:, 0, pose] = x, guess
-        whole = begin + (count - 1) * every
-        fleet.drive([u[begin : whole + 1] for u in inputs], list(part), begin * DT_S, every)
-        x, done = part[:, -1], done + count
-    blank_what_diverged(out)
+        count = (end - begin) // least + 1
+        parts = []
+        for states, step, done in zip(out, every, kept, strict=True):
+            parts.append(states[done : done + count] if step == least else np.empty((count, len(STATES))))
+        for part, now in zip(parts, x, strict=True):
+            part[0], part[0, pose] = now, guess
+        whole = begin + (count - 1) * least
+        fleet.drive([u[begin : whole + 1] for u in inputs], parts, begin * DT_S, least)
+        x = [part[-1] for part in parts]
+        for i, (part, step) in enumerate(zip(parts, every, strict=True)):
+            some = part[:: step // least]
+            if step != least:
+                out[i][kept[i] : kept[i] + len(some)] = some
+            kept[i] += len(some)
+    for states in out:
+        blank_what_diverged(states[None])
     return out
 
 
-def _led_in(log: Log, fleet: Fleet, inputs: Sequence[Array]) -> Array:
-    """States (B, X) at the first window."""
+def _led_in(log: Log, fleet: Fleet, inputs: Sequence[Array]) -> list[Array]:
+    """State (X,) of each run at the first window."""
     known: dict[int, tuple[Array, Array]] = {}
     lead = []
     for plant, u in zip(fleet.plants, inputs, strict=True):
@@ -106,29 +154,46 @@ def _led_in(log: Log, fleet: Fleet, inputs: Sequence[Array]) -> Array:
     out = np.empty((len(lead), 2, len(STATES)))
     out[:, 0] = [x for x, _ in lead]
     fleet.drive([before for _, before in lead], list(out), -LEAD_S, whole)
-    return out[:, 1]
+    return list(out[:, 1])
 
 
 class Sensors:
-    """The measurement graph with all effects, at the samples (N,) of the runs of one log."""
+    """The sensors' readings at the samples (N,) of the runs of one log."""
 
     def __init__(self, log: Log, model: Model, candidates: Candidates, samples: Rows) -> None:
-        self.names, self.samples = tuple(sorted(candidates.keys)), samples
+        self.keys, self.samples = frozenset(candidates.keys), samples
+        self.sensing = self.keys - {*candidates.moving} | {*GROUND} & self.keys
         self.mounting = mounting_vector(model.vehicle)
         route = plant_of(log, dataclasses.replace(model, effects={}), [])[0].route
         self.fixed = route.is_fixed()
         self.soil = route.soil[0] if self.fixed else along(route, route.soil, samples.astype(float) * DT_S)
         self._inputs: dict[int, tuple[Array, Array]] = {}
 
-    def read(self, states: Array, plant: Plant, inputs: Array, effects: Effects) -> Array:
-        """Outputs (N, Y) of the states (N, X) of a run that was told `inputs`."""
-        values = np.array([effects.get(name, 0.0) for name in self.names])
+    def read(
+        self, states: Array, plant: Plant, inputs: Array, effects: Effects, group: Sequence[str] = ()
+    ) -> Array:
+        """Outputs (N, Y) of the states (N, X) of a run that was told `inputs`.
+
+        Args:
+            group: effects that share a graph with those of the run; an effect that is in a graph costs, in
+                every run. Where it lacks one of the run's, all are in the graph.
+        """
+        names = self._names(effects, group)
+        values = np.array([effects.get(name, 0.0) for name in names])
         if id(inputs) not in self._inputs:
             self._inputs[id(inputs)] = inputs, inputs[self.samples]
         heard = self._inputs[id(inputs)][1]
-        native = reader(self.names, self.fixed)
+        native = reader(names, self.fixed)
         if native is not None:
             return native(states, heard, self.soil, plant.vehicle, values, self.mounting)
         ground = np.tile(np.atleast_2d(self.soil), (len(states) if self.fixed else 1, len(WHEELS)))
-        named = dict(zip(self.names, values, strict=True))
+        named = dict(zip(names, values, strict=True))
         return measured(states, heard, plant.vehicle, ground, self.mounting, named)
+
+    def _names(self, effects: Effects, group: Sequence[str]) -> tuple[str, ...]:
+        """Of the least graph that has all effects of a run."""
+        present = {k for k, value in effects.items() if value != 0.0} & self.keys
+        for some in ({*group, *GROUND} & self.keys, self.sensing):
+            if present <= some:
+                return tuple(sorted(some))
+        return tuple(sorted(self.keys))

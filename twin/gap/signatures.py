@@ -14,17 +14,20 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.late import in_time, late_layout
+from terrafusion.twin.gap.poses import PAIRS
 from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
     AS_IT_IS,
-    GROUND,
     Sensors,
     driven,
+    graphs,
     groups,
     inputs_of,
     plants_of,
+    what_moves,
 )
-from terrafusion.twin.identify.log import Log
+from terrafusion.twin.identify.log import Log, window_of
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.layout import INDEX, OUTPUTS
 
@@ -77,19 +80,21 @@ def predictions(
     None in place of a run that diverged.
     """
     sets = [{**model.effects, **some} for some in effects]
-    beside = {k for some in sets for k, v in some.items() if v != 0.0} - {*GROUND}
-    plants = plants_of(log, model, candidates, sets, candidates.moving if beside else ())
-    inputs = inputs_of(log, model, sets)
-    sensors, out = Sensors(log, model, candidates, samples_of(log, 1)), list[list[Array] | None]()
-    for states, plant, some, heard in zip(
-        driven(log, plants, inputs, start), plants, sets, inputs, strict=True
-    ):
-        if not np.isfinite(states).all():
-            out.append(None)
-            continue
-        y = sensors.read(states, plant, heard, some)
-        by_channel = zip(log.observed, layout(log).fine, strict=True)
-        out.append([means(at, _channel(y, o.channel)) for o, at in by_channel])
+    alike: dict[tuple[tuple[str, float], ...], list[int]] = {}
+    for i, some in enumerate(sets):
+        alike.setdefault(what_moves(candidates, some), []).append(i)
+    sensors = Sensors(log, model, candidates, samples_of(log, 1))
+    out: list[list[Array] | None] = [None] * len(sets)
+    for group, runs in graphs(candidates, sets).items():
+        twin = [dict(run) for run in runs]
+        twin += twin[: len(group) > 0 and len(twin) == 1]  # one alone would have a graph compiled for one
+        plants, inputs = plants_of(log, model, candidates, twin, group), inputs_of(log, model, twin)
+        states = driven(log, plants, inputs, start, [1] * len(twin))
+        for run, x, plant, heard in zip(runs, states, plants, inputs, strict=False):
+            for i in alike[run] if np.isfinite(x).all() else ():
+                y = sensors.read(x, plant, heard, in_time(sets[i]), group)
+                by_channel = zip(log.observed, late_layout(log, sets[i], layout(log)), strict=True)
+                out[i] = [means(at, _channel(y, o.channel)) for o, at in by_channel]
     return out
 
 
@@ -130,7 +135,8 @@ def _readings(
         keys = [k for k in group if k in sets]
         some, whole = [sets[k] for k in keys], AS_IT_IS in keys
         plants, inputs = plants_of(log, model, candidates, some, group), inputs_of(log, model, some)
-        states = driven(log, plants, inputs, start, 1 if whole else EVERY) if keys else np.zeros(0)
+        steps = [1 if k == AS_IT_IS else EVERY for k in keys]
+        states = driven(log, plants, inputs, start, steps) if keys else []
         if whole:
             if not np.isfinite(states[0]).all():
                 raise TerrafusionError(
@@ -140,55 +146,40 @@ def _readings(
                 )
             every = Sensors(log, model, candidates, samples_of(log, 1))
             fine = every.read(states[0], plants[0], inputs[0], some[0])
-            states = states[:, among_all(log)]
-            coarse, twin = states[0], (plants[0], inputs[0])
+            states[0] = coarse = states[0][among_all(log)]
+            twin = plants[0], inputs[0]
         for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
-            read[k] = sensors.read(x, plant, u, sets[k])
+            read[k] = sensors.read(x, plant, u, sets[k], group)
     for k in sets.keys() - read.keys():  # effects of the sensors alone
         read[k] = sensors.read(coarse, *twin, sets[k])
     return fine, coarse, read
 
 
-def placed(found: Drive, log: Log, start: Array) -> Drive:
-    """The drive from other poses (W, 3) at the windows' starts: on a level plane it shifts and turns as a
-    whole."""
-    if np.array_equal(found.start, start):
-        return found
-    parts = {
-        name: (getattr(found, name).copy(), every)
-        for name, every in (("fine", 1), ("y", EVERY), ("change", EVERY))
-    }
-    heading = found.heading.copy()
-    for name, (values, every) in parts.items():
-        counts = np.diff(log.windows, axis=1).ravel() // every + 1
-        for k, first in enumerate(np.cumsum([0, *counts[:-1]])):
-            rows = slice(int(first), int(first) + counts[k])
-            turn = start[k, 2] - found.start[k, 2]
-            R = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
-            for pair, is_position in ((_POSITION, True), (_VELOCITY, False)):
-                block = values[rows][:, pair]
-                about, to = (
-                    (found.start[k, :2], start[k, :2]) if is_position and name != "change" else (0.0, 0.0)
-                )
-                if block.ndim == 2:
-                    values[rows, pair] = (block - about) @ R.T + to
-                else:
-                    values[rows, pair] = np.einsum("ab,nbk->nak", R, block)
-            if name == "y":
-                heading[rows] += turn
-    y = parts["y"][0]
-    by_pose = found.by_pose.copy()
-    at = np.repeat(start[:, :2], coarse_counts(log), axis=0)
-    (east, north), (v_e, v_n) = _POSITION_AT, _VELOCITY_AT
-    by_pose[:, east, 2], by_pose[:, north, 2] = at[:, 1] - y[:, north], y[:, east] - at[:, 0]
-    by_pose[:, v_e, 2], by_pose[:, v_n, 2] = -y[:, v_n], y[:, v_e]
-    return Drive(start, parts["fine"][0], y, parts["change"][0], by_pose, heading)
-
-
-_POSITION_AT = (OUTPUTS.index("gnss_east_m"), OUTPUTS.index("gnss_north_m"))
-_VELOCITY_AT = (OUTPUTS.index("gnss_v_e_mps"), OUTPUTS.index("gnss_v_n_mps"))
-_POSITION = slice(_POSITION_AT[0], _POSITION_AT[1] + 1)
-_VELOCITY = slice(_VELOCITY_AT[0], _VELOCITY_AT[1] + 1)
+def placed(log: Log, found: Sequence[Signature], old: Array, new: Array) -> list[Signature]:
+    """Signatures of the channels of the log from other poses (W, 3) at the windows' starts than the old ones:
+    on a level plane the drive shifts and turns as a whole."""
+    if np.array_equal(old, new):
+        return list(found)
+    at, out = {o.channel: i for i, o in enumerate(log.observed)}, list(found)
+    of = [np.clip(window_of(o, log.windows), 0, len(log.windows) - 1) for o in log.observed]
+    turn = new[:, 2] - old[:, 2]
+    for pair in PAIRS:
+        if not all(channel in at for channel in pair):
+            continue
+        east, north = (at[channel] for channel in pair)
+        k = of[east]
+        shift = (old[k, :2], new[k, :2]) if pair == PAIRS[0] else (np.zeros((1, 2)), np.zeros((1, 2)))
+        cos, sin = np.cos(turn[k]), np.sin(turn[k])
+        a, b = found[east], found[north]
+        x, y = a.value - shift[0][:, 0], b.value - shift[0][:, 1]
+        for i, s, (p, q), to in (
+            (east, a, (cos, -sin), shift[1][:, 0]), (north, b, (sin, cos), shift[1][:, 1])
+        ):  # fmt: skip
+            by_pose = s.by_pose.copy()  # by x and y it is the same in all poses
+            by_pose[:, 2] = p * a.by_pose[:, 2] + q * b.by_pose[:, 2]
+            change = p[:, None] * a.change + q[:, None] * b.change
+            out[i] = Signature(p * x + q * y + to, change, by_pose, s.heading)
+    return [dataclasses.replace(s, heading=s.heading + turn[k]) for s, k in zip(out, of, strict=True)]
 
 
 def signatures(log: Log, drive: Drive) -> list[Signature]:

@@ -203,13 +203,16 @@ def run_up(log: Log, plant: Plant, inputs: Array) -> tuple[Array, Array]:
     return x, np.vstack([before, inputs[: log.windows[0, 0] + 1]])
 
 
-def averaging(observed: Observed, log: Log, shift: NDArray[np.int64]) -> tuple[NDArray[np.int64], Array]:
+def averaging(
+    observed: Observed, log: Log, shift: NDArray[np.int64], window: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], Array]:
     """Stacked samples (n, k) that a row depends on, and their weights (n, k): its mean over its interval.
 
     Between samples the twin's channel is a cubic (Keys 1981, a = -1/2), at a window's ends it goes on
     straight: the mean is right to the fourth order of `DT_S`.
+    `window` (n,) is that of each row; None: the one it lies in.
     """
-    window = window_of(observed, log.windows)
+    window = window_of(observed, log.windows) if window is None else window
     first, last = log.windows[window, :1], log.windows[window, 1:]
     a, b = observed.begin_s[:, None] / DT_S, observed.end_s[:, None] / DT_S
     at = np.floor(a + 1e-9).astype(np.int64) - 1 + np.arange(int(np.ceil(np.max(b - a, initial=0.0))) + 4)

@@ -101,8 +101,8 @@ def site(number: int) -> tuple[str, str, list[tuple[Shape | None, float]]]:
     return kind, soil, out + [(None, 0.0)] * NULLS
 
 
-def specs(number: int) -> list[RunSpec]:
-    """Runs of a site: its trials', then the references."""
+def specs(number: int, references: int = REFERENCES) -> list[RunSpec]:
+    """Runs of a site: its trials', then so many references."""
     kind, soil, trials = site(number)
     rng = np.random.default_rng([FIRST_SEED, number, 2])
     vehicle, ground, robot = load_vehicle(VEHICLE), load_soil(soil), int(rng.integers(2**31))
@@ -117,7 +117,7 @@ def specs(number: int) -> list[RunSpec]:
     for t, (shape, severity) in enumerate(trials):
         knobs = {} if shape is None else shape.turned(_size(shape, kind, severity), rng)
         out += [one(i, RUNS * t + i, knobs) for i in range(RUNS)]
-    return out + [one(RUNS + i, RUNS * len(trials) + i, {}) for i in range(REFERENCES)]
+    return out + [one(RUNS + i, RUNS * len(trials) + i, {}) for i in range(references)]
 
 
 def make(number: int, jobs: int) -> list[Trial]:
