@@ -31,6 +31,8 @@ LEAST_M2PS = 1e-4
 """A centimetre after a second: a slide is over."""
 MEMORY_S = 10.0
 """How long a slide is remembered while the robot drives and fixes are accepted (assumed: a few turns)."""
+FORGOTTEN_S = 20.0
+"""How long it is remembered without fixes (assumed: the next ground is another one)."""
 DRIVING_MPS = 0.3
 """At this speed, of the robot or its wheels, half a second counts as driven in a second; at rest none."""
 
@@ -48,6 +50,7 @@ class Slide:
         self.refutations = 0
         self._before: tuple[float, list[tuple[int, WheelIncrement | None]]] = (0.0, [])
         self._driven_s = 0.0
+        self._before_m = np.zeros(2)
         self._last_ns: int | None = None
 
     def refuted(
@@ -106,7 +109,10 @@ class Slide:
         """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
         driven_s = dt_s * driving(before, wheels, dt_s)
         self._driven_s += driven_s
-        return wheels.loosened(self.rate_m2ps * driven_s) if self.rate_m2ps else wheels
+        if not self.rate_m2ps:
+            return wheels
+        self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
+        return wheels.loosened(self.rate_m2ps * driven_s)
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
         """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it."""
@@ -114,8 +120,10 @@ class Slide:
         if before_ns is not None and t_ns <= before_ns:
             return
         self._last_ns, driven_s, self._driven_s = t_ns, self._driven_s, 0.0
+        before_m, self._before_m = self._before_m, innovation_m
         if self.rate_m2ps and driven_s > 0.0:
-            beyond = 0.5 * float(np.sum(innovation_m**2 - predicted_m2)) / driven_s
+            more_m2 = 0.5 * min(float(innovation_m @ before_m), float(np.sum(innovation_m**2 - predicted_m2)))
+            beyond = more_m2 / driven_s
             rate = self.rate_m2ps + (1.0 - math.exp(-driven_s / MEMORY_S)) * beyond
             self.rate_m2ps = rate if rate > LEAST_M2PS else 0.0
 

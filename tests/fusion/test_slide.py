@@ -130,7 +130,7 @@ def test_a_robot_at_rest_does_not_slide() -> None:
     assert (slide.loosened(still, moving(0.0), 0.1).sigma == still.sigma).all()
     sliding, spinning = slide.loosened(still, moving(3.0), 0.1), dataclasses.replace(still, distance_m=0.3)
     assert sliding.sigma[0] == pytest.approx(np.hypot(0.01, np.sqrt(0.05)), rel=0.02)
-    assert slide.loosened(spinning, moving(0.0), 0.1).sigma[0] == pytest.approx(sliding.sigma[0])
+    assert slide.loosened(spinning, moving(0.0), 0.1).sigma[0] == pytest.approx(sliding.sigma[0], rel=0.02)
 
 
 def test_a_slide_is_forgotten_when_fixes_agree_with_the_wheels_and_only_then() -> None:
