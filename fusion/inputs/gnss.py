@@ -234,6 +234,8 @@ class GnssUpdater:
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
         if verdict is Verdict.REJECT and nis <= self.weighting.passed_nis:
             verdict = Verdict.ACCEPT
+        if verdict is Verdict.REJECT and not again and self._slid(chain, k, fix):
+            return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not Verdict.REACQUIRE:
             drift_m2 = (share * self.drift_sigma_m) ** 2
@@ -250,8 +252,6 @@ class GnssUpdater:
             )
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
         if verdict is Verdict.REJECT:
-            if not again and self._slid(chain, k, fix):
-                return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
             if again:
                 self.slide.put_back(chain)
             self.rejected += 1

@@ -6,7 +6,7 @@ can have slid is known: no further than its wheels rolled and its speed carried 
 was used. Fixes that are refused, lie on one side of the estimate and no further off than that, refute
 the wheels, not the receiver: the wheels' way since then is taken to be as wrong as the fixes say, and how
 fast it goes wrong (a random walk, m2 a second of driving) is remembered, as the noise of an adaptive
-filter (Mehra 1972, IEEE T-AC 17(5), covariance matching), until accepted fixes tell that they are to be
+filter (Mehra 1972, IEEE T-AC 17(5)), until accepted fixes tell that they are to be
 trusted again.
 """
 
@@ -88,9 +88,9 @@ class Slide:
         more_m2ps = 0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps
         if more_m2ps <= 0.0:
             return False
+        self._before = self.rate_m2ps, [(i, node.wheels) for i, node in zip(passed, nodes, strict=True)]
         self.rate_m2ps += more_m2ps
         self.refutations += 1
-        self._before = more_m2ps, [(i, node.wheels) for i, node in zip(passed, nodes, strict=True)]
         for i, node, driven in zip(passed, nodes, driven_s, strict=True):
             if node.wheels is not None:
                 chain.revise(i, wheels=node.wheels.loosened(more_m2ps * driven))
@@ -99,8 +99,7 @@ class Slide:
 
     def put_back(self, chain: Chain) -> None:
         """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
-        more_m2ps, wheels = self._before
-        self.rate_m2ps -= more_m2ps
+        self.rate_m2ps, wheels = self._before
         self.refutations -= 1
         for i, increment in wheels:
             chain.revise(i, wheels=increment)
@@ -115,7 +114,11 @@ class Slide:
         return wheels.loosened(self.rate_m2ps * driven_s)
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
-        """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it."""
+        """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.
+
+        Wheels that are still trusted too much leave innovations on one side, fix after fix; what is new at
+        every fix is the receiver's (Mehra: the innovations of the right filter are white).
+        """
         before_ns = self._last_ns
         if before_ns is not None and t_ns <= before_ns:
             return

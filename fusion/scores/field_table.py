@@ -220,7 +220,7 @@ def _drives(log: str) -> tuple[list[Recording], bool]:
     drives = [d for d in drives if d.truth is not None]
     if not drives:
         told = f"holds {len(recordings)} pieces that make no drive of {LEAST_JOINED_S:g} s with a truth"
-        raise DataError(told)
+        raise DataError(told, remedy="give a log that is one drive")
     return drives, True
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.doctor import Finding, Patient, examine, treat
+from terrafusion.datasets.doctor.offsets import _finding
 from terrafusion.datasets.doctor.pairs import far_lag, signal_pairs
 from terrafusion.datasets.lag import Lag
 from terrafusion.datasets.readers import open_recording
@@ -164,6 +165,23 @@ def test_clock_faults_are_named_and_mended(drive: Recording, name: str) -> None:
     good, now = getattr(drive, channel).t_ns, getattr(mended, channel).t_ns
     assert np.abs(now - good).max() * 1e-9 < tolerance_s
     assert mended.start_ns <= now[0]
+
+
+@pytest.mark.parametrize(
+    ("lag", "severity"),
+    [
+        (Lag(0.8, 0.78, 0.82, 0.95), "error"),
+        (Lag(-0.8, -0.82, -0.78, 0.95), "error"),
+        (Lag(0.4, 0.39, 0.41, 0.95), "warning"),
+        (Lag(-1.19, -1.97, -0.42, 0.85), "warning"),  # wheels of a robot on ice, beside its truth
+    ],
+)
+def test_a_clock_that_is_surely_off_by_half_a_second_is_an_error(
+    drive: Recording, lag: Lag, severity: str
+) -> None:
+    """What is not sure must not stop a replay."""
+    pair = ("truth", "wheels")
+    assert _finding(drive, {pair: lag}, {pair}).severity == severity
 
 
 VALUE_FAULTS: dict[str, tuple[str, str, Spoil]] = {

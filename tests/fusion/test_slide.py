@@ -77,7 +77,7 @@ def test_fixes_are_not_refused_for_wheels_that_spin_on_ice(
 
 def test_a_batch_knows_what_was_learnt_of_the_wheels(sliding: Recording) -> None:
     log = thinned(sliding, 5, True)
-    assert rms_m(replay(log, batch=True)) < rms_m(replay(log))
+    assert rms_m(replay(log, batch=True)) < min(0.05, rms_m(replay(log)))  # .086 m where nothing was learnt
 
 
 def test_a_dump_in_a_slide_goes_on_with_the_same_bits(sliding: Recording) -> None:
@@ -190,6 +190,6 @@ def test_a_refutation_that_does_not_help_keeps_no_fix_out() -> None:
     found = replay(mud, mode="fixed")
     accepted = [i.accepted for i in found.estimate.innovations if i.sensor == "gnss"]
     runs = "".join("x" if yes else "." for yes in accepted).split("x")
-    assert max(map(len, runs)) <= 8  # each fix is told of twice, where it was tested again
+    assert max(map(len, runs)) <= 4
     assert found.rejected_gnss <= 16
     assert rms_m(found) < 0.1
