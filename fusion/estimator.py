@@ -41,6 +41,8 @@ from terrafusion.fusion.inputs.alignment import (
 )
 from terrafusion.fusion.inputs.gates import WheelGate
 from terrafusion.fusion.inputs.gnss import GnssUpdater, checked_fix
+from terrafusion.fusion.inputs.grip import grip_of
+from terrafusion.fusion.inputs.slide import Slide
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.monitor import MotionMonitor
 from terrafusion.fusion.propagate import Propagator
@@ -62,9 +64,8 @@ class Estimator:
     """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
 
     Samples may come late and out of order (see `streams.Lateness`); keyframes are made as soon as the
-    IMU (and the wheels, or their waiting time) cover them. `on_state` is called
-    with every new `State`, `on_innovation` with every tested measurement;
-    `archive` keeps all factors for a batch solution afterwards.
+    IMU (and the wheels, or their waiting time) cover them. `on_state` is called with every new `State`,
+    `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
     """
 
     def __init__(
@@ -79,11 +80,12 @@ class Estimator:
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
         self.weights = TerrainWeights(config)
-        self.gnss = GnssUpdater(config, self._report, self.weights.single)
+        self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
+        self._slide = Slide(grip_of(config, self._preintegrator, self.weights.note))
+        self.gnss = GnssUpdater(config, self._report, self.weights.single, self._slide)
         self.aids = Aids(config.rig, config.declination_rad, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
-        self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._step_ns = round(config.keyframe_s * 1e9)
         self._keep = round(config.lag_s / config.keyframe_s) + LAG_MARGIN
@@ -301,6 +303,7 @@ class Estimator:
         if self.config.inputs.planar:
             segments = in_a_turn(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
+        segments, wheels = self._slide.dragged(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
@@ -361,14 +364,13 @@ class Estimator:
         travelled = self.wheels.travelled(before_ns, t_ns)
         if travelled is None:
             return None
-        rig = self.config.rig
+        rig, inputs = self.config.rig, self.config.inputs
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         bias_z = float(before.bias.gyroscope()[2])
         change = self.wheels.speed_change_mps(before_ns, t_ns)
         row, surging = self.weights.row, self.config.calibrate
         increment = wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, row, change, surging)
-        increment = self.gnss.slide.loosened(increment, before, (t_ns - before_ns) * 1e-9)
-        inputs = self.config.inputs
+        increment = self._slide.loosened(increment, before, (t_ns - before_ns) * 1e-9)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(

@@ -106,7 +106,7 @@ def inputs_of(recording: Recording, gnss: Gnss | None) -> Inputs:
     """
     wheels = recording.wheels
     fixes = gnss is not None and bool(((gnss.fix > 0) & np.isfinite(gnss.enu_m[:, :2].sum(axis=1))).any())
-    return Inputs(_imu_kind(recording.imu), wheels is None or wheels.has_sides(), fixes)
+    return Inputs(imu_kind(recording.imu), wheels is None or wheels.has_sides(), fixes)
 
 
 def complete_rows(imu: Imu, kind: str) -> np.ndarray:
@@ -117,7 +117,8 @@ def complete_rows(imu: Imu, kind: str) -> np.ndarray:
     return np.asarray(z)
 
 
-def _imu_kind(imu: Imu | None) -> str:
+def imu_kind(imu: Imu | None) -> str:
+    """Which of `IMU_KINDS` the IMU of a log is."""
     if imu is None or not complete_rows(imu, "gyro_z").any():
         return "none"
     six, z = int(complete_rows(imu, "six_axis").sum()), int(complete_rows(imu, "gyro_z").sum())

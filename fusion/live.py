@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import DataError, TerrafusionError
 from terrafusion.datasets.frames import quaternion_to_matrix
-from terrafusion.datasets.recording import Recording, Wheels
+from terrafusion.datasets.recording import Imu, Recording, Wheels
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State
 from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.front import complete_rows, imu_kind, inputs_of
 
 Array = NDArray[np.float64]
 
@@ -63,23 +64,22 @@ def messages(recording: Recording, wheel_radius_m: float) -> Iterator[Message]:
     Raises:
         DataError: no IMU, or no wheels.
     """
-    if recording.imu is None or recording.wheels is None:
+    kind = imu_kind(recording.imu)
+    if recording.imu is None or recording.wheels is None or kind == "none":
         raise DataError(
             "the log lacks IMU or wheels", remedy="live use needs both; see `terrafusion inspect`"
         )
+    imu = recording.imu.select(complete_rows(recording.imu, kind))
     streams = [
         _wheels(recording.wheels, wheel_radius_m), _gnss(recording), _commands(recording),
-        _pressures(recording), _imu(recording),
+        _pressures(recording), _imu(imu),
     ]  # fmt: skip
     return heapq.merge(*streams, key=lambda message: message[0])
 
 
-def _imu(recording: Recording) -> Iterator[Message]:
-    imu = recording.imu
-    assert imu is not None
+def _imu(imu: Imu) -> Iterator[Message]:
     for t_ns, gyro, accel in zip(imu.t_ns.tolist(), imu.gyro_radps, imu.accel_mps2, strict=True):
-        if np.isfinite(gyro.sum() + accel.sum()):
-            yield t_ns, "imu", lambda e, t=t_ns, g=gyro, a=accel: e.add_imu(t, g, a)  # type: ignore[misc]
+        yield t_ns, "imu", lambda e, t=t_ns, g=gyro, a=accel: e.add_imu(t, g, a)  # type: ignore[misc]
 
 
 def _wheels(wheels: Wheels, radius_m: float) -> Iterator[Message]:
@@ -247,7 +247,8 @@ def _live(log: str, vehicle: str | None, realtime: bool) -> None:
 
     recording = open_recording(log)
     robot, _ = choose_vehicle(recording, vehicle)
-    estimator = Estimator(EstimatorConfig(robot.rig(), robot.name))
+    inputs = inputs_of(recording, recording.gnss)
+    estimator = Estimator(EstimatorConfig(robot.rig(), robot.name, inputs=inputs))
     newest: list[State | None] = [None]
 
     def publish(state: State) -> None:

@@ -387,6 +387,9 @@ def _said(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"the heading was wrong and was set right from the motion {estimator.gnss.turned} times")
     if gnss.slide.refutations:
         notes.append(f"fixes showed {gnss.slide.refutations} times that the robot slid beside its wheels")
+    grip = gnss.slide.grip
+    if grip is not None and grip.slides:
+        notes.append(f"at its end the robot slid, with a grip of {grip.mps2:.1f} m/s2")
     if estimator.imu.spikes:
         notes.append(
             f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "

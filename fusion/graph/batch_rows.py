@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, TypeVar
+from typing import TypeVar
 
 import gtsam
 import numpy as np
@@ -35,11 +35,9 @@ from terrafusion.fusion.graph.key_state import (
     YAW_SCALE,
 )
 from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-
-if TYPE_CHECKING:
-    from terrafusion.fusion.graph.chain import Node
 
 Array = NDArray[np.float64]
 Places = NDArray[np.intp]

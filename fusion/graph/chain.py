@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import bisect
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from typing import Any
 
 import gtsam
@@ -41,6 +41,7 @@ from terrafusion.fusion.graph.key_state import (
     skew,
 )
 from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
@@ -48,32 +49,6 @@ from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, res
 Array = NDArray[np.float64]
 
 _ZERO = np.zeros(3)
-
-
-@dataclass(eq=False)
-class Node:
-    """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.
-
-    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before; `preintegrated`
-    tells that `link` is one `CombinedImuFactor` made of them. `prior` (m, dim + 1) are whitened rows of all
-    that went before, `delta` (dim,) leads from `point` to the estimate.
-    """
-
-    point: KeyState
-    t_ns: int
-    link: gtsam.NonlinearFactorGraph
-    markov: MarkovStep | None
-    wheels: WheelIncrement | None
-    gyro_radps: Array
-    accel_mps2: Array
-    preintegrated: bool
-    prior: Array
-    delta: Array
-    unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
-    unary_keys: set[str] = field(default_factory=set)
-    fixes: list[GnssPosition] = field(default_factory=list)
-    velocities: list[GnssVelocity] = field(default_factory=list)
-    conditional: Array | None = None
 
 
 _SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
@@ -280,13 +255,20 @@ class Chain:
         self._anchor, self._dirty = None, self.first
         self._eliminate_all()
 
-    def revise(self, k: int, markov: MarkovStep | None = None, wheels: WheelIncrement | None = None) -> None:
-        """Another step of slip and drift, or increment of the wheels, into keyframe k, not the first."""
+    def revise(
+        self,
+        k: int,
+        markov: MarkovStep | None = None,
+        wheels: WheelIncrement | None = None,
+        link: gtsam.NonlinearFactorGraph | None = None,
+    ) -> None:
+        """Another step of slip and drift, increment of the wheels, or link into keyframe k, not the first."""
         node = self.nodes[k - self.first]
         node.markov, node.wheels = markov or node.markov, wheels or node.wheels
+        node.link = node.link if link is None else link
         self._dirty = min(self._dirty, k - 1)
         if self.archive is not None:
-            self.archive.revise(k, markov, wheels)
+            self.archive.revise(k, markov, wheels, link)
 
     def rebuild(self) -> None:
         """Make the variables of GTSAM anew from the keyframes, which hold the same."""

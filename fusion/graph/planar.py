@@ -100,7 +100,9 @@ class PlanarPreintegrator(Preintegrator):
         turned = sum(float(piece.gyro_radps[2]) * piece.dt_s for piece in segments)
         total = sum(piece.dt_s for piece in segments)
         density = self.yaw_density(turned / total if total > 0.0 else 0.0, row.gyro_yaw_inflation)
-        measured = gtsam.PreintegratedCombinedMeasurements(self._planar(density), bias)
+        forces = segments[0].accel_density_mps2 if segments else None
+        params = self._planar(density, forces or (ACCEL_DENSITY_MPS2, ACCEL_DENSITY_MPS2))
+        measured = gtsam.PreintegratedCombinedMeasurements(params, bias)
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
         return measured
@@ -113,15 +115,16 @@ class PlanarPreintegrator(Preintegrator):
             return UNKNOWN_YAW_DENSITY_RADPS
         return float(np.hypot(TURN_SHARE * rate_radps * np.sqrt(TURN_TIME_S), WHEEL_YAW_DENSITY_RADPS))
 
-    def _planar(self, yaw_density: float) -> gtsam.PreintegrationCombinedParams:
+    def _planar(self, yaw_density: float, accel: tuple[float, float]) -> gtsam.PreintegrationCombinedParams:
         eye = np.eye(3)
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
         params.setGyroscopeCovariance(np.diag([TILT_DENSITY_RADPS**2, TILT_DENSITY_RADPS**2, yaw_density**2]))
-        params.setAccelerometerCovariance(eye * ACCEL_DENSITY_MPS2**2)
+        params.setAccelerometerCovariance(np.diag([accel[0] ** 2, accel[1] ** 2, ACCEL_DENSITY_MPS2**2]))
         walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw == "gyro" else _BIAS_WALK
         params.setBiasOmegaCovariance(np.diag([_BIAS_WALK**2, _BIAS_WALK**2, walk**2]))
         params.setBiasAccCovariance(eye * _BIAS_WALK**2)
         params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
+        params.setBodyPSensor(gtsam.Pose3())  # a snapshot knows factors with a lever arm only
         return params
 
 

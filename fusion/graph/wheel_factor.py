@@ -61,6 +61,7 @@ class WheelIncrement:
         yaw_rad: turn by the gyro, bias removed.
         speed_change_mps: wheel speed at the end less that at the start.
         surge_m: a / g (|distance| + v0 dt) of wheels that accelerate by a; 0 unless calibrated.
+        slid_m: way along body x that the wheels rolled and the robot, by friction, did not go.
     """
 
     displacement_m: Array
@@ -70,6 +71,7 @@ class WheelIncrement:
     yaw_rad: float = 0.0
     speed_change_mps: float = 0.0
     surge_m: float = 0.0
+    slid_m: float = 0.0
 
     def without_turn(self) -> WheelIncrement:
         """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
@@ -89,8 +91,8 @@ class WheelIncrement:
 
 
 def slip_of(linear: Array, wheels: WheelIncrement) -> float:
-    """Slip over the interval of `wheels`, what their acceleration asks for included."""
-    asked_m = float(linear[_A]) * wheels.surge_m
+    """Slip over the interval of `wheels`, what their acceleration asks for and a slide included."""
+    asked_m = float(linear[_A]) * wheels.surge_m + (1.0 - float(linear[_S])) * wheels.slid_m
     return float(linear[_S]) + (asked_m / wheels.distance_m if abs(wheels.distance_m) > MOVED_M else 0.0)
 
 

@@ -71,6 +71,7 @@ class GnssUpdater:
         config: EstimatorConfig,
         report: Callable[[Innovation], None],
         weighting: Weighting | None = None,
+        slide: Slide | None = None,
     ) -> None:
         self.weighting = weighting or Weighting()
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
@@ -79,7 +80,7 @@ class GnssUpdater:
         spec = config.rig.sensors.gnss
         self.track = MotionTrack(self.antenna_m)
         self.turned = 0
-        self.slide = Slide()
+        self.slide = slide or Slide()
         self.scale, self.white = 1.0, WHITE_SHARE
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._best = best_fix(spec)
@@ -135,6 +136,8 @@ class GnssUpdater:
                 used |= self._place(chain, fix)
             else:
                 self.track.add(fix)
+                if self.slide.grip is not None:
+                    self.slide.grip.seen(fix)
                 self._hear(self.track.scatter())
                 renewed = self._change_class(chain, k, fix)
                 if renewed or used or k < chain.last:
@@ -205,6 +208,8 @@ class GnssUpdater:
         chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
         chain.smooth(len(chain.nodes))
         self.track.restart()
+        if self.slide.grip is not None:
+            self.slide.grip.restart()
         self.turned += 1
         return True
 
@@ -234,7 +239,7 @@ class GnssUpdater:
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
         if verdict is Verdict.REJECT and nis <= self.weighting.passed_nis:
             verdict = Verdict.ACCEPT
-        if verdict is Verdict.REJECT and not again and self._slid(chain, k, fix):
+        if verdict is Verdict.REJECT and not again and self._slid(chain, k, fix, row):
             return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not Verdict.REACQUIRE:
@@ -283,13 +288,13 @@ class GnssUpdater:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
 
-    def _slid(self, chain: Chain, k: int, fix: GnssFix) -> bool:
+    def _slid(self, chain: Chain, k: int, fix: GnssFix, row: SensorNoise) -> bool:
         """Whether the fixes just refused show that the wheels did not roll where the robot went."""
         refused = [off for off, _ in self.gate.rejected]
         sigma_m = float(np.max(fix.sigma_m[:2]))
         if not self.track.smooth_at(fix.t_ns):
             return False
-        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m):
+        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m, row):
             return False
         self.gate.rejected.pop()  # it is tested again
         return True

@@ -14,12 +14,16 @@ from __future__ import annotations
 
 import math
 
+import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.grip import Grip
+from terrafusion.fusion.inputs.streams import ImuSegment
+from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
@@ -36,25 +40,38 @@ FORGOTTEN_S = 20.0
 DRIVING_MPS = 0.3
 """At this speed, of the robot or its wheels, half a second counts as driven in a second; at rest none."""
 
+_Passed = tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]
+
 
 class Slide:
     """How wrong the wheels are beyond their noise.
 
     Attributes:
+        grip: what friction leaves of the wheels' way, where that is heard.
         rate_m2ps: variance of the wheels' way, each axis, per second of driving.
         refutations: how often fixes refuted the wheels.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, grip: Grip | None = None) -> None:
+        self.grip = grip
         self.rate_m2ps = 0.0
         self.refutations = 0
-        self._before: tuple[float, list[tuple[int, WheelIncrement | None]]] = (0.0, [])
+        self._before: tuple[float, list[tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]]] = (
+            0.0,
+            [],
+        )
         self._driven_s = 0.0
         self._before_m = np.zeros(2)
         self._last_ns: int | None = None
 
     def refuted(
-        self, chain: Chain, k: int, since_ns: int | None, refused: list[Array], sigma_m: float
+        self,
+        chain: Chain,
+        k: int,
+        since_ns: int | None,
+        refused: list[Array],
+        sigma_m: float,
+        row: SensorNoise,
     ) -> bool:
         """Whether refused fixes, the last at keyframe k, refute the wheels; loosens them if so.
 
@@ -66,6 +83,7 @@ class Slide:
             since_ns: time of the last fix used.
             refused: offsets (2,), m, of the fixes refused in a row from the estimate.
             sigma_m: 1 sigma of the newest fix.
+            row: noise of the ground.
         """
         if since_ns is None or len(refused) < (1 if self.rate_m2ps else 2) or not _on_one_side(refused[-2:]):
             return False
@@ -88,21 +106,22 @@ class Slide:
         more_m2ps = 0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps
         if more_m2ps <= 0.0:
             return False
-        self._before = self.rate_m2ps, [(i, node.wheels) for i, node in zip(passed, nodes, strict=True)]
+        self._before = self.rate_m2ps, [(i, n.wheels, n.link) for i, n in zip(passed, nodes, strict=True)]
         self.rate_m2ps += more_m2ps
         self.refutations += 1
         for i, node, driven in zip(passed, nodes, driven_s, strict=True):
             if node.wheels is not None:
-                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * driven))
+                loose = self.grip.loose_link(chain, i, more_m2ps, row) if self.grip else None
+                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * driven), link=loose)
         chain.smooth(chain.last - begin + 1)
         return True
 
     def put_back(self, chain: Chain) -> None:
         """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
-        self.rate_m2ps, wheels = self._before
+        self.rate_m2ps, passed = self._before
         self.refutations -= 1
-        for i, increment in wheels:
-            chain.revise(i, wheels=increment)
+        for i, wheels, link in passed:
+            chain.revise(i, wheels=wheels, link=link)
 
     def loosened(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
         """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
@@ -112,6 +131,20 @@ class Slide:
             return wheels
         self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
         return wheels.loosened(self.rate_m2ps * driven_s)
+
+    def dragged(
+        self,
+        t_ns: int,
+        dt_s: float,
+        segments: list[ImuSegment],
+        wheels: WheelIncrement | None,
+        before: KeyState,
+        covariance: Array,
+    ) -> tuple[list[ImuSegment], WheelIncrement | None]:
+        """What links a keyframe, as friction has it where fixes have shown that; see `Grip.step`."""
+        if self.grip is None:
+            return segments, wheels
+        return self.grip.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
         """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.

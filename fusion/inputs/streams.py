@@ -19,12 +19,13 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, eq=False)
 class ImuSegment:
     """A piece of time (s) with constant angular rate (3,) and specific force (3,); `held` where samples
-    before stand for a spike."""
+    before stand for a spike. A force that is reasoned, not measured, brings its noise density along x, y."""
 
     dt_s: float
     gyro_radps: Array
     accel_mps2: Array
     held: bool = False
+    accel_density_mps2: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -79,6 +79,10 @@ class TerrainWeights:
         self._last_speed = 0.0
         self._source = "detector"
 
+    def note(self, change: WeightChange) -> None:
+        """Record a change that another part made."""
+        self.changes.append(change)
+
     def take_changes(self) -> list[WeightChange]:
         """The changes since the last call."""
         taken = list(self.changes)

@@ -1,0 +1,43 @@
+"""One keyframe of the chain, with all that touches it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.graph.gnss_factor import GnssPosition
+from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.markov import MarkovStep
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+
+Array = NDArray[np.float64]
+
+
+@dataclass(eq=False)
+class Node:
+    """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.
+
+    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before; `preintegrated`
+    tells that `link` is one `CombinedImuFactor` made of them. `prior` (m, dim + 1) are whitened rows of all
+    that went before, `delta` (dim,) leads from `point` to the estimate.
+    """
+
+    point: KeyState
+    t_ns: int
+    link: gtsam.NonlinearFactorGraph
+    markov: MarkovStep | None
+    wheels: WheelIncrement | None
+    gyro_radps: Array
+    accel_mps2: Array
+    preintegrated: bool
+    prior: Array
+    delta: Array
+    unary: gtsam.NonlinearFactorGraph = field(default_factory=gtsam.NonlinearFactorGraph)
+    unary_keys: set[str] = field(default_factory=set)
+    fixes: list[GnssPosition] = field(default_factory=list)
+    velocities: list[GnssVelocity] = field(default_factory=list)
+    conditional: Array | None = None

@@ -1,0 +1,296 @@
+"""Grip of the ground, heard from fixes, on a twin whose laws are not those of `graph.friction`."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+
+from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimate import WeightChange
+from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.front import Inputs, inputs_of
+from terrafusion.fusion.graph.key_state import LINEAR, KeyState
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs import grip as grips
+from terrafusion.fusion.inputs.grip import Grip, grip_of
+from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
+from terrafusion.fusion.live import messages
+from terrafusion.fusion.replay import Replay, choose_vehicle, replay
+from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.fusion.scores.outage_plan import aided_by_truth
+from terrafusion.twin.simulate import simulate_run
+from terrafusion.twin.soil import load_soil
+
+FRICTION = 0.1
+"""Of rubber on ice: 0.98 m/s2."""
+DRIVE = """
+description: fast turns and stops
+max_accel_mps2: 3.0
+drive:
+  - {duration_s: 3}
+  - {duration_s: 6, v_mps: 3.0}
+  - {duration_s: 4, v_mps: 3.0, yaw_rate_radps: 0.6}
+  - {duration_s: 4, v_mps: 0.5}
+  - {duration_s: 5, v_mps: 3.0, yaw_rate_radps: -0.6}
+  - {duration_s: 5, v_mps: 2.0, yaw_rate_radps: 0.8}
+  - {duration_s: 4, v_mps: -2.0}
+  - {duration_s: 5, v_mps: 3.0}
+  - {duration_s: 4, v_mps: 3.0, yaw_rate_radps: 0.6}
+  - {duration_s: 4, v_mps: 0.0}
+  - {duration_s: 5, v_mps: 3.0, yaw_rate_radps: -0.6}
+  - {duration_s: 6, v_mps: 2.0, yaw_rate_radps: 0.8}
+  - {duration_s: 3}
+"""
+OUTAGE = Outage(35.0, 15.0)
+
+
+def driven(folder: Path, friction: float | None) -> Recording:
+    """A Warthog that is driven hard, with a gyro about z alone, and fixes of 0.1 m twice a second."""
+    soil = load_soil("asphalt")
+    if friction is not None:
+        shear = dataclasses.replace(
+            soil.shear, friction_angle_rad=float(np.arctan(friction)), friction_cap=friction
+        )
+        soil = dataclasses.replace(soil, shear=shear)
+    (folder / "hard.yaml").write_text(DRIVE)
+    run = simulate_run(
+        folder / "hard.yaml", vehicle="warthog", terrain="asphalt", soils={"asphalt": soil}, seed=3
+    )
+    imu = run.recording.imu
+    assert imu is not None
+    flat = dataclasses.replace(imu, gyro_radps=imu.gyro_radps * np.array([np.nan, np.nan, 1.0]))
+    return aided_by_truth(dataclasses.replace(run.recording, imu=flat, gnss=None), 1)
+
+
+@pytest.fixture(scope="module")
+def ice(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return driven(tmp_path_factory.mktemp("ice"), FRICTION)
+
+
+@pytest.fixture(scope="module")
+def asphalt(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    return driven(tmp_path_factory.mktemp("asphalt"), None)
+
+
+def places(found: Replay) -> bytes:
+    return found.estimate.trajectory.position_m.tobytes()
+
+
+def rms_m(found: Replay) -> float:
+    assert found.scores.errors is not None
+    return float(np.sqrt(np.nanmean(found.scores.errors.distance_m() ** 2)))
+
+
+def config_of(recording: Recording) -> EstimatorConfig:
+    robot, _ = choose_vehicle(recording, None)
+    return EstimatorConfig(robot.rig(), robot.name, inputs=inputs_of(recording, recording.gnss))
+
+
+def followed(recording: Recording, until_s: float = np.inf) -> tuple[list[float], list[bool], Estimator]:
+    """Grip and whether the robot slides after every fix, of a live estimator."""
+    estimator = Estimator(config_of(recording))
+    grip = estimator.gnss.slide.grip
+    assert grip is not None
+    found, slides = [], []
+    for t_ns, channel, give in messages(recording, estimator.config.rig.wheel_radius_m):
+        if t_ns > recording.start_ns + until_s * 1e9:
+            break
+        give(estimator)
+        if channel == "gnss":
+            found.append(grip.mps2)
+            slides.append(grip.slides)
+    return found, slides, estimator
+
+
+def test_the_grip_of_ice_is_found(ice: Recording) -> None:
+    """Wheels on the twin slip on by a law of shear displacement, and roll: the grip comes out low."""
+    found, slides, _ = followed(ice)
+    late = slice(len(found) // 3, None)
+    assert all(slides[late])
+    assert 0.5 < np.median(found[late]) < 1.2 * FRICTION * 9.81
+
+
+def test_without_fixes_friction_leads_where_wheels_do_not(ice: Recording) -> None:
+    """15 s without fixes: 1.7 m at their end where wheels lead to 4.5 m."""
+    adaptive, fixed = (replay(ice, mode=mode, outages=[OUTAGE]) for mode in ("adaptive", "fixed"))
+    assert adaptive.scores.outages[0].end_error_m < 0.6 * fixed.scores.outages[0].end_error_m
+    assert rms_m(adaptive) < 0.6 * rms_m(fixed)
+    assert any("the robot slid, with a grip of" in note for note in adaptive.estimate.notes)
+
+
+def test_with_fixes_none_is_refused_for_the_wheels(ice: Recording) -> None:
+    found = replay(ice)
+    assert found.rejected_gnss <= 3
+    assert rms_m(found) < 0.25
+
+
+def test_ground_that_holds_costs_nothing(asphalt: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where rolling wheels tell the way, the estimate is to the last bit the one without a grip."""
+    _, slides, _ = followed(asphalt)
+    assert not any(slides)
+    heard = replay(asphalt)
+    monkeypatch.setattr("terrafusion.fusion.estimator.grip_of", lambda *_: None)
+    assert places(heard) == places(replay(asphalt))
+
+
+def test_slip_of_a_slide_is_told(ice: Recording) -> None:
+    assert ice.truth is not None
+    assert ice.wheels is not None
+    robot, _ = choose_vehicle(ice, None)
+    rim = ice.wheels.side_speeds_mps(robot.odometry.wheel_radius_m).mean(axis=1)
+    velocity = ice.truth.twist_body
+    assert velocity is not None
+
+    def error(mode: str) -> float:
+        found = replay(ice, mode=mode).estimate
+        t_ns = found.trajectory.t_ns
+        rolled = np.interp(t_ns, ice.wheels.t_ns, rim)  # type: ignore[union-attr]
+        went = np.interp(t_ns, ice.truth.t_ns, velocity[:, 0])  # type: ignore[union-attr]
+        turning = np.abs(rolled) > 1.0
+        return float(np.sqrt(np.mean((found.slip - 1.0 + went / rolled)[turning] ** 2)))
+
+    assert error("adaptive") < 0.5 * error("fixed")
+
+
+def test_a_change_of_the_wheels_worth_is_told_with_its_reason(ice: Recording) -> None:
+    told = [c for c in replay(ice).estimate.changes if c.reason.startswith("grip: friction")]
+    assert told
+    assert told[0].before == np.inf
+    assert all(change.unit == "m/s2" for change in told)
+
+
+def test_a_dump_in_a_slide_goes_on_with_the_same_bits(ice: Recording) -> None:
+    config = config_of(ice)
+    one, other = Estimator(config), None
+    for k, (_, _, give) in enumerate(messages(ice, config.rig.wheel_radius_m)):
+        give(one)
+        if other is not None:
+            give(other)
+        elif k > 1000 and one.gnss.slide.grip is not None and one.gnss.slide.grip.slides:
+            other = Estimator.restore(config, one.dump())
+    assert other is not None
+    state, same = one.latest(), other.latest()
+    assert state is not None
+    assert same is not None
+    assert state.position_m.tobytes() == same.position_m.tobytes()
+    assert state.covariance.tobytes() == same.covariance.tobytes()
+
+
+def test_who_hears_the_grip() -> None:
+    """A planar graph with two wheels and a gyro, whose weights follow the ground; no calibration."""
+    base = dataclasses.replace(Estimator.for_vehicle("warthog").config, inputs=Inputs(imu="gyro_z"))
+
+    def hears(**changes: object) -> bool:
+        config: EstimatorConfig = dataclasses.replace(base, **changes)  # type: ignore[arg-type]
+        return (
+            grip_of(config, config.inputs.preintegrator(config.rig.sensors.imu), lambda _: None) is not None
+        )
+
+    assert hears()
+    assert not hears(mode="fixed")
+    assert not hears(calibrate=True)
+    assert not hears(inputs=Inputs())
+    assert not hears(inputs=Inputs(imu="none"))
+    assert not hears(inputs=Inputs(imu="gyro_z", sides=False))
+
+
+class Straight:
+    """A robot whose wheels roll at 3 m/s along a heading, while it goes as told; a fix every half second."""
+
+    def __init__(self, heading_rad: float = 0.0, origin_m: tuple[float, float] = (0.0, 0.0)) -> None:
+        config = dataclasses.replace(Estimator.for_vehicle("warthog").config, inputs=Inputs(imu="gyro_z"))
+        self.told: list[WeightChange] = []
+        grip = grip_of(config, config.inputs.preintegrator(config.rig.sensors.imu), self.told.append)
+        assert grip is not None
+        self.grip: Grip = grip
+        self.heading = gtsam.Rot3.Rz(heading_rad)
+        self.at = np.array([*origin_m, 0.0]) + self.heading.matrix() @ grip.antenna_m
+        self.k = 0
+
+    def drive(
+        self, seconds: float, speed_mps: float, acceleration_mps2: float = 0.0, jump_m: float = 0.0
+    ) -> float:
+        """Wheels at 3 m/s, the robot from `speed_mps` on; gives its speed at the end."""
+        R = self.heading.matrix()
+        wheels = WheelIncrement(np.array([0.3, 0.0, 0.0]), np.full(4, 0.01), 0.3, 0.0)
+        for _ in range(round(seconds / 0.1)):
+            self.k += 1
+            # The grip is given the velocity that an estimate would have: the robot's own.
+            state = KeyState(
+                gtsam.Pose3(self.heading, self.at),
+                R @ np.array([speed_mps, 0.0, 0.0]),
+                gtsam.imuBias.ConstantBias(),
+                np.zeros(len(LINEAR)),
+            )
+            segments = [ImuSegment(0.1, np.zeros(3), np.array([0.0, 0.0, 9.81]))]
+            self.grip.step(self.k * 10**8, 0.1, segments, wheels, state, np.eye(21) * 1e-4, 0.0)
+            self.at = self.at + R @ np.array([0.1 * speed_mps + 0.005 * acceleration_mps2, 0.0, 0.0])
+            speed_mps = min(speed_mps + 0.1 * acceleration_mps2, 3.0)
+            if self.k % 5 == 0:
+                jump = jump_m if self.k == 20 else 0.0
+                self.grip.seen(
+                    GnssFix(self.k * 10**8, self.at + jump * np.array([1.0, 1.0, 0.0]), np.full(3, 0.05))
+                )
+        return speed_mps
+
+
+@pytest.mark.parametrize("true_mps2", [0.5, 0.7, 1.0])
+def test_the_grip_of_a_robot_that_speeds_up(true_mps2: float) -> None:
+    robot = Straight()
+    robot.drive(2.6, 0.1, true_mps2)
+    assert robot.grip.slides
+    assert robot.grip.mps2 == pytest.approx(true_mps2, rel=0.3)
+    assert robot.told[0].before == np.inf
+    assert robot.told[-1].after == pytest.approx(robot.grip.mps2, rel=grips.TELL_STEP)
+
+
+def test_heading_and_place_do_not_matter() -> None:
+    here, there = Straight(), Straight(2.3, (-400.0, 1200.0))
+    for robot in (here, there):
+        robot.drive(2.6, 0.1, 1.0)
+    assert there.grip.mps2 == pytest.approx(here.grip.mps2, rel=1e-6)
+
+
+def test_one_wild_fix_makes_no_slide() -> None:
+    robot = Straight()
+    robot.drive(6.0, 3.0, jump_m=4.0)
+    assert not robot.grip.slides
+    assert not robot.told
+
+
+def test_what_is_heard_is_forgotten_on_the_way() -> None:
+    robot = Straight()
+    speed = robot.drive(2.6, 0.1, 1.0)
+    assert robot.grip.slides
+    robot.drive(30.0, 3.0 if speed > 2.6 else speed)
+    assert not robot.grip.slides
+    assert robot.told[-1].after == np.inf
+
+
+def test_silent_wheels_begin_the_ways_anew() -> None:
+    robot = Straight()
+    robot.drive(2.6, 0.1, 1.0)
+    before = robot.grip.mps2
+    state = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
+    segments = [ImuSegment(0.1, np.zeros(3), np.array([0.0, 0.0, 9.81]))]
+    assert robot.grip.step(10**10, 0.1, segments, None, state, np.eye(21), 0.0) == (segments, None)
+    robot.grip.seen(GnssFix(10**10, np.array([50.0, 0.0, 0.0]), np.full(3, 0.05)))
+    assert robot.grip.mps2 == before
+
+
+def test_a_refuted_slide_loosens_its_links_and_has_them_back(ice: Recording) -> None:
+    _, _, estimator = followed(ice, until_s=34.0)
+    chain, slide = estimator.chain, estimator.gnss.slide
+    nodes = chain.nodes[-8:]
+    links, sure = [node.link for node in nodes], chain.covariance()
+    since, ahead = nodes[0].t_ns, [np.array([0.5, 0.0]), np.array([0.6, 0.0])]
+    assert slide.refuted(chain, chain.last, since, ahead, 0.1, estimator.weights.row)
+    assert all(node.link is not link for node, link in zip(nodes[1:], links[1:], strict=True))
+    assert (np.diag(chain.covariance())[3:8] > 1.2 * np.diag(sure)[3:8]).any()
+    slide.put_back(chain)
+    assert all(node.link is link for node, link in zip(nodes, links, strict=True))
