@@ -23,7 +23,7 @@ from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import WeightChange
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.friction import slid
-from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
+from terrafusion.fusion.graph.key_state import ICR_X, SIDE_SLIP, VELOCITY, KeyState
 from terrafusion.fusion.graph.link import imu_factor
 from terrafusion.fusion.graph.planar import ACCEL_DENSITY_MPS2
 from terrafusion.fusion.graph.preintegration import Preintegrator
@@ -33,9 +33,9 @@ from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
-GRIPS_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0])
-"""Grips that are told apart: mu g from wet ice to dry asphalt."""
-USUAL_MPS2, USUAL_SPREAD = 5.0, 0.7
+GRIPS_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0])
+"""Grips that are told apart: mu g of ice, and of wet or snowy ground. With more, wheels lead as well."""
+USUAL_MPS2, USUAL_SPREAD = 1.0, 0.7
 """Grip of a robot that slides, before any fix, and standard deviation of its logarithm (assumed)."""
 ROLLS = 0.9
 """Probability, before any fix, that the robot goes as its wheels roll (assumed)."""
@@ -195,7 +195,8 @@ class Grip:
             here = np.tile((R @ self.antenna_m)[:2], (len(self._prior), 1))
             self._paths.append((t_ns - round(dt_s * 1e9), here))
         self._velocity, way = slid(self._velocity, *motion, GRIPS_MPS2, self.track_m, dt_s)
-        way = np.vstack([way, before.rolling * wheels.displacement_m[:2]])
+        rolled = before.rolling * wheels.displacement_m[:2] + [0.0, _across_m(wheels, before)]
+        way = np.vstack([way, rolled])
         turned = R @ (gtsam.Rot3.Rz(wheels.yaw_rad).matrix() - np.eye(3)) @ self.antenna_m
         self._paths.append((t_ns, self._paths[-1][1] + way @ R[:2, :2].T + turned[:2]))
         while t_ns - self._paths[0][0] > HELD_S * 1e9:
@@ -258,7 +259,8 @@ class Grip:
         ]
         sigma = wheels.sigma.copy()
         sigma[:2] = np.sqrt(sigma[:2] ** 2 + variance)
-        way = np.append(ways[0] / before.rolling, 0.0)
+        # The factor will slip it, and carry it to the side, as it does with wheels that roll.
+        way = np.append((ways[0] - [0.0, _across_m(wheels, before)]) / before.rolling, 0.0)
         slid_m = wheels.displacement_m[0] - way[0]
         return segments, dataclasses.replace(wheels, displacement_m=way, sigma=sigma, slid_m=float(slid_m))
 
@@ -294,6 +296,11 @@ def grip_of(
 def _density2(rate_m2ps: float) -> float:
     """Squared density of an acceleration whose way is after `LASTS_S` as unsure as a walk of `rate_m2ps`."""
     return 3.0 * rate_m2ps / LASTS_S**2
+
+
+def _across_m(wheels: WheelIncrement, before: KeyState) -> float:
+    """How far the wheel factor takes a robot that rolls to go sideways."""
+    return float(before.of(SIDE_SLIP) * wheels.distance_m - before.of(ICR_X) * wheels.yaw_rad)
 
 
 def _carries(link: gtsam.NonlinearFactorGraph) -> bool:

