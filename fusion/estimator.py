@@ -315,9 +315,9 @@ class Estimator:
             link.add(imu_factor(k, measured))
             if not self.config.inputs.planar:  # the planar link is no witness against the wheels
                 preintegrated = True
-                wheels = self._gated(t_ns, wheels, before, point, dt, switch)
+                wheels = self._gated(t_ns, wheels, before, point, switch)
         up = before.pose.rotation().matrix()[2]
-        markov = slow_states.step(dt, row, up, *drift, switch, rolled)
+        markov = slow_states.step(dt, row, up, *drift, switch, wheels)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
@@ -372,16 +372,12 @@ class Estimator:
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
-        self,
-        t_ns: int,
-        wheels: WheelIncrement | None,
-        before: KeyState,
-        point: KeyState,
-        dt: float,
-        switch: float,
+        self, t_ns: int, wheels: WheelIncrement | None, before: KeyState, point: KeyState, switch: float
     ) -> WheelIncrement | None:
         if wheels is None:
             return None
+        gate, dt = self._wheel_gate, self._step_ns * 1e-9
+        wheels = gate.rejoined(wheels, dt)
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
         innovation = float(moved[0] - before.rolling * d[0])
@@ -393,12 +389,13 @@ class Estimator:
             + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
             + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
         )
-        accepted, nis = self._wheel_gate.test(innovation, float(np.sqrt(variance)))
+        robot = float(forward @ before.velocity), float(point.pose.rotation().matrix()[:, 0] @ point.velocity)
+        accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
             return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
         self.wheels_rejected += not self._silent
-        return wheels.doubted(variance, self._wheel_gate.doubt(nis))
+        return wheels.doubted(variance, gate.doubt(nis))
 
     def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
         """Zero velocity and rate where the robot has stood for a window."""
