@@ -33,6 +33,7 @@ from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.aids import Aids
 from terrafusion.fusion.inputs.alignment import (
+    WINDOW_NS,
     GivenStart,
     Start,
     checked_given,
@@ -227,13 +228,15 @@ class Estimator:
         if not self.imu.t_ns or not self.wheels.t_ns:
             return False
         begin = max(self.imu.t_ns[0], self.wheels.t_ns[0])
-        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
-        if elapsed < 1.0 and not last:
+        level_ns = begin + WINDOW_NS
+        covered = self.wheels.covers(level_ns) or self.imu.covers(level_ns + WINDOW_NS)
+        if not last and not (covered and self.imu.covers(level_ns)):
             return False
+        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
         if self._level is None:
             self._level = level_start(self.imu, self.wheels, begin)
         if self._given is None:
-            self._level, self._given = self.aids.start(self._level, self.imu, self.wheels, self.gnss.waiting)
+            self._given = self.aids.start(self._level, self.imu, self.gnss.waiting)
         if self._given is not None:
             self._begin(self._given.at(self._level))
         elif self.gnss.waiting and self.gnss.news():
