@@ -335,7 +335,7 @@ class Estimator:
         if self.gnss.update(chain, self._covariance, self.weights.row):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
-        if self.aids.update(chain, before, self._covariance, self.gnss):
+        if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         chain.forget(self._keep)

@@ -37,18 +37,19 @@ class Aids:
         self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report, tilt)
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
-    def update(self, chain: Chain, before: Array, after: Array, gnss: GnssUpdater) -> bool:
+    def update(self, chain: Chain, newest_ns: int, before: Array, after: Array, gnss: GnssUpdater) -> bool:
         """Use what has come up to the newest keyframe; True where factors were added to it.
 
-        `before` and `after` (n, n) are its covariance without and with its fixes.
+        `before` and `after` (n, n) are its covariance without and with its fixes; the IMU has come to
+        `newest_ns`.
         """
         t_ns = chain.nodes[-1].t_ns
         if gnss.local:
             self.heading.forget_north()
         placed = gnss.placed is not None
-        height = self.height.active and self.height.update(chain, t_ns, before, after, placed)
+        height = self.height.active and self.height.update(chain, t_ns, newest_ns, before, after, placed)
         turned = gnss.turned + placed
-        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, turned)
+        heading = self.heading.active and self.heading.update(chain, t_ns, newest_ns, before, after, turned)
         return height or heading
 
     def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> GivenStart | None:
