@@ -425,3 +425,11 @@ def test_wheels_that_break_loose_for_a_second_hardly_move_the_pose(drive: Record
     plain, spoilt = (feed(recording, heard) for recording in (drive, loose))
     pairs = zip(plain.states, spoilt.states, strict=True)
     assert max(np.linalg.norm(a.position_m - b.position_m) for a, b in pairs) < 0.1
+
+
+@pytest.mark.parametrize("terrain", ["loose_sand", "mud"])
+def test_wheels_that_set_off_on_loose_ground_are_no_fault(terrain: str) -> None:
+    recording = winding(terrain=terrain)
+    fed = feed(recording, messages(recording), "adaptive")
+    assert fed.estimator.wheels_rejected == 0
+    assert max(abs(s.slip) for s in fed.states) > 0.05
