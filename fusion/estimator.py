@@ -33,6 +33,7 @@ from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.aids import Aids
 from terrafusion.fusion.inputs.alignment import (
+    WINDOW_NS,
     GivenStart,
     Start,
     checked_given,
@@ -229,13 +230,15 @@ class Estimator:
         if not self.imu.t_ns or not self.wheels.t_ns:
             return False
         begin = max(self.imu.t_ns[0], self.wheels.t_ns[0])
-        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
-        if elapsed < 1.0 and not last:
+        level_ns = begin + WINDOW_NS
+        covered = self.wheels.covers(level_ns) or self.imu.covers(level_ns + WINDOW_NS)
+        if not last and not (covered and self.imu.covers(level_ns)):
             return False
+        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
         if self._level is None:
             self._level = level_start(self.imu, self.wheels, begin)
         if self._given is None:
-            self._level, self._given = self.aids.start(self._level, self.imu, self.wheels, self.gnss.waiting)
+            self._given = self.aids.start(self._level, self.imu, self.gnss.waiting)
         if self._given is not None:
             self._begin(self._given.at(self._level))
         elif self.gnss.waiting and self.gnss.news():
@@ -318,9 +321,9 @@ class Estimator:
             link.add(imu_factor(k, measured))
             if not self.config.inputs.planar:  # the planar link is no witness against the wheels
                 preintegrated = True
-                wheels = self._gated(t_ns, wheels, before, point, dt, switch)
+                wheels = self._gated(t_ns, wheels, before, point, switch)
         up = before.pose.rotation().matrix()[2]
-        markov = slow_states.step(dt, row, up, *drift, switch, rolled)
+        markov = slow_states.step(dt, row, up, *drift, switch, wheels)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
@@ -335,7 +338,7 @@ class Estimator:
         if self.gnss.update(chain, self._covariance, self.weights.row):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
-        if self.aids.update(chain, before, self._covariance, self.gnss):
+        if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         chain.forget(self._keep)
@@ -374,16 +377,12 @@ class Estimator:
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
-        self,
-        t_ns: int,
-        wheels: WheelIncrement | None,
-        before: KeyState,
-        point: KeyState,
-        dt: float,
-        switch: float,
+        self, t_ns: int, wheels: WheelIncrement | None, before: KeyState, point: KeyState, switch: float
     ) -> WheelIncrement | None:
         if wheels is None:
             return None
+        gate, dt = self._wheel_gate, self._step_ns * 1e-9
+        wheels = gate.rejoined(wheels, dt)
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
         innovation = float(moved[0] - before.rolling * d[0])
@@ -395,12 +394,13 @@ class Estimator:
             + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
             + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
         )
-        accepted, nis = self._wheel_gate.test(innovation, float(np.sqrt(variance)))
+        robot = float(forward @ before.velocity), float(point.pose.rotation().matrix()[:, 0] @ point.velocity)
+        accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
             return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
         self.wheels_rejected += not self._silent
-        return wheels.doubted(variance, self._wheel_gate.doubt(nis))
+        return wheels.doubted(variance, gate.doubt(nis))
 
     def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
         """Zero velocity and rate where the robot has stood for a window."""

@@ -38,10 +38,10 @@ class Preintegrator:
     ) -> gtsam.PreintegratedCombinedMeasurements:
         """Preintegrate the segments about `bias`; the row's inflations multiply the data sheet's noise.
 
-        With a spike that another sample stands for, the whole is `HELD_INFLATION` times less certain.
+        With a spike that another sample stands for, what its sensor tells in the whole is `HELD_INFLATION`
+        times less certain.
         """
-        if any(piece.held for piece in segments):
-            row = _less_sure(row)
+        row = _less_sure(row, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
         measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(row), bias)
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
@@ -66,6 +66,6 @@ class Preintegrator:
         return self._params[key]
 
 
-def _less_sure(row: SensorNoise) -> SensorNoise:
-    names = ("gyro_inflation", "gyro_yaw_inflation", "accel_inflation")
+def _less_sure(row: SensorNoise, gyro: bool, accel: bool) -> SensorNoise:
+    names = ("gyro_inflation", "gyro_yaw_inflation") * gyro + ("accel_inflation",) * accel
     return dataclasses.replace(row, **{name: HELD_INFLATION * getattr(row, name) for name in names})

@@ -81,7 +81,9 @@ class WheelIncrement:
         """The same, so much less sure of distance and turn that an innovation along body x of `variance_m2`
         has `times` of it; the non-holonomic constraint stays."""
         scale = float(np.sqrt(1.0 + (times - 1.0) * variance_m2 / self.sigma[0] ** 2))
-        return dataclasses.replace(self, sigma=self.sigma * np.array([scale, 1.0, 1.0, scale]))
+        change = self.speed_change_mps if np.isfinite(scale) else 0.0
+        sigma = self.sigma * np.array([scale, 1.0, 1.0, scale])
+        return dataclasses.replace(self, sigma=sigma, speed_change_mps=change)
 
     def loosened(self, variance_m2: float) -> WheelIncrement:
         """The same, less sure of the way along body x and y by `variance_m2` each."""

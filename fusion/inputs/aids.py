@@ -12,17 +12,11 @@ from terrafusion.datasets.frames import GRAVITY_MPS2
 from terrafusion.datasets.sensors import Rig
 from terrafusion.fusion.estimate import Innovation
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.inputs.alignment import (
-    LEVEL_SIGMA_STILL_RAD,
-    WINDOW_NS,
-    GivenStart,
-    Start,
-    level_start,
-)
+from terrafusion.fusion.inputs.alignment import LEVEL_SIGMA_STILL_RAD, WINDOW_NS, GivenStart, Start
 from terrafusion.fusion.inputs.barometer import HeightAid
 from terrafusion.fusion.inputs.gnss import GnssUpdater
 from terrafusion.fusion.inputs.magnetometer import HeadingAid
-from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream
 
 Array = NDArray[np.float64]
 
@@ -43,44 +37,37 @@ class Aids:
         self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report, tilt)
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
-    def update(self, chain: Chain, before: Array, after: Array, gnss: GnssUpdater) -> bool:
+    def update(self, chain: Chain, newest_ns: int, before: Array, after: Array, gnss: GnssUpdater) -> bool:
         """Use what has come up to the newest keyframe; True where factors were added to it.
 
-        `before` and `after` (n, n) are its covariance without and with its fixes.
+        `before` and `after` (n, n) are its covariance without and with its fixes; the IMU has come to
+        `newest_ns`.
         """
         t_ns = chain.nodes[-1].t_ns
         if gnss.local:
             self.heading.forget_north()
         placed = gnss.placed is not None
-        height = self.height.active and self.height.update(chain, t_ns, before, after, placed)
+        height = self.height.active and self.height.update(chain, t_ns, newest_ns, before, after, placed)
         turned = gnss.turned + placed
-        heading = self.heading.active and self.heading.update(chain, t_ns, before, after, turned)
+        heading = self.heading.active and self.heading.update(chain, t_ns, newest_ns, before, after, turned)
         return height or heading
 
-    def start(
-        self, level: Start, imu: ImuStream, wheels: WheelStream, fixes: Sequence[GnssFix]
-    ) -> tuple[Start, GivenStart | None]:
-        """Where a robot at rest stands and where it heads, once a fix and the field have told it.
-
-        Slow wheels may not have covered the first second when `level` was made; the level given back
-        knows that the robot stood.
-        """
+    def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> GivenStart | None:
+        """Where a robot at rest stands and where it heads, once a fix and the field have told it."""
         self.height.forget(imu.t_ns[0])
         self.heading.forget(imu.t_ns[0])
         early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
         if not early or not self.heading.ready:
-            return level, None
-        if level.gyro_bias_radps is None and level.t_ns >= imu.t_ns[0]:
-            level = level_start(imu, wheels, level.t_ns)
+            return None
         tilt = float(np.hypot(level.level_sigma_rad, self._accel_tilt_rad))
         told = self.heading.heading_at_rest(level, tilt)
         if told is None:
-            return level, None
+            return None
         yaw, sigma = told
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, yaw).matrix()
         best = min(early, key=lambda fix: float(fix.sigma_m[0]))
         position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
-        return level, GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
+        return GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
 
     def notes(self) -> tuple[str, ...]:
         """What was made of the samples, in sentences."""

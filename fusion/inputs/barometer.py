@@ -85,11 +85,14 @@ class HeightAid:
         """Whether a sample has ever come."""
         return bool(self._samples) or self.bias is not None or self._mean[1] > 0.0
 
-    def update(self, chain: Chain, t_ns: int, before: Array, after: Array, placed: bool = False) -> bool:
+    def update(
+        self, chain: Chain, t_ns: int, newest_ns: int, before: Array, after: Array, placed: bool = False
+    ) -> bool:
         """Use what has come up to the newest keyframe; True where a factor was added.
 
         `before` and `after` (n, n) are the newest keyframe's covariance, without and with the other
         measurements of this keyframe; `placed` tells that a local path was laid onto the map, heights too.
+        The IMU has come to `newest_ns`.
         """
         if placed and not self._placed:
             self._placed, self._mean, self._due_ns = True, [0.0, 0.0], None
@@ -102,7 +105,7 @@ class HeightAid:
         if self.bias is not None:
             self.bias.told(was, now)
         height = float((key.pose.translation() + key.pose.rotation().matrix() @ lever)[2])
-        self._gather(t_ns, height, key)
+        self._gather(t_ns, newest_ns, height, key)
         if self._due_ns is None:
             self._due_ns = t_ns + EVERY_NS
         if t_ns < self._due_ns or not self._mean[1]:
@@ -110,9 +113,9 @@ class HeightAid:
         self._due_ns = t_ns + EVERY_NS
         return self._measure(chain, t_ns, height, now)
 
-    def _gather(self, t_ns: int, height_m: float, key: KeyState) -> None:
+    def _gather(self, t_ns: int, newest_ns: int, height_m: float, key: KeyState) -> None:
         """Sums of pressure height less own height over the samples up to now."""
-        due, self._samples, impossible = split(self._samples, t_ns)
+        due, self._samples, impossible = split(self._samples, t_ns, newest_ns)
         self.refused += impossible
         for at_ns, pressure in due:
             if t_ns - at_ns > OLDEST_NS:

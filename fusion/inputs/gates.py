@@ -2,16 +2,25 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+
 Array = NDArray[np.float64]
 
 FAULT = 3.0
 """An increment of the wheels that is so many limits off is no measurement at all (a counter that jumps)."""
+JUMP_MPS2 = 5.0
+"""Wheels that change their speed by so much more than the robot (assumed): a jump of 5 cm in a keyframe of
+0.1 s. Motors ramp theirs by 1 to 3."""
+JUMP_LASTS = 2
+"""A jump takes so many keyframes at most, where it falls between them; wheels that keep their new speed for
+longer have it."""
 
 
 class Verdict(Enum):
@@ -78,25 +87,56 @@ class WheelGate:
     beyond the limit not at all; but for at most `patience` keyframes in a row: the IMU alone must not judge
     for longer than it can.
 
+    What does not count at all, because it is so far off or comes so abruptly, is a fault for now, and says
+    nothing of slip either: wheels that change their speed make slip new (`slow_states.step`), and with a
+    new slip the next increments would fit, whatever they say. The first that is believed again tells by how
+    much the wheels have changed their speed since before: not at all where a counter jumped, by all of it
+    where they broke loose.
+
     Attributes:
         limit_sigma: normalised innovation up to which an increment is believed.
         patience: keyframes in a row in which an increment may count less.
+        faulty: the increment just tested is a fault.
+        last_mps: speeds of wheels and robot in the last increment that was none.
     """
 
     limit_sigma: float
     patience: int = 10
     in_a_row: int = 0
+    faulty: bool = False
+    last_mps: tuple[float, float] | None = None
 
-    def test(self, innovation_m: float, sigma_m: float) -> tuple[bool, float]:
-        """Believe it or not, and the normalised innovation squared."""
-        nis = (innovation_m / sigma_m) ** 2
-        if nis <= self.limit_sigma**2 or self.in_a_row >= self.patience:
-            self.in_a_row = 0
-            return True, nis
-        self.in_a_row += 1
-        return False, nis
+    def rejoined(self, wheels: WheelIncrement, dt_s: float) -> WheelIncrement:
+        """An increment over `dt_s`; after faults with its change of speed since before them."""
+        if not self.faulty or self.last_mps is None:
+            return wheels
+        change_mps = wheels.distance_m / dt_s - self.last_mps[0]
+        return dataclasses.replace(wheels, speed_change_mps=change_mps)
+
+    def test(
+        self,
+        innovation_m: float,
+        sigma_m: float,
+        wheels: WheelIncrement,
+        robot_mps: tuple[float, float],
+        dt_s: float,
+    ) -> tuple[bool, float]:
+        """Believe it or not, and the normalised innovation squared.
+
+        `wheels` is the increment, `rejoined`, over `dt_s`, `robot_mps` how fast the robot goes forward by the
+        IMU at its start and end.
+        """
+        since_mps = self.last_mps[1] if self.faulty and self.last_mps is not None else robot_mps[0]
+        left_mps = abs(wheels.speed_change_mps - (robot_mps[1] - since_mps))
+        abrupt = left_mps > JUMP_MPS2 * dt_s and self.in_a_row < JUMP_LASTS
+        off = abs(innovation_m) / sigma_m
+        believed = (off <= self.limit_sigma and not abrupt) or self.in_a_row >= self.patience
+        self.in_a_row = 0 if believed else self.in_a_row + 1
+        self.faulty = not believed and (self.faulty or abrupt or off >= FAULT * self.limit_sigma)
+        if not self.faulty:
+            self.last_mps = wheels.distance_m / dt_s, robot_mps[1]
+        return believed, off**2
 
     def doubt(self, nis: float) -> float:
-        """Factor on the variance of an increment that is not believed, from 1 at the limit to infinity."""
-        off = float(np.sqrt(nis))
-        return off / self.limit_sigma if off < FAULT * self.limit_sigma else np.inf
+        """Factor on the variance of the increment just tested and not believed, from 1 at the limit."""
+        return np.inf if self.faulty else float(np.sqrt(nis)) / self.limit_sigma

@@ -214,11 +214,14 @@ class HeadingAid:
         self._last_ns = still[-1][0]
         return wrapped(yaw), sigma
 
-    def update(self, chain: Chain, t_ns: int, before: Array, after: Array, turned: int = 0) -> bool:
+    def update(
+        self, chain: Chain, t_ns: int, newest_ns: int, before: Array, after: Array, turned: int = 0
+    ) -> bool:
         """Use what has come up to the newest keyframe; True where a factor was added.
 
         `before` and `after` (n, n) are the newest keyframe's covariance, without and with the other
-        measurements of this keyframe; `turned` counts the headings that GNSS has set right.
+        measurements of this keyframe; `turned` counts the headings that GNSS has set right. The IMU has come
+        to `newest_ns`.
         """
         R = chain.state(chain.last).pose.rotation().matrix()
         row = yaw_jacobian(R)
@@ -227,7 +230,7 @@ class HeadingAid:
         if turned != self._turned:
             self._turned = turned
             self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
-        recent = self._recent(t_ns)
+        recent = self._recent(t_ns, newest_ns)
         if not recent or (self._last_ns is not None and t_ns - self._last_ns < EVERY_NS):
             return False
         elapsed = 0.0 if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
@@ -236,8 +239,8 @@ class HeadingAid:
         tilt = math.sqrt(0.5 * float(after[0, 0] + after[1, 1]))
         return self._measure(chain, t_ns, R, np.mean(recent, axis=0), len(recent), now, tilt)
 
-    def _recent(self, t_ns: int) -> list[Array]:
-        due, self._samples, impossible = split(self._samples, t_ns)
+    def _recent(self, t_ns: int, newest_ns: int) -> list[Array]:
+        due, self._samples, impossible = split(self._samples, t_ns, newest_ns)
         self.refused += impossible
         return [field for at_ns, field in due if t_ns - at_ns <= NEAR_NS]
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from terrafusion.fusion.estimate import State
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import DRIFT, quaternion_of
+from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.inputs.track import MotionTrack
 
@@ -26,6 +27,8 @@ PLACE = (2, 3, 4, 5)
 """Tangent of heading and position: what a local frame leaves open."""
 YAW_SIGMA_RAD = 0.25
 """What the window's linearisation bears; further fixes make the heading surer (assumed)."""
+UPRIGHT = 0.99
+"""Vertical part of a direction that is the same in every frame: a level robot's up."""
 OPEN_YAW_RAD, OPEN_M = np.pi, 1e4
 """Prior sigmas of heading and place of the first keyframe in a batch, once fixes tell them."""
 
@@ -83,13 +86,38 @@ def place(
     doubt[5] = float(fix.sigma_m[2]) ** 2 if known else OPEN_M**2
     doubt[DRIFT] = drift_sigma_m**2
     told = Placement(fix.t_ns, track.error_of(fit), antenna, to_m)
+    leave_frame(chain.nodes)
     chain.restart(doubt, chain.first, PLACE)
     chain.turn(told.yaw_rad, told.from_m, told.to_m)
     chain.smooth(len(chain.nodes))
     if chain.archive is not None:
+        leave_frame(chain.archive.nodes)
         chain.archive.turn(told.yaw_rad, told.from_m, told.to_m)
         prior = chain.archive.nodes[0].prior
         prior[PLACE, :] = 0.0
         prior[PLACE, PLACE] = 1.0 / np.array([OPEN_YAW_RAD, *[OPEN_M] * 3])
     track.restart()
     return told
+
+
+def leave_frame(nodes: list[Node]) -> None:
+    """Drop the headings and heights that barometer and magnetometer have told in a frame that is no more.
+
+    They are as sure as the start was, which was arbitrary: turned along they would make the map's as sure.
+    """
+    for node in nodes:
+        factors = [node.unary.at(i) for i in range(node.unary.size())]
+        stays = [factor for factor in factors if not _of_a_frame(factor)]
+        if len(stays) < len(factors):
+            node.unary = gtsam.NonlinearFactorGraph()
+            for factor in stays:
+                node.unary.add(factor)
+            symbols = [gtsam.Symbol(key) for factor in stays for key in list(factor.keys())]
+            node.unary_keys = {chr(symbol.chr()).upper() for symbol in symbols}
+
+
+def _of_a_frame(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether a factor of one pose tells a height, or a direction other than the vertical."""
+    if isinstance(factor, gtsam.AttitudeFactorPose3):
+        return abs(float(factor.nRef().point3()[2])) < UPRIGHT
+    return isinstance(factor, gtsam.GPSFactorArm)

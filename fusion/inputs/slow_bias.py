@@ -33,19 +33,22 @@ LEAST_SHARE = 0.03
 """Below this a / P_s the measurement tells next to nothing new of s: it only teaches the bias."""
 
 AHEAD_NS = 10_000_000_000
-"""A sample stamped so far ahead of the estimate has a clock of its own; one less far waits."""
+"""A sample stamped so far ahead of the newest IMU sample has a clock of its own; one less far waits."""
 
 
 def split(
-    samples: Iterable[tuple[int, T]], t_ns: int
+    samples: Iterable[tuple[int, T]], t_ns: int, newest_ns: int
 ) -> tuple[list[tuple[int, T]], deque[tuple[int, T]], int]:
-    """Samples (time, value) up to `t_ns`, those to wait for, and how many have an impossible time."""
+    """Samples (time, value) up to `t_ns`, those to wait for, and how many have an impossible time.
+
+    `newest_ns` is how far the IMU has come: an estimate that has just started is behind by its wait.
+    """
     due, waiting, count = [], deque[tuple[int, T]](), 0
     for sample in samples:
         count += 1
         if sample[0] <= t_ns:
             due.append(sample)
-        elif sample[0] <= t_ns + AHEAD_NS:
+        elif sample[0] <= max(t_ns, newest_ns) + AHEAD_NS:
             waiting.append(sample)
     return due, waiting, count - len(due) - len(waiting)
 

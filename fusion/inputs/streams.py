@@ -18,13 +18,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ImuSegment:
-    """A piece of time (s) with constant angular rate (3,) and specific force (3,); `held` where samples
-    before stand for a spike. A force that is reasoned, not measured, brings its noise density along x, y."""
+    """A piece of time (s) with constant angular rate (3,) and specific force (3,); either is held where
+    samples before stand for a spike. A force that is reasoned, not measured, brings its density along x, y."""
 
     dt_s: float
     gyro_radps: Array
     accel_mps2: Array
-    held: bool = False
+    gyro_held: bool = False
+    accel_held: bool = False
     accel_density_mps2: tuple[float, float] | None = None
 
 
@@ -110,7 +111,8 @@ class ImuStream:
         self.six_axis = six_axis
         self.spikes = 0
         self._wild_ns: list[int] = []
-        self._held_ns: list[int] = []
+        self._gyro_held_ns: list[int] = []
+        self._accel_held_ns: list[int] = []
         self.late = Lateness("imu")
         self.t_ns: list[int] = []
         self.gyro: list[Array] = []
@@ -134,9 +136,12 @@ class ImuStream:
             if any(wild):
                 if self._alone(i, t_ns):
                     recent = slice(max(i - RECENT, 0), i)
-                    gyro = np.mean(self.gyro[recent], axis=0) if wild[0] else gyro
-                    accel = np.mean(self.accel[recent], axis=0) if wild[1] else accel
-                    self._held_ns.append(t_ns)
+                    if wild[0]:
+                        gyro = np.mean(self.gyro[recent], axis=0)
+                        self._gyro_held_ns.append(t_ns)
+                    if wild[1]:
+                        accel = np.mean(self.accel[recent], axis=0)
+                        self._accel_held_ns.append(t_ns)
                     self.spikes += 1
                 self._wild_ns.append(t_ns)
             self.t_ns.insert(i, t_ns)
@@ -158,9 +163,9 @@ class ImuStream:
         while t < end_ns:
             until = min(self.t_ns[i], end_ns)
             if until > t:
-                held = bool(self._held_ns) and self.t_ns[i] in self._held_ns
+                held = self.t_ns[i] in self._gyro_held_ns, self.t_ns[i] in self._accel_held_ns
                 readings = self._for_graph(self.gyro[i], self.accel[i])
-                pieces.append(ImuSegment((until - t) * 1e-9, *readings, held))
+                pieces.append(ImuSegment((until - t) * 1e-9, *readings, *held))
             t = until
             i += 1
         return pieces
@@ -194,7 +199,7 @@ class ImuStream:
         i = bisect.bisect_left(self.t_ns, before_ns)
         if i > 256:
             del self.t_ns[:i], self.gyro[:i], self.accel[:i]
-            for times in (self._wild_ns, self._held_ns):
+            for times in (self._wild_ns, self._gyro_held_ns, self._accel_held_ns):
                 times[:] = [t for t in times if t >= before_ns]
 
 

@@ -240,7 +240,7 @@ def stand(aid: HeightAid, heights: list[float], placed_from: int | None = None) 
         chain.nodes[-1].t_ns = i * 1_100_000_000
         aid.add(chain.nodes[-1].t_ns, float(pressure_at(height)))
         placed = placed_from is not None and i >= placed_from
-        if aid.update(chain, chain.nodes[-1].t_ns, P, P, placed):
+        if aid.update(chain, chain.nodes[-1].t_ns, chain.nodes[-1].t_ns, P, P, placed):
             chain.solve(1)
             P = chain.covariance()
 
@@ -287,10 +287,11 @@ def test_a_magnetometer_that_does_not_turn_with_the_robot_is_left_out() -> None:
 
 
 def test_a_stamp_of_another_clock_stops_nothing() -> None:
-    due, waiting, impossible = split([(10, "a"), (10**18, "b"), (30, "c"), (20 + AHEAD_NS, "d")], 20)
+    due, waiting, impossible = split([(10, "a"), (10**18, "b"), (30, "c"), (20 + AHEAD_NS, "d")], 20, 20)
     assert [value for _, value in due] == ["a"]
     assert [value for _, value in waiting] == ["c", "d"]
     assert impossible == 1
+    assert split([(30 + AHEAD_NS, "late start")], 20, 30)[2] == 0
 
 
 def test_a_climb_in_warm_air_is_within_the_sigma_told() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 
 import numpy as np
@@ -385,18 +386,50 @@ def test_a_velocity_of_two_axes_and_an_endless_sigma_are_refused() -> None:
         checked_fix(0, np.zeros(3), np.array([np.inf, np.inf, 1.0]), None, np.nan, None)
 
 
-@pytest.mark.parametrize("jump_m", [0.1, 0.2, 0.5, -0.5, 5.0])
-def test_a_counter_of_the_wheels_that_jumps_once_moves_the_pose_by_less_than_2_cm(
-    drive: Recording, jump_m: float
-) -> None:
-    wheels = drive.wheels
+def with_wheels(recording: Recording, more_mps: np.ndarray) -> Recording:
+    """The same drive with all wheels faster by `more_mps`, one for each of their samples."""
+    wheels = recording.wheels
     assert wheels is not None
-    k = int(np.searchsorted(wheels.t_ns, drive.start_ns + 20_000_000_000))
-    period_s = float(wheels.t_ns[k] - wheels.t_ns[k - 1]) * 1e-9
-    speed = wheels.speed.copy()
-    speed[k] += jump_m / load_vehicle("elevate").wheel.radius_m / period_s
-    jumped = dataclasses.replace(drive, wheels=dataclasses.replace(wheels, speed=speed))
-    clean = feed(drive, messages(drive), "adaptive")
-    spoilt = feed(jumped, messages(drive), "adaptive")
-    pairs = zip(clean.states, spoilt.states, strict=True)
+    speed = wheels.speed + more_mps[:, None] / load_vehicle("elevate").wheel.radius_m
+    return dataclasses.replace(recording, wheels=dataclasses.replace(wheels, speed=speed))
+
+
+@functools.cache
+def plainly_driven(mode: str) -> Fed:
+    recording = winding()
+    return feed(recording, messages(recording), mode)
+
+
+@pytest.mark.parametrize("mode", ["adaptive", "fixed", "robust", "innovation"])
+@pytest.mark.parametrize(("jump_m", "at_s"), [(0.1, 20.0), (0.2, 20.02), (-0.5, 20.05), (5.0, 20.0)])
+def test_a_counter_of_the_wheels_that_jumps_once_moves_the_pose_by_less_than_2_cm(
+    drive: Recording, mode: str, jump_m: float, at_s: float
+) -> None:
+    """Wherever in a keyframe or between two it falls."""
+    assert drive.wheels is not None
+    t_ns = drive.wheels.t_ns
+    k = int(np.searchsorted(t_ns, drive.start_ns + round(at_s * 1e9)))
+    more_mps = np.zeros(len(t_ns))
+    more_mps[k] = jump_m / (float(t_ns[k] - t_ns[k - 1]) * 1e-9)
+    spoilt = feed(with_wheels(drive, more_mps), messages(drive), mode)
+    pairs = zip(plainly_driven(mode).states, spoilt.states, strict=True)
     assert max(np.linalg.norm(a.position_m - b.position_m) for a, b in pairs) < 0.02
+
+
+def test_wheels_that_break_loose_for_a_second_hardly_move_the_pose(drive: Recording) -> None:
+    """1 m/s faster within 0.1 s, where no fix tells: half a metre more on their counter."""
+    assert drive.wheels is not None
+    t_s = (drive.wheels.t_ns - drive.start_ns) * 1e-9
+    loose = with_wheels(drive, np.interp(t_s, [20.0, 20.1, 20.5, 20.6], [0.0, 1.0, 1.0, 0.0]))
+    heard = [m for m in messages(drive) if m[2] != "gnss" or m[1] - drive.start_ns < 18e9]
+    plain, spoilt = (feed(recording, heard) for recording in (drive, loose))
+    pairs = zip(plain.states, spoilt.states, strict=True)
+    assert max(np.linalg.norm(a.position_m - b.position_m) for a, b in pairs) < 0.1
+
+
+@pytest.mark.parametrize("terrain", ["loose_sand", "mud"])
+def test_wheels_that_set_off_on_loose_ground_are_no_fault(terrain: str) -> None:
+    recording = winding(terrain=terrain)
+    fed = feed(recording, messages(recording), "adaptive")
+    assert fed.estimator.wheels_rejected == 0
+    assert max(abs(s.slip) for s in fed.states) > 0.05

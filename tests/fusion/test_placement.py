@@ -16,6 +16,7 @@ from terrafusion.fusion.replay import Replay, replay
 from terrafusion.twin.scenario import load_scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.vehicle import load_vehicle
+from tests.fusion.test_aided_drives import aided
 
 WITHOUT_S = 50.0
 
@@ -27,6 +28,20 @@ def drive(heading_deg: float, fix: Fix | None = None, terrain: str = "asphalt", 
     assert recording.gnss is not None
     late = recording.gnss.t_ns > recording.start_ns + round(WITHOUT_S * 1e9)
     return dataclasses.replace(recording, gnss=recording.gnss.select(late))
+
+
+UP_M = 30.0
+
+
+def aided_drive(heading_deg: float, until_s: float) -> Recording:
+    """The same with barometer and magnetometer, 30 m above the local frame; no fixes after `until_s`."""
+    scenario = dataclasses.replace(load_scenario("figure_eight"), heading_deg=heading_deg)
+    recording = simulate(scenario, terrain="asphalt", vehicle=aided("elevate"), seed=100)
+    gnss = recording.gnss
+    assert gnss is not None
+    t_s = (gnss.t_ns - recording.start_ns) * 1e-9
+    lifted = dataclasses.replace(gnss, enu_m=gnss.enu_m + np.array([0.0, 0.0, UP_M]))
+    return dataclasses.replace(recording, gnss=lifted.select((t_s > WITHOUT_S) & (t_s < until_s)))
 
 
 def yaw_errors(result: Replay) -> np.ndarray:
@@ -52,6 +67,37 @@ def test_the_path_lies_where_the_robot_was_whatever_its_heading(heading_deg: flo
     assert any(
         "before GNSS laid the path onto the map are not scored" in note for note in result.scores.notes
     )
+
+
+@pytest.mark.parametrize("heading_deg", [137.0, -100.0])
+@pytest.mark.parametrize("until_s", [65.0, 1e9])
+def test_compass_and_barometer_follow_onto_the_map(heading_deg: float, until_s: float) -> None:
+    """What they told in the local frame is left there: heading and height are the map's from the first
+    moment, and what they tell from then on agrees with it, also once the fixes are gone again."""
+    result = replay(aided_drive(heading_deg, until_s), magnetometer=True)
+    estimate, path = result.estimate, result.estimate.trajectory
+    placed = estimate.status != "no_gnss"
+    assert 0 < placed.sum() < len(placed)
+    truth = result.recording.truth
+    assert truth is not None
+    rows = np.searchsorted(truth.t_ns, path.t_ns).clip(0, len(truth) - 1)
+    off = np.abs(np.degrees(wrap_angle(path.yaw_rad() - truth.yaw_rad()[rows])))[placed]
+    assert off[0] < 3.0
+    assert off.max() < 4.0
+    assert np.abs(path.position_m[placed, 2] - UP_M).max() < 1.5
+    (note,) = [note for note in estimate.notes if note.startswith("magnetometer")]
+    used, refused = (int(word) for word in note.replace(",", "").split() if word.isdigit())
+    assert used > 0.9 * (path.t_ns[-1] - path.t_ns[0]) * 1e-9, "those of the wait for fixes, too"
+    assert refused == 0
+    told = [i for i in estimate.innovations if i.sensor == "magnetometer"]
+    after = [i for i in told if i.t_ns >= path.t_ns[placed][0]]
+    assert max(abs(float(np.degrees(i.value[0]))) for i in after[1:]) < 15.0
+
+
+def test_a_batch_of_them_is_on_the_map_from_its_first_moment() -> None:
+    result = replay(aided_drive(137.0, 1e9), batch=True, magnetometer=True)
+    assert np.degrees(np.nanmax(yaw_errors(result))) < 1.0
+    assert np.abs(result.estimate.trajectory.position_m[:, 2] - UP_M).max() < 1.5
 
 
 def test_with_stand_alone_fixes_it_waits_until_they_tell_the_heading() -> None:

@@ -42,7 +42,8 @@ def test_the_samples_before_stand_for_spikes_and_nothing_else_changes() -> None:
         else:
             assert b.accel_mps2.tolist() == a.accel_mps2.tolist()
         assert b.gyro_radps.tolist() == a.gyro_radps.tolist()
-        assert (a.held, b.held) == (False, i in (60, 61))
+        assert (a.accel_held, b.accel_held) == (False, i in (60, 61))
+        assert not b.gyro_held
 
 
 @pytest.mark.parametrize(("gyro", "beyond"), [(0.99 * SPIN_RADPS, False), (-1.01 * SPIN_RADPS, True)])
@@ -62,15 +63,22 @@ def test_what_most_samples_say_is_believed() -> None:
     assert from_100.accel[-1][0] > SHOCK_MPS2
 
 
-def test_a_held_sample_makes_the_preintegration_less_certain() -> None:
+def test_a_held_sample_makes_what_its_sensor_tells_less_certain_and_nothing_else() -> None:
     spec: ImuSpec = load_vehicle("elevate").rig().sensors.imu
     row, bias = load_policy().fixed, gtsam.imuBias.ConstantBias()
-    sigmas = []
-    for spiked in ({}, {60: SPIKE}):
-        pieces = stream(spiked).segments(55 * STEP_NS, 65 * STEP_NS)
-        P = Preintegrator(spec).integrate(pieces, bias, row).preintMeasCov()
-        sigmas.append(np.sqrt(np.diag(P)[[0, 6]]))
-    assert sigmas[1] == pytest.approx(HELD_INFLATION * sigmas[0], rel=0.1)
+
+    def sigmas(spin_radps: float, force_mps2: np.ndarray) -> np.ndarray:
+        """Of rotation about z and velocity along x, with one sample of ten beyond belief."""
+        imu = stream({}, 60)
+        for i in range(60, 100):
+            extra = float(i == 60)
+            imu.add(i * STEP_NS, [0.0, 0.0, extra * spin_radps], LEVEL + extra * force_mps2)
+        P = Preintegrator(spec).integrate(imu.segments(55 * STEP_NS, 65 * STEP_NS), bias, row).preintMeasCov()
+        return np.sqrt(np.diag(P)[[2, 6]])
+
+    plain = sigmas(0.0, 0.0 * SPIKE)
+    assert sigmas(0.0, SPIKE) == pytest.approx(plain * [1.0, HELD_INFLATION], rel=0.1)
+    assert sigmas(20.0, 0.0 * SPIKE) == pytest.approx(plain * [HELD_INFLATION, 1.0], rel=0.1)
 
 
 @pytest.fixture(scope="module")

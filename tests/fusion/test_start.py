@@ -15,6 +15,7 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.config import EstimatorConfig
 from terrafusion.fusion.estimate import State
 from terrafusion.fusion.estimator import Estimator
+from terrafusion.fusion.front import Inputs
 from terrafusion.fusion.inputs.alignment import turn_between
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
@@ -199,3 +200,47 @@ def test_turn_between_is_exact_for_a_turned_and_scaled_path() -> None:
     z = np.array([0.0, 1.0 + 0.2j, 2.0 - 0.1j, 2.5 + 1.0j])
     turn, information = turn_between(z, 5.0 - 3.0j + 0.8 * np.exp(2.1j) * z, np.array([1.0, 2.0, 1.0, 3.0]))
     assert turn / information == pytest.approx(0.8 * np.exp(2.1j))
+
+
+RATE_RADPS = 0.02
+"""What the gyro below tells at rest."""
+
+
+def samples(rest_s: float, wheel_period_s: float, wheels_first: bool) -> list[tuple[int, str, float]]:
+    """Time, channel and speed of 3 s of wheels and a 100 Hz IMU that set off at 0.5 m/s after `rest_s`."""
+    times = {"wheels": np.arange(0.0, 3.0, wheel_period_s), "imu": np.arange(0.0, 3.0, 0.01)}
+    order = sorted(times, reverse=wheels_first)
+    rows = [(round(t * 1e9), name, 0.5 * (t > rest_s + 1e-6)) for name in order for t in times[name]]
+    return sorted(rows, key=lambda row: row[0])
+
+
+@pytest.mark.parametrize("wheels_first", [True, False])
+@pytest.mark.parametrize(
+    ("wheel_period_s", "rest_s", "stood"),
+    [(0.02, 1.0, True), (0.02, 0.9, False), (0.07, 1.05, True), (0.4, 1.2, True), (0.4, 0.7, False)],
+)
+def test_a_rest_of_just_a_second_is_seen_whichever_channel_comes_first_and_however_slow(
+    wheel_period_s: float, rest_s: float, stood: bool, wheels_first: bool
+) -> None:
+    """The rest ends with the first sample of the wheels that is a second old, or sooner."""
+    states: list[State] = []
+    config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=Inputs(gnss=False))
+    estimator = Estimator(config, on_state=states.append)
+    for t_ns, name, speed in samples(rest_s, wheel_period_s, wheels_first):
+        if name == "wheels":
+            estimator.add_wheels(t_ns, speed, speed)
+        else:
+            estimator.add_imu(t_ns, [0.0, 0.0, RATE_RADPS], [0.0, 0.0, 9.81])
+    seen = states[0].gyro_bias_radps[2] / RATE_RADPS
+    assert seen == pytest.approx(1.0, abs=0.1) if stood else seen < 0.5
+    assert states[0].t_ns < 1_500_000_000
+
+
+def test_wheels_that_fall_silent_do_not_hold_up_the_start() -> None:
+    states: list[State] = []
+    config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=Inputs(gnss=False))
+    estimator = Estimator(config, on_state=states.append)
+    estimator.add_wheels(0, 0.0, 0.0)
+    for i in range(300):
+        estimator.add_imu(i * 10_000_000, np.zeros(3), [0.0, 0.0, 9.81])
+    assert states
