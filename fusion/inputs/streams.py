@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, eq=False)
 class ImuSegment:
     """A piece of time (s) with constant angular rate (3,) and specific force (3,); either is held where
-    samples before stand for a spike. A force that is reasoned, not measured, brings its density along x, y."""
+    samples before stand for a spike. A force that is reasoned, not measured, brings its density on x, y."""
 
     dt_s: float
     gyro_radps: Array
