@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import pytest
 
 LIMIT_S = 10.0
+"""Of processor time: a machine that is busy with other things makes nothing slow."""
+WAITING_S = 60.0
 
 SCENARIO = """\
 description: a short drive with turns both ways
@@ -38,9 +41,10 @@ def good_log(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """A test that asks for this may not take long; it works in a folder of its own."""
     monkeypatch.chdir(tmp_path)
-    begun = time.monotonic()
+    begun, worked_s = time.monotonic(), sum(os.times()[:4])
     yield
-    assert time.monotonic() - begun < LIMIT_S
+    assert sum(os.times()[:4]) - worked_s < LIMIT_S
+    assert time.monotonic() - begun < WAITING_S
 
 
 @pytest.fixture

@@ -171,7 +171,8 @@ def test_clock_faults_are_named_and_mended(drive: Recording, name: str) -> None:
     ("lag", "severity"),
     [
         (Lag(0.8, 0.78, 0.82, 0.95), "error"),
-        (Lag(-0.8, -0.82, -0.78, 0.95), "error"),
+        (Lag(-0.8, -0.82, -0.78, 0.95), "warning"),  # the wheels of a robot on ice are so far ahead
+        (Lag(-2.3, -2.32, -2.28, 0.95), "error"),
         (Lag(0.4, 0.39, 0.41, 0.95), "warning"),
         (Lag(-1.19, -1.97, -0.42, 0.85), "warning"),  # wheels of a robot on ice, beside its truth
     ],
