@@ -38,6 +38,7 @@ from terrafusion.twin.gap.blind.shapes import (
     shapes,
 )
 from terrafusion.twin.gap.choice import LAPSE, Told, Weights
+from terrafusion.twin.gap.goodness import FITS, Goodness
 from terrafusion.twin.soil import load_soil
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -53,8 +54,6 @@ SINGLES, OUTSIDERS, NULLS = 12, 6, 2
 """Trials of a site: effects of the catalogue, half of them shifted, causes outside it, and none at all."""
 NULL = "null"
 """Stands for the shape of a trial without a gap."""
-LEAST_UNFIT = 0.51
-"""`Weights.unfit` is no less: the verdict is then unknown."""
 SHRINK = 0.002
 """Weight of the squares of the weights, against a log likelihood of one a trial (assumed)."""
 
@@ -69,7 +68,7 @@ class Trial:
         told: what each effect's best law leaves (inside, outside, square), by effect; empty where no gap is
         seen.
         before: the gap as it is.
-        misfit: of the likeliest effects.
+        fits: of the likeliest effects: `left`, `above` and `quieter` of `Goodness`.
         answer: the diagnosis, by the weights that the package had.
     """
 
@@ -80,7 +79,7 @@ class Trial:
     effect: str | None
     told: dict[str, tuple[float, float, float]]
     before: tuple[float, float, float]
-    misfit: float
+    fits: tuple[float, float, float]
     answer: dict[str, Any]
 
     def teaches(self) -> bool:
@@ -144,7 +143,7 @@ def diagnosed_trials(number: int, bench: Bench) -> list[Trial]:
     for t, (shape, severity) in enumerate(trials):
         mine = slice(RUNS * t, RUNS * (t + 1))
         found = diagnosed(dataclasses.replace(bench, runs=bench.runs[mine], raws=bench.raws[mine]), VEHICLE)
-        good = found.verdict.goodness
+        good = found.verdict.goodness or FITS
         told = {k: _numbers(v) for k, v in found.choice.told.items()} if found.detected else {}
         key, effect = NULL, None
         if shape is not None:
@@ -152,7 +151,7 @@ def diagnosed_trials(number: int, bench: Bench) -> list[Trial]:
         out.append(
             Trial(
                 key, kind, soil, severity, effect, told, _numbers(found.choice.before),
-                good.misfit if good is not None else 0.0, _brief(found.to_json()),
+                (good.left, good.above, good.quieter), _brief(found.to_json()),
             )
         )  # fmt: skip
         print(f"{key} {severity:g}: {found.verdict.kind} {' '.join(found.verdict.named)}", flush=True)
@@ -172,7 +171,7 @@ def utilities(trial: Trial, weights: Weights) -> dict[str | None, float]:
     """Log odds of all causes of a trial; None is the unknown one."""
     before = Told(*trial.before)
     odds: dict[str | None, float] = {k: weights.cause(Told(*v), before) for k, v in trial.told.items()}
-    odds[None] = weights.outsider(before, trial.misfit)
+    odds[None] = weights.outsider(before, Goodness(*trial.fits))
     return odds
 
 
@@ -187,22 +186,16 @@ def surprise(trials: Iterable[Trial], weights: Weights) -> float:
 
 
 def train(trials: Sequence[Trial]) -> Weights:
-    """Weights of least surprise on trials in which a gap was seen; `unfit` is counted (Laplace's rule)."""
+    """Weights of least surprise on trials in which a gap was seen."""
     from scipy.optimize import minimize
 
     some = [trial for trial in trials if trial.teaches()]
-    unfit = [trial.effect is None for trial in some if trial.misfit > 0.0]
-    share: float = max((sum(unfit) + 1) / (len(unfit) + 2), LEAST_UNFIT)
-
-    def weights(w: Array) -> Weights:
-        slope, left, unknown, misfit = w.tolist()
-        return Weights(slope, left, unknown, misfit, share)
 
     def cost(w: Array) -> float:
-        return surprise(some, weights(w)) + SHRINK * float(w @ w)
+        return surprise(some, Weights(*w.tolist())) + SHRINK * float(w @ w)
 
-    limits = [(0.0, 60.0), (0.0, 1.5), (-20.0, 20.0), (0.0, 10.0)]
-    return weights(minimize(cost, [6.0, 0.8, 0.0, 1.0], method="L-BFGS-B", bounds=limits).x)
+    limits = [(0.0, 60.0), (0.0, 1.5), (-20.0, 20.0), (0.0, 10.0), (0.0, 10.0)]
+    return Weights(*minimize(cost, [6.0, 0.8, 0.0, 1.0, 1.0], method="L-BFGS-B", bounds=limits).x.tolist())
 
 
 def scores(trials: Sequence[Trial]) -> dict[str, Any]:
@@ -242,7 +235,9 @@ def read(paths: Iterable[Path]) -> list[Trial]:
     rows = [row for path in paths for row in json.loads(path.read_text(encoding="utf-8"))]
     return [
         Trial(
-            **{**row, "told": {k: tuple(v) for k, v in row["told"].items()}, "before": tuple(row["before"])}
+            **row
+            | {"told": {k: tuple(v) for k, v in row["told"].items()}}
+            | {key: tuple(row[key]) for key in ("before", "fits")}
         )
         for row in rows
     ]
