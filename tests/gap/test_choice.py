@@ -11,7 +11,16 @@ import pytest
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.gap import choice as choice_module
 from terrafusion.twin.gap.blind import plan
-from terrafusion.twin.gap.blind.development import Trial, read, site, specs, train, utilities, write
+from terrafusion.twin.gap.blind.development import (
+    Trial,
+    crossed,
+    read,
+    site,
+    specs,
+    train,
+    utilities,
+    write,
+)
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channels import RIDGE, Block, Products, Table
 from terrafusion.twin.gap.choice import Told, Weights, probabilities, weights
@@ -22,6 +31,7 @@ from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.residuals import state_sigmas
 from terrafusion.twin.gap.score import learnt_sigma, score
+from terrafusion.twin.gap.verdict import UNKNOWN
 from terrafusion.twin.vehicle import load_vehicle
 
 from .drives import runs
@@ -196,6 +206,14 @@ def test_trained_weights_name_causes_they_were_not_trained_on() -> None:
     for effect in [*"def" * 5, *[None] * 10]:
         odds = utilities(made(rng, effect), trained)
         assert max(odds, key=lambda k: odds[k]) == effect
+
+
+def test_sites_left_out_are_judged_by_the_others() -> None:
+    rng = np.random.default_rng(7)
+    sites = [[made(rng, effect) for effect in ["a", "b", "c", None, None]] for _ in range(4)]
+    known, outside = crossed(sites)
+    assert (len(known), len(outside)) == (12, 8)
+    assert max(known) < UNKNOWN < min(outside)
 
 
 def test_trials_and_weights_survive_a_file(tmp_path: Path) -> None:

@@ -34,8 +34,8 @@ RIDGES = (0.3, 1.0, 3.0)
 """1 sigma of all columns and probes together, in typical sizes."""
 MOST_EFFECTS = 3
 UNKNOWN = 0.3
-"""Probability of an unknown cause, given a gap, above which the verdict is that. Set on development trials: of
-known and of unknown causes about the same share is then told wrongly."""
+"""Probability of an unknown cause, given a gap, above which the verdict is that. Set on development trials:
+of known and of unknown causes about the same share is then told wrongly."""
 CLASSES = 5
 """Causes, the first ones, of which the class is told."""
 

@@ -2,12 +2,14 @@
 
     python -m terrafusion.twin.gap.blind.development make --site 1 --out development
     python -m terrafusion.twin.gap.blind.development train development/*.json --out choice.yaml
+    python -m terrafusion.twin.gap.blind.development cross development/*.json
     python -m terrafusion.twin.gap.blind.development score others/*.json
 
 Truth is read here, so none of this may enter a blind check: everything is drawn from seeds of its own, and
 the sealed trials are never opened. A site is one robot on one ground with one kind of drive: a few references
 and three drives that all of its trials share, so that a trial costs seconds. Shapes take turns over the
-sites. Some effects can be kept out of the training (`--without`), to see what the weights make of the rest.
+sites. Some effects can be kept out of the training (`--without`), to see what the weights make of the rest;
+`cross` judges each site by weights trained on the others.
 """
 
 from __future__ import annotations
@@ -37,7 +39,7 @@ from terrafusion.twin.gap.blind.shapes import (
     Shape,
     shapes,
 )
-from terrafusion.twin.gap.choice import LAPSE, Told, Weights
+from terrafusion.twin.gap.choice import LAPSE, Told, Weights, probabilities
 from terrafusion.twin.gap.goodness import FITS, Goodness
 from terrafusion.twin.soil import load_soil
 from terrafusion.twin.vehicle import load_vehicle
@@ -54,6 +56,8 @@ SINGLES, OUTSIDERS, NULLS = 12, 6, 2
 """Trials of a site: effects of the catalogue, half of them shifted, causes outside it, and none at all."""
 NULL = "null"
 """Stands for the shape of a trial without a gap."""
+CROSSED = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+"""Probabilities of an unknown cause above which `cross` counts trials."""
 SHRINK = 0.002
 """Weight of the squares of the weights, against a log likelihood of one a trial (assumed)."""
 
@@ -198,6 +202,24 @@ def train(trials: Sequence[Trial]) -> Weights:
     return Weights(*minimize(cost, [6.0, 0.8, 0.0, 1.0, 1.0], method="L-BFGS-B", bounds=limits).x.tolist())
 
 
+def unknown_chance(trial: Trial, weights: Weights) -> float:
+    """Probability of an unknown cause, given that there is a gap."""
+    odds = utilities(trial, weights)
+    outsider = odds.pop(None)
+    return probabilities({str(effect): value for effect, value in odds.items()}, outsider)[1]
+
+
+def crossed(sites: Sequence[Sequence[Trial]]) -> tuple[list[float], list[float]]:
+    """`unknown_chance` of trials with effects of the catalogue, and of those with other causes, where a gap
+    is seen, by weights trained on all other sites."""
+    known, outside = list[float](), list[float]()
+    for i, mine in enumerate(sites):
+        weights = train([trial for j, some in enumerate(sites) if j != i for trial in some])
+        for trial in (t for t in mine if t.teaches()):
+            (outside if trial.effect is None else known).append(unknown_chance(trial, weights))
+    return known, outside
+
+
 def scores(trials: Sequence[Trial]) -> dict[str, Any]:
     """Scores of the answers, as a blind check has them."""
     from terrafusion.twin.gap.blind.plan import Trial as Planned
@@ -269,6 +291,8 @@ def main() -> None:
     making.add_argument("--jobs", type=int, default=1)
     scoring = commands.add_parser("score")
     scoring.add_argument("sites", type=Path, nargs="+")
+    crossing = commands.add_parser("cross")
+    crossing.add_argument("sites", type=Path, nargs="+")
     training = commands.add_parser("train")
     training.add_argument("sites", type=Path, nargs="+")
     training.add_argument("--without", nargs="*", default=[], help="true effects that are kept out")
@@ -281,6 +305,12 @@ def main() -> None:
         return
     if given.command == "score":
         print("\n".join(lines(scores(read(given.sites)))))
+        return
+    if given.command == "cross":
+        known, outside = crossed([read([path]) for path in sorted(given.sites)])
+        for most in CROSSED:
+            false, told = (sum(p > most for p in some) for some in (known, outside))
+            print(f"above {most:g}: falsely {false} of {len(known)}, rightly {told} of {len(outside)}")
         return
     trials = [t for t in read(sorted(given.sites)) if t.shape.split("/")[0] not in given.without]
     write(given.out, train(trials), trials, len(given.sites))
