@@ -79,12 +79,12 @@ def goodness(table: Table, errors: Sequence[Products], weight: Array) -> Goodnes
     sigma = np.maximum(usual.std(axis=0, ddof=1), LEAST_SPREAD) * math.sqrt(1.0 / runs + 1.0 / count)
     chance = sigma * float(stdtrit(count - 1, 1.0 - LEVEL / (4 * C)))
 
-    def above(some: Sequence[Products]) -> Array:
+    def beyond(some: Sequence[Products]) -> Array:
         pairs = zip(table.blocks, some, strict=True)
         each = [np.log(energy(block, error, table.sigma, weight)) for block, error in pairs]
         return np.asarray(np.mean(each, axis=0) - usual.mean(axis=0))
 
-    gap, change = above([block.error for block in table.blocks]), above(errors)
+    gap, change = beyond([block.error for block in table.blocks]), beyond(errors)
     whole, rest = (float(some[some > chance].sum()) for some in (gap, change))
     above = float(np.max(change, where=change > chance, initial=0.0))
     quieter = float(np.max(-change, where=change < -chance, initial=0.0))
