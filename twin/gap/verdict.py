@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Table
 from terrafusion.twin.gap.choice import Choice, Told
-from terrafusion.twin.gap.classes import class_of
+from terrafusion.twin.gap.classes import class_of, done
 from terrafusion.twin.gap.goodness import Goodness, goodness
 from terrafusion.twin.gap.ladder import bounds
 from terrafusion.twin.gap.posterior import WIDE, Beliefs, Pool, beliefs
@@ -247,8 +247,7 @@ def judge(
     order = sorted(weight, key=lambda k: -choice.odds[k])
     together = found.effects if found is not None else ()
     causes = [
-        _cause(name, weight[name] * known, pool, choice, refits, candidates, floor, together)
-        for name in order
+        _cause(name, weight[name] * known, pool, choice, refits, search, floor, together) for name in order
     ]
     kind = _kind(found, causes, unknown)
     named = found.effects if found is not None and kind != "unknown" else ()
@@ -285,11 +284,11 @@ def _cause(
     pool: Pool,
     choice: Choice,
     refits: Mapping[str, Refit],
-    candidates: Candidates,
+    search: Search,
     floor: tuple[float, float],
     together: Sequence[str],
 ) -> Cause:
-    columns = choice.laws[name].columns
+    columns, candidates = choice.laws[name].columns, search.candidates
     value, covariance, _ = pool.fit(columns)
     fit, least = refits.get(name), 0.0
     failed = fit is not None and bool(fit.failure)
@@ -298,9 +297,12 @@ def _cause(
     order = sorted(choice.odds, key=lambda k: -choice.odds[k])
     members: tuple[str, ...] = (name,)
     if order.index(name) < CLASSES:
-        alike = class_of(pool, candidates, name, columns, order)
+        whole = fit is not None and not failed
+        law = choice.laws[name]
+        does, signal = done(pool, columns, lambda: search.remaining((law,))[0] if whole else pool)
+        alike = class_of(pool, candidates, name, does, signal, order)
         close = [k for k in order if abs(choice.odds[k] - choice.odds[name]) < SAME_ODDS]
-        close = [k for k in class_of(pool, candidates, name, columns, close, NEARLY) if k in close]
+        close = [k for k in class_of(pool, candidates, name, does, signal, close, NEARLY) if k in close]
         both = set(together) if name in together else set()
         members = (name, *(k for k in order if k not in {name, *both} and (k in alike or k in close)))
     share = None if failed else share_of(pool, candidates.columns(name), floor, least)
