@@ -11,16 +11,27 @@ import pytest
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.gap import choice as choice_module
 from terrafusion.twin.gap.blind import plan
-from terrafusion.twin.gap.blind.development import Trial, read, site, specs, train, utilities, write
+from terrafusion.twin.gap.blind.development import (
+    Trial,
+    crossed,
+    read,
+    site,
+    specs,
+    train,
+    utilities,
+    write,
+)
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channels import RIDGE, Block, Products, Table
 from terrafusion.twin.gap.choice import Told, Weights, probabilities, weights
 from terrafusion.twin.gap.evidence import gather
+from terrafusion.twin.gap.goodness import Goodness
 from terrafusion.twin.gap.ladder import Fitter, bounds, sizes
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.residuals import state_sigmas
 from terrafusion.twin.gap.score import learnt_sigma, score
+from terrafusion.twin.gap.verdict import UNKNOWN
 from terrafusion.twin.vehicle import load_vehicle
 
 from .drives import runs
@@ -109,7 +120,7 @@ def told(left: float) -> Told:
 
 def chances(one: float, other: float, before: float) -> tuple[dict[str, float], float]:
     """Of two causes that leave so much of a gap, and of the unknown one."""
-    by, gap = Weights(6.0, 0.9, 2.0, 1.0, 0.7), told(before)
+    by, gap = Weights(6.0, 0.9, 2.0, 3.0, 4.0), told(before)
     odds = {"one": by.cause(told(one), gap), "other": by.cause(told(other), gap)}
     return probabilities(odds, by.outsider(gap))
 
@@ -127,14 +138,16 @@ def test_odds_follow_what_is_left_and_an_unknown_cause_what_is_unexplained() -> 
 
 
 def test_the_less_the_best_fits_the_likelier_is_an_unknown_cause() -> None:
-    by, gap = Weights(6.0, 0.9, 2.0, 1.0, 0.7), told(8.0)
+    by, gap = Weights(6.0, 0.9, 2.0, 3.0, 4.0), told(8.0)
     odds = {"one": by.cause(told(5.0), gap), "other": by.cause(told(6.0), gap)}
-    shares = [probabilities(odds, by.outsider(gap, misfit))[1] for misfit in (-1.0, 0.0, 1.0)]
-    assert shares == sorted(shares)
-    assert shares[0] < shares[-1]
-    known, unknown = probabilities(odds, by.outsider(gap, -1.0), by.unfit)
-    assert unknown == pytest.approx(0.7)
-    assert sum(known.values()) == pytest.approx(0.3)
+    worse = [(0.0, 1.0, 0.0), (0.5, 1.0, 0.0), (1.0, 1.0, 0.0)]
+    quieter = [(0.5, 1.0, 0.0), (0.5, 1.0, 0.5), (0.5, 1.0, 1.0)]
+    for ways in (worse, quieter):
+        shares = [probabilities(odds, by.outsider(gap, Goodness(*way)))[1] for way in ways]
+        assert shares[0] < shares[1] < shares[2]
+    known, unknown = probabilities(odds, by.outsider(gap, Goodness(1.0, 1.0, 1.0)))
+    assert unknown > 0.5
+    assert sum(known.values()) == pytest.approx(1.0 - unknown)
     assert known["one"] > known["other"]
 
 
@@ -183,8 +196,8 @@ def made(rng: np.random.Generator, effect: str | None) -> Trial:
     if effect is not None:
         left[effect] = before * float(rng.uniform(0.1, 0.5))
     parts = {name: (x, 0.2 * x, 0.3 * x) for name, x in left.items()}
-    gap, misfit = (before, 0.2 * before, 0.3 * before), float(rng.uniform(-1.0, 0.5))
-    return Trial(f"{effect}/same", "gentle", "grass", 1.5, effect, parts, gap, misfit, {})
+    gap, fits = (before, 0.2 * before, 0.3 * before), (float(rng.uniform(0.0, 0.9)), 1.0, 0.0)
+    return Trial(f"{effect}/same", "gentle", "grass", 1.5, effect, parts, gap, fits, {})
 
 
 def test_trained_weights_name_causes_they_were_not_trained_on() -> None:
@@ -193,6 +206,14 @@ def test_trained_weights_name_causes_they_were_not_trained_on() -> None:
     for effect in [*"def" * 5, *[None] * 10]:
         odds = utilities(made(rng, effect), trained)
         assert max(odds, key=lambda k: odds[k]) == effect
+
+
+def test_sites_left_out_are_judged_by_the_others() -> None:
+    rng = np.random.default_rng(7)
+    sites = [[made(rng, effect) for effect in ["a", "b", "c", None, None]] for _ in range(4)]
+    known, outside = crossed(sites)
+    assert (len(known), len(outside)) == (12, 8)
+    assert max(known) < UNKNOWN < min(outside)
 
 
 def test_trials_and_weights_survive_a_file(tmp_path: Path) -> None:
@@ -211,7 +232,8 @@ def test_trials_and_weights_survive_a_file(tmp_path: Path) -> None:
 def test_weights_of_the_package_are_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert weights().slope > 0.0
     assert 0.5 < weights().share < 1.5
-    assert 0.5 < weights().unfit < 1.0  # the verdict is then unknown
+    assert weights().misfit > 0.0
+    assert weights().quieter > 0.0
     (tmp_path / "choice.yaml").write_text("weights: {slope: 1}\n", encoding="utf-8")
     monkeypatch.setattr(choice_module.resources, "files", lambda _: tmp_path)
     weights.cache_clear()

@@ -13,7 +13,7 @@ from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.effects.reece import second_terramechanics
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channel_noise import first_noise
-from terrafusion.twin.gap.classes import likeness
+from terrafusion.twin.gap.classes import done, likeness
 from terrafusion.twin.gap.detect import choices
 from terrafusion.twin.gap.discrepancy import FUNCTIONS, modulated
 from terrafusion.twin.gap.evidence import prepared, starting_model
@@ -162,8 +162,28 @@ def test_what_references_share_is_no_gap() -> None:
 def test_an_effect_is_wholly_like_itself() -> None:
     null = learn(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
     pool = Pool.of(_scores(np.random.default_rng(2), 3, np.zeros(len(CANDIDATES.keys) + 6)), null)
-    assert likeness(pool, [3], np.ones(1), [3, 4]) == pytest.approx(1.0)
-    assert likeness(pool, [3], np.ones(1), [5]) < 0.5
+    does, size = pool.information[:, 3], float(pool.information[3, 3])
+    assert likeness(pool, does, size, [3, 4]) == pytest.approx(1.0)
+    assert likeness(pool, does, size, [5]) < 0.5
+
+
+def test_what_a_silent_law_does_is_what_its_fit_takes_away() -> None:
+    """Its column says nothing; its fit takes away what another column does."""
+    silent, other, third = 3, 4, 5
+    null = learn(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
+    truth = np.zeros(len(CANDIDATES.keys) + 6)
+    truth[other] = 3.0
+    gap, after = (Pool.of(_scores(np.random.default_rng(2), 3, t), null) for t in (truth, 0.0 * truth))
+    information = gap.information.copy()
+    information[silent], information[:, silent] = 0.0, 0.0
+    pool = dataclasses.replace(gap, information=information)
+    does, size = done(pool, [silent], lambda: after)
+    assert size == pytest.approx(gap.square - after.square)
+    assert likeness(pool, does, size, [other]) > 0.8 > 2.0 * likeness(pool, does, size, [third])
+    _, nothing = done(pool, [silent], lambda: pool)
+    assert nothing == pytest.approx(0.0, abs=1e-9)
+    _, by_signature = done(gap, [other], lambda: pool)
+    assert by_signature > 100.0
 
 
 def test_an_effect_of_ones_own_takes_part(monkeypatch: pytest.MonkeyPatch) -> None:

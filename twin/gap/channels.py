@@ -79,12 +79,6 @@ class Block:
         square = error.square - (error.gain[:, at] + gain[:, at]) @ value
         return Products(gain, np.maximum(square, 0.0))
 
-    def done_by(self, columns: Sequence[int], value: Array) -> Products:
-        """What effects of such size do, linearly."""
-        at = [self.states + i for i in columns]
-        gain = self.gram[:, :, at] @ value
-        return Products(gain, gain[:, at] @ value)
-
 
 def _products(run: Evidence, gram: Array, offset: Array, error: Array | None = None) -> Products:
     N, T = gram.shape[1], run.states
@@ -170,14 +164,6 @@ class Table:
         """Of other whitened errors of the runs."""
         return [
             _products(run, block.gram, self.offset, error)
-            for run, block, error in zip(self.runs, self.blocks, errors, strict=True)
-        ]
-
-    def done_by(self, errors: Sequence[Array]) -> list[Products]:
-        """What effects do that leave these whitened errors of the runs."""
-        nothing = np.zeros_like(self.offset)
-        return [
-            _products(run, block.gram, nothing, run.rows[:, -1] - error)
             for run, block, error in zip(self.runs, self.blocks, errors, strict=True)
         ]
 

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Table
-from terrafusion.twin.gap.goodness import Goodness
+from terrafusion.twin.gap.goodness import FITS, Goodness
 from terrafusion.twin.gap.ladder import Fitted, bounds
 from terrafusion.twin.gap.posterior import Pool
 
@@ -61,23 +61,22 @@ LAPSE = 0.05
 class Weights:
     """Of the odds: `slope` by the share that is left, times the root of the gap; `share` that an unknown
     cause is taken to leave, and its log odds, `unknown`, beside one of the catalogue that leaves as much and
-    just fits; `misfit`, by how far it is from there. `unfit` is the probability of an unknown cause where the
-    likeliest effects do not fit: no less is told then."""
+    fits; these rise by `misfit` and `quieter` times those of the likeliest effects (see `Goodness`)."""
 
     slope: float
     share: float
     unknown: float
     misfit: float
-    unfit: float
+    quieter: float
 
     def cause(self, told: Told, before: Told) -> float:
         """Log odds of a cause that leaves this of a gap, up to a constant."""
         return -self.slope * told.total / math.sqrt(max(before.total, LEAST))
 
-    def outsider(self, before: Told, misfit: float = 0.0) -> float:
-        """The same of an unknown cause, beside effects of that `Goodness.misfit`."""
+    def outsider(self, before: Told, good: Goodness = FITS) -> float:
+        """The same of an unknown cause, beside effects that fit so well."""
         by_share = self.slope * self.share * math.sqrt(max(before.total, LEAST))
-        return self.unknown + self.misfit * misfit - by_share
+        return self.unknown + self.misfit * good.misfit + self.quieter * good.quieter - by_share
 
 
 @functools.cache
@@ -109,7 +108,6 @@ class Choice:
         odds: log odds by effect.
         unknown: of a cause outside the catalogue.
         by: weights.
-        fits: whether the likeliest effects leave what references leave.
     """
 
     laws: dict[str, Hypothesis]
@@ -118,7 +116,6 @@ class Choice:
     odds: dict[str, float]
     unknown: float
     by: Weights
-    fits: bool = True
 
     @classmethod
     def of(
@@ -154,23 +151,18 @@ class Choice:
 
     def after(self, good: Goodness) -> Choice:
         """The same once it is known how well the likeliest effects fit."""
-        return dataclasses.replace(self, unknown=self.by.outsider(self.before, good.misfit), fits=good.fits)
+        return dataclasses.replace(self, unknown=self.by.outsider(self.before, good))
 
     def probabilities(self) -> tuple[dict[str, float], float]:
         """Of the effects and of an unknown cause, given that there is a gap."""
-        return probabilities(self.odds, self.unknown, 0.0 if self.fits else self.by.unfit)
+        return probabilities(self.odds, self.unknown)
 
 
-def probabilities(
-    odds: Mapping[str, float], unknown: float, least: float = 0.0
-) -> tuple[dict[str, float], float]:
-    """Of causes with these log odds and of the unknown one, which has no less than `least`."""
+def probabilities(odds: Mapping[str, float], unknown: float) -> tuple[dict[str, float], float]:
+    """Of causes with these log odds and of the unknown one."""
     values = np.array([*odds.values(), unknown])
     shares = np.exp(values - values.max())
     shares = (1.0 - LAPSE) * shares / shares.sum() + LAPSE / len(shares)
-    if shares[-1] < least:
-        shares *= (1.0 - least) / (1.0 - shares[-1])
-        shares[-1] = least
     *known, last = shares.tolist()
     return dict(zip(odds, known, strict=True)), last
 

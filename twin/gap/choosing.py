@@ -9,7 +9,8 @@ from terrafusion.twin.gap.posterior import Beliefs
 from terrafusion.twin.gap.refit import Refit
 
 BY_ODDS, BY_FACTOR = 8, 5
-"""Laws that are fitted: the best by what channels leave to first order, and by Bayes factor."""
+"""Laws that are fitted: the best by what channels leave to first order, and by Bayes factor; beside them
+those of which the first order says nothing."""
 
 
 def chosen(
@@ -25,6 +26,6 @@ def chosen(
     laws = [law for law in told if law.effect != SOIL]
     best = sorted(laws, key=lambda law: told[law].total)[:BY_ODDS]
     best += sorted(laws, key=lambda law: -believed.forms[law.effect, law.form])[:BY_FACTOR]
-    best += [law for law in told if law.effect == SOIL]
+    best += [law for law in told if law.effect == SOIL or fitter.silent(law)]
     fitted, failed = fitter.fits([(law, sizes[law]) for law in dict.fromkeys(best)])
     return Choice.of(fitter.pool, fitter.table, told, fitted, by), fitted, failed

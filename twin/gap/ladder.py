@@ -39,7 +39,14 @@ LATE = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Sizes of a delay that are tried on both sides, in that of its range: what fits beyond half a swing of the
 drive has nothing to do with a signature, and no further run of the twin is needed."""
 CLOSER = (0.2, 0.1, 0.05, 0.025)
-"""Shares of the best delay by which others are tried on both sides of it, one after the other."""
+"""Shares of the best delay by which others are tried on both sides of it, one after the other; and of the
+best size of a silent law."""
+SILENT = 1.0
+"""A law is silent where its signature, at the ends of its range, makes a smaller square in all runs."""
+SPREAD = (0.4, 0.7, 0.85, 1.0)
+"""Sizes of a silent law that are tried, in that of its range: it acts beyond a threshold, if at all."""
+SPEAKS = 0.5
+"""By how much less than the gap a silent law must leave for sizes near its best to be tried (assumed)."""
 
 
 DIVERGED = "the twin diverges at every size tried, its linear value stands"
@@ -88,18 +95,22 @@ class Fitter:
     ) -> tuple[dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
         """Laws with their linear fits (k,), side by side; and those with which the twin diverges at all
         sizes, as failures with their linear value."""
+        silent = [law for law, _ in laws if self.silent(law)]
         ladder = [
             (law, point)
             for law, value in laws
+            if law not in silent
             for point in sizes(value, *bounds(self.bench.candidates, law.columns))
         ]
         delays = [law for law, _ in laws if self._is_delay(law)]
-        for law in delays:
-            low, high = bounds(self.bench.candidates, law.columns)
-            ladder += [(law, share * end) for share in LATE for end in (low, high)]
+        for law, shares in [*((law, LATE) for law in delays), *((law, SPREAD) for law in silent)]:
+            ends = [end for end in bounds(self.bench.candidates, law.columns) if end.any()]
+            ladder += [(law, share * end) for share in shares for end in ends]
         best = self._better({}, ladder)
+        most = self.table.before().total - SPEAKS
+        speak = delays + [law for law in silent if law in best and best[law].left.total < most]
         for share in CLOSER:
-            found = {law: best[law].fit.value for law in delays if law in best}
+            found = {law: best[law].fit.value for law in speak if law in best}
             closer = [(law, (1.0 + way * share) * at) for law, at in found.items() for way in (-1.0, 1.0)]
             best = self._better(best, [(law, self._inside(law, point)) for law, point in closer])
         for _ in range(ROUNDS):
@@ -110,6 +121,14 @@ class Fitter:
                 break
             best = self._better(best, tried)
         return best, {law: self._failed(law, value) for law, value in laws if law not in best}
+
+    def silent(self, law: Hypothesis) -> bool:
+        """Whether the law's signature says nothing, whatever its size."""
+        at = np.asarray(law.columns)
+        most = np.maximum(*np.abs(bounds(self.bench.candidates, law.columns)))
+        blocks = self.table.blocks
+        squares = sum((b.gram.sum(axis=0).diagonal()[b.states + at] for b in blocks), np.zeros(len(at)))
+        return bool(squares @ most**2 < SILENT)
 
     def _is_delay(self, law: Hypothesis) -> bool:
         return all(self.bench.candidates.keys[i] in DELAYS for i in law.columns)

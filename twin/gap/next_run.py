@@ -110,9 +110,10 @@ def separation(bench: Bench, sigma: Array, name: str, one: Cause, other: Cause) 
 def _told(pool: Pool, bench: Bench, true: Cause, other: str) -> float:
     """Sigmas that are left of the true cause once any form of the other is fitted to it."""
     at = np.asarray(true.columns)
-    signal = float(true.value @ pool.information[np.ix_(at, at)] @ true.value)
+    does = pool.information[:, at] @ true.value
+    signal = float(true.value @ does[at])
     forms = [h.columns for h in bench.candidates.hypotheses if h.effect == other]
-    alike = max(likeness(pool, true.columns, true.value, columns) for columns in forms)
+    alike = max(likeness(pool, does, signal, columns) for columns in forms)
     return math.sqrt(max(signal * (1.0 - alike**2), 0.0))
 
 

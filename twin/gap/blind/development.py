@@ -2,12 +2,14 @@
 
     python -m terrafusion.twin.gap.blind.development make --site 1 --out development
     python -m terrafusion.twin.gap.blind.development train development/*.json --out choice.yaml
+    python -m terrafusion.twin.gap.blind.development cross development/*.json
     python -m terrafusion.twin.gap.blind.development score others/*.json
 
 Truth is read here, so none of this may enter a blind check: everything is drawn from seeds of its own, and
 the sealed trials are never opened. A site is one robot on one ground with one kind of drive: a few references
 and three drives that all of its trials share, so that a trial costs seconds. Shapes take turns over the
-sites. Some effects can be kept out of the training (`--without`), to see what the weights make of the rest.
+sites. Some effects can be kept out of the training (`--without`), to see what the weights make of the rest;
+`cross` judges each site by weights trained on the others.
 """
 
 from __future__ import annotations
@@ -37,7 +39,8 @@ from terrafusion.twin.gap.blind.shapes import (
     Shape,
     shapes,
 )
-from terrafusion.twin.gap.choice import LAPSE, Told, Weights
+from terrafusion.twin.gap.choice import LAPSE, Told, Weights, probabilities
+from terrafusion.twin.gap.goodness import FITS, Goodness
 from terrafusion.twin.soil import load_soil
 from terrafusion.twin.vehicle import load_vehicle
 
@@ -53,8 +56,8 @@ SINGLES, OUTSIDERS, NULLS = 12, 6, 2
 """Trials of a site: effects of the catalogue, half of them shifted, causes outside it, and none at all."""
 NULL = "null"
 """Stands for the shape of a trial without a gap."""
-LEAST_UNFIT = 0.51
-"""`Weights.unfit` is no less: the verdict is then unknown."""
+CROSSED = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+"""Probabilities of an unknown cause above which `cross` counts trials."""
 SHRINK = 0.002
 """Weight of the squares of the weights, against a log likelihood of one a trial (assumed)."""
 
@@ -69,7 +72,7 @@ class Trial:
         told: what each effect's best law leaves (inside, outside, square), by effect; empty where no gap is
         seen.
         before: the gap as it is.
-        misfit: of the likeliest effects.
+        fits: of the likeliest effects: `left`, `above` and `quieter` of `Goodness`.
         answer: the diagnosis, by the weights that the package had.
     """
 
@@ -80,7 +83,7 @@ class Trial:
     effect: str | None
     told: dict[str, tuple[float, float, float]]
     before: tuple[float, float, float]
-    misfit: float
+    fits: tuple[float, float, float]
     answer: dict[str, Any]
 
     def teaches(self) -> bool:
@@ -144,7 +147,7 @@ def diagnosed_trials(number: int, bench: Bench) -> list[Trial]:
     for t, (shape, severity) in enumerate(trials):
         mine = slice(RUNS * t, RUNS * (t + 1))
         found = diagnosed(dataclasses.replace(bench, runs=bench.runs[mine], raws=bench.raws[mine]), VEHICLE)
-        good = found.verdict.goodness
+        good = found.verdict.goodness or FITS
         told = {k: _numbers(v) for k, v in found.choice.told.items()} if found.detected else {}
         key, effect = NULL, None
         if shape is not None:
@@ -152,7 +155,7 @@ def diagnosed_trials(number: int, bench: Bench) -> list[Trial]:
         out.append(
             Trial(
                 key, kind, soil, severity, effect, told, _numbers(found.choice.before),
-                good.misfit if good is not None else 0.0, _brief(found.to_json()),
+                (good.left, good.above, good.quieter), _brief(found.to_json()),
             )
         )  # fmt: skip
         print(f"{key} {severity:g}: {found.verdict.kind} {' '.join(found.verdict.named)}", flush=True)
@@ -172,7 +175,7 @@ def utilities(trial: Trial, weights: Weights) -> dict[str | None, float]:
     """Log odds of all causes of a trial; None is the unknown one."""
     before = Told(*trial.before)
     odds: dict[str | None, float] = {k: weights.cause(Told(*v), before) for k, v in trial.told.items()}
-    odds[None] = weights.outsider(before, trial.misfit)
+    odds[None] = weights.outsider(before, Goodness(*trial.fits))
     return odds
 
 
@@ -187,22 +190,34 @@ def surprise(trials: Iterable[Trial], weights: Weights) -> float:
 
 
 def train(trials: Sequence[Trial]) -> Weights:
-    """Weights of least surprise on trials in which a gap was seen; `unfit` is counted (Laplace's rule)."""
+    """Weights of least surprise on trials in which a gap was seen."""
     from scipy.optimize import minimize
 
     some = [trial for trial in trials if trial.teaches()]
-    unfit = [trial.effect is None for trial in some if trial.misfit > 0.0]
-    share: float = max((sum(unfit) + 1) / (len(unfit) + 2), LEAST_UNFIT)
-
-    def weights(w: Array) -> Weights:
-        slope, left, unknown, misfit = w.tolist()
-        return Weights(slope, left, unknown, misfit, share)
 
     def cost(w: Array) -> float:
-        return surprise(some, weights(w)) + SHRINK * float(w @ w)
+        return surprise(some, Weights(*w.tolist())) + SHRINK * float(w @ w)
 
-    limits = [(0.0, 60.0), (0.0, 1.5), (-20.0, 20.0), (0.0, 10.0)]
-    return weights(minimize(cost, [6.0, 0.8, 0.0, 1.0], method="L-BFGS-B", bounds=limits).x)
+    limits = [(0.0, 60.0), (0.0, 1.5), (-20.0, 20.0), (0.0, 10.0), (0.0, 10.0)]
+    return Weights(*minimize(cost, [6.0, 0.8, 0.0, 1.0, 1.0], method="L-BFGS-B", bounds=limits).x.tolist())
+
+
+def unknown_chance(trial: Trial, weights: Weights) -> float:
+    """Probability of an unknown cause, given that there is a gap."""
+    odds = utilities(trial, weights)
+    outsider = odds.pop(None)
+    return probabilities({str(effect): value for effect, value in odds.items()}, outsider)[1]
+
+
+def crossed(sites: Sequence[Sequence[Trial]]) -> tuple[list[float], list[float]]:
+    """`unknown_chance` of trials with effects of the catalogue, and of those with other causes, where a gap
+    is seen, by weights trained on all other sites."""
+    known, outside = list[float](), list[float]()
+    for i, mine in enumerate(sites):
+        weights = train([trial for j, some in enumerate(sites) if j != i for trial in some])
+        for trial in (t for t in mine if t.teaches()):
+            (outside if trial.effect is None else known).append(unknown_chance(trial, weights))
+    return known, outside
 
 
 def scores(trials: Sequence[Trial]) -> dict[str, Any]:
@@ -242,7 +257,9 @@ def read(paths: Iterable[Path]) -> list[Trial]:
     rows = [row for path in paths for row in json.loads(path.read_text(encoding="utf-8"))]
     return [
         Trial(
-            **{**row, "told": {k: tuple(v) for k, v in row["told"].items()}, "before": tuple(row["before"])}
+            **row
+            | {"told": {k: tuple(v) for k, v in row["told"].items()}}
+            | {key: tuple(row[key]) for key in ("before", "fits")}
         )
         for row in rows
     ]
@@ -274,6 +291,8 @@ def main() -> None:
     making.add_argument("--jobs", type=int, default=1)
     scoring = commands.add_parser("score")
     scoring.add_argument("sites", type=Path, nargs="+")
+    crossing = commands.add_parser("cross")
+    crossing.add_argument("sites", type=Path, nargs="+")
     training = commands.add_parser("train")
     training.add_argument("sites", type=Path, nargs="+")
     training.add_argument("--without", nargs="*", default=[], help="true effects that are kept out")
@@ -286,6 +305,12 @@ def main() -> None:
         return
     if given.command == "score":
         print("\n".join(lines(scores(read(given.sites)))))
+        return
+    if given.command == "cross":
+        known, outside = crossed([read([path]) for path in sorted(given.sites)])
+        for most in CROSSED:
+            false, told = (sum(p > most for p in some) for some in (known, outside))
+            print(f"above {most:g}: falsely {false} of {len(known)}, rightly {told} of {len(outside)}")
         return
     trials = [t for t in read(sorted(given.sites)) if t.shape.split("/")[0] not in given.without]
     write(given.out, train(trials), trials, len(given.sites))
