@@ -33,12 +33,16 @@ from terrafusion.fusion.weights.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
-GRIPS_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0])
-"""Grips that are told apart: mu g of ice, and of wet or snowy ground. With more, wheels lead as well."""
+GRIPS_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
+"""Grips that are told apart: mu g from ice to dry ground."""
+SLIPPERY_MPS2 = 2.0
+"""Up to this grip, of ice and of wet or snowy ground, friction leads; with more, wheels lead as well."""
+SLIPPERY = GRIPS_MPS2[GRIPS_MPS2 <= SLIPPERY_MPS2]
 USUAL_MPS2, USUAL_SPREAD = 1.0, 0.7
 """Grip of a robot that slides, before any fix, and standard deviation of its logarithm (assumed)."""
-ROLLS = 0.9
-"""Probability, before any fix, that the robot goes as its wheels roll (assumed)."""
+HOLDS = 0.9
+"""Probability, before any fix, that the wheels hold: half of it that the robot goes as they roll, half that
+it does as friction has it on ground that is not slippery (assumed)."""
 APART_S, FURTHEST_S = 0.9, 1.6
 """Fixes so far apart are compared."""
 WAY_SHARE, WAY_SIGMA_M = 0.1, 0.05
@@ -75,8 +79,9 @@ class Grip:
         self._tell = tell
         self._told_mps2 = math.inf
         self._linked: deque[tuple[int, list[ImuSegment]]] = deque()
-        usual = np.exp(-0.5 * (np.log(GRIPS_MPS2 / USUAL_MPS2) / USUAL_SPREAD) ** 2)
-        self._prior = np.log(np.append((1.0 - ROLLS) * usual / usual.sum(), ROLLS))
+        usual = np.exp(-0.5 * (np.log(SLIPPERY / USUAL_MPS2) / USUAL_SPREAD) ** 2)
+        dry = np.full(len(GRIPS_MPS2) - len(SLIPPERY), 0.5 * HOLDS / (len(GRIPS_MPS2) - len(SLIPPERY)))
+        self._prior = np.log([*(1.0 - HOLDS) * usual / usual.sum(), *dry, 0.5 * HOLDS])
         self._score = np.zeros(len(self._prior))
         self._velocity: Array | None = None
         self._paths: deque[tuple[int, Array]] = deque()
@@ -84,8 +89,8 @@ class Grip:
 
     @property
     def slides(self) -> bool:
-        """Whether fixes have shown friction to tell the robot's way better than its wheels do."""
-        return float(self._weights()[-1]) < 0.5
+        """Whether fixes have shown that friction on slippery ground tells the robot's way best."""
+        return float(self._weights()[: len(SLIPPERY)].sum()) > 0.5
 
     @property
     def mps2(self) -> float:
@@ -100,9 +105,9 @@ class Grip:
 
     def _known(self) -> tuple[float, float]:
         """Mean and standard deviation of the grip, m/s2."""
-        weight = self._weights()[:-1]
-        mean = float(weight @ GRIPS_MPS2 / weight.sum())
-        return mean, math.sqrt(float(weight @ (GRIPS_MPS2 - mean) ** 2 / weight.sum()))
+        weight = self._weights()[: len(SLIPPERY)]
+        mean = float(weight @ SLIPPERY / weight.sum())
+        return mean, math.sqrt(float(weight @ (SLIPPERY - mean) ** 2 / weight.sum()))
 
     def restart(self) -> None:
         """Forget the ways, not the grip: the robot was set elsewhere, or its wheels were silent."""
@@ -207,12 +212,9 @@ class Grip:
     def _note(self, t_ns: int) -> None:
         now, told = self.mps2 if self.slides else math.inf, self._told_mps2
         if now != told and (math.isinf(told) or abs(now - told) > TELL_STEP * told):
-            why = (
-                "friction tells the way between fixes better than rolling wheels"
-                if self.slides
-                else ("rolling wheels tell the way between fixes better than friction")
-            )
-            self._tell(WeightChange(t_ns, "wheels", told, now, "m/s2", f"grip: {why}"))
+            best = "friction of slippery ground" if self.slides else "rolling of the wheels"
+            why = f"grip: {best} tells the way between fixes best"
+            self._tell(WeightChange(t_ns, "wheels", told, now, "m/s2", why))
             self._told_mps2 = now
 
     def _motion(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> tuple[float, float, float]:
