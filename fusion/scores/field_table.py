@@ -401,4 +401,6 @@ def _table(
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    from terrafusion.fusion.scores import field_table
+
+    sys.exit(field_table.main())  # workers know the tasks by the module's own name

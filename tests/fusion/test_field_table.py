@@ -316,3 +316,17 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
 def test_whole_drives_come_before_outages_and_short_outages_before_long_ones() -> None:
     shuffled = ["outage 120 s", "outage 30 s", "whole", "outage 60 s"]
     assert sorted(shuffled, key=in_order) == ["whole", "outage 30 s", "outage 60 s", "outage 120 s"]
+
+
+def test_the_command_shares_logs_among_processes(tmp_path: Path) -> None:
+    """As a user calls it; the logs are refused at once."""
+    logs = [tmp_path / name for name in ("one", "two")]
+    for log in logs:
+        log.mkdir()
+        (log / "wheels.csv").write_text("t_s,left_mps,right_mps\n0.0,0.1,0.1\n0.1,0.1,0.1\n")
+    words = ["--out", "out", "--jobs", "2", "--modes", "fixed", "--logs", *map(str, logs)]
+    command = [sys.executable, "-m", "terrafusion.fusion.scores.field_table", *words]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 0, done.stderr + done.stdout
+    refused = (tmp_path / "out" / "refused.csv").read_text()
+    assert all(str(log) in refused for log in logs)
