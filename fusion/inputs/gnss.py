@@ -136,9 +136,9 @@ class GnssUpdater:
                 used |= self._place(chain, fix)
             else:
                 self.track.add(fix)
-                if self.slide.grip is not None:
-                    self.slide.grip.seen(fix)
                 self._hear(self.track.scatter())
+                if self.slide.grip is not None:
+                    self.slide.grip.seen(fix, self.scale)
                 renewed = self._change_class(chain, k, fix)
                 if renewed or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))

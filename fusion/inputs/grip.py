@@ -115,12 +115,17 @@ class Grip:
         self._paths.clear()
         self._fixes.clear()
 
-    def seen(self, fix: GnssFix) -> None:
-        """Judge the ways by a fix that the ways have passed."""
+    def seen(self, fix: GnssFix, scale: float = 1.0) -> None:
+        """Judge the ways by a fix that they have passed; one that comes after a newer one judges nothing.
+
+        Args:
+            fix: as the receiver gives it.
+            scale: how many times more than it claims the receiver is seen to scatter.
+        """
         here = self._at(fix.t_ns)
-        if here is None:
+        if here is None or (self._fixes and fix.t_ns <= self._fixes[-1][0]):
             return
-        sigma_m = np.asarray(fix.sigma_m[:2])
+        sigma_m = scale * np.asarray(fix.sigma_m[:2])
         for t_ns, enu_m, there in reversed(self._fixes):
             apart_s = (fix.t_ns - t_ns) * 1e-9
             if apart_s < APART_S:

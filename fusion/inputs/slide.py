@@ -56,10 +56,7 @@ class Slide:
         self.grip = grip
         self.rate_m2ps = 0.0
         self.refutations = 0
-        self._before: tuple[float, list[tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]]] = (
-            0.0,
-            [],
-        )
+        self._before: tuple[float, list[_Passed]] = (0.0, [])
         self._driven_s = 0.0
         self._before_m = np.zeros(2)
         self._last_ns: int | None = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from pathlib import Path
 
 import gtsam
@@ -297,3 +298,20 @@ def test_a_refuted_slide_loosens_its_links_and_has_them_back(ice: Recording) -> 
     assert (np.diag(chain.covariance())[3:8] > 1.2 * np.diag(sure)[3:8]).any()
     slide.put_back(chain)
     assert all(node.link is link for node, link in zip(nodes, links, strict=True))
+
+
+def test_a_receiver_known_to_scatter_more_than_it_claims_says_less() -> None:
+    honest, liar = Straight(), Straight()
+    liar.grip.seen = functools.partial(liar.grip.seen, scale=20.0)  # type: ignore[method-assign]
+    for robot in (honest, liar):
+        robot.drive(2.6, 0.1, 1.0)
+    assert honest.grip.slides
+    assert not liar.grip.slides
+
+
+def test_a_fix_that_comes_after_a_newer_one_judges_nothing() -> None:
+    robot = Straight()
+    robot.drive(2.0, 0.1, 1.0)
+    before = robot.grip.mps2
+    robot.grip.seen(GnssFix(19 * 10**8, np.array([40.0, 9.0, 0.0]), np.full(3, 0.05)))
+    assert robot.grip.mps2 == before
