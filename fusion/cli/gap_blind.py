@@ -18,6 +18,9 @@ def gap_blind(
         Path, typer.Option("--out", help="Folder for blind.json, report.html and the sealed labels.")
     ],
     quick: Annotated[bool, typer.Option("--quick", help="A small subset: every family, few trials.")] = False,
+    share: Annotated[
+        float, typer.Option(min=0.01, max=1.0, help="Of the trials of every family in the full check.")
+    ] = 1.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that diagnose.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the trials; the same seed makes the same ones.")] = 0,
 ) -> None:
@@ -26,18 +29,32 @@ def gap_blind(
     The trials come from a plant with laws and integrator of its own. Stopped, the same command continues.
     Writes commitment.json first, answers.jsonl, then blind.json, sheet.png and report.html.
 
-    Example: terrafusion gap-blind --quick --out blind
+    Examples:
+
+      terrafusion gap-blind --quick --out blind
+
+      terrafusion gap-blind --share 0.2 --jobs 2 --out blind
     """
     from terrafusion.datasets.atomic import check_folder
     from terrafusion.fusion.blind.page import summary, write_blind
     from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.check import run_blind_check
+    from terrafusion.twin.gap.blind.plan import FULL
 
+    if quick and share < 1.0:
+        raise typer.BadParameter("a quick check has its own size", param_hint="--share")
     check_folder(out)
     judged = partial(diagnose, jobs=1) if jobs > 1 else diagnose  # processes, or threads inside
     with progress_bar("diagnosing") as progress:
         scores = run_blind_check(
-            out, judged, quick=quick, seed=seed, jobs=jobs, progress=progress, oracle=judged
+            out,
+            judged,
+            quick=quick,
+            scale=None if share == 1.0 else FULL.part(share),
+            seed=seed,
+            jobs=jobs,
+            progress=progress,
+            oracle=judged,
         )
     write_blind(out, scores, {"command": shlex.join(["terrafusion", *sys.argv[1:]])})
     for line in summary(scores):

@@ -90,6 +90,18 @@ def test_a_plan_depends_on_its_seed_alone_and_its_order_tells_nothing() -> None:
     assert from_text(to_text(plan(3, QUICK))) == plan(3, QUICK)
 
 
+@pytest.mark.parametrize("share", [0.01, 0.2, 1.0])
+def test_a_share_has_every_family_drive_and_severity(share: float) -> None:
+    trials, full = plan(3, FULL.part(share)), plan(3, FULL)
+    cells = {(t.family, t.drive, t.severity) for t in trials}
+    assert cells <= {(t.family, t.drive, t.severity) for t in full}
+    assert {c for c in cells if c[0] != "null"} == {
+        (t.family, t.drive, t.severity) for t in full if t.family != "null"
+    }
+    assert share * len(full) <= len(trials) <= share * len(full) + len(cells)
+    assert {(t.runs, t.references) for t in trials} == {(FULL.runs, FULL.references)}
+
+
 def test_only_the_runs_have_the_effect() -> None:
     """References are of the same robot and soil without it; every run has its own ground, noise and drive."""
     trial = next(t for t in plan(0, QUICK) if t.family == "pair")

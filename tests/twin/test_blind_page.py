@@ -61,3 +61,16 @@ def test_the_command_writes_and_continues(
     assert scores["schema"] == "terrafusion.gap-blind/1"
     assert (scores["trials"], scores["crashes"]) == (1, [])
     terrafusion("gap-blind", "--quick", "--seed", 9, "--out", out).refused("another seed")
+
+
+def test_a_share_is_of_the_full_check(
+    terrafusion: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("terrafusion.twin.gap.diagnose", fake.guess)
+    monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", fake.short_cases)
+    done = terrafusion("gap-blind", "--share", 0.01, "--out", tmp_path)
+    assert done.status == 0, done.err
+    assert json.loads((tmp_path / "blind.json").read_text())["trials"] == len(plan(0, FULL.part(0.01)))
+    assert terrafusion("gap-blind", "--share", 0.5, "--quick", "--out", tmp_path / "b").status == 2
+    assert terrafusion("gap-blind", "--share", 0, "--out", tmp_path / "b").status == 2
+    assert not (tmp_path / "b").exists()

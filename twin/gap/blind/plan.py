@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -44,7 +45,13 @@ class Scale:
     references: int
     severities: tuple[float, ...] = SEVERITIES
 
+    def part(self, share: float) -> Scale:
+        """The same data a trial, but only `share` (0 to 1] of the trials of every family, rounded up."""
+        counts = {name: math.ceil(share * getattr(self, name)) for name in COUNTS}
+        return dataclasses.replace(self, **counts)
 
+
+COUNTS = ("nulls", "effects", "outside", "pairs")
 FULL = Scale(nulls=200, effects=37, outside=24, pairs=40, runs=3, references=20)
 QUICK = Scale(nulls=4, effects=2, outside=1, pairs=1, runs=3, references=12, severities=(4.0,))
 
