@@ -67,8 +67,13 @@ STEPS: dict[str, dict[str, float]] = {
     "variational": {"wheel_memory": 3.0, "gnss_memory": 3.0, "wheel_span": 3.0},
 }
 """Numbers tuned of each method, in this order, and the factor of a step."""
-LIMITS = {("adaptive", "wheel_factor"): (0.01, 1.5), ("adaptive", "slip_factor"): (1.0, 100.0)}
-"""Beyond these positions still get better and slip worse: it is an answer of its own (docs/modes.md)."""
+LIMITS = {
+    ("adaptive", "wheel_factor"): (0.01, 1.5),
+    ("adaptive", "slip_factor"): (1.0, 100.0),
+    ("adaptive", "gnss_factor"): (0.01, 1.0),
+}
+"""Beyond these positions still get better, and slip (beyond the last: covariances) worse: answers of their own
+(docs/modes.md)."""
 MODE_OF: dict[str, tuple[str, dict[str, str]]] = {
     "fixed": ("fixed", {}),
     "adaptive": ("adaptive", {}),
