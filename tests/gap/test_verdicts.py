@@ -94,6 +94,16 @@ def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references
     assert answer["next_run"]["scenario"] == BY_HAND  # lost counts are a scale whatever is driven
 
 
+def test_a_small_effect_is_named_beside_a_large_one(references: list[Recording]) -> None:
+    """Of the whole gap it explains almost nothing, of what the large one leaves nearly all."""
+    both = {"wheel_radius/scale": 0.1, "imu_yaw_misalignment/rotation": 0.15}
+    answer = checked(diagnose(runs(740, 2, both), references, VEHICLE))
+    assert answer["named"] == ["wheel_radius", "imu_yaw_misalignment"]
+    values = {k: v for c in answer["causes"][:2] for k, v in c["parameters"].items()}
+    for key, value in both.items():
+        assert values[key]["value"] == pytest.approx(value, rel=0.2)
+
+
 def test_parameters_ground_of_stiffer_bearing(references: list[Recording]) -> None:
     """The ground varies among the references too: it takes more of them to call a change of it a gap."""
     softer = runs(400, 2, {"soil_strength/bearing": 0.9})

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -170,11 +169,13 @@ def diagnosed(
     floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
     table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys), bench.jobs)
     detected = found.p_value <= significance
-    choice, fits, failed = chosen(Fitter(bench, scores, sigma, null, pool, table), case.believed, detected)
+    fitter = Fitter(bench, scores, sigma, null, pool, table)
+    choice, fits, failed = chosen(fitter, case.believed, detected)
     refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}
     refits |= {name: failed[law] for name, law in choice.laws.items() if law in failed}
     held_out = HeldOut.of([Pool.of([s], null).plain() for s in scores])
-    search = Search(functools.partial(_remaining, case, fits), held_out, candidates, table)
+    remaining = _Remaining(case, fitter, {(law,): fitted for law, fitted in fits.items()})
+    search = Search(remaining, held_out, candidates, table)
     verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)
     if progress is not None:
         progress(0.9)
@@ -251,21 +252,37 @@ def _with_other_forms(bench: Bench, sigma: Array, run: Evidence) -> Score:
     return dataclasses.replace(score(run, sigma), other=modulated(run, bench.model, sigma, columns))
 
 
-def _remaining(
-    case: _Case, fits: Mapping[Hypothesis, Fitted], forms: Sequence[Hypothesis]
-) -> tuple[Pool, Refit | None]:
-    """What is left of the gap with some effects in the twin, and their fit; the gap itself where that
-    fails."""
-    fit = fits[forms[0]].fit if len(forms) == 1 and forms[0] in fits else None
-    if fit is None:
-        fit = case.refitted([tuple(i for h in forms for i in h.columns)])[0]
-    if not fit.errors:
-        return case.pool, fit
-    left = [
-        dataclasses.replace(scored(run, case.sigma, error, own.A), other=own.other)
-        for run, error, own in zip(case.bench.runs, fit.errors, case.scores, strict=True)
-    ]
-    return Pool.of(left, case.null), fit
+@dataclass(frozen=True, eq=False)
+class _Remaining:
+    """What is left of the gap with some effects in the twin, and their fit; the gap itself where that fails.
+    `known` are those fitted so far."""
+
+    case: _Case
+    fitter: Fitter
+    known: dict[tuple[Hypothesis, ...], Fitted]
+
+    def __call__(self, forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
+        case, fit = self.case, self._fit(tuple(forms))
+        if not fit.errors:
+            return case.pool, fit
+        left = [
+            dataclasses.replace(scored(run, case.sigma, error, own.A), other=own.other)
+            for run, error, own in zip(case.bench.runs, fit.errors, case.scores, strict=True)
+        ]
+        return Pool.of(left, case.null), fit
+
+    def _fit(self, forms: tuple[Hypothesis, ...]) -> Refit:
+        """The last one beside those before it, where these are known."""
+        before = self.known.get(forms[:-1])
+        if forms not in self.known and before is not None and before.fit.errors:
+            effects, names = (" and ".join(h.effect for h in forms), " and ".join(h.form for h in forms))
+            columns = (*before.fit.columns, *forms[-1].columns)
+            fitted = self.fitter.beside(before, Hypothesis(effects, names, columns))
+            if fitted is not None:
+                self.known[forms] = fitted
+        if forms in self.known:
+            return self.known[forms].fit
+        return self.case.refitted([tuple(i for h in forms for i in h.columns)])[0]
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:

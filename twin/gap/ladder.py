@@ -113,6 +113,24 @@ class Fitter:
             found = {law: best[law].fit.value for law in speak if law in best}
             closer = [(law, (1.0 + way * share) * at) for law, at in found.items() for way in (-1.0, 1.0)]
             best = self._better(best, [(law, self._inside(law, point)) for law, point in closer])
+        best = self._improved(best)
+        return best, {law: self._failed(law, value) for law, value in laws if law not in best}
+
+    def beside(self, found: Fitted, law: Hypothesis) -> Fitted | None:
+        """A law of several effects, whose first columns are those of `found`: from there, the further ones at
+        a ladder of sizes along their signatures in what is left; None where the twin diverges at all."""
+        known = len(found.fit.columns)
+        low, high = bounds(self.bench.candidates, law.columns)
+        rest = self.table.products(found.fit.errors)
+        more, _ = self.table.linear(law.columns[known:], low[known:], high[known:], rest)
+        at = np.append(found.fit.value, np.zeros(len(more)))
+        step, _ = self.table.linear(law.columns, low - at, high - at, rest)
+        points = [at + step, *(np.append(found.fit.value, share * more) for share in LADDER)]
+        best = self._better({}, [(law, self._inside(law, point)) for point in points])
+        return self._improved(best).get(law)
+
+    def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
+        """The best laws, along their signatures from where they are."""
         for _ in range(ROUNDS):
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
             steps = [(law, self._next(law, best[law])) for law in first]
@@ -120,7 +138,7 @@ class Fitter:
             if not tried:
                 break
             best = self._better(best, tried)
-        return best, {law: self._failed(law, value) for law, value in laws if law not in best}
+        return best
 
     def silent(self, law: Hypothesis) -> bool:
         """Whether the law's signature says nothing, whatever its size."""

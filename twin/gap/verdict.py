@@ -20,13 +20,14 @@ from terrafusion.twin.gap.refit import Refit
 
 Array = NDArray[np.float64]
 
-SECOND_FACTOR, SECOND_SHARE = 20.0, 0.08
+SECOND_FACTOR, SECOND_TRIED = 20.0, 3
 """Log Bayes factor that a further effect must have beside those found, and all together over one effect with
-a law of another form; and the share of the gap on runs left out that it must explain more (tuned on twin
-trials)."""
-SECOND_LEFT, SECOND_ODDS = 0.15, 2.0
-"""Share of what the effects found leave in the channels that a further one must take away, and the log odds
-that each further effect costs (assumed)."""
+a law of another form (tuned on twin trials); and how many such, the greatest, are fitted with them."""
+SECOND_SHARE, SECOND_LEFT = 0.15, 1.0
+"""What a further effect must take away of that which the effects found leave in the channels: as a share,
+and in units of it (set on development trials, docs/gap-blind.md)."""
+SECOND_ODDS = 2.0
+"""Log odds that each further effect costs (assumed)."""
 SAME_ODDS, NEARLY = math.log(3.0), 0.9
 """Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
 other, either (assumed)."""
@@ -155,6 +156,15 @@ class Found:
         """Their names."""
         return tuple(h.effect for h in self.forms)
 
+    def one(self, effect: str) -> tuple[tuple[int, ...], Array, Array] | None:
+        """Columns (k,), values (k,) and covariance (k, k) of one as all are fitted together; None where that
+        failed."""
+        if self.fit is None or self.fit.failure:
+            return None
+        columns = next(h.columns for h in self.forms if h.effect == effect)
+        at = [self.fit.columns.index(i) for i in columns]
+        return columns, self.fit.value[at], self.fit.covariance[np.ix_(at, at)]
+
 
 Remaining = Callable[[Sequence[Hypothesis]], tuple[Pool, Refit | None]]
 """What is left of the gap once some effects, refitted together, are in the twin; and their fit."""
@@ -198,18 +208,26 @@ class Search:
     def _extended(self, found: Found, alone: float) -> Found:
         """Further effects beside those found, as long as they are called for; `alone` is the log Bayes factor
         of one effect with a law of another form."""
-        while len(found.forms) < MOST_EFFECTS and found.beside.effects:
-            name = max(found.beside.effects, key=lambda k: found.beside.effects[k])
-            gain = found.beside.effects[name]
-            if gain < SECOND_FACTOR or found.factor + gain < alone + SECOND_FACTOR:
+        while len(found.forms) < MOST_EFFECTS:
+            further = self._further(found, alone)
+            if further is None:
                 break
-            more = self._with((*found.forms, found.beside.best[name]), found.factor + gain)
-            if more.explained < found.explained + SECOND_SHARE * max(self.held_out.total, found.explained):
-                break
-            if more.left.total > (1.0 - SECOND_LEFT) * found.left.total:
-                break
-            found = more
+            found = further
         return found
+
+    def _further(self, found: Found, alone: float) -> Found | None:
+        """With the one more effect that leaves least; None where none is called for.
+
+        What one explains of the whole gap says little: a small effect is seen beside a large one by what it
+        takes away of the rest. By the channels the best is not always the one with the greatest factor.
+        """
+        gains = found.beside.effects
+        least = max(SECOND_FACTOR, alone + SECOND_FACTOR - found.factor)
+        names = sorted((k for k in gains if gains[k] >= least), key=lambda k: -gains[k])[:SECOND_TRIED]
+        tried = [self._with((*found.forms, found.beside.best[k]), found.factor + gains[k]) for k in names]
+        most = min((1.0 - SECOND_SHARE) * found.left.total, found.left.total - SECOND_LEFT)
+        called = [t for t in tried if t.left.total <= most and t.explained > found.explained]
+        return min(called, key=lambda t: t.left.total, default=None)
 
 
 def _explained(fit: Refit | None) -> float:
@@ -245,10 +263,7 @@ def judge(
     p_unknown = (1.0 - p_null) * unknown if detected else 0.0
     known = (1.0 - p_null - p_unknown) / sum(weight.values())
     order = sorted(weight, key=lambda k: -choice.odds[k])
-    together = found.effects if found is not None else ()
-    causes = [
-        _cause(name, weight[name] * known, pool, choice, refits, search, floor, together) for name in order
-    ]
+    causes = [_cause(k, weight[k] * known, pool, choice, refits, search, floor, found) for k in order]
     kind = _kind(found, causes, unknown)
     named = found.effects if found is not None and kind != "unknown" else ()
     fit = found.fit if found is not None and named else None
@@ -286,11 +301,12 @@ def _cause(
     refits: Mapping[str, Refit],
     search: Search,
     floor: tuple[float, float],
-    together: Sequence[str],
+    found: Found | None,
 ) -> Cause:
     columns, candidates = choice.laws[name].columns, search.candidates
     value, covariance, _ = pool.fit(columns)
     fit, least = refits.get(name), 0.0
+    together = found.effects if found is not None and name in found.effects else ()
     failed = fit is not None and bool(fit.failure)
     if fit is not None and not failed:
         columns, value, covariance, least = fit.columns, fit.value, fit.covariance, fit.explained
@@ -303,8 +319,11 @@ def _cause(
         alike = class_of(pool, candidates, name, does, signal, order)
         close = [k for k in order if abs(choice.odds[k] - choice.odds[name]) < SAME_ODDS]
         close = [k for k in class_of(pool, candidates, name, does, signal, close, NEARLY) if k in close]
-        both = set(together) if name in together else set()
-        members = (name, *(k for k in order if k not in {name, *both} and (k in alike or k in close)))
+        members = (name, *(k for k in order if k not in {name, *together} and (k in alike or k in close)))
     share = None if failed else share_of(pool, candidates.columns(name), floor, least)
-    sigma = np.full(len(columns), np.nan) if failed else np.sqrt(np.diag(covariance))
+    joint = found.one(name) if found is not None and len(together) > 1 else None
+    if joint is not None:
+        columns, value, covariance = joint
+    told = joint is not None or not failed
+    sigma = np.sqrt(np.diag(covariance)) if told else np.full(len(columns), np.nan)
     return Cause(name, members, max(probability, 0.0), columns, value, sigma, share)
