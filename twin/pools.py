@@ -13,6 +13,7 @@ import logging
 import platform
 import socket
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Executor, Future, wait
 from dataclasses import dataclass
@@ -128,6 +129,8 @@ def _loky(jobs: int) -> Iterator[Executor]:
     # The arrays are small: threads of the linear algebra would only fight over the processors.
     threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     executor = get_reusable_executor(max_workers=jobs, reuse=False, env=threads)
+    # A worker whose memory has grown is replaced by a fresh one, with a warning; no job is lost by it.
+    warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
     try:
         yield executor
     finally:
