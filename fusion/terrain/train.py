@@ -7,7 +7,6 @@ the weight of `unknown`, one for the scores. No set sees another's drives.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -39,6 +38,8 @@ UNKNOWN_SPREAD = 3.0
 UNKNOWN_SHARE = 0.03
 ODD_SHARE = 0.002
 """Share of the moments on known ground whose last windows may pass for odd."""
+NEVER_ODD = 1e6
+"""Limit where the drives are too short to tell."""
 TEMPERATURES = np.round(np.geomspace(2.0, 20.0, 11), 3)
 """From 2 up: windows overlap by half, so each moment is seen twice."""
 PATCHES = 60
@@ -90,7 +91,7 @@ def train(plan: Plan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainM
         unknown=_broad(mixtures),
         temperature=1.0,
         patch_length_m=PATCH_LENGTH_M,
-        odd_limit=math.inf,
+        odd_limit=NEVER_ODD,
         vehicles=(plan.training().vehicle,),
         inputs_sha256=fingerprint_of(plan),
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
@@ -140,7 +141,8 @@ def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
         if _log_loss(model, evidence, temperature, log_weight)[1] <= UNKNOWN_SHARE:
             break
     weighted = dataclasses.replace(model.unknown, log_weight=np.array([log_weight]))
-    limit = round(float(np.quantile(_running_oddness(model, route), 1.0 - ODD_SHARE)), 3)
+    odd = _running_oddness(model, route)
+    limit = round(float(np.quantile(odd, 1.0 - ODD_SHARE)), 3) if odd.size else NEVER_ODD
     return dataclasses.replace(model, unknown=weighted, temperature=temperature, odd_limit=limit)
 
 
@@ -150,6 +152,8 @@ def _running_oddness(model: TerrainModel, route: Route) -> Array:
     moving = [w for w in route.windows if w.ground_speed_mps() > MIN_SPEED_MPS]
     odd = np.array([table.oddness(*extract(w)) for w in moving])
     odd = odd[np.isfinite(odd)]
+    if len(odd) < ODD_WINDOWS:
+        return np.empty(0)
     return np.asarray(np.convolve(odd, np.full(ODD_WINDOWS, 1.0 / ODD_WINDOWS), "valid"))
 
 

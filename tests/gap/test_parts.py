@@ -273,5 +273,5 @@ def test_held_out_share_is_of_what_runs_have_in_common() -> None:
     shared, single = _scores(rng, 3, shift), [*_scores(rng, 1, shift), *still]
     pools = [[Pool.of([r], null) for r in runs] for runs in (shared, single)]
     np.testing.assert_allclose(Pool.sum(pools[0]).information, Pool.of(shared, null).information)
-    assert HeldOut.of(pools[0]).explained([3]) > 0.8 * Pool.of(shared, null).fit([3])[2]
-    assert HeldOut.of(pools[1]).explained([3]) < 0.0
+    assert HeldOut(tuple(pools[0])).explained([3]) > 0.8 * Pool.of(shared, null).fit([3])[2]
+    assert HeldOut(tuple(pools[1])).explained([3]) < 0.0

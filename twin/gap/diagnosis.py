@@ -173,7 +173,7 @@ def diagnosed(
     choice, fits, failed = chosen(fitter, case.believed, detected)
     refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}
     refits |= {name: failed[law] for name, law in choice.laws.items() if law in failed}
-    held_out = HeldOut.of([Pool.of([s], null).plain() for s in scores])
+    held_out = HeldOut(tuple(Pool.of([s], null).plain() for s in scores))
     remaining = _Remaining(case, fitter, {(law,): fitted for law, fitted in fits.items()})
     search = Search(remaining, held_out, candidates, table)
     verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)

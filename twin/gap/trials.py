@@ -201,7 +201,7 @@ class Trials:
         def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
             return pool, None
 
-        each = HeldOut.of([Pool.of([dataclasses.replace(s, other=None)], self.null) for s in scores])
+        each = HeldOut(tuple(Pool.of([dataclasses.replace(s, other=None)], self.null) for s in scores))
         search = Search(remaining, each, candidates, table)
         return judge(True, 0.01, pool, beliefs(pool, candidates), choice, {}, search, self.floor)
 

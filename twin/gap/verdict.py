@@ -31,8 +31,6 @@ SECOND_ODDS = 2.0
 SAME_ODDS, NEARLY = math.log(3.0), 0.9
 """Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
 other, either (assumed)."""
-RIDGES = (0.3, 1.0, 3.0)
-"""1 sigma of all columns and probes together, in typical sizes."""
 MOST_EFFECTS = 3
 UNKNOWN = 0.3
 """Probability of an unknown cause, given a gap, above which the verdict is that. Set on development trials:
@@ -95,36 +93,24 @@ def share_of(pool: Pool, columns: Sequence[int], floor: tuple[float, float], lea
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """The gap on each judged run as effects fitted to the other runs explain it.
-
-    Attributes:
-        pools: one a run.
-        total: what all columns and probes explain so, at the strength of ridge that serves them best.
-    """
+    """The gap on each judged run (`pools`) as effects fitted to the other runs explain it; with one run it is
+    scored on itself, less what chance explains."""
 
     pools: tuple[Pool, ...]
-    total: float
-
-    @classmethod
-    def of(cls, pools: Sequence[Pool]) -> HeldOut:
-        """With one run it is scored on itself, less what chance explains."""
-        every = range(pools[0].own)
-        total = max(_held_out(pools, every, size) for size in RIDGES)
-        return cls(tuple(pools), total)
 
     def explained(self, columns: Sequence[int], least: float = -math.inf) -> float:
         """What the columns explain; `least` is what they are known to."""
-        return max(_held_out(self.pools, columns, WIDE), least)
+        return max(_held_out(self.pools, columns), least)
 
 
-def _held_out(pools: Sequence[Pool], columns: Sequence[int], size: float) -> float:
+def _held_out(pools: Sequence[Pool], columns: Sequence[int]) -> float:
     """What coefficients fitted to the other runs explain of each, summed."""
     at = np.asarray(columns)
     if len(pools) == 1:
-        return pools[0].fit(columns, size)[2] - 2.0 * len(at)
+        return pools[0].fit(columns, WIDE)[2] - 2.0 * len(at)
     whole, found = Pool.sum(pools), 0.0
     for pool in pools:
-        value, _, _ = whole.without(pool).fit(columns, size)
+        value, _, _ = whole.without(pool).fit(columns, WIDE)
         found += float(2.0 * value @ pool.gain[at] - value @ pool.information[np.ix_(at, at)] @ value)
     return found
 
