@@ -6,6 +6,7 @@ import math
 
 from terrafusion.twin.gap.diagnosis import Diagnosis
 from terrafusion.twin.gap.next_run import BY_HAND
+from terrafusion.twin.gap.verdict import Cause
 
 MOST_LISTED = 4
 
@@ -47,23 +48,33 @@ def _cause(d: Diagnosis) -> str:
         )
     if verdict.kind == "parameters":
         return f"The ground has changed its strength; nothing structural is missing ({numbers(d)})."
+    if len(verdict.named) > 1:
+        together = "; and ".join(f"{_told_apart(cause)} ({numbers(d, cause)})" for cause in _named(d))
+        return f"Several causes act together: {together}."
     if verdict.kind == "ambiguous":
         listed = ", ".join(first.members)
         return f"Its cause is one of {listed}: these runs cannot tell them apart{share} ({numbers(d)})."
-    others = ""
-    if len(verdict.named) > 1:
-        others = f", together with {' and '.join(verdict.named[1:])}"
     return (
-        f"The most probable cause is {first.effect}{others} "
+        f"The most probable cause is {first.effect} "
         f"(probability {100.0 * first.probability:.0f} %){share} ({numbers(d)})."
     )
 
 
-def numbers(d: Diagnosis) -> str:
-    """The first cause's parameters with one sigma."""
-    first, c = d.verdict.causes[0], d.bench.candidates
+def _named(d: Diagnosis) -> list[Cause]:
+    return [cause for name in d.verdict.named for cause in d.verdict.causes if cause.effect == name]
+
+
+def _told_apart(cause: Cause) -> str:
+    if len(cause.members) == 1:
+        return cause.effect
+    return f"one of {', '.join(cause.members)}, which these runs cannot tell apart"
+
+
+def numbers(d: Diagnosis, cause: Cause | None = None) -> str:
+    """A cause's parameters with one sigma; None: the first one's."""
+    cause, c = cause or d.verdict.causes[0], d.bench.candidates
     parts = []
-    for i, value, sigma in zip(first.columns, first.value, first.sigma, strict=True):
+    for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
         unit = f" {c.units[i]}" if c.units[i] else ""
         within = (
             f"+- {sigma * c.scale[i]:.2g}{unit}" if math.isfinite(sigma) else f"{unit} (fit failed)".strip()

@@ -12,6 +12,7 @@ import pytest
 
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.gap_page.words import sentences
 from terrafusion.twin.gap import Diagnosis, diagnose
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.corrected import values_of, write_corrected
@@ -97,8 +98,12 @@ def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references
 def test_a_small_effect_is_named_beside_a_large_one(references: list[Recording]) -> None:
     """Of the whole gap it explains almost nothing, of what the large one leaves nearly all."""
     both = {"wheel_radius/scale": 0.1, "imu_yaw_misalignment/rotation": 0.15}
-    answer = checked(diagnose(runs(740, 2, both), references, VEHICLE))
+    found = diagnose(runs(740, 2, both), references, VEHICLE)
+    answer = checked(found)
     assert answer["named"] == ["wheel_radius", "imu_yaw_misalignment"]
+    said = " ".join(sentences(found))
+    assert "Several causes act together: " in said
+    assert all(key in said for key in both)
     values = {k: v for c in answer["causes"][:2] for k, v in c["parameters"].items()}
     for key, value in both.items():
         assert values[key]["value"] == pytest.approx(value, rel=0.2)
