@@ -139,11 +139,11 @@ FORMS = (
         "front left wheel R (1 + e)", "geometry",
     ),
     Form(
-        "track_width", "scale", one("", 0.05, -0.3, 0.5),
+        "track_width", "scale", one("", 0.05, -0.5, 0.5),
         {"vehicle": lambda q, e: {"track_m": q["track_m"] * (1.0 + e)}}, "track (1 + e)", "geometry",
     ),
     Form(
-        "track_width", "turning", one("", 0.1, -0.3, 0.5),
+        "track_width", "turning", one("", 0.1, -0.5, 0.5),
         {"vehicle": lambda q, e: {"track_m": q["track_m"] * (1.0 + e * grown(q["r"], TURNING_RADPS))}},
         "track (1 + e r^2 / (r^2 + (0.2 rad/s)^2))", "ours: forces move outward in a turn",
     ),
