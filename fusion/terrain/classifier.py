@@ -5,10 +5,8 @@ looks different flat and on a slope. Features that were not observed are
 marginalised (dropped from mean and covariance, which is exact for Gaussians);
 the variance of the slip estimate is added to that of its class. `unknown` is
 one broad Gaussian around all grounds: it wins where every class fits badly.
-Ground between the known ones fits none of them badly in any one window; it is told by how
-far its windows lie from the nearest on average (`oddness`). The logarithms are divided by a
-temperature calibrated on drives held out from training (Guo et al. 2017), as neighbouring
-windows repeat one another.
+The logarithms are divided by a temperature calibrated on drives held out from
+training (Guo et al. 2017), as neighbouring windows repeat one another.
 """
 
 from __future__ import annotations
@@ -28,7 +26,7 @@ from terrafusion.fusion.terrain.features import FEATURES, SLIP
 
 Array = NDArray[np.float64]
 
-SCHEMA = "terrafusion.terrain/2"
+SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
 FOREIGN_SLIP = 0.03
 """1 sigma of the relative error of the rolling radius of a robot not trained on: it looks like slip.
@@ -41,12 +39,10 @@ SLIP_TEMPERATURE = 20.0
 """Windows that are one observation where slip alone is judged: its estimate stays as it is for about 10 s
 (`slip_time_s` of the policy's fixed row, and receivers wander as slowly), windows come twice a second."""
 _BROAD_SHARE = 0.1
-LEAST_SEEN = 4
-"""Features that must be seen to tell how odd a window is."""
 
 _KEYS = (
-    "schema", "made_by", "inputs_sha256", "vehicles", "features", "temperature", "patch_length_m",
-    "odd_limit", "classes", "unknown", "scores",
+    "schema", "made_by", "inputs_sha256", "vehicles", "features", "temperature", "patch_length_m", "classes",
+    "unknown", "scores",
 )  # fmt: skip
 
 
@@ -73,7 +69,6 @@ class TerrainModel:
         unknown: the broad density; its weight is calibrated, so it need not be 1.
         temperature: what log-likelihoods are divided by (>= 1).
         patch_length_m: expected distance between two changes of ground.
-        odd_limit: mean oddness of the last windows above which the ground is none of the classes.
         vehicles: names of the vehicles whose vibration the model knows.
         slip_only: judge by the slip alone; see `for_vehicle`.
         scores: held-out figures of the training.
@@ -83,7 +78,6 @@ class TerrainModel:
     unknown: Mixture
     temperature: float
     patch_length_m: float
-    odd_limit: float
     vehicles: tuple[str, ...]
     inputs_sha256: str = ""
     made_by: str = ""
@@ -152,11 +146,6 @@ class LikelihoodTable:
         self._mean = np.concatenate([m.mean for m in mixtures])
         self._covariance = np.concatenate([m.covariance for m in mixtures])
         self._starts = np.cumsum([0] + [len(m.log_weight) for m in mixtures[:-1]])
-        known = [
-            np.full(len(m.log_weight), name in model.classes)
-            for name, m in zip(classes, mixtures, strict=True)
-        ]
-        self._known = np.concatenate(known)
         self._temperature = model.temperature
         self._judged = np.arange(len(FEATURES)) == SLIP if model.slip_only else np.ones(len(FEATURES), bool)
 
@@ -165,37 +154,18 @@ class LikelihoodTable:
 
         `variances` (d,) are those of the measurements themselves, added to the classes' own.
         """
-        seen = self._seen(values)
+        seen = np.flatnonzero(np.isfinite(values) & self._judged)
         if not seen.size:
             return np.zeros(len(self._starts))
-        log_p, _ = self._densities(values, variances, seen)
-        top = np.maximum.reduceat(log_p, self._starts)
-        sizes = np.diff(np.append(self._starts, len(log_p)))
-        sums = np.add.reduceat(np.exp(log_p - np.repeat(top, sizes)), self._starts)
-        return np.asarray((top + np.log(sums)) / self._temperature)
-
-    def oddness(self, values: Array, variances: Array) -> float:
-        """Squared distance of the features from the likeliest Gaussian of a known ground, over their number.
-
-        Near 1 where that density is true; NaN where fewer than `LEAST_SEEN` features are seen.
-        """
-        seen = self._seen(values)
-        if seen.size < LEAST_SEEN or not self._known.any():
-            return float("nan")
-        log_p, square = self._densities(values, variances, seen)
-        return float(square[np.argmax(np.where(self._known, log_p, -np.inf))]) / seen.size
-
-    def _seen(self, values: Array) -> NDArray[np.intp]:
-        return np.flatnonzero(np.isfinite(values) & self._judged)
-
-    def _densities(self, values: Array, variances: Array, seen: NDArray[np.intp]) -> tuple[Array, Array]:
-        """Log-densities (m,) of all Gaussians, up to a constant, and the squared distances (m,) from them."""
         covariance = self._covariance[:, seen[:, None], seen] + np.diag(variances[seen])
         root = np.linalg.cholesky(covariance)
         whitened = np.linalg.solve(root, (values[seen] - self._mean[:, seen])[:, :, None])[:, :, 0]
         log_det = np.log(np.diagonal(root, axis1=1, axis2=2)).sum(axis=1)
-        square = (whitened * whitened).sum(axis=1)
-        return self._log_weight - log_det - 0.5 * square, square
+        log_p = self._log_weight - log_det - 0.5 * (whitened * whitened).sum(axis=1)
+        top = np.maximum.reduceat(log_p, self._starts)
+        sizes = np.diff(np.append(self._starts, len(log_p)))
+        sums = np.add.reduceat(np.exp(log_p - np.repeat(top, sizes)), self._starts)
+        return np.asarray((top + np.log(sums)) / self._temperature)
 
 
 def load_terrain_model(path: Path | None = None) -> TerrainModel:
@@ -239,7 +209,6 @@ def _parse(content: dict[str, Any], file: Path) -> TerrainModel:
         unknown=_mixture(content["unknown"], file, UNKNOWN),
         temperature=_number(content["temperature"], Quantity("", 1.0, 1e3), file, "temperature"),
         patch_length_m=_number(content["patch_length_m"], Quantity("m", 0.1, 1e5), file, "patch_length_m"),
-        odd_limit=_number(content["odd_limit"], Quantity("", 0.1, 1e6), file, "odd_limit"),
         vehicles=tuple(str(name) for name in vehicles),
         inputs_sha256=str(content["inputs_sha256"]),
         made_by=str(content["made_by"]),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,6 @@ __all__ = ["TerrainDetector", "Window"]
 
 Array = NDArray[np.float64]
 
-ODD_WINDOWS = 20
-"""Windows whose mean oddness is judged, 10 s of driving: one of unknown ground may be a known one's."""
-ODD_EVIDENCE = 5.0
-"""Log-likelihood by which `unknown` then fits a window better than the best of the classes, times the mean
-beyond its limit (assumed)."""
 EXTERNAL_TRUST = 0.3
 """Exponent on the evidence of an external source: its frames repeat one another as windows do."""
 EXTERNAL_ERROR = 0.1
@@ -48,8 +42,6 @@ class TerrainDetector:
             )
         self.classes = classes
         self._table = LikelihoodTable(model, classes)
-        self._odd_limit = model.odd_limit
-        self._odd: list[float] = []
         self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
 
     @property
@@ -62,21 +54,8 @@ class TerrainDetector:
         speed = window.ground_speed_mps()
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
-            values, variances = extract(window)
-            evidence = self._table.evaluate(values, variances)
-            beyond = self._beyond(self._table.oddness(values, variances))
-            if beyond > 0.0:
-                evidence[self.classes.index(UNKNOWN)] = evidence.max() + ODD_EVIDENCE * beyond
-            self._filter.update(evidence)
+            self._filter.update(self._table.evaluate(*extract(window)))
         return self.probabilities
-
-    def _beyond(self, oddness: float) -> float:
-        """By how much the last windows, with one of this oddness, are odder than known ground."""
-        if math.isfinite(oddness):
-            self._odd = [*self._odd, oddness][-ODD_WINDOWS:]
-        if len(self._odd) < ODD_WINDOWS:
-            return 0.0
-        return math.fsum(self._odd) / ODD_WINDOWS - self._odd_limit
 
     def fuse(self, probabilities: ArrayLike) -> Array:
         """Class probabilities (k,) after an external source (a camera) gave its own (k,) for now.
@@ -101,11 +80,7 @@ class TerrainDetector:
 
     def state(self) -> dict[str, Any]:
         """What `restore` needs to go on with the same bits: plain lists and texts."""
-        return {
-            "classes": list(self.classes),
-            "probabilities": self._filter.probabilities.tolist(),
-            "odd": list(self._odd),
-        }
+        return {"classes": list(self.classes), "probabilities": self._filter.probabilities.tolist()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Take up a state of a detector with the same classes.
@@ -120,4 +95,3 @@ class TerrainDetector:
                 remedy=f"this detector has {', '.join(self.classes)}",
             )
         self._filter.probabilities = np.array(state["probabilities"], dtype=float)
-        self._odd = [float(x) for x in state["odd"]]

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
-from terrafusion.fusion.terrain.detector import ODD_WINDOWS
 from terrafusion.fusion.terrain.drives import GROUNDS, Grid, run_all, windows_of
 from terrafusion.fusion.terrain.evaluate import Route, Scores, evaluate, splice
 from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, Window, extract
@@ -36,10 +35,6 @@ SIGMA_FLOOR = np.array([0.03] * SLIP + [0.02, 0.05])
 UNKNOWN_SPREAD = 3.0
 """`unknown` is as wide as all grounds together, times this."""
 UNKNOWN_SHARE = 0.03
-ODD_SHARE = 0.002
-"""Share of the moments on known ground whose last windows may pass for odd."""
-NEVER_ODD = 1e6
-"""Limit where the drives are too short to tell."""
 TEMPERATURES = np.round(np.geomspace(2.0, 20.0, 11), 3)
 """From 2 up: windows overlap by half, so each moment is seen twice."""
 PATCHES = 60
@@ -91,7 +86,6 @@ def train(plan: Plan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainM
         unknown=_broad(mixtures),
         temperature=1.0,
         patch_length_m=PATCH_LENGTH_M,
-        odd_limit=NEVER_ODD,
         vehicles=(plan.training().vehicle,),
         inputs_sha256=fingerprint_of(plan),
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
@@ -128,11 +122,10 @@ def features_of(windows: list[Window]) -> Array:
 
 
 def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
-    """Temperature by the filtered log-score of the true ground, weight of `unknown`, and when ground is odd.
+    """Temperature by the filtered log-score of the true ground, then the weight of `unknown`.
 
     The weight is the largest of a falling series for which at most
-    `UNKNOWN_SHARE` of the windows are called unknown; the limit of the oddness is
-    exceeded by `ODD_SHARE` of its running means.
+    `UNKNOWN_SHARE` of the windows are called unknown.
     """
     evidence = _evidence(model, route)
     temperature = min((float(t) for t in TEMPERATURES), key=lambda t: _log_loss(model, evidence, t, 0.0)[0])
@@ -141,20 +134,7 @@ def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
         if _log_loss(model, evidence, temperature, log_weight)[1] <= UNKNOWN_SHARE:
             break
     weighted = dataclasses.replace(model.unknown, log_weight=np.array([log_weight]))
-    odd = _running_oddness(model, route)
-    limit = round(float(np.quantile(odd, 1.0 - ODD_SHARE)), 3) if odd.size else NEVER_ODD
-    return dataclasses.replace(model, unknown=weighted, temperature=temperature, odd_limit=limit)
-
-
-def _running_oddness(model: TerrainModel, route: Route) -> Array:
-    """Means of the oddness of `ODD_WINDOWS` moving windows in a row."""
-    table = LikelihoodTable(model, (*model.classes, UNKNOWN))
-    moving = [w for w in route.windows if w.ground_speed_mps() > MIN_SPEED_MPS]
-    odd = np.array([table.oddness(*extract(w)) for w in moving])
-    odd = odd[np.isfinite(odd)]
-    if len(odd) < ODD_WINDOWS:
-        return np.empty(0)
-    return np.asarray(np.convolve(odd, np.full(ODD_WINDOWS, 1.0 / ODD_WINDOWS), "valid"))
+    return dataclasses.replace(model, unknown=weighted, temperature=temperature)
 
 
 def _evidence(model: TerrainModel, route: Route) -> list[tuple[float, Array, int]]:
@@ -203,7 +183,7 @@ def fingerprint_of(plan: Plan) -> str:
         "plan": dataclasses.asdict(plan),
         "features": list(FEATURES),
         "sigma_floor": SIGMA_FLOOR.tolist(),
-        "unknown": [UNKNOWN_SPREAD, UNKNOWN_SHARE, ODD_SHARE, ODD_WINDOWS],
+        "unknown": [UNKNOWN_SPREAD, UNKNOWN_SHARE],
         "patch_length_m": PATCH_LENGTH_M,
     }
     return plan.training().fingerprint(settings=settings)
@@ -235,7 +215,6 @@ def write_model(model: TerrainModel, path: Path) -> None:
         "features": list(FEATURES),
         "temperature": model.temperature,
         "patch_length_m": model.patch_length_m,
-        "odd_limit": model.odd_limit,
         "classes": {name: _listed(mixture) for name, mixture in model.classes.items()},
         "unknown": _listed(model.unknown),
         "scores": model.scores,

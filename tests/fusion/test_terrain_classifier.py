@@ -154,7 +154,7 @@ def test_written_and_read_back(model: TerrainModel, tmp_path: Path) -> None:
 
 
 BROKEN = [
-    (["schema"], "terrafusion.terrain/9", "terrafusion.terrain/2"),
+    (["schema"], "terrafusion.terrain/9", "terrafusion.terrain/1"),
     (["colour"], "red", "unknown key 'colour'"),
     (["temperature"], None, "'temperature' is missing"),
     (["temperature"], 0.1, "'temperature' is 0.1"),
