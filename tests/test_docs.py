@@ -115,6 +115,12 @@ def anchor_of(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-")
 
 
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_no_document_holds_a_path_of_a_machine(document: Path) -> None:
+    found = re.findall(r"(?<![\w.}])/(?:home|mnt|root|tmp|Users|var|work)/\S*", document.read_text("utf-8"))
+    assert not found
+
+
 def test_readme_is_short() -> None:
     assert len((ROOT / "README.md").read_text(encoding="utf-8").splitlines()) < 150
 

@@ -126,7 +126,7 @@ def document_lines(made: Sequence[Table], found: Found, origin: Mapping[str, str
     for table in made:
         lines += [*markdown(table), ""]
     if found.refused:
-        lines += ["## Logs not run", "", *(f"- {one.log}: {one.why}" for one in found.refused), ""]
+        lines += ["## Logs not run", "", *(f"- {one.line}" for one in found.refused), ""]
     return [*lines, "## Made by", "", *(f"- {name}: `{text}`" for name, text in origin.items())]
 
 
@@ -163,8 +163,7 @@ def _page(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, 
         if k == 0:
             body.append(page.figure(plot_ratios(contrasts(found.rows)), CAPTION))
     if found.refused:
-        refused = (f"{escape(one.log)}: {escape(one.why)}" for one in found.refused)
-        body += ["<h2>Logs not run</h2>", page.bullets(refused)]
+        body += ["<h2>Logs not run</h2>", page.bullets(escape(one.line) for one in found.refused)]
     body.append(page.where_from(origin, LIBRARIES))
     page.write_page(path, "Fixed against adaptive weighting", body)
 

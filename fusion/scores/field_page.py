@@ -53,9 +53,7 @@ def markdown(lines: Sequence[Line], refusals: Sequence[Refusal]) -> str:
     if others:
         parts.append(f"## Logs without a reference\n\n{_health_table(others)}")
     if refusals:
-        # The library's own errors name their log already.
-        told = [r.why if r.why.startswith(r.log) else f"{r.log}: {r.why}" for r in refusals]
-        parts.append("## Not run\n\n" + "".join(f"- {line}\n" for line in told))
+        parts.append("## Not run\n\n" + "".join(f"- {refusal.line}\n" for refusal in refusals))
     return "\n".join(parts)
 
 

@@ -100,10 +100,15 @@ class Run:
 
 @dataclass(frozen=True)
 class Refusal:
-    """A log that was not run, and the line that says why."""
+    """A log that was not run, and why."""
 
     log: str
     why: str
+
+    @property
+    def line(self) -> str:
+        """Both, as tables tell it."""
+        return f"{self.log}: {self.why}"
 
 
 @dataclass(frozen=True)
@@ -206,8 +211,18 @@ def each_drive(log: str, run: Callable[[str, Recording], Iterable[Found | Refusa
 
 
 def _refusal(name: str, error: Exception) -> Refusal:
-    known = isinstance(error, TerrafusionError)
-    return Refusal(name, str(error) if known else f"FAILED, {type(error).__name__}: {error}")
+    """Told of the log and its file, not of the folder where they lie: tables go into documents."""
+    if not isinstance(error, TerrafusionError):
+        return Refusal(name, f"FAILED, {type(error).__name__}: {error}")
+    file = None if error.file is None else Path(error.file).name
+    told = TerrafusionError(
+        error.what,
+        file=None if file == Path(name).name else file,
+        channel=error.channel,
+        time_s=error.time_s,
+        remedy=error.remedy,
+    )
+    return Refusal(name, str(told))
 
 
 @functools.lru_cache(maxsize=1)
@@ -246,7 +261,7 @@ def _tried(
     try:
         result = replay(recording, mode=task.mode, outages=[] if outage is None else [outage])
     except TerrafusionError as error:
-        return Refusal(where, str(error))
+        return _refusal(where, error)
     except UNFORESEEN as error:
         return _refusal(f"{where}, {task.mode}", error)
     return _run(task, result, reference, test, outage)

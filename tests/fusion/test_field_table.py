@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import Imu, Recording, Terrain, Wheels
 from terrafusion.fusion.scores import field_table, parts
-from terrafusion.fusion.scores.field_page import plot_lines, write
+from terrafusion.fusion.scores.field_page import markdown, plot_lines, write
 from terrafusion.fusion.scores.field_summary import condense, in_order, verdicts
 from terrafusion.fusion.scores.field_table import (
     Refusal,
@@ -200,7 +200,7 @@ def test_reference_is_truth_before_fixes(drive: Callable[..., Any]) -> None:
 
 def test_files_hold_all_runs_and_the_refusals(tmp_path: Path) -> None:
     runs = [made_run("a", "adaptive", 1.0), made_run("a", "fixed", 2.0), made_run("c", "fixed", None)]
-    text = write(tmp_path, runs, [Refusal("d", "holds 3 pieces"), Refusal("e", "e: has no wheels")])
+    text = write(tmp_path, runs, [Refusal("d", "holds 3 pieces"), Refusal("e", "has no wheels")])
     with (tmp_path / "runs.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["error_m"] for row in rows] == ["1.0", "2.0", ""]
@@ -311,6 +311,27 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
         [*command, "--collect", "--modes", "fixed", "robust"], capture_output=True, text=True, check=False
     )
     assert "2 of 4 logs and modes not run yet" in more.stdout
+
+
+@pytest.mark.parametrize(
+    ("file", "told"),
+    [
+        ("/somewhere/on/this/machine/one/wheels.csv", "set/one: wheels.csv, speed: holds NaN; mend it"),
+        ("set/one", "set/one: speed: holds NaN; mend it"),
+        (None, "set/one: speed: holds NaN; mend it"),
+    ],
+)
+def test_a_refusal_does_not_tell_where_a_log_lies(
+    file: str | None, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def opened(log: str) -> list[Recording]:
+        raise DataError("holds NaN", file=file, channel="speed", remedy="mend it")
+
+    monkeypatch.setattr(field_table, "open_recordings", opened)
+    _, (refusal,) = run_task(Task("set/one", "fixed", 1, 1))
+    assert isinstance(refusal, Refusal)
+    assert refusal.line == told
+    assert markdown([], [refusal]).endswith(f"- {told}\n")
 
 
 def test_whole_drives_come_before_outages_and_short_outages_before_long_ones() -> None:
