@@ -27,6 +27,8 @@ from terrafusion.twin.version import model_sha256, version
 T = TypeVar("T")
 
 BACKENDS = ("loky", "dask")
+REPLACED = "A worker stopped while some jobs"
+"""What loky warns of when it replaces a worker whose memory has grown: no job is lost by it."""
 CONNECT_S = 8.0
 """A scheduler or its first worker that has not answered by then is told as missing."""
 WORKERLESS_S = 10.0
@@ -94,7 +96,8 @@ def open_pool(backend: str, jobs: int, address: str | None = None) -> Iterator[P
     elif jobs == 1:
         yield Pool(None)
     else:
-        with _loky(jobs) as executor:
+        with warnings.catch_warnings(), _loky(jobs) as executor:
+            warnings.filterwarnings("ignore", message=REPLACED, category=UserWarning)
             # Less than loky hands on at once (2 jobs + 1): it stops cleanly only when none waits inside it.
             yield Pool(executor, at_once=2 * jobs)
 
@@ -129,8 +132,6 @@ def _loky(jobs: int) -> Iterator[Executor]:
     # The arrays are small: threads of the linear algebra would only fight over the processors.
     threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     executor = get_reusable_executor(max_workers=jobs, reuse=False, env=threads)
-    # A worker whose memory has grown is replaced by a fresh one, with a warning; no job is lost by it.
-    warnings.filterwarnings("ignore", message="A worker stopped while some jobs", category=UserWarning)
     try:
         yield executor
     finally:

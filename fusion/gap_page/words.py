@@ -49,8 +49,10 @@ def _cause(d: Diagnosis) -> str:
     if verdict.kind == "parameters":
         return f"The ground has changed its strength; nothing structural is missing ({numbers(d)})."
     if len(verdict.named) > 1:
-        together = "; and ".join(f"{_told_apart(cause)} ({numbers(d, cause)})" for cause in _named(d))
-        return f"Several causes act together: {together}."
+        several = [cause for name in verdict.named for cause in verdict.causes if cause.effect == name]
+        listed = "; and ".join(f"{_class_of(cause)} ({numbers(d, cause)})" for cause in several)
+        sure = 100.0 * sum(cause.probability for cause in several)
+        return f"The most probable causes act together (probability {sure:.0f} %): {listed}."
     if verdict.kind == "ambiguous":
         listed = ", ".join(first.members)
         return f"Its cause is one of {listed}: these runs cannot tell them apart{share} ({numbers(d)})."
@@ -60,11 +62,7 @@ def _cause(d: Diagnosis) -> str:
     )
 
 
-def _named(d: Diagnosis) -> list[Cause]:
-    return [cause for name in d.verdict.named for cause in d.verdict.causes if cause.effect == name]
-
-
-def _told_apart(cause: Cause) -> str:
+def _class_of(cause: Cause) -> str:
     if len(cause.members) == 1:
         return cause.effect
     return f"one of {', '.join(cause.members)}, which these runs cannot tell apart"

@@ -102,7 +102,7 @@ def test_a_small_effect_is_named_beside_a_large_one(references: list[Recording])
     answer = checked(found)
     assert answer["named"] == ["wheel_radius", "imu_yaw_misalignment"]
     said = " ".join(sentences(found))
-    assert "Several causes act together: " in said
+    assert "The most probable causes act together (probability 9" in said
     assert all(key in said for key in both)
     values = {k: v for c in answer["causes"][:2] for k, v in c["parameters"].items()}
     for key, value in both.items():

@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -117,6 +118,17 @@ def test_a_worker_that_dies_is_told() -> None:
     words = "a worker process died .* fewer --jobs; finished runs are kept"
     with pytest.raises(TerrafusionError, match=words), open_pool("loky", 2) as pool:
         list(pool.results(os._exit, [(1,)]))
+
+
+def test_a_worker_that_is_replaced_is_no_news_and_other_warnings_are() -> None:
+    replaced = "A worker stopped while some jobs were given to the executor. This can be caused by a memory leak."
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        with open_pool("loky", 2):
+            warnings.warn(replaced, UserWarning, stacklevel=1)
+            warnings.warn("another", UserWarning, stacklevel=1)
+        warnings.warn(replaced, UserWarning, stacklevel=1)
+    assert [str(one.message) for one in seen] == ["another", replaced]
 
 
 @pytest.mark.parametrize(
