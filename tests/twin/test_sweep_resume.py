@@ -121,7 +121,7 @@ def test_a_worker_that_dies_is_told() -> None:
 
 
 def test_a_worker_that_is_replaced_is_no_news_and_other_warnings_are() -> None:
-    replaced = "A worker stopped while some jobs were given to the executor. This can be caused by a memory leak."
+    replaced = "A worker stopped while some jobs were given to the executor. This can be ..."
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
         with open_pool("loky", 2):
