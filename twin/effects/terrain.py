@@ -79,9 +79,31 @@ def _passive_grousers(q: Quantities, height: Any) -> dict[str, Any]:
     }
 
 
+def _way(q: Quantities) -> Any:
+    """Sign of the wheel's rotation, smooth through rest."""
+    return q["rim_mps"] / smooth_abs(q["rim_mps"], CLINGING_SPEED_MPS)
+
+
 def _clinging(q: Quantities, share: Any) -> dict[str, Any]:
-    way = q["rim_mps"] / smooth_abs(q["rim_mps"], CLINGING_SPEED_MPS)
-    torque = share * q["load_n"] * q["radius_m"] * grown(q["travel"], BUILD_UP_M) * way
+    torque = share * q["load_n"] * q["radius_m"] * grown(q["travel"], BUILD_UP_M) * _way(q)
+    return {"drag_torque_nm": q["drag_torque_nm"] + torque}
+
+
+def _in_motion(q: Quantities, share: Any) -> dict[str, Any]:
+    """A rolling resistance that does not hold at rest."""
+    return {"drag_torque_nm": q["drag_torque_nm"] + share * q["load_n"] * q["radius_m"] * _way(q)}
+
+
+def _with_speed(q: Quantities, share: Any) -> dict[str, Any]:
+    """A rolling resistance in proportion to the speed of the rim."""
+    return {"drag_torque_nm": q["drag_torque_nm"] + share * q["load_n"] * q["radius_m"] * q["rim_mps"]}
+
+
+def _sucking(q: Quantities, pressure: Any) -> dict[str, Any]:
+    """Suction under the rear contact that does not hold at rest."""
+    z = q["sinkage_m"]
+    chord_square = 2.0 * q["radius_m"] * z - z * z + q["contact_floor_m"] * q["contact_floor_m"]
+    torque = 0.5 * pressure * q["width_m"] * chord_square * _way(q)
     return {"drag_torque_nm": q["drag_torque_nm"] + torque}
 
 
@@ -127,6 +149,14 @@ FORMS = (
         "rolling torque (c_rr + e) W R", "as the model's own c_rr",
     ),
     Form(
+        "motion_resistance", "in_motion", one("", 0.03, 0.0, 0.5), {"wheel": _in_motion},
+        "rolling torque e W R w / sqrt(w^2 + (0.05 m/s / R)^2)", "the same without a hold at rest",
+    ),
+    Form(
+        "motion_resistance", "with_speed", one("s/m", 0.03, 0.0, 0.5), {"wheel": _with_speed},
+        "rolling torque e W R^2 w", "a coefficient that grows with speed, as Gillespie 1992",
+    ),
+    Form(
         "motion_resistance", "ploughing", one("", 0.2, 0.0, 3.0), {"wheel": _plough},
         "force e W z / R against the hub's velocity", "ours",
     ),
@@ -143,6 +173,11 @@ FORMS = (
         "grousers", "passive_pressure", one("m", 0.01, 0.0, 0.05), {"ground": _passive_grousers},
         "c + (gamma h^2 N / 2 + 2 c h sqrt(N)) / 50 mm, N = tan^2(45 deg + phi/2), h = e; mu likewise",
         "Rankine 1857, per blade",
+    ),
+    Form(
+        "grousers", "shearing_radius", one("m", 0.01, 0.0, 0.05),
+        {"corner": lambda q, e: {"radius_m": q["radius_m"] + 0.5 * e}, "ground": _track_grousers},
+        "R + h/2, and strength as by the track law, h = e", "Ding et al. 2011: soil between lugs shears",
     ),
     Form(
         "soil_drift", "over_travel", one("", 0.3, -1.5, 1.5),
@@ -171,9 +206,18 @@ FORMS = (
         "ours",
     ),
     Form(
+        "multipass_compaction", "strengthening", one("", 0.2, -1.0, 2.0),
+        {"ground": lambda q, e: scaled_shear(q, ca.exp(e * q["following"]))},
+        "under the following axle strength times exp(e f), f share in the rut", "ours, after Holm 1969",
+    ),
+    Form(
         "mud_adhesion", "suction", one("Pa", 1000.0, 0.0, 10_000.0),
         {"ground": lambda q, e: {"suction_pa": q["suction_pa"] + e}},
         "torque (p + e) b l^2 / 2 against rolling", "as the model's own suction p",
+    ),
+    Form(
+        "mud_adhesion", "in_motion", one("Pa", 1000.0, 0.0, 10_000.0), {"wheel": _sucking},
+        "torque e b l^2 / 2 w / sqrt(w^2 + (0.05 m/s / R)^2)", "the same without a hold at rest",
     ),
     Form(
         "mud_adhesion", "build_up", one("", 0.03, 0.0, 0.5), {"wheel": _clinging},

@@ -7,9 +7,9 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.effects.form import Form, Quantities, one
+from terrafusion.twin.effects.form import Form, Parameter, Quantities, one
 from terrafusion.twin.layout import WHEELS
-from terrafusion.twin.smooth import grown, smooth_max
+from terrafusion.twin.smooth import grown
 
 # Constants of the laws, assumed unless a source is given; the equations below tell them.
 SHORTEST_LAG_S = 0.002
@@ -83,10 +83,10 @@ def _fallen(q: Quantities, share: Any, energy_j: float) -> Any:
     return ca.exp(-share * q["electric_energy"] / energy_j)
 
 
-def _sagging(q: Quantities, ohm: Any) -> dict[str, Any]:
-    """A further resistance behind the battery's own; the current is smoothed: the loop is not stiff."""
-    drop = ohm * smooth_max(q["sag_current"], 0.0, 0.01) / q["supply_v"]
-    return {"voltage_share": q["voltage_share"] / (1.0 + drop)}
+def _dry(q: Quantities, torque: Any) -> dict[str, Any]:
+    """Friction of each wheel's bearings and gears that holds at rest, too: by the bristle of the rolling
+    resistance."""
+    return {"rolling": q["rolling"] + torque / (q["load_n"] * q["radius_m"])}
 
 
 FORMS = (
@@ -158,8 +158,9 @@ FORMS = (
         "torque limit times exp(-e E / 1 kJ), E drawn so far", "ours: derating",
     ),
     Form(
-        "battery_sag", "resistance", one("ohm", 0.1, 0.0, 1.0), {"supply": _sagging},
-        "supply U / (1 + e I / U), I of all motors, smoothed over 20 ms", "a resistance in series, bounded",
+        "battery_sag", "resistance", one("ohm", 0.1, 0.0, 1.0),
+        {"vehicle": lambda q, e: {"battery_ohm": q["battery_ohm"] + e}},
+        "internal resistance e larger", "as the model's own, bounded",
     ),
     Form(
         "battery_sag", "discharge", one("", 0.1, 0.0, 2.0),
@@ -170,6 +171,10 @@ FORMS = (
         "drivetrain_friction", "coulomb", one("N m", 0.3, 0.0, 5.0),
         {"wheel": lambda q, e: _braked(q, e * ca.tanh(q["wheel_speed"] / FRICTION_SPEED_RADPS))},
         "torque e tanh(w / 0.1 rad/s) against rotation, each wheel", "Coulomb, smoothed",
+    ),
+    Form(
+        "drivetrain_friction", "dry", one("N m", 0.3, 0.0, 5.0), {"ground": _dry},
+        "torque e against rotation, each wheel, which holds at rest", "Dahl 1968, as the rolling resistance",
     ),
     Form(
         "drivetrain_friction", "viscous", one("N m s/rad", 0.1, 0.0, 5.0),
@@ -191,6 +196,16 @@ FORMS = (
         "backlash", "torque_gap", one("", 0.5, 0.0, 1.0),
         {"motor": lambda q, e: {"d_play": _crossing(q)}, "wheel": _slack},
         "torque times 1 - e (1 - p^2) while the gear crosses its backlash", "ours",
+    ),
+    Form(
+        "backlash", "open_gear",
+        (Parameter("rad", 0.02, 0.0, 0.3, "gap"), Parameter("", 0.5, 0.0, 1.0, "share")),
+        {
+            "motor": lambda q, gap, share: {"d_play": _crossing(q)},
+            "wheel": lambda q, gap, share: _slack(q, share),
+            "measurement": lambda q, gap, share: _seen_through_backlash(q, gap),
+        },
+        "both of these", "ours",
     ),
     Form(
         "dead_time", "transport", one("s", 0.05, 0.0, 1.0),

@@ -79,6 +79,12 @@ class Block:
         square = error.square - (error.gain[:, at] + gain[:, at]) @ value
         return Products(gain, np.maximum(square, 0.0))
 
+    def adapted(self, error: Products, sigma: Array, weight: Array) -> Array:
+        """The states (T,) that suit an error, with their prior, channels weighted (C,)."""
+        T = self.states
+        H = np.einsum("c,cij->ij", weight, self.gram[:, :T, :T]) + np.diag(sigma**-2.0)
+        return np.asarray(np.linalg.solve(H, weight @ error.gain[:, :T]))
+
 
 def _products(run: Evidence, gram: Array, offset: Array, error: Array | None = None) -> Products:
     N, T = gram.shape[1], run.states
@@ -193,15 +199,15 @@ class Table:
         value, best = np.zeros(len(columns)), start
         weight = start.weight
         for _ in range(STEPS):
-            tried = np.clip(self._solved(columns, first, weight), low, high)
+            tried = np.clip(self.solved(columns, first, weight), low, high)
             now = self.left([b.moved(e, columns, tried) for b, e in zip(self.blocks, first, strict=True)])
             weight = now.weight
             if now.total < best.total:
                 value, best = tried, now
         return value, best
 
-    def _solved(self, columns: Sequence[int], errors: Sequence[Products], weight: Array) -> Array:
-        """Weighted least squares with the states of each run at their prior."""
+    def solved(self, columns: Sequence[int], errors: Sequence[Products], weight: Array) -> Array:
+        """Sizes (k,) of some columns by weighted least squares, the states of each run with their prior."""
         k, T = len(columns), self.blocks[0].states
         A, b = np.eye(k) / WIDE**2, np.zeros(k)
         at = [*range(T), *(T + i for i in columns)]
@@ -221,9 +227,7 @@ def energies(
     states in units of their variance, summed over the runs."""
     inside, outside, states = np.zeros(len(weight)), np.zeros(len(weight)), np.zeros(len(sigma))
     for block, error in zip(blocks, errors, strict=True):
-        T = block.states
-        H = np.einsum("c,cij->ij", weight, block.gram[:, :T, :T]) + np.diag(sigma**-2.0)
-        theta = np.linalg.solve(H, weight @ error.gain[:, :T])
+        T, theta = block.states, block.adapted(error, sigma, weight)
         gain = error.gain - block.gram[:, :, :T] @ theta
         square = error.square - (error.gain[:, :T] + gain[:, :T]) @ theta
         within = ((gain[:, None] @ block.inverse)[:, 0] * gain).sum(axis=1)

@@ -8,9 +8,9 @@ from terrafusion.twin.gap.ladder import Fitted, Fitter
 from terrafusion.twin.gap.posterior import Beliefs
 from terrafusion.twin.gap.refit import Refit
 
-BY_ODDS, BY_FACTOR = 8, 5
-"""Laws that are fitted: the best by what channels leave to first order, and by Bayes factor; beside them
-those of which the first order says nothing."""
+BY_ODDS, BY_FACTOR, BY_SCREEN = 7, 4, 5
+"""Laws that are fitted: the best by what channels leave to first order, by Bayes factor, and by what they
+leave of one run at a few sizes; beside them those of which the first order says nothing."""
 
 
 def chosen(
@@ -27,5 +27,8 @@ def chosen(
     best = sorted(laws, key=lambda law: told[law].total)[:BY_ODDS]
     best += sorted(laws, key=lambda law: -believed.forms[law.effect, law.form])[:BY_FACTOR]
     best += [law for law in told if law.effect == SOIL or fitter.silent(law)]
-    fitted, failed = fitter.fits([(law, sizes[law]) for law in dict.fromkeys(best)])
+    screened = fitter.screened()
+    seen = sorted(screened, key=lambda law: screened[law][1])[:BY_SCREEN]
+    further = [(law, screened[law][0]) for law in seen]
+    fitted, failed = fitter.fits([(law, sizes[law]) for law in dict.fromkeys([*best, *seen])], further)
     return Choice.of(fitter.pool, fitter.table, told, fitted, by), fitted, failed

@@ -24,6 +24,7 @@ from terrafusion.twin.gap.residuals import (
     Raw,
     at_own_ground,
     raw,
+    reach,
     state_sigmas,
     whitened,
     whitened_error,
@@ -264,7 +265,10 @@ def gather(
     raws = raws_of(logs, drives, channels, jobs, told)
     first = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
     with ThreadPoolExecutor(jobs) as pool:
-        raws = list(pool.map(lambda run: at_own_ground(run, drives, first), raws))
+        normal_raws = list(pool.map(lambda run: at_own_ground(run, drives, first), raws[len(runs) :]))
+        most = reach(normal_raws, candidates)
+        judged_raws = pool.map(lambda run: at_own_ground(run, drives, first, most), raws[: len(runs)])
+        raws = [*judged_raws, *normal_raws]
         noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
         evidence = list(pool.map(lambda run: whitened(run, noise), raws))
     judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates), jobs)

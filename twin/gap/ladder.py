@@ -8,7 +8,8 @@ along the signature.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import repeat
@@ -23,6 +24,7 @@ from terrafusion.twin.gap.late import DELAYS
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.refit import Refit, effects_at, errors_with, scored
+from terrafusion.twin.gap.residuals import MOST_SOIL, WITHIN
 from terrafusion.twin.gap.score import Score
 
 Array = NDArray[np.float64]
@@ -31,9 +33,14 @@ LADDER = (0.4, 1.0, 2.0, 4.0)
 """Sizes tried, in that of the linear fit."""
 SMALL, SIZES = 0.7, (1.0, 3.0, 8.0)
 """Below that size of the linear fit, in typical ones, those tried beside it."""
-WITHIN = 0.98
-"""Share of an effect's range that is tried."""
-ROUNDS, IMPROVED = 2, 4
+FURTHER, NEAR = 1.0, 0.05
+"""How far beyond the last size the next is tried, in the step to it; shares of an interval that are taken
+for its ends."""
+AS_GOOD = 0.5
+"""What the size of weighted least squares may leave more than the best one (assumed)."""
+SAME_SIZE = 1e-3
+"""Sizes that are no nearer, typical ones, are tried apart."""
+ROUNDS, IMPROVED = 3, 5
 """Rounds of improvement, and how many laws, the best ones, take part in them."""
 LATE = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Sizes of a delay that are tried on both sides, in that of its range: what fits beyond half a swing of the
@@ -45,6 +52,9 @@ SILENT = 1.0
 """A law is silent where its signature, at the ends of its range, makes a smaller square in all runs."""
 SPREAD = (0.4, 0.7, 0.85, 1.0)
 """Sizes of a silent law that are tried, in that of its range: it acts beyond a threshold, if at all."""
+SCREEN = (0.12, 0.4)
+"""Sizes, in that of its range, at which each law is tried on one run, as its first order may mislead
+(assumed)."""
 SPEAKS = 0.5
 """By how much less than the gap a silent law must leave for sizes near its best to be tried (assumed)."""
 
@@ -54,10 +64,13 @@ DIVERGED = "the twin diverges at every size tried, its linear value stands"
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """One law at its best: the fit, and what it leaves."""
+    """One law at its best: the fit, what it leaves, each run's ground (S,) beside it, and what any size (k,)
+    that was tried left."""
 
     fit: Refit
     left: Left
+    grounds: tuple[Array, ...]
+    tried: tuple[tuple[Array, float], ...]
 
 
 def bounds(candidates: Candidates, columns: Sequence[int]) -> tuple[Array, Array]:
@@ -79,6 +92,28 @@ def sizes(value: Array, low: Array, high: Array) -> list[Array]:
     return [p for i, p in enumerate(inside) if not any(np.array_equal(p, q) for q in inside[:i])]
 
 
+def between(tried: Sequence[tuple[Array, float]], before: float) -> float:
+    """A size beside the best so far: where a parabola through it and its neighbours is least, or beyond it.
+
+    Args:
+        tried: sizes (1,) and what they leave.
+        before: what size zero leaves.
+    """
+    cost = {0.0: before}
+    for size, left in tried:
+        cost[float(size[0])] = min(left, cost.get(float(size[0]), left))
+    at = sorted(cost)
+    i = min(range(len(at)), key=lambda k: cost[at[k]])
+    if i in (0, len(at) - 1):
+        return at[i] + FURTHER * (at[i] - at[1 if i == 0 else -2])
+    a, b, c = at[i - 1 : i + 2]
+    up, down = (cost[a] - cost[b]) / (b - a), (cost[c] - cost[b]) / (c - b)
+    found = 0.5 * (a + b) + 0.5 * (c - a) * up / (up + down) if up + down > 0.0 else b
+    if abs(found - b) < NEAR * (c - a):
+        found = b + 0.3 * max(c - b, a - b, key=abs)
+    return float(np.clip(found, a + NEAR * (b - a), c - NEAR * (c - b)))
+
+
 @dataclass(frozen=True, eq=False)
 class Fitter:
     """Fits laws to the judged runs."""
@@ -90,11 +125,43 @@ class Fitter:
     pool: Pool
     table: Table
 
+    def screened(self) -> dict[Hypothesis, tuple[Array, float]]:
+        """Laws of one parameter that move the robot: the best of a few sizes (1,) over their range, and what
+        it leaves of the first judged run."""
+        candidates, bench = self.bench.candidates, self.bench
+        moving = [
+            law for law in candidates.hypotheses if candidates.keys[law.columns[0]] in candidates.moving
+        ]
+        points = [
+            (law, share * end)
+            for law in moving
+            if len(law.columns) == 1
+            for end in bounds(candidates, law.columns)
+            if end.any()
+            for share in SCREEN
+        ]
+        sets = [effects_at(bench, law.columns, point) for law, point in points]
+        table = dataclasses.replace(self.table, runs=self.table.runs[:1], blocks=self.table.blocks[:1])
+        half = -(-len(sets) // bench.jobs)
+        parts = [sets[i : i + half] for i in range(0, len(sets), half)]
+        with ThreadPoolExecutor(bench.jobs) as threads:
+            of = threads.map(errors_with, repeat(bench), repeat(bench.runs[0]), repeat(bench.raws[0]), parts)
+            errors = [error for part in of for error in part]
+        out = dict[Hypothesis, tuple[Array, float]]()
+        for (law, point), error in zip(points, errors, strict=True):
+            if error is not None:
+                left = table.left(table.products([error])).total
+                if law not in out or left < out[law][1]:
+                    out[law] = point, left
+        return out
+
     def fits(
-        self, laws: Sequence[tuple[Hypothesis, Array]]
+        self,
+        laws: Sequence[tuple[Hypothesis, Array]],
+        further: Sequence[tuple[Hypothesis, Array]] = (),
     ) -> tuple[dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
-        """Laws with their linear fits (k,), side by side; and those with which the twin diverges at all
-        sizes, as failures with their linear value."""
+        """Laws with their linear fits (k,), side by side, and at `further` sizes; and those with which the
+        twin diverges at all sizes, as failures with their linear value."""
         silent = [law for law, _ in laws if self.silent(law)]
         ladder = [
             (law, point)
@@ -106,7 +173,7 @@ class Fitter:
         for law, shares in [*((law, LATE) for law in delays), *((law, SPREAD) for law in silent)]:
             ends = [end for end in bounds(self.bench.candidates, law.columns) if end.any()]
             ladder += [(law, share * end) for share in shares for end in ends]
-        best = self._better({}, ladder)
+        best = self._better({}, [*ladder, *further])
         most = self.table.before().total - SPEAKS
         speak = delays + [law for law in silent if law in best and best[law].left.total < most]
         for share in CLOSER:
@@ -130,15 +197,36 @@ class Fitter:
         return self._improved(best).get(law)
 
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
-        """The best laws, along their signatures from where they are."""
+        """The best laws, along their signatures from where they are, and between the sizes tried so far."""
+        before, best = self.table.before().total, self._on_their_ground(best)
         for _ in range(ROUNDS):
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
             steps = [(law, self._next(law, best[law])) for law in first]
-            tried = [(law, point) for law, point in steps if np.abs(point - best[law].fit.value).max() > 1e-3]
+            steps += [
+                (law, self._inside(law, np.array([between(best[law].tried, before)])))
+                for law in first
+                if len(law.columns) == 1
+            ]
+            tried = [
+                (law, point)
+                for law, point in steps
+                if all(np.abs(point - size).max() > SAME_SIZE for size, _ in best[law].tried)
+            ]
             if not tried:
                 break
             best = self._better(best, tried)
-        return best
+        return self._by_squares(self._on_their_ground(best))
+
+    def _on_their_ground(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
+        """The best laws with each run on the ground that suits it beside them: without the effect it looked
+        otherwise."""
+        table, grounds, S = self.table, dict[Hypothesis, tuple[Array, ...]](), len(self.bench.raws[0].own)
+        first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
+        for law in first:
+            errors, weight = table.products(best[law].fit.errors), best[law].left.weight
+            states = [b.adapted(e, table.sigma, weight) for b, e in zip(table.blocks, errors, strict=True)]
+            grounds[law] = tuple(np.clip(theta[:S], -MOST_SOIL, MOST_SOIL) for theta in states)
+        return self._better(best, [(law, best[law].fit.value) for law in first], grounds)
 
     def silent(self, law: Hypothesis) -> bool:
         """Whether the law's signature says nothing, whatever its size."""
@@ -155,24 +243,49 @@ class Fitter:
         return np.asarray(np.clip(point, *bounds(self.bench.candidates, law.columns)))
 
     def _better(
-        self, best: dict[Hypothesis, Fitted], points: Sequence[tuple[Hypothesis, Array]]
+        self,
+        best: dict[Hypothesis, Fitted],
+        points: Sequence[tuple[Hypothesis, Array]],
+        grounds: Mapping[Hypothesis, tuple[Array, ...]] | None = None,
+        worse: float = 0.0,
     ) -> dict[Hypothesis, Fitted]:
+        """The best of each law once these points are tried, too.
+
+        Args:
+            grounds: other grounds of the runs beside a law than those that it has.
+            worse: by how much more a point may leave to be taken.
+        """
         if not points:
             return best
-        sets = [effects_at(self.bench, law.columns, point) for law, point in points]
-        bench = self.bench
+        bench, own = self.bench, {law: found.grounds for law, found in best.items()} | dict(grounds or {})
+        usual = tuple(raw.own for raw in bench.raws)
+        sets = [effects_at(bench, law.columns, point) for law, point in points]
+        of = [[own.get(law, usual)[run] for law, _ in points] for run in range(len(bench.runs))]
         with ThreadPoolExecutor(bench.jobs) as threads:
-            errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets)))
+            errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets), of))
         out = dict(best)
         for i, (law, point) in enumerate(points):
-            own = [mine[i] for mine in errors]
-            whole = [error for error in own if error is not None]
-            if len(whole) < len(own):
+            mine = [some[i] for some in errors]
+            whole = [error for error in mine if error is not None]
+            if len(whole) < len(mine):
                 continue
             left = self.table.left(self.table.products(whole))
-            if law not in out or left.total < out[law].left.total:
-                out[law] = Fitted(self._fit(law, point, whole), left)
+            tried = (*(out[law].tried if law in out else ()), (point, left.total))
+            if law not in out or left.total < out[law].left.total + worse:
+                out[law] = Fitted(self._fit(law, point, whole), left, own.get(law, usual), tried)
+            else:
+                out[law] = dataclasses.replace(out[law], tried=tried)
         return out
+
+    def _by_squares(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
+        """The best laws at the size of weighted least squares: logarithms say which law it is, but are flat
+        near their least sum, where channels are back at their floor."""
+        points = []
+        for law in sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]:
+            found = best[law]
+            step = self.table.solved(law.columns, self.table.products(found.fit.errors), found.left.weight)
+            points.append((law, self._inside(law, found.fit.value + step)))
+        return self._better(best, points, worse=AS_GOOD)
 
     def _failed(self, law: Hypothesis, value: Array) -> Refit:
         _, covariance, _ = self.pool.fit(law.columns)

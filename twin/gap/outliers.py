@@ -15,19 +15,15 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.residuals import Evidence
+from terrafusion.twin.gap.residuals import OUTLIER_SIGMAS, ROBUST_STEPS, Evidence, explained, within_limits
 
 Array = NDArray[np.float64]
 
-SIGMAS = 4.0
-"""Limit in sigmas of the channel's noise: one in 16 000 normal errors is beyond it."""
 HEAVY = 0.02
 """A channel is bounded where more than this share of the references' errors is beyond the limit."""
 STRONG = 1.5
 """Where half of the judged runs' errors exceed by this factor what noise makes of them, the runs themselves
 have changed: their limit is in their own sigmas."""
-STEPS = 8
-"""Steps of the fit that outliers do not pull on."""
 NORMAL = 1.4826
 """Standard deviation over median absolute deviation of normal errors."""
 
@@ -44,39 +40,35 @@ def bounded(
     channels = range(len(references[0].limit) if references else 0)
     every = (*runs, *references)
     with ThreadPoolExecutor(jobs) as pool:
-        adapted = pool.map(lambda run: _adapted(run, sigma, STEPS), every)
+        adapted = pool.map(lambda run: _adapted(run, sigma), every)
         left = dict(zip(map(id, every), adapted, strict=True))
 
     def errors(group: Sequence[Evidence], channel: int) -> Array:
         parts = [left[id(run)][1][run.channel == channel] for run in group]
         return np.abs(np.concatenate(parts))
 
-    heavy = [float(np.mean(errors(references, i) > SIGMAS)) > HEAVY for i in channels]
+    heavy = [float(np.mean(errors(references, i) > OUTLIER_SIGMAS)) > HEAVY for i in channels]
     own = [NORMAL * float(np.median(errors(runs, i))) for i in channels]
-    normal = np.where(heavy, SIGMAS, np.inf)
+    normal = np.where(heavy, OUTLIER_SIGMAS, np.inf)
     changed = np.where(np.array(own) > STRONG, own, 1.0) * normal
     return (
-        [_bounded(run, *left[id(run)], changed) for run in runs],
-        [_bounded(run, *left[id(run)], normal) for run in references],
+        [_bounded(run, left[id(run)][0], changed) for run in runs],
+        [_bounded(run, left[id(run)][0], normal) for run in references],
     )
 
 
-def _adapted(run: Evidence, sigma: Array, steps: int) -> tuple[Array, Array]:
-    """Error (n,) as the run's own states explain it, and what they leave; outliers do not pull on them."""
+def _adapted(run: Evidence, sigma: Array) -> tuple[Array, Array]:
+    """Gain (T, n) of the states, and what they leave (n,) of the error."""
     J, e = run.rows[:, : run.states].astype(float), run.rows[:, -1].astype(float)
     gain = np.linalg.solve(run.gram[: run.states, : run.states] + np.diag(sigma**-2.0), J.T)
-    told = np.zeros(len(e))
-    for _ in range(steps):
-        told = J @ (gain @ (told + np.clip(e - told, -SIGMAS, SIGMAS)))
-    return told, e - told
+    return gain, e - explained(J, gain, e, OUTLIER_SIGMAS, ROBUST_STEPS)
 
 
-def _bounded(run: Evidence, told: Array, left: Array, limit: Array) -> Evidence:
+def _bounded(run: Evidence, gain: Array, limit: Array) -> Evidence:
     if not np.isfinite(limit).any():
         return run
-    rows = run.rows.astype(float)
-    most = limit[run.channel]
-    rows[:, -1] = told + np.clip(left, -most, most)
+    out, rows = dataclasses.replace(run, gain=gain, limit=limit), run.rows.astype(float)
+    rows[:, -1] = within_limits(out, rows[:, -1])
     gram = run.gram.copy()
     gram[:, -1] = gram[-1, :] = rows.T @ rows[:, -1]
-    return dataclasses.replace(run, gram=gram, rows=rows.astype(np.float32), told=told, limit=limit)
+    return dataclasses.replace(out, gram=gram, rows=rows.astype(np.float32))

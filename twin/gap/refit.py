@@ -20,7 +20,7 @@ from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.poses import all_settled
 from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.residuals import SOIL_STATE, Evidence, Raw, whitened_error
+from terrafusion.twin.gap.residuals import Evidence, Raw, carried_back, on_own_ground, whitened_error
 from terrafusion.twin.gap.score import Score
 from terrafusion.twin.gap.signatures import predictions
 
@@ -123,27 +123,27 @@ def _bounded(bench: Bench, columns: Sequence[int], value: Array) -> Array:
 
 
 def errors_with(
-    bench: Bench, run: Evidence, raw: Raw, sets: Sequence[Mapping[str, float]]
+    bench: Bench,
+    run: Evidence,
+    raw: Raw,
+    sets: Sequence[Mapping[str, float]],
+    grounds: Sequence[Array] | None = None,
 ) -> list[Array | None]:
-    """Whitened errors of a run against the twin with each set of effects; None where it diverges."""
-    c, base = bench.candidates, bench.model.effects
-    soil = [name for name in SOIL_STATE if name in c.keys]
-    driven = [{k: v for k, v in some.items() if k not in soil} for some in sets]
-    told = predictions(run.log, bench.model, c, [{}, *driven], run.log.start)
-    plain, *found = all_settled(run.log, told)
+    """Whitened errors of a run against the twin with each set of effects; None where it diverges.
+
+    Args:
+        grounds: the run's ground (S,) beside each set, in typical sizes; None: `raw.own`.
+    """
+    grounds = [raw.own] * len(sets) if grounds is None else grounds
+    driven = [on_own_ground(own, bench.drives, some) for own, some in zip(grounds, sets, strict=True)]
+    told = predictions(run.log, bench.model, bench.candidates, driven, run.log.start)
     out: list[Array | None] = []
-    for some, y in zip(sets, found, strict=True):
-        if y is None or plain is None:
+    for own, y in zip(grounds, all_settled(run.log, told), strict=True):
+        if y is None:
             out.append(None)
             continue
-        # The errors are linearised about the run's own ground: the ground itself enters linearly, all else
-        # as the twin has it.
-        moved = [(some.get(k, base.get(k, 0.0)) - base.get(k, 0.0)) / c.scale[c.keys.index(k)] for k in soil]
-        error = [
-            e - (new - old) - s[:, : len(soil)] @ np.array(moved)
-            for e, new, old, s in zip(raw.error, y, plain, raw.state, strict=True)
-        ]
-        out.append(whitened_error(raw, run, bench.noise, error))
+        error = [o.value - value for o, value in zip(run.log.observed, y, strict=True)]
+        out.append(whitened_error(raw, run, bench.noise, carried_back(raw, own, error)))
     return out
 
 

@@ -44,9 +44,17 @@ OFFSETS = {
 SAME_YAW_RAD = 0.2
 """Runs that were told the same share a signature where they set out within such a sector of headings."""
 MOST_SOIL = 4.0
-"""A run's own ground is looked for within so many typical sizes."""
+"""A reference's own ground is looked for within so many typical sizes."""
+REACH = 3.0
+"""That of a judged run within so many sigmas of how the references' grounds scatter: what goes beyond is
+something to be found."""
 GROUND_STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
 """Steps of that search; it ends when one gains less than 3 %, or the errors are near the noise."""
+WITHIN = 0.98
+"""Share of its range in which a parameter is looked for."""
+OUTLIER_SIGMAS, ROBUST_STEPS = 4.0, 8
+"""Errors beyond so many sigmas of the channel's noise do not pull on a run's states (one in 16 000 normal
+errors is); steps of that fit."""
 NUISANCE = 0.3
 """1 sigma of the effects, in typical sizes, while a run's own ground is looked for."""
 
@@ -56,11 +64,13 @@ class Raw:
     """One run before whitening; lists hold one entry a channel of `log.observed`.
 
     Attributes:
-        error: (n,) measured less predicted, linearised about the run's own ground (see `at_own_ground`).
+        own: (S,) the run's own ground, in typical sizes from the model's, in the order of `SOIL_STATE`.
+        error: (n,) measured less predicted, linearised about that ground (see `at_own_ground`).
         state, change, probe, pose: (n, T), (n, K), (n, G) and (n, 3) derivatives.
     """
 
     log: Log
+    own: Array
     error: list[Array]
     state: list[Array]
     change: list[Array]
@@ -79,8 +89,8 @@ class Evidence:
         frame: (n, 3) orthonormal columns a window, along which the poses move the rows.
         seconds: length.
         states: T.
-        told: (n,) part of the error that the run's own states explain.
-        limit: by channel, beyond which what they leave counts as this much (see `outliers`).
+        gain: (T, n) states by an error, as ridge regression has them; no rows where nothing is bounded.
+        limit: by channel, beyond which what the states leave of an error counts as so much (see `outliers`).
     """
 
     name: str
@@ -93,7 +103,7 @@ class Evidence:
     window: NDArray[np.int64]
     seconds: float
     states: int
-    told: Array
+    gain: Array
     limit: Array
 
 
@@ -158,25 +168,29 @@ def raw_of(
         change.append(s.change)
         probe.append(probes.columns(log, model, observed, s, channels))
         pose.append(s.by_pose)
-    return Raw(log, error, state, change, probe, pose)
+    return Raw(log, np.zeros(len(soil)), error, state, change, probe, pose)
 
 
-def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
+def at_own_ground(
+    run: Raw, drives: Drives, noise: Mapping[str, Noise], most: Array | float = MOST_SOIL
+) -> Raw:
     """The run with errors linearised about its own ground, not about that of the references.
 
     Slip grows steeply with the ground's strength; to first order, a run on softer ground would show a gap.
     The twin is run on the ground that suits this run, as long as that lowers the errors, and the way there
     is carried back linearly.
+
+    Args:
+        most: the ground is looked for within so many typical sizes (S,).
     """
-    names = [name for name in SOIL_STATE if name in drives.candidates.keys]
-    own, best = np.zeros(len(names)), run
+    own, errors = run.own, run.error
     evidence = whitened(without_probes(run), noise)
     rows, cost = evidence.rows[:, :-1].astype(float), float(evidence.gram[-1, -1])
     gain = evidence.gram[:-1, -1]
     for _ in range(GROUND_STEPS):
-        step = _soil_step(evidence, gain, drives.candidates, len(names))
-        tried = np.clip(own + step, -MOST_SOIL, MOST_SOIL)
-        effects = _soil_at(tried, names, drives)
+        step = _soil_step(evidence, gain, drives.candidates, len(own))
+        tried = np.clip(own + step, -most, most)
+        effects = on_own_ground(tried, drives, {})
         told = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)
         found = all_settled(run.log, told)[0]
         if found is None:
@@ -186,11 +200,34 @@ def at_own_ground(run: Raw, drives: Drives, noise: Mapping[str, Noise]) -> Raw:
         now, before = float(white @ white), cost
         if now >= before:
             break
-        own, best, cost, gain = tried, dataclasses.replace(run, error=error), now, rows.T @ white
+        own, errors, cost, gain = tried, error, now, rows.T @ white
         if now > ENOUGH * before or now < GOOD * len(evidence.time_s):
             break
-    back = [e + s[:, : len(names)] @ own for e, s in zip(best.error, run.state, strict=True)]
-    return dataclasses.replace(run, error=back)
+    return dataclasses.replace(run, own=own, error=carried_back(run, own, errors))
+
+
+def carried_back(run: Raw, own: Array, errors: Sequence[Array]) -> list[Array]:
+    """Errors on the run's own ground (S,) as they would be on the model's, to first order."""
+    return [e + s[:, : len(own)] @ own for e, s in zip(errors, run.state, strict=True)]
+
+
+def on_own_ground(own: Array, drives: Drives, effects: Mapping[str, float]) -> dict[str, float]:
+    """Effects with the ground as far (S,) from the model's, or from theirs, as the run's own is, within its
+    range."""
+    c, out = drives.candidates, dict(effects)
+    for size, name in zip(own, (k for k in SOIL_STATE if k in c.keys), strict=True):
+        i = c.keys.index(name)
+        value = effects.get(name, drives.model.effects.get(name, 0.0)) + float(size * c.scale[i])
+        out[name] = float(np.clip(value, WITHIN * c.low[i], WITHIN * c.high[i]))
+    return out
+
+
+def reach(runs: Sequence[Raw], candidates: Candidates) -> Array:
+    """How far (S,) the ground of a run may lie from the model's, by those of the references; the first guess
+    counts as one of them."""
+    first = np.array([sigma for name, sigma in SOIL_STATE.items() if name in candidates.keys])
+    squares = sum((run.own**2 for run in runs), first**2)
+    return np.asarray(REACH * np.sqrt(squares / (1 + len(runs))))
 
 
 def _soil_step(evidence: Evidence, gain: Array, candidates: Candidates, count: int) -> Array:
@@ -206,17 +243,6 @@ def _soil_step(evidence: Evidence, gain: Array, candidates: Candidates, count: i
 def without_probes(run: Raw) -> Raw:
     """The run with no probes: they are half of all columns, and only the scores need them."""
     return dataclasses.replace(run, probe=[p[:, :0] for p in run.probe])
-
-
-def _soil_at(own: Array, names: Sequence[str], drives: Drives) -> dict[str, float]:
-    """Soil parameters that lie `own` (T,) typical sizes from the model's; `own` is kept within their
-    ranges."""
-    c, effects = drives.candidates, {}
-    for i, name in enumerate(names):
-        at, base = c.keys.index(name), drives.model.effects.get(name, 0.0)
-        effects[name] = float(np.clip(base + own[i] * c.scale[at], 0.95 * c.low[at], 0.95 * c.high[at]))
-        own[i] = (effects[name] - base) / c.scale[at]
-    return effects
 
 
 def state_sigmas(candidates: Candidates) -> Array:
@@ -263,7 +289,7 @@ def projected(run: Raw, white: Array) -> Evidence:
     return Evidence(
         run.log.name, run.log, out.T @ out, out.astype(np.float32), frame, channel,
         np.concatenate([middle[i][rows] for i, _, rows in parts]), window, run.log.seconds(),
-        run.state[0].shape[1], np.zeros(len(window)), np.full(len(run.log.observed), np.inf),
+        run.state[0].shape[1], np.zeros((0, len(window))), np.full(len(run.log.observed), np.inf),
     )  # fmt: skip
 
 
@@ -281,5 +307,23 @@ def whitened_error(run: Raw, evidence: Evidence, noise: Mapping[str, Noise], err
     for k in np.unique(evidence.window):
         mine = evidence.window == k
         out[mine] -= evidence.frame[mine] @ (evidence.frame[mine].T @ out[mine])
+    return within_limits(evidence, out)
+
+
+def explained(J: Array, gain: Array, error: Array, limit: float, steps: int) -> Array:
+    """Part (n,) of an error that a run's states explain, by their columns J (n, T) and `gain` (T, n); what
+    is beyond the limit does not pull on them (Huber 1964)."""
+    told = np.zeros(len(error))
+    for _ in range(steps):
+        told = J @ (gain @ (told + np.clip(error - told, -limit, limit)))
+    return told
+
+
+def within_limits(evidence: Evidence, error: Array) -> Array:
+    """A whitened error (n,) of which what the run's states leave is kept within the limits."""
+    if not len(evidence.gain):
+        return error
+    J = evidence.rows[:, : evidence.states].astype(float)
+    told = explained(J, evidence.gain, error, OUTLIER_SIGMAS, ROBUST_STEPS)
     most = evidence.limit[evidence.channel]
-    return np.asarray(evidence.told + np.clip(out - evidence.told, -most, most))
+    return np.asarray(told + np.clip(error - told, -most, most))

@@ -24,6 +24,8 @@ SIDES = np.array([1.0, -1.0, 1.0, -1.0])[:, None]
 ENDS = np.array([1.0, 1.0, -1.0, -1.0])[:, None]
 TRANSFER_S = 0.05
 """Time constant with which loads follow the body's acceleration."""
+SUPPLY_S = 0.05
+"""Time constant of the battery's current."""
 DRAG_MPS, BRAKE_RADPS, PLAY_S = 0.02, 0.05, 0.03
 AIR_KG_PER_M3 = 1.2
 WHEEL_STATES = ("speed", "angle", "torque", "integral", "force_x", "force_y", "play")
@@ -39,6 +41,7 @@ class Machine:
         self.s: dict[str, Array] = {name: np.zeros(runs) for name in BODY_STATES}
         self.s |= {name: np.zeros((4, runs)) for name in WHEEL_STATES}
         self.s["yaw"] = n["heading_rad"].copy()
+        self.s |= {"drawn_a": np.zeros(runs), "supply_v": n["open_v"].copy()}  # the battery's
         self.s["slosh"] = np.zeros((4, runs))  # displacement and velocity of a swinging load, body x and y
         self.t_s = 0.0
         self.frame: dict[str, Any] = {}
@@ -76,7 +79,7 @@ class Machine:
         f |= self._footprints(f)
         f |= self._strengths(f)
         f |= self._drags(f)
-        f |= self._supply(f)
+        f |= self._supply(frame_s)
         f |= self._outer_forces(f, frame_s)
         return f
 
@@ -200,14 +203,22 @@ class Machine:
         hot = n["knob_brake_nm"] * (0.2 + 0.8 * (1.0 - np.exp(-s["heat"] / 300.0)))
         return {"drag": drag, "brake": brake + hot * last, "brake_hot": hot}
 
-    def _supply(self, f: dict[str, Any]) -> dict[str, Any]:
-        """Battery voltage over the motors' nominal one, and each motor's current, A."""
-        n = self.n
-        current = motor_current(n, self.s["torque"], self.s["speed"])
-        drawn = np.maximum(np.abs(current).sum(axis=0), 0.0)
+    def _supply(self, frame_s: float) -> dict[str, Any]:
+        """Battery voltage over the motors' nominal one, and each motor's current, A.
+
+        The bridges draw power: the battery's current is that over its voltage, not the motors' current, and
+        what a braking motor gives back is burnt. Capacitors smooth it.
+        """
+        n, s = self.n, self.s
+        current = motor_current(n, s["torque"], s["speed"])
+        power = np.maximum(motor_volts(n, current, s["speed"]) * current, 0.0).sum(axis=0)
+        drawn = s["drawn_a"] = s["drawn_a"] + frame_s / (frame_s + SUPPLY_S) * (
+            power / s["supply_v"] - s["drawn_a"]
+        )
         volts = n["open_v"] - (n["inner_ohm"] + n["knob_sag_ohm"]) * drawn
         volts = volts - n["knob_sag_root"] * np.sqrt(5.0 * drawn)
-        return {"current": current, "supply": np.maximum(volts / n["supply_v"], 0.3)}
+        s["supply_v"] = np.maximum(volts, 0.3 * n["supply_v"])
+        return {"current": current, "supply": s["supply_v"] / n["supply_v"]}
 
     def _outer_forces(self, f: dict[str, Any], frame_s: float) -> dict[str, Any]:
         """Air, gusts and a load that swings, N, body axes."""
@@ -259,7 +270,8 @@ class Machine:
         s["force_x"] = kept + slip * (radius * speed - hub_u)
         s["force_y"] = push_y - side * hub_v
         s["torque"] = torque_0 - torque_per_speed * speed
-        s["integral"] = s["integral"] + h * np.where(self._clipped, 0.0, command - speed)
+        error = command - speed
+        s["integral"] = s["integral"] + h * np.where(self._clipped * error > 0.0, 0.0, error)
         s["motor_work"] = s["motor_work"] + h * (arriving * s["torque"] * speed).sum(axis=0)
         s["heat"] = s["heat"] + h * f["brake_hot"] * np.abs(speed[3])
         s["speed"], s["angle"] = speed, s["angle"] + h * speed
@@ -293,13 +305,12 @@ class Machine:
         lower = -np.minimum(limit, stall * (f["supply"] + relative))
         loop = n["loop_p"] * command + n["loop_i"] * s["integral"]
         asked = loop - n["loop_p"] * s["speed"]
-        self._clipped = (asked > upper) | (asked < lower)
+        self._clipped = 1.0 * (asked > upper) - 1.0 * (asked < lower)
         lag = n["lag_s"] + n["knob_lag_s"]
         held = lag / (lag + h)
-        line = np.where(self._clipped, np.clip(asked, lower, upper), loop)
-        return held * s["torque"] + (1.0 - held) * line, np.where(
-            self._clipped, 0.0, (1.0 - held) * n["loop_p"]
-        )
+        clipped = self._clipped != 0.0
+        line = np.where(clipped, np.clip(asked, lower, upper), loop)
+        return held * s["torque"] + (1.0 - held) * line, np.where(clipped, 0.0, (1.0 - held) * n["loop_p"])
 
     def _body(
         self, u: Array, v: Array, along: tuple[Array, Array], across: tuple[Array, Array], h: float
@@ -348,6 +359,13 @@ def motor_current(n: dict[str, Any], torque: Array, speed: Array) -> Array:
     constant = n["supply_v"] / n["no_load_radps"]
     idle = n["no_load_a"] * np.tanh(speed / 0.1)
     return np.asarray(torque / n["ratio"] / constant * loss + idle)
+
+
+def motor_volts(n: dict[str, Any], current: Array, speed: Array) -> Array:
+    """Voltage at each motor, V: over its winding, and what its turning makes."""
+    constant = n["supply_v"] / n["no_load_radps"]
+    winding_ohm = n["supply_v"] * constant / n["stall_nm"]
+    return np.asarray(winding_ohm * current + constant * n["ratio"] * speed)
 
 
 def _rotated(u: Array, v: Array, angle: Array) -> tuple[Array, Array]:
