@@ -19,7 +19,7 @@ from terrafusion.twin.gap.blind.compare import steady_differences
 from terrafusion.twin.gap.blind.plant import contact
 from terrafusion.twin.gap.blind.plant.field import Patches
 from terrafusion.twin.gap.blind.plant.knobs import KNOBS
-from terrafusion.twin.gap.blind.plant.machine import Machine
+from terrafusion.twin.gap.blind.plant.machine import Machine, motor_current
 from terrafusion.twin.gap.blind.plant.run import record, simulate
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment, side_by_side
 from terrafusion.twin.soil import load_soil
@@ -206,3 +206,26 @@ def test_twin_and_plant_agree_on_firm_ground() -> None:
     for soil, limits in AGREES.items():
         values = (found[soil]["u"], found[soil]["r"], found[soil]["wheel"])
         assert all(value < limit for value, limit in zip(values, limits, strict=True)), (soil, values)
+
+
+def test_a_loop_at_its_limit_comes_back() -> None:
+    """A spin on strong ground takes all torque there is; what comes after is driven as told."""
+    drive = (Segment(1.0), Segment(5.0, 0.0, 2.5), Segment(6.0, 1.6))
+    h = simulate([spec("gravel", drive, knobs={"strength": 1.2})])[0]
+    assert h["speed"][-1].mean() == pytest.approx(1.6 / 0.175, rel=0.01)
+    assert np.ptp(h["speed"][-1]) < 0.1  # and no wheel holds a speed of its own
+
+
+def test_the_battery_gives_the_power_that_the_motors_take() -> None:
+    """At rest under torque a motor's current is large and its power small: so is the battery's current."""
+    held = machine("asphalt")
+    held.s["torque"] = np.full_like(held.s["torque"], 8.0)
+    motors = np.abs(motor_current(held.n, held.s["torque"], held.s["speed"])).sum()
+    for _ in range(200):
+        supplied = held._supply(0.01)
+    volts, drawn = float(held.s["supply_v"][0]), float(held.s["drawn_a"][0])
+    winding = held.n["supply_v"] ** 2 / (held.n["no_load_radps"] * held.n["stall_nm"])
+    heat = float((winding * supplied["current"] ** 2).sum())
+    assert volts * drawn == pytest.approx(heat, rel=1e-6)
+    assert drawn < 0.5 * motors
+    assert volts == pytest.approx(float((held.n["open_v"] - held.n["inner_ohm"] * drawn)[0]), rel=1e-9)

@@ -61,6 +61,7 @@ class Bench:
         channels: observed channels, those of the probes.
         noise: of each channel.
         runs, references: evidence of each.
+        reach: (S,) how far a judged run's ground may lie from the model's, typical sizes.
         drives: signatures, shared by runs that were told the same.
         notes: what was assumed, in sentences.
         jobs: threads.
@@ -73,6 +74,7 @@ class Bench:
     runs: list[Evidence]
     references: list[Evidence]
     raws: list[Raw]
+    reach: Array
     drives: Drives
     notes: tuple[str, ...]
     jobs: int = 1
@@ -275,5 +277,5 @@ def gather(
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return Bench(
         model, candidates, channels, noise, judged, normal,
-        raws[: len(runs)], drives, tuple(dict.fromkeys(notes)), jobs,
+        raws[: len(runs)], most, drives, tuple(dict.fromkeys(notes)), jobs,
     )  # fmt: skip

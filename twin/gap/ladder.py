@@ -24,7 +24,7 @@ from terrafusion.twin.gap.late import DELAYS
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.refit import Refit, effects_at, errors_with, scored
-from terrafusion.twin.gap.residuals import MOST_SOIL, WITHIN
+from terrafusion.twin.gap.residuals import SOIL_STATE, WITHIN
 from terrafusion.twin.gap.score import Score
 
 Array = NDArray[np.float64]
@@ -220,12 +220,13 @@ class Fitter:
     def _on_their_ground(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws with each run on the ground that suits it beside them: without the effect it looked
         otherwise."""
-        table, grounds, S = self.table, dict[Hypothesis, tuple[Array, ...]](), len(self.bench.raws[0].own)
+        table, most = self.table, self.bench.reach
+        grounds = dict[Hypothesis, tuple[Array, ...]]()
         first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
         for law in first:
             errors, weight = table.products(best[law].fit.errors), best[law].left.weight
             states = [b.adapted(e, table.sigma, weight) for b, e in zip(table.blocks, errors, strict=True)]
-            grounds[law] = tuple(np.clip(theta[:S], -MOST_SOIL, MOST_SOIL) for theta in states)
+            grounds[law] = tuple(np.clip(theta[: len(most)], -most, most) for theta in states)
         return self._better(best, [(law, best[law].fit.value) for law in first], grounds)
 
     def silent(self, law: Hypothesis) -> bool:
@@ -258,9 +259,9 @@ class Fitter:
         if not points:
             return best
         bench, own = self.bench, {law: found.grounds for law, found in best.items()} | dict(grounds or {})
-        usual = tuple(raw.own for raw in bench.raws)
         sets = [effects_at(bench, law.columns, point) for law, point in points]
-        of = [[own.get(law, usual)[run] for law, _ in points] for run in range(len(bench.runs))]
+        own = {law: self._grounds(law) for law, _ in points} | own
+        of = [[own[law][run] for law, _ in points] for run in range(len(bench.runs))]
         with ThreadPoolExecutor(bench.jobs) as threads:
             errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets), of))
         out = dict(best)
@@ -272,10 +273,17 @@ class Fitter:
             left = self.table.left(self.table.products(whole))
             tried = (*(out[law].tried if law in out else ()), (point, left.total))
             if law not in out or left.total < out[law].left.total + worse:
-                out[law] = Fitted(self._fit(law, point, whole), left, own.get(law, usual), tried)
+                out[law] = Fitted(self._fit(law, point, whole), left, own[law], tried)
             else:
                 out[law] = dataclasses.replace(out[law], tried=tried)
         return out
+
+    def _grounds(self, law: Hypothesis) -> tuple[Array, ...]:
+        """Each run's ground beside a law to begin with: its own, but that of the references where the law is
+        one of the ground's strength, which its own has taken up in part."""
+        keys = self.bench.candidates.keys
+        share = float(not any(keys[i] in SOIL_STATE for i in law.columns))
+        return tuple(share * raw.own for raw in self.bench.raws)
 
     def _by_squares(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws at the size of weighted least squares: logarithms say which law it is, but are flat

@@ -1,0 +1,87 @@
+"""Fits through the twin on each run's own ground: what a state explained first, a law may take over."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.evidence import Bench, gather
+from terrafusion.twin.gap.ladder import between
+from terrafusion.twin.gap.refit import effects_at, errors_with
+from terrafusion.twin.gap.residuals import SOIL_STATE, Evidence, reach, state_sigmas, within_limits
+from terrafusion.twin.vehicle import load_vehicle
+
+from .drives import runs
+
+STRONGER = "soil_strength/shear"
+
+
+@pytest.fixture(scope="module")
+def bench() -> Bench:
+    candidates = Candidates.of(["soil_strength", "motion_resistance", "wheel_radius"])
+    given = runs(980, 2, {STRONGER: 0.9}), runs(985, 4)
+    return gather(*given, load_vehicle("elevate"), None, candidates, jobs=2)
+
+
+def adapted(run: Evidence, error: np.ndarray) -> float:
+    """Mean square of an error, the run's own states taken out."""
+    J = run.rows[:, : run.states].astype(float)
+    return float(np.mean((error - J @ np.linalg.lstsq(J, error, rcond=None)[0]) ** 2))
+
+
+def left_at(bench: Bench, value: float) -> float:
+    """What is left of the runs' errors with the ground stronger in the twin."""
+    i = bench.candidates.keys.index(STRONGER)
+    some = effects_at(bench, [i], np.array([value / bench.candidates.scale[i]]))
+    found = [errors_with(bench, run, raw, [some])[0] for run, raw in zip(bench.runs, bench.raws, strict=True)]
+    assert all(error is not None for error in found)
+    return float(
+        np.mean([adapted(run, e) for run, e in zip(bench.runs, found, strict=True) if e is not None])
+    )
+
+
+def test_a_ground_far_away_is_driven_and_not_a_multiple_of_a_small_change(bench: Bench) -> None:
+    """Near the true ground little is left; no multiple of the derivative at the references' does that."""
+    linear = float(np.mean([adapted(run, run.rows[:, -1].astype(float)) for run in bench.runs]))
+    print(linear, [left_at(bench, v) for v in (0.0, 0.8, 0.9, 1.0)])
+    assert left_at(bench, 0.9) < 2.0
+    assert linear > 10.0 * left_at(bench, 0.9)
+
+
+def test_a_run_looks_for_its_ground_where_the_references_are(bench: Bench) -> None:
+    """A gap is not taken up as ground before anything else is asked; references stay near each other."""
+    assert len(bench.raws[0].own) == len(SOIL_STATE)
+    assert all(np.abs(raw.own[0]) < 2.0 for raw in bench.raws)  # .9 is 4.5 typical sizes
+    wide = [dataclasses.replace(bench.raws[0], own=np.array([3.0, 0.0, 0.0]))] * 9
+    near = [dataclasses.replace(bench.raws[0], own=np.zeros(3))] * 9
+    assert reach(wide, bench.candidates)[0] > 8.0
+    assert reach(near, bench.candidates)[0] < 0.6
+
+
+def test_limits_move_with_what_the_states_explain(bench: Bench) -> None:
+    """An error that is all state stays whole at any size, and none at all stays none: limits are about
+    what is left, whatever an error was when the limits were set."""
+    run = bench.runs[0]
+    J = run.rows[:, : run.states].astype(float)
+    gain = np.linalg.solve(J.T @ J + np.diag(state_sigmas(bench.candidates) ** -2.0), J.T)
+    tight = dataclasses.replace(run, gain=gain, limit=np.full(len(run.limit), 4.0))
+    far = 60.0 * J[:, 0] / np.abs(J[:, 0]).max()
+    np.testing.assert_allclose(within_limits(tight, far), far, atol=4.0)
+    assert np.abs(within_limits(tight, 0.0 * far)).max() == 0.0
+    spike = np.zeros(len(J))
+    spike[len(J) // 2] = 100.0
+    assert 3.9 < within_limits(tight, spike).max() < 8.0
+
+
+def test_the_next_size_lies_between_the_best_ones_and_beyond_the_last() -> None:
+    def tried(*pairs: tuple[float, float]) -> list[tuple[np.ndarray, float]]:
+        return [(np.array([size]), left) for size, left in pairs]
+
+    whole = [(x, (x - 0.7) ** 2) for x in (0.3, 0.6, 1.2)]
+    assert between(tried(*whole), before=0.49) == pytest.approx(0.7, abs=0.05)  # a parabola's own least
+    assert between(tried((1.0, 3.0), (2.0, 1.0)), before=4.0) == pytest.approx(3.0)
+    assert between(tried((-1.0, 3.0), (-2.0, 1.0)), before=4.0) == pytest.approx(-3.0)
+    assert between(tried((1.0, 9.0), (2.0, 9.5)), before=8.0) == pytest.approx(-1.0)  # none helps: below zero
