@@ -198,8 +198,9 @@ class Fitter:
 
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws, along their signatures from where they are, and between the sizes tried so far."""
-        before, best = self.table.before().total, self._on_their_ground(best)
+        before = self.table.before().total
         for _ in range(ROUNDS):
+            best = self._on_their_ground(best)
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
             steps = [(law, self._next(law, best[law])) for law in first]
             steps += [
@@ -219,15 +220,23 @@ class Fitter:
 
     def _on_their_ground(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws with each run on the ground that suits it beside them: without the effect it looked
-        otherwise."""
-        table, most = self.table, self.bench.reach
-        grounds = dict[Hypothesis, tuple[Array, ...]]()
-        first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
-        for law in first:
+        otherwise. Where the law is one of the ground itself, what the runs have in common is the law's."""
+        table, keys, most = self.table, self.bench.candidates.keys, self.bench.reach
+        grounds, points = dict[Hypothesis, tuple[Array, ...]](), []
+        soil = [keys.index(name) for name in SOIL_STATE if name in keys]
+        for law in sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]:
             errors, weight = table.products(best[law].fit.errors), best[law].left.weight
-            states = [b.adapted(e, table.sigma, weight) for b, e in zip(table.blocks, errors, strict=True)]
-            grounds[law] = tuple(np.clip(theta[: len(most)], -most, most) for theta in states)
-        return self._better(best, [(law, best[law].fit.value) for law in first], grounds)
+            pairs = zip(table.blocks, errors, strict=True)
+            own = np.array([b.adapted(e, table.sigma, weight)[: len(most)] for b, e in pairs])
+            value = best[law].fit.value.copy()
+            for k, i in enumerate(law.columns):
+                if i in soil:
+                    common = own[:, soil.index(i)].mean()
+                    value[k] += common
+                    own[:, soil.index(i)] -= common
+            grounds[law] = tuple(np.clip(own, -most, most))
+            points.append((law, self._inside(law, value)))
+        return self._better(best, points, grounds)
 
     def silent(self, law: Hypothesis) -> bool:
         """Whether the law's signature says nothing, whatever its size."""
