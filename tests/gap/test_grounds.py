@@ -48,7 +48,7 @@ def test_a_ground_far_away_is_driven_and_not_a_multiple_of_a_small_change(bench:
     scale = bench.candidates.scale[law.columns[0]]
     assert float(found.fit.value[0]) * scale == pytest.approx(STRONGER["soil_strength/shear"], abs=0.1)
     assert found.left.total < 0.35 * told[law].total
-    assert all((np.abs(own) <= bench.reach).all() for own in found.grounds)
+    assert all((np.abs(own) <= bench.reach).all() for own in found.fit.grounds)
 
 
 def test_a_run_looks_for_its_ground_where_the_references_are(bench: Bench) -> None:

@@ -27,7 +27,7 @@ from terrafusion.twin.gap.ladder import Fitted, Fitter
 from terrafusion.twin.gap.next_run import NextRun, propose
 from terrafusion.twin.gap.null import Null, learn
 from terrafusion.twin.gap.posterior import Beliefs, Pool, beliefs
-from terrafusion.twin.gap.refit import Refit, refit_all, scored
+from terrafusion.twin.gap.refit import Refit, scored
 from terrafusion.twin.gap.replicates import COUNT, replicates
 from terrafusion.twin.gap.residuals import Evidence, state_sigmas
 from terrafusion.twin.gap.score import Score, learnt_sigma, score
@@ -174,7 +174,9 @@ def diagnosed(
     refits = {name: fits[law].fit for name, law in choice.laws.items() if law in fits}
     refits |= {name: failed[law] for name, law in choice.laws.items() if law in failed}
     held_out = HeldOut(tuple(Pool.of([s], null).plain() for s in scores))
-    remaining = _Remaining(case, fitter, {(law,): fitted for law, fitted in fits.items()})
+    known: dict[tuple[Hypothesis, ...], Fitted | Refit] = {(law,): fit for law, fit in failed.items()}
+    known |= {(law,): fit for law, fit in fits.items()}
+    remaining = _Remaining(case, fitter, known)
     search = Search(remaining, held_out, candidates, table)
     verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)
     if progress is not None:
@@ -242,10 +244,6 @@ class _Case:
     pool: Pool
     believed: Beliefs
 
-    def refitted(self, chosen: Sequence[Sequence[int]]) -> list[Refit]:
-        """Several sets of columns, fitted through the twin itself."""
-        return refit_all(self.bench, self.scores, self.sigma, self.null, self.pool, chosen)
-
 
 def _with_other_forms(bench: Bench, sigma: Array, run: Evidence) -> Score:
     columns = len(bench.candidates.keys)
@@ -259,10 +257,11 @@ class _Remaining:
 
     case: _Case
     fitter: Fitter
-    known: dict[tuple[Hypothesis, ...], Fitted]
+    known: dict[tuple[Hypothesis, ...], Fitted | Refit]
 
-    def __call__(self, forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
-        case, fit = self.case, self._fit(tuple(forms))
+    def __call__(self, forms: Sequence[Hypothesis]) -> tuple[Pool, Refit]:
+        case, fitted = self.case, self._fitted(tuple(forms))
+        fit = fitted.fit if isinstance(fitted, Fitted) else fitted
         if not fit.errors:
             return case.pool, fit
         left = [
@@ -271,18 +270,21 @@ class _Remaining:
         ]
         return Pool.of(left, case.null), fit
 
-    def _fit(self, forms: tuple[Hypothesis, ...]) -> Refit:
-        """The last one beside those before it, where these are known."""
-        before = self.known.get(forms[:-1])
-        if forms not in self.known and before is not None and before.fit.errors:
-            effects, names = (" and ".join(h.effect for h in forms), " and ".join(h.form for h in forms))
-            columns = (*before.fit.columns, *forms[-1].columns)
-            fitted = self.fitter.beside(before, Hypothesis(effects, names, columns))
-            if fitted is not None:
-                self.known[forms] = fitted
-        if forms in self.known:
-            return self.known[forms].fit
-        return self.case.refitted([tuple(i for h in forms for i in h.columns)])[0]
+    def _fitted(self, forms: tuple[Hypothesis, ...]) -> Fitted | Refit:
+        """The last one beside those before it; the failure of those where they have none."""
+        if forms not in self.known:
+            self.known[forms] = self._now(forms)
+        return self.known[forms]
+
+    def _now(self, forms: tuple[Hypothesis, ...]) -> Fitted | Refit:
+        if len(forms) == 1:
+            return self.fitter.alone(forms[0])
+        before = self._fitted(forms[:-1])
+        if not isinstance(before, Fitted):
+            return before
+        effects, names = (" and ".join(h.effect for h in forms), " and ".join(h.form for h in forms))
+        columns = (*before.fit.columns, *forms[-1].columns)
+        return self.fitter.beside(before, Hypothesis(effects, names, columns))
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:

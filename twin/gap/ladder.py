@@ -64,12 +64,10 @@ DIVERGED = "the twin diverges at every size tried, its linear value stands"
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """One law at its best: the fit, what it leaves, each run's ground (S,) beside it, and what any size (k,)
-    that was tried left."""
+    """One law at its best: the fit, what it leaves, and what any size (k,) that was tried left."""
 
     fit: Refit
     left: Left
-    grounds: tuple[Array, ...]
     tried: tuple[tuple[Array, float], ...]
 
 
@@ -183,9 +181,15 @@ class Fitter:
         best = self._improved(best)
         return best, {law: self._failed(law, value) for law, value in laws if law not in best}
 
-    def beside(self, found: Fitted, law: Hypothesis) -> Fitted | None:
+    def alone(self, law: Hypothesis) -> Fitted | Refit:
+        """One law by itself, or its failure."""
+        value, _ = self.table.linear(law.columns, *bounds(self.bench.candidates, law.columns))
+        best, failed = self.fits([(law, value)])
+        return best[law] if law in best else failed[law]
+
+    def beside(self, found: Fitted, law: Hypothesis) -> Fitted | Refit:
         """A law of several effects, whose first columns are those of `found`: from there, the further ones at
-        a ladder of sizes along their signatures in what is left; None where the twin diverges at all."""
+        a ladder of sizes along their signatures in what is left; or its failure."""
         known = len(found.fit.columns)
         low, high = bounds(self.bench.candidates, law.columns)
         rest = self.table.products(found.fit.errors)
@@ -193,8 +197,9 @@ class Fitter:
         at = np.append(found.fit.value, np.zeros(len(more)))
         step, _ = self.table.linear(law.columns, low - at, high - at, rest)
         points = [at + step, *(np.append(found.fit.value, share * more) for share in LADDER)]
-        best = self._better({}, [(law, self._inside(law, point)) for point in points])
-        return self._improved(best).get(law)
+        inside = [(law, self._inside(law, point)) for point in points]
+        best = self._improved(self._better({}, inside, {law: found.fit.grounds}))
+        return best[law] if law in best else self._failed(law, at)
 
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws, along their signatures from where they are, and between the sizes tried so far."""
@@ -267,7 +272,7 @@ class Fitter:
         """
         if not points:
             return best
-        bench, own = self.bench, {law: found.grounds for law, found in best.items()} | dict(grounds or {})
+        bench, own = self.bench, {law: found.fit.grounds for law, found in best.items()} | dict(grounds or {})
         sets = [effects_at(bench, law.columns, point) for law, point in points]
         own = {law: self._grounds(law) for law, _ in points} | own
         of = [[own[law][run] for law, _ in points] for run in range(len(bench.runs))]
@@ -282,7 +287,7 @@ class Fitter:
             left = self.table.left(self.table.products(whole))
             tried = (*(out[law].tried if law in out else ()), (point, left.total))
             if law not in out or left.total < out[law].left.total + worse:
-                out[law] = Fitted(self._fit(law, point, whole), left, own[law], tried)
+                out[law] = Fitted(self._fit(law, point, whole, own[law]), left, tried)
             else:
                 out[law] = dataclasses.replace(out[law], tried=tried)
         return out
@@ -306,7 +311,7 @@ class Fitter:
 
     def _failed(self, law: Hypothesis, value: Array) -> Refit:
         _, covariance, _ = self.pool.fit(law.columns)
-        return Refit(law.columns, value, value, covariance, 0.0, [], DIVERGED)
+        return Refit(law.columns, value, covariance, 0.0, [], (), DIVERGED)
 
     def _next(self, law: Hypothesis, found: Fitted) -> Array:
         low, high = bounds(self.bench.candidates, law.columns)
@@ -314,10 +319,10 @@ class Fitter:
         step, _ = self.table.linear(law.columns, low - at, high - at, self.table.products(found.fit.errors))
         return self._inside(law, at + step)
 
-    def _fit(self, law: Hypothesis, value: Array, errors: list[Array]) -> Refit:
+    def _fit(self, law: Hypothesis, value: Array, errors: list[Array], grounds: tuple[Array, ...]) -> Refit:
         square = 0.0
         for run, first, error in zip(self.bench.runs, self.scores, errors, strict=True):
             x, _ = self.null.standardised(scored(run, self.sigma, error, first.A))
             square += float(x @ self.null.inverse @ x)
         _, covariance, _ = self.pool.fit(law.columns)
-        return Refit(law.columns, value, value, covariance, self.pool.square - square, errors, "")
+        return Refit(law.columns, value, covariance, self.pool.square - square, errors, grounds, "")

@@ -91,7 +91,8 @@ def _left_out(
         others = [s for k, s in enumerate(scores) if k != i] or list(scores)
         value, _, _ = Pool.of(others, null).fit(fit.columns)
         value = fit.value + (value - whole)  # the linear change on top of what the twin itself was fitted to
-        error = errors_with(bench, run, raw, [effects_at(bench, fit.columns, value)])[0]
+        grounds = [fit.grounds[i]] if fit.grounds else None
+        error = errors_with(bench, run, raw, [effects_at(bench, fit.columns, value)], grounds)[0]
         common = run.rows[:, run.states : -1].astype(float) @ null.offset
         return was[i] if error is None else error - common
 

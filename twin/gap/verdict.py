@@ -173,7 +173,7 @@ class Search:
         """
         first = choice.first()
         alone = max(believed.effects.values())
-        return self._extended(self._with((choice.laws[first],), linear.effects[first]), alone)
+        return self._extended(self._with((choice.laws[first],), linear.effects[first]), alone, linear.effects)
 
     def _with(self, forms: tuple[Hypothesis, ...], factor: float) -> Found:
         """Effects of this log Bayes factor, with all that is judged of them."""
@@ -191,15 +191,28 @@ class Search:
         good = goodness(table, errors, left.weight)
         return Found(forms, fit, mine, left, good, factor, beliefs(pool.plain(), self.candidates, given))
 
-    def _extended(self, found: Found, alone: float) -> Found:
-        """Further effects beside those found, as long as they are called for; `alone` is the log Bayes factor
-        of one effect with a law of another form."""
+    def _extended(self, found: Found, alone: float, factors: Mapping[str, float]) -> Found:
+        """Further effects beside those found, as long as they are called for.
+
+        Args:
+            alone: log Bayes factor of one effect with a law of another form.
+            factors: of each effect by itself.
+        """
         while len(found.forms) < MOST_EFFECTS:
             further = self._further(found, alone)
             if further is None:
                 break
-            found = further
+            found = self._exchanged(further, alone, factors) if len(further.forms) == 2 else further
         return found
+
+    def _exchanged(self, found: Found, alone: float, factors: Mapping[str, float]) -> Found:
+        """Of two effects the first was chosen with the other unexplained: the best beside the other, where
+        that leaves less."""
+        second = found.forms[1]
+        other = self._further(self._with((second,), factors[second.effect]), alone)
+        if other is None or {*other.effects} == {*found.effects}:
+            return found
+        return other if other.left.total < found.left.total else found
 
     def _further(self, found: Found, alone: float) -> Found | None:
         """With the one more effect that leaves least; None where none is called for.
