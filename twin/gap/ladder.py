@@ -203,9 +203,9 @@ class Fitter:
 
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws, along their signatures from where they are, and between the sizes tried so far."""
-        before = self.table.before().total
-        for _ in range(ROUNDS):
-            best = self._on_their_ground(best)
+        before, best = self.table.before().total, self._on_their_ground(best, len(best))
+        for i in range(ROUNDS):
+            best = self._on_their_ground(best) if i else best
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
             steps = [(law, self._next(law, best[law])) for law in first]
             steps += [
@@ -223,13 +223,15 @@ class Fitter:
             best = self._better(best, tried)
         return self._by_squares(self._on_their_ground(best))
 
-    def _on_their_ground(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
+    def _on_their_ground(
+        self, best: dict[Hypothesis, Fitted], count: int = IMPROVED
+    ) -> dict[Hypothesis, Fitted]:
         """The best laws with each run on the ground that suits it beside them: without the effect it looked
         otherwise. Where the law is one of the ground itself, what the runs have in common is the law's."""
         table, keys, most = self.table, self.bench.candidates.keys, self.bench.reach
         grounds, points = dict[Hypothesis, tuple[Array, ...]](), []
         soil = [keys.index(name) for name in SOIL_STATE if name in keys]
-        for law in sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]:
+        for law in sorted(best, key=lambda law: best[law].left.total)[:count]:
             errors, weight = table.products(best[law].fit.errors), best[law].left.weight
             pairs = zip(table.blocks, errors, strict=True)
             own = np.array([b.adapted(e, table.sigma, weight)[: len(most)] for b, e in pairs])
