@@ -125,10 +125,15 @@ class Choice:
         told: Mapping[Hypothesis, Told],
         fitted: Mapping[Hypothesis, Fitted] | None = None,
         by: Weights | None = None,
+        gap: Left | None = None,
     ) -> Choice:
-        """From what all laws leave to first order, and what those fitted through the twin do."""
+        """From what all laws leave to first order, and what those fitted through the twin do.
+
+        Args:
+            gap: what is left without any there; None: to first order.
+        """
         by = weights() if by is None else by
-        before = Told.of(table.before(), pool)
+        before = Told.of(table.before() if gap is None else gap, pool)
         laws: dict[str, Hypothesis] = {}
         least: dict[str, Told] = {}
         for law, first in told.items():

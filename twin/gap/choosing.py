@@ -31,4 +31,4 @@ def chosen(
     seen = sorted(screened, key=lambda law: screened[law][1])[:BY_SCREEN]
     further = [(law, screened[law][0]) for law in seen]
     fitted, failed = fitter.fits([(law, sizes[law]) for law in dict.fromkeys([*best, *seen])], further)
-    return Choice.of(fitter.pool, fitter.table, told, fitted, by), fitted, failed
+    return Choice.of(fitter.pool, fitter.table, told, fitted, by, fitter.gap), fitted, failed

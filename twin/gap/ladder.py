@@ -9,6 +9,7 @@ along the signature.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -73,7 +74,7 @@ class Fitted:
 
 def bounds(candidates: Candidates, columns: Sequence[int]) -> tuple[Array, Array]:
     """Least and greatest sizes (k,) of some columns, in typical ones."""
-    at = np.asarray(columns)
+    at = np.asarray(columns, dtype=np.int64)
     scale = candidates.scale[at]
     return WITHIN * candidates.low[at] / scale, WITHIN * candidates.high[at] / scale
 
@@ -143,7 +144,9 @@ class Fitter:
         half = -(-len(sets) // bench.jobs)
         parts = [sets[i : i + half] for i in range(0, len(sets), half)]
         with ThreadPoolExecutor(bench.jobs) as threads:
-            of = threads.map(errors_with, repeat(bench), repeat(bench.runs[0]), repeat(bench.raws[0]), parts)
+            at = ([np.zeros(len(bench.reach))] * len(part) for part in parts)
+            run, raw = repeat(bench.runs[0]), repeat(bench.raws[0])
+            of = threads.map(errors_with, repeat(bench), run, raw, parts, at)
             errors = [error for part in of for error in part]
         out = dict[Hypothesis, tuple[Array, float]]()
         for (law, point), error in zip(points, errors, strict=True):
@@ -172,7 +175,7 @@ class Fitter:
             ends = [end for end in bounds(self.bench.candidates, law.columns) if end.any()]
             ladder += [(law, share * end) for share in shares for end in ends]
         best = self._better({}, [*ladder, *further])
-        most = self.table.before().total - SPEAKS
+        most = self.gap.total - SPEAKS
         speak = delays + [law for law in silent if law in best and best[law].left.total < most]
         for share in CLOSER:
             found = {law: best[law].fit.value for law in speak if law in best}
@@ -203,7 +206,7 @@ class Fitter:
 
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws, along their signatures from where they are, and between the sizes tried so far."""
-        before, best = self.table.before().total, self._on_their_ground(best, len(best))
+        before, best = self.gap.total, self._on_their_ground(best, len(best))
         for i in range(ROUNDS):
             best = self._on_their_ground(best) if i else best
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
@@ -269,14 +272,15 @@ class Fitter:
         """The best of each law once these points are tried, too.
 
         Args:
-            grounds: other grounds of the runs beside a law than those that it has.
+            grounds: other grounds of the runs beside a law than those that it has; to begin with it has that
+                of the references, as what a run takes for its own holds a part of the effect.
             worse: by how much more a point may leave to be taken.
         """
         if not points:
             return best
         bench, own = self.bench, {law: found.fit.grounds for law, found in best.items()} | dict(grounds or {})
         sets = [effects_at(bench, law.columns, point) for law, point in points]
-        own = {law: self._grounds(law) for law, _ in points} | own
+        own = {law: (np.zeros(len(bench.reach)),) * len(bench.runs) for law, _ in points} | own
         of = [[own[law][run] for law, _ in points] for run in range(len(bench.runs))]
         with ThreadPoolExecutor(bench.jobs) as threads:
             errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets), of))
@@ -294,12 +298,16 @@ class Fitter:
                 out[law] = dataclasses.replace(out[law], tried=tried)
         return out
 
-    def _grounds(self, law: Hypothesis) -> tuple[Array, ...]:
-        """Each run's ground beside a law to begin with: its own, but that of the references where the law is
-        one of the ground's strength, which its own has taken up in part."""
-        keys = self.bench.candidates.keys
-        share = float(not any(keys[i] in SOIL_STATE for i in law.columns))
-        return tuple(share * raw.own for raw in self.bench.raws)
+    @functools.cached_property
+    def gap(self) -> Left:
+        """What is left with no law in the twin, each run on the ground that suits it so."""
+        none = Hypothesis("", "", ())
+        best = self._better({}, [(none, np.zeros(0))])
+        for _ in range(ROUNDS if best else 0):
+            best = self._on_their_ground(best)
+        first = self.table.before()
+        found = best[none].left if best else first
+        return found if found.total < first.total else first
 
     def _by_squares(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws at the size of weighted least squares: logarithms say which law it is, but are flat

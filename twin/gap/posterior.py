@@ -121,7 +121,7 @@ class Pool:
 
     def fit(self, columns: Sequence[int], size: float = WIDE) -> tuple[Array, Array, float]:
         """Best coefficients (k,), their covariance (k, k), and how much of `square` they explain."""
-        at = np.asarray(columns)
+        at = np.asarray(columns, dtype=np.int64)
         H = self.information[np.ix_(at, at)] + np.eye(len(at)) / size**2
         covariance = np.linalg.inv(H)
         best = covariance @ self.gain[at]
