@@ -205,7 +205,7 @@ FORMS = (
             "wheel": lambda q, gap, share: _slack(q, share),
             "measurement": lambda q, gap, share: _seen_through_backlash(q, gap),
         },
-        "both of these", "ours",
+        "a gear that shows `gap` to the encoder and loses the share `share` while it crosses it", "ours",
     ),
     Form(
         "dead_time", "transport", one("s", 0.05, 0.0, 1.0),
