@@ -2,8 +2,8 @@
 
 What an effect of real size does is not its signature times that size: a delay of a third of a second is no
 multiple of one of 15 ms. A fit that starts where the signature suggests often ends there, at a loss. So each
-law is driven at a ladder of sizes, the best of them is kept by what it leaves in each channel, and improved
-along the signature.
+law is driven at a ladder of sizes, the best of them is kept by what it leaves in each channel, and improved:
+along the signature, between the sizes tried, and by the ground on which each run is beside the law.
 """
 
 from __future__ import annotations
@@ -207,8 +207,7 @@ class Fitter:
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws, along their signatures from where they are, and between the sizes tried so far."""
         before, best = self.gap.total, self._on_their_ground(best, len(best))
-        for i in range(ROUNDS):
-            best = self._on_their_ground(best) if i else best
+        for _ in range(ROUNDS):
             first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
             steps = [(law, self._next(law, best[law])) for law in first]
             steps += [
@@ -223,8 +222,8 @@ class Fitter:
             ]
             if not tried:
                 break
-            best = self._better(best, tried)
-        return self._by_squares(self._on_their_ground(best))
+            best = self._on_their_ground(self._better(best, tried))
+        return self._by_squares(best)
 
     def _on_their_ground(
         self, best: dict[Hypothesis, Fitted], count: int = IMPROVED
