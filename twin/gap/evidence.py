@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -267,10 +268,14 @@ def gather(
     raws = raws_of(logs, drives, channels, jobs, told)
     first = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
     with ThreadPoolExecutor(jobs) as pool:
-        normal_raws = list(pool.map(lambda run: at_own_ground(run, drives, first), raws[len(runs) :]))
-        most = reach(normal_raws, candidates)
-        judged_raws = pool.map(lambda run: at_own_ground(run, drives, first, most), raws[: len(runs)])
-        raws = [*judged_raws, *normal_raws]
+        free = list(pool.map(lambda run: at_own_ground(run, drives, first), raws[len(runs) :]))
+        most = reach(free, candidates)
+        # One limit for all, or a run that is but a further reference would differ from them.
+        far = [not (abs(run.own) <= most).all() for run in free]
+        again = [*raws[: len(runs)], *itertools.compress(raws[len(runs) :], far)]
+        limited = pool.map(lambda run: at_own_ground(run, drives, first, most), again)
+        judged_raws = list(itertools.islice(limited, len(runs)))
+        raws = judged_raws + [next(limited) if too else run for run, too in zip(free, far, strict=True)]
         noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
         evidence = list(pool.map(lambda run: whitened(run, noise), raws))
     judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates), jobs)

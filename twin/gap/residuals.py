@@ -44,10 +44,10 @@ OFFSETS = {
 SAME_YAW_RAD = 0.2
 """Runs that were told the same share a signature where they set out within such a sector of headings."""
 MOST_SOIL = 4.0
-"""A reference's own ground is looked for within so many typical sizes."""
+"""A run's own ground is looked for within so many typical sizes,"""
 REACH = 3.0
-"""That of a judged run within so many sigmas of how the references' grounds scatter: what goes beyond is
-something to be found."""
+"""and within so many sigmas of how the references' grounds scatter: what goes beyond is something to be
+found."""
 GROUND_STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
 """Steps of that search; it ends when one gains less than 3 %, or the errors are near the noise."""
 WITHIN = 0.98
@@ -227,7 +227,7 @@ def reach(runs: Sequence[Raw], candidates: Candidates) -> Array:
     counts as one of them."""
     first = np.array([sigma for name, sigma in SOIL_STATE.items() if name in candidates.keys])
     squares = sum((run.own**2 for run in runs), first**2)
-    return np.asarray(REACH * np.sqrt(squares / (1 + len(runs))))
+    return np.minimum(REACH * np.sqrt(squares / (1 + len(runs))), MOST_SOIL)
 
 
 def _soil_step(evidence: Evidence, gain: Array, candidates: Candidates, count: int) -> Array:
