@@ -123,7 +123,7 @@ class Pool:
         """Best coefficients (k,), their covariance (k, k), and how much of `square` they explain."""
         at = np.asarray(columns, dtype=np.int64)
         H = self.information[np.ix_(at, at)] + np.eye(len(at)) / size**2
-        covariance = np.linalg.inv(H)
+        covariance: Array = np.asarray(np.linalg.inv(H), dtype=float)
         best = covariance @ self.gain[at]
         explained = 2.0 * best @ self.gain[at] - best @ self.information[np.ix_(at, at)] @ best
         return best, covariance, float(explained)
