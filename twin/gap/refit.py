@@ -74,9 +74,9 @@ def errors_with(
     """
     grounds = [raw.own] * len(sets) if grounds is None else grounds
     driven = [on_own_ground(own, bench.drives, some) for own, some in zip(grounds, sets, strict=True)]
-    told = predictions(run.log, bench.model, bench.candidates, driven, run.log.start)
+    told = predictions(run.log, bench.model, bench.candidates, [some for some, _ in driven], run.log.start)
     out: list[Array | None] = []
-    for own, y in zip(grounds, all_settled(run.log, told), strict=True):
+    for (_, own), y in zip(driven, all_settled(run.log, told), strict=True):
         if y is None:
             out.append(None)
             continue

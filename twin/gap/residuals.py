@@ -44,10 +44,10 @@ OFFSETS = {
 SAME_YAW_RAD = 0.2
 """Runs that were told the same share a signature where they set out within such a sector of headings."""
 MOST_SOIL = 4.0
-"""A run's own ground is looked for within so many typical sizes,"""
+"""A run's own ground is looked for within so many typical sizes."""
 REACH = 3.0
-"""and within so many sigmas of how the references' grounds scatter: what goes beyond is something to be
-found."""
+"""It is also looked for within so many sigmas of how the references' grounds scatter: what goes beyond is
+something to be found."""
 GROUND_STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
 """Steps of that search; it ends when one gains less than 3 %, or the errors are near the noise."""
 WITHIN = 0.98
@@ -190,7 +190,7 @@ def at_own_ground(
     for _ in range(GROUND_STEPS):
         step = _soil_step(evidence, gain, drives.candidates, len(own))
         tried = np.clip(own + step, -most, most)
-        effects = on_own_ground(tried, drives, {})
+        effects, tried = on_own_ground(tried, drives, {})
         told = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)
         found = all_settled(run.log, told)[0]
         if found is None:
@@ -211,15 +211,17 @@ def carried_back(run: Raw, own: Array, errors: Sequence[Array]) -> list[Array]:
     return [e + s[:, : len(own)] @ own for e, s in zip(errors, run.state, strict=True)]
 
 
-def on_own_ground(own: Array, drives: Drives, effects: Mapping[str, float]) -> dict[str, float]:
+def on_own_ground(own: Array, drives: Drives, effects: Mapping[str, float]) -> tuple[dict[str, float], Array]:
     """Effects with the ground as far (S,) from the model's, or from theirs, as the run's own is, within its
-    range."""
-    c, out = drives.candidates, dict(effects)
-    for size, name in zip(own, (k for k in SOIL_STATE if k in c.keys), strict=True):
+    range; and how far it so is: what is not driven must not be carried back."""
+    c, out, driven = drives.candidates, dict(effects), own.copy()
+    for k, name in enumerate(name for name in SOIL_STATE if name in c.keys):
         i = c.keys.index(name)
-        value = effects.get(name, drives.model.effects.get(name, 0.0)) + float(size * c.scale[i])
-        out[name] = float(np.clip(value, WITHIN * c.low[i], WITHIN * c.high[i]))
-    return out
+        base = effects.get(name, drives.model.effects.get(name, 0.0))
+        low, high = min(WITHIN * c.low[i], base), max(WITHIN * c.high[i], base)
+        out[name] = float(np.clip(base + own[k] * c.scale[i], low, high))
+        driven[k] = (out[name] - base) / c.scale[i]
+    return out, driven
 
 
 def reach(runs: Sequence[Raw], candidates: Candidates) -> Array:
