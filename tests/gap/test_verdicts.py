@@ -75,7 +75,7 @@ def test_ambiguous_larger_wheels_and_encoder_scale(wide: Diagnosis) -> None:
     answer = checked(wide)
     assert answer["verdict"] == "ambiguous"
     assert answer["named"] == ["wheel_radius"]
-    assert set(answer["causes"][0]["class"]) == {"wheel_radius", "encoder_scale", "grousers"}
+    assert {"wheel_radius", "grousers"} <= set(answer["causes"][0]["class"])
     number = answer["causes"][0]["parameters"]["wheel_radius/scale"]
     assert number["value"] == pytest.approx(0.03, abs=0.004)
     following = answer["next_run"]
@@ -89,9 +89,11 @@ def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references
     both = {"gyro_scale/scale": 0.08, "encoder_dropout/share": 0.03}
     answer = checked(diagnose(runs(700, 2, both), references, VEHICLE))
     assert answer["verdict"] == "ambiguous"
-    assert {"encoder_scale", "encoder_dropout"} <= set(answer["causes"][0]["class"])
     assert len(answer["named"]) == 2
     assert "gyro_scale" in answer["named"]
+    by_name = {c["effect"]: c["class"] for c in answer["causes"]}
+    (other,) = set(answer["named"]) - {"gyro_scale"}
+    assert {"encoder_scale", "encoder_dropout"} <= set(by_name[other])
     assert answer["next_run"]["scenario"] == BY_HAND  # lost counts are a scale whatever is driven
 
 
@@ -134,12 +136,12 @@ def _with_encoder_crosstalk(run: Recording) -> Recording:
     return dataclasses.replace(run, wheels=dataclasses.replace(run.wheels, speed=speed, angle_rad=None))
 
 
-def test_motor_current_in_the_gyro_passes_for_a_fault_of_the_gyro(references: list[Recording]) -> None:
-    """A known limit: no catalogue has it, but a bias explains its mean."""
+def test_motor_current_in_the_gyro_is_unknown_or_a_fault_of_the_gyro(references: list[Recording]) -> None:
+    """No catalogue has it, but a bias explains its mean."""
     odd = [_with_crosstalk(run) for run in runs(600, 2)]
     answer = checked(diagnose(odd, references, VEHICLE))
     assert answer["gap"]["detected"]
-    assert {cause["effect"] for cause in answer["causes"][:2]} == {"gyro_bias", "gyro_scale"}
+    assert answer["causes"][0]["effect"] in ("gyro_bias", "gyro_scale")
     assert set(answer["named"]) <= {"gyro_bias", "gyro_scale"}
 
 
@@ -203,6 +205,14 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
     assert answer["where"] == []
     assert answer["shrink"]["floor"] is None
     assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale", "grousers")
+
+
+@pytest.mark.parametrize("first", [410, 430])
+def test_without_references_the_twins_own_runs_are_no_gap(first: int) -> None:
+    """Whatever its sensors drew for the run: an offset and a gain of each current sensor among it."""
+    answer = checked(diagnose(runs(first, 2), [], VEHICLE))
+    assert answer["gap"]["uncalibrated"]
+    assert answer["verdict"] == "no_gap"
 
 
 def test_the_same_input_gives_the_same_bits(fresh: list[Recording], unreferred: Diagnosis) -> None:

@@ -33,22 +33,21 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True)
 class Told:
     """What a cause leaves: over channels inside and outside the candidates' space, and the logarithm of the
-    square that stays beyond the learned null's expectation, in units of it."""
+    greatest deviation (its square, in what is usual) of any effect's own score."""
 
     inside: float
     outside: float
-    square: float
+    most: float
 
     @classmethod
-    def of(cls, left: Left, pool: Pool, columns: tuple[int, ...] = ()) -> Told:
-        """Of an explanation by these columns; none: of the gap as it is."""
-        explained = pool.fit(columns)[2] if columns else 0.0
-        return cls(left.inside, left.outside, math.log(max((pool.square - explained) / pool.dims, 1.0)))
+    def of(cls, left: Left, squares: Array) -> Told:
+        """Of what is left in the channels, and the squares (P,) of the deviations."""
+        return cls(left.inside, left.outside, math.log(max(float(squares.max()), 1.0)))
 
     @property
     def total(self) -> float:
         """All three."""
-        return self.inside + self.outside + self.square
+        return self.inside + self.outside + self.most
 
 
 LEAST = 0.5
@@ -133,14 +132,13 @@ class Choice:
             gap: what is left without any there; None: to first order.
         """
         by = weights() if by is None else by
-        before = Told.of(table.before() if gap is None else gap, pool)
+        before = Told.of(table.before() if gap is None else gap, pool.alone.squares())
         laws: dict[str, Hypothesis] = {}
         least: dict[str, Told] = {}
         for law, first in told.items():
             now = first
             if fitted is not None and law in fitted:
-                left = fitted[law].left
-                now = Told(left.inside, left.outside, first.square)
+                now = Told.of(fitted[law].left, fitted[law].fit.squares)
             if law.effect not in laws or now.total < least[law.effect].total:
                 laws[law.effect], least[law.effect] = law, now
         odds = {effect: by.cause(now, before) for effect, now in least.items()}
@@ -179,5 +177,5 @@ def linear(
     told, sizes = dict[Hypothesis, Told](), dict[Hypothesis, Array]()
     for law in candidates.hypotheses:
         sizes[law], left = table.linear(law.columns, *bounds(candidates, law.columns))
-        told[law] = Told.of(left, pool, law.columns)
+        told[law] = Told.of(left, pool.alone.squares(law.columns, sizes[law]))
     return told, sizes

@@ -5,7 +5,9 @@ ones. The statistic of the judged runs is compared with that of other choices fr
 against the null of the rest (split-conformal over runs; exact for exchangeable runs, whatever their noise).
 What is compared is the greatest of all effects' deviations, each in units of what it usually is over all
 choices (max-T, Westfall and Young 1993): in the field some effects scatter from run to run, and a sum over
-effects would show these only.
+effects would show these only. Each effect has two: by its own score alone, and beside all other scores. The
+second is sharper where the twin is nearly right and their covariance is known; in the field it is learnt
+from too few runs, and the first is.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import WIDE, Beliefs, Pool, beliefs
+from terrafusion.twin.gap.posterior import UNKNOWN_SIZES, WIDE, Pool
 from terrafusion.twin.gap.score import Score
 
 Array = NDArray[np.float64]
@@ -33,43 +35,47 @@ EXACT = 1e-9
 """Deviations that differ by less than this share are equal."""
 LEAST_SQUARE = 1.5
 """The usual square of an effect's deviation is taken as no less: one and a half parameters."""
+LEAST_SPREAD = 0.25
+"""1 sigma of the logarithm of a reference's greatest deviation is taken as no less (assumed)."""
+FLOORS = 20
+"""Choices of references that are judged by the rest."""
 PERMUTATIONS = 99
 """Other choices of runs that the judged ones are compared with, at most."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """Log Bayes factor of any gap in the judged runs, the p-value of the test, and that factor in other
-    choices of runs."""
+    """What the test finds.
+
+    Attributes:
+        statistic: the greatest deviation of any effect, in units of what it usually is in references.
+        p_value: of the permutation test.
+        least: the least that so many choices can show.
+        usual: (P,) square of each column's deviation that is usual among the choices.
+        nulls: some references judged by the others.
+        normal: the statistic of each of them.
+    """
 
     statistic: float
     p_value: float
-    others: tuple[float, ...]
-    pool: Pool
-    beliefs: Beliefs
+    least: float
+    usual: Array
+    nulls: tuple[Pool, ...]
+    normal: tuple[float, ...]
 
     def tail(self) -> float:
         """The p-value carried on beyond what so few choices resolve: for the odds of a gap, not for the test.
 
-        On a scale that is linear for small and logarithmic for large statistics, others are taken as
-        Student's t.
+        Many of the choices hold judged runs, too, and show their gap. So what carries it on is the logarithm
+        of the statistic in references that others judge, taken as Student's t.
         """
         from scipy.special import stdtr
 
-        if self.p_value > 1.5 / (1 + len(self.others)) or len(self.others) < 3:
+        if self.p_value > 1.5 * self.least or len(self.normal) < 3:
             return self.p_value
-        others = np.arcsinh(self.others)
-        z = (math.asinh(self.statistic) - others.mean()) / max(float(others.std(ddof=1)), 0.2)
+        others = np.log(self.normal)
+        z = (math.log(self.statistic) - others.mean()) / max(float(others.std(ddof=1)), LEAST_SPREAD)
         return min(self.p_value, float(stdtr(TAIL_FREEDOM, -z)))
-
-
-def judged(
-    runs: Sequence[Score], references: Sequence[Score], candidates: Candidates
-) -> tuple[Pool, Beliefs]:
-    """Sums and beliefs of some runs against the null of others, by the catalogue's own forms alone."""
-    null = learn(references, len(runs))
-    pool = Pool.of([dataclasses.replace(r, other=None) for r in runs], null)
-    return pool, beliefs(pool, candidates)
 
 
 def choices(total: int, size: int, seed: int) -> list[tuple[int, ...]]:
@@ -85,34 +91,55 @@ def choices(total: int, size: int, seed: int) -> list[tuple[int, ...]]:
     return list(found)
 
 
+def among(references: Sequence[Score], size: int, seed: int) -> list[Pool]:
+    """References judged as if they were so many runs, against the rest; at most `FLOORS` choices."""
+    size = min(size, max(1, len(references) // 2))
+    some = list(itertools.combinations(range(len(references)), size))
+    order = np.random.default_rng(seed).permutation(len(some))[:FLOORS]
+    pools = []
+    for choice in (some[i] for i in order):
+        rest = [s for i, s in enumerate(references) if i not in choice]
+        if rest:
+            pools.append(Pool.of([references[i] for i in choice], learn(rest, size)))
+    return pools
+
+
 def detect(
     runs: Sequence[Score], references: Sequence[Score], candidates: Candidates, seed: int, jobs: int = 1
 ) -> Detection:
     """The permutation test, in so many threads."""
-    pool, found = judged(runs, references, candidates)
-    every = [*runs, *references]
+    every, nulls = [*runs, *references], among(references, len(runs), seed)
 
-    def other(choice: tuple[int, ...]) -> tuple[Array, float]:
+    def of(choice: tuple[int, ...]) -> Array:
         rest = [r for i, r in enumerate(every) if i not in choice]
-        some, believed = judged([every[i] for i in choice], rest, candidates)
-        return _squares(some, believed, candidates), believed.statistic()
+        return _squares(judged([every[i] for i in choice], rest), candidates)
 
+    tried = [tuple(range(len(runs))), *choices(len(every), len(runs), seed)]
     with ThreadPoolExecutor(jobs) as threads:
-        tried = list(threads.map(other, choices(len(every), len(runs), seed)))
-    squares = [_squares(pool, found, candidates), *(square for square, _ in tried)]
-    others = [statistic for _, statistic in tried]
-    usual = np.maximum(np.mean(squares, axis=0), LEAST_SQUARE)
-    greatest = np.sqrt(np.array(squares) / usual).max(axis=1)
+        squares = np.array(list(threads.map(of, tried)))
+        alone = np.array(list(threads.map(_squares, nulls, itertools.repeat(candidates))))
+    usual = np.maximum(squares.mean(axis=0), LEAST_SQUARE)
+    greatest = np.sqrt(squares / usual).max(axis=1)
     p_value = float(np.mean(greatest >= greatest[0] * (1.0 - EXACT)))
-    return Detection(found.statistic(), p_value, tuple(others), pool, found)
+    own = np.maximum(alone.mean(axis=0) if nulls else 0.0, LEAST_SQUARE)
+    statistic, *normal = (float(np.sqrt((some / own).max())) for some in (squares[0], *alone))
+    P = len(runs[0].b)
+    return Detection(statistic, p_value, 1.0 / len(tried), usual[:P], tuple(nulls), tuple(normal))
 
 
-def _squares(pool: Pool, found: Beliefs, candidates: Candidates) -> Array:
-    """Square of the deviation along every form, and twice the log Bayes factor of an unknown cause."""
+def judged(runs: Sequence[Score], references: Sequence[Score]) -> Pool:
+    """Sums of some runs against the null of others, by the catalogue's own forms alone."""
+    return Pool.of([dataclasses.replace(r, other=None) for r in runs], learn(references, len(runs)))
+
+
+def _squares(pool: Pool, candidates: Candidates) -> Array:
+    """Square of the deviation of every column's own score, of that along every form beside all scores, and
+    twice the log Bayes factor of an unknown cause."""
     own = pool.gain[: pool.own]
     information = np.diag(pool.information)[: pool.own]
     best = own / (information + 1.0 / WIDE**2)
     alone = best * (2.0 * own - best * information)  # as `Pool.fit`, of each column by itself
     forms = [h.columns for h in candidates.hypotheses]
-    known = [alone[c[0]] if len(c) == 1 else pool.fit(c)[2] for c in forms]
-    return np.maximum([*known, 2.0 * found.unknown], 0.0)
+    joint = [alone[c[0]] if len(c) == 1 else pool.fit(c)[2] for c in forms]
+    unknown = pool.log_factor(range(len(candidates.keys), pool.own), UNKNOWN_SIZES)
+    return np.maximum([*pool.alone.squares(), *joint, 2.0 * unknown], 0.0)

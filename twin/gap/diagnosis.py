@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -34,7 +33,7 @@ from terrafusion.twin.gap.score import Score, learnt_sigma, score
 from terrafusion.twin.gap.shrink import Shrink, adapted, own_error, shrink
 from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.gap.threads import one_blas_thread
-from terrafusion.twin.gap.verdict import HeldOut, Search, Verdict, floor_of, judge
+from terrafusion.twin.gap.verdict import HeldOut, Search, Verdict, alike, floor_of, judge
 from terrafusion.twin.gap.where import Cell, gap_map
 from terrafusion.twin.identify.inputs import check_source
 from terrafusion.twin.vehicle import VehicleParams
@@ -42,8 +41,6 @@ from terrafusion.twin.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-FLOORS = 20
-"""Choices of references by which the floor of the gap is learnt."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +161,9 @@ def diagnosed(
         normal = _filled(bench, sigma, normal, seed)
     found = detect(scores, normal, candidates, seed, bench.jobs)
     null = learn(normal, len(scores))
-    pool = Pool.of(scores, null)
+    pool = Pool.of(scores, null).in_units_of(found.usual)
     case = _Case(bench, scores, sigma, null, pool, beliefs(pool, candidates))
-    floor = floor_of(_null_pools(normal, len(scores), seed), range(pool.own))
+    floor = floor_of(found.nulls, range(pool.own))
     table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys), bench.jobs)
     detected = found.p_value <= significance
     fitter = Fitter(bench, scores, sigma, null, pool, table)
@@ -177,7 +174,7 @@ def diagnosed(
     known: dict[tuple[Hypothesis, ...], Fitted | Refit] = {(law,): fit for law, fit in failed.items()}
     known |= {(law,): fit for law, fit in fits.items()}
     remaining = _Remaining(case, fitter, known)
-    search = Search(remaining, held_out, candidates, table)
+    search = Search(remaining, held_out, candidates, table, pool.alone)
     verdict = judge(detected, found.tail(), pool, case.believed, choice, refits, search, floor)
     if progress is not None:
         progress(0.9)
@@ -218,19 +215,6 @@ def _filled(bench: Bench, sigma: Array, normal: list[Score], seed: int) -> list[
     templates = bench.references or bench.runs
     common = learn(normal, 1).offset if normal else None
     return normal + replicates(templates, sigma, common, COUNT, seed)
-
-
-def _null_pools(normal: Sequence[Score], judged: int, seed: int) -> list[Pool]:
-    """References judged as if they were runs, against the rest."""
-    size = min(judged, max(1, len(normal) // 2))
-    some = list(itertools.combinations(range(len(normal)), size))
-    order = np.random.default_rng(seed).permutation(len(some))[:FLOORS]
-    pools = []
-    for choice in (some[i] for i in order):
-        rest = [s for i, s in enumerate(normal) if i not in choice]
-        if rest:
-            pools.append(Pool.of([normal[i] for i in choice], learn(rest, size)))
-    return pools
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,8 +272,8 @@ class _Remaining:
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:
-    """For the first cause and the likeliest of those that cannot be told from it."""
+    """For the first cause that has look-alikes and the likeliest of these."""
     if verdict.kind != "ambiguous":
         return None
-    first, by_name = verdict.causes[0], {c.effect: c for c in verdict.causes}
-    return propose(bench, sigma, first, by_name[first.members[1]])
+    first, by_name = alike(verdict.causes, verdict.named), {c.effect: c for c in verdict.causes}
+    return None if first is None else propose(bench, sigma, first, by_name[first.members[1]])

@@ -320,7 +320,7 @@ class Fitter:
 
     def _failed(self, law: Hypothesis, value: Array) -> Refit:
         _, covariance, _ = self.pool.fit(law.columns)
-        return Refit(law.columns, value, covariance, 0.0, [], (), DIVERGED)
+        return Refit(law.columns, value, covariance, 0.0, [], (), np.zeros(0), DIVERGED)
 
     def _next(self, law: Hypothesis, found: Fitted) -> Array:
         low, high = bounds(self.bench.candidates, law.columns)
@@ -329,9 +329,11 @@ class Fitter:
         return self._inside(law, at + step)
 
     def _fit(self, law: Hypothesis, value: Array, errors: list[Array], grounds: tuple[Array, ...]) -> Refit:
-        square = 0.0
+        square, gain = 0.0, np.zeros(self.pool.own)
         for run, first, error in zip(self.bench.runs, self.scores, errors, strict=True):
-            x, _ = self.null.standardised(scored(run, self.sigma, error, first.A))
+            x, U = self.null.standardised(scored(run, self.sigma, error, first.A))
             square += float(x @ self.null.inverse @ x)
+            gain += np.diag(U) * x
         _, covariance, _ = self.pool.fit(law.columns)
-        return Refit(law.columns, value, covariance, self.pool.square - square, errors, grounds, "")
+        squares = dataclasses.replace(self.pool.alone, gain=gain).squares()
+        return Refit(law.columns, value, covariance, self.pool.square - square, errors, grounds, squares, "")

@@ -100,10 +100,9 @@ def separation(bench: Bench, sigma: Array, name: str, one: Cause, other: Cause) 
     except TerrafusionError:
         return 0.0
     own = score(run, sigma)
-    root = 1.0 / np.sqrt(np.diag(own.A) + 1.0)
-    zero = np.zeros(len(root))
-    inverse: Array = np.asarray(np.linalg.inv(root[:, None] * own.A * root + JITTER * np.eye(len(root))))
-    pool = Pool.of([dataclasses.replace(own, b=zero)], Null(zero, zero, inverse, 1))
+    zero = np.zeros(len(own.b))
+    covariance = own.fisher + JITTER * np.eye(len(zero))
+    pool = Pool.of([dataclasses.replace(own, b=zero)], Null(zero, zero, covariance, 1))
     return min(_told(pool, bench, one, other.effect), _told(pool, bench, other, one.effect))
 
 

@@ -7,6 +7,7 @@ would be were the twin right (Ledoit and Wolf 2004: shrinkage to a structured ta
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -30,14 +31,19 @@ class Null:
     Attributes:
         offset: (P,) phi0, what all references have in common, in the columns' units.
         mean: (P,) what is left of it.
-        inverse: (P, P) inverse covariance, that of the mean's own error included.
+        covariance: (P, P), that of the mean's own error included.
         runs: how many references it was learnt from.
     """
 
     offset: Array
     mean: Array
-    inverse: Array
+    covariance: Array
     runs: int
+
+    @functools.cached_property
+    def inverse(self) -> Array:
+        """(P, P) inverse of the covariance."""
+        return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
 
     def standardised(self, run: Score) -> tuple[Array, Array]:
         """x - mean (P,) of a run, and the change of x by the columns (P, P)."""
@@ -70,5 +76,4 @@ def learn(references: Sequence[Score], judged: int) -> Null:
     covariance = (shown + SHRINK_RUNS * target) / (count - 1 + SHRINK_RUNS)
     covariance = covariance + JITTER * np.eye(P)
     covariance *= 1.0 + judged / count
-    inverse: Array = np.asarray(np.linalg.inv(covariance), dtype=np.float64)
-    return Null(offset, mean, inverse, count)
+    return Null(offset, mean, covariance, count)

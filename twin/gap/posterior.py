@@ -8,6 +8,8 @@ them along all probes at once.
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -34,6 +36,49 @@ OTHER_FORM = 0.1
 
 
 @dataclass(frozen=True, eq=False)
+class Alone:
+    """Each column by its own score, whatever the others say (marginal, where `Pool` is joint).
+
+    Where effects scatter from run to run for reasons of their own, the covariance of all scores is not known
+    from a few references, and what it subtracts is noise.
+
+    Attributes:
+        gain: (P,) sum of u x, with u the change of a column's own score by it.
+        moved: (P, P) the change of that by the columns.
+        variance: (P,) sum of u^2 times the variance of x.
+        usual: (P,) square of a deviation that is usual.
+    """
+
+    gain: Array
+    moved: Array
+    variance: Array
+    usual: Array
+
+    @classmethod
+    def none(cls, P: int) -> Alone:
+        """Of no run."""
+        return cls(np.zeros(P), np.zeros((P, P)), np.full(P, 1e-9), np.ones(P))
+
+    @classmethod
+    def of(cls, x: Array, U: Array, null: Null) -> Alone:
+        """Of one run's standardised scores (P,) and their change by the columns (P, P)."""
+        own = np.diag(U)
+        return cls(own * x, own[:, None] * U, own**2 * np.diag(null.covariance), np.ones(len(x)))
+
+    def plus(self, other: Alone, sign: float = 1.0) -> Alone:
+        """With other runs, or without them."""
+        return Alone(
+            self.gain + sign * other.gain, self.moved + sign * other.moved,
+            self.variance + sign * other.variance, self.usual,
+        )  # fmt: skip
+
+    def squares(self, columns: Sequence[int] = (), value: Array | None = None) -> Array:
+        """Squares (P,) of the deviations, in what is usual, with some columns (k,) taken out at a value."""
+        left = self.gain if value is None else self.gain - self.moved[:, list(columns)] @ value
+        return np.asarray(left**2 / (np.maximum(self.variance, 1e-9) * self.usual))
+
+
+@dataclass(frozen=True, eq=False)
 class Pool:
     """All judged runs together, against a null, in the space of the columns.
 
@@ -44,6 +89,7 @@ class Pool:
         square: sum of x' C^-1 x.
         dims: length of all x.
         own: P.
+        alone: the same by each column's own score.
     """
 
     information: Array
@@ -51,15 +97,17 @@ class Pool:
     square: float
     dims: int
     own: int
+    alone: Alone
 
     @classmethod
     def of(cls, runs: Sequence[Score], null: Null) -> Pool:
         """Sums over the runs."""
         P, square = len(null.mean), 0.0
         extra = 0 if runs[0].other is None else runs[0].other[0].size
-        information, gain = np.zeros((P + extra, P + extra)), np.zeros(P + extra)
+        information, gain, alone = np.zeros((P + extra, P + extra)), np.zeros(P + extra), Alone.none(P)
         for run in runs:
             x, U = null.standardised(run)
+            alone = alone.plus(Alone.of(x, U, null))
             if run.other is not None:
                 root = 1.0 / np.sqrt(np.diag(run.A) + 1.0)
                 U = np.hstack([U, root[:, None] * run.other.reshape(P, -1)])
@@ -67,7 +115,7 @@ class Pool:
             information += U.T @ weighted
             gain += weighted.T @ x
             square += float(x @ null.inverse @ x)
-        return cls(0.5 * (information + information.T), gain, square, P * len(runs), P)
+        return cls(0.5 * (information + information.T), gain, square, P * len(runs), P, alone)
 
     @classmethod
     def sum(cls, pools: Sequence[Pool]) -> Pool:
@@ -76,18 +124,23 @@ class Pool:
             sum((p.information for p in pools), np.zeros_like(pools[0].information)),
             sum((p.gain for p in pools), np.zeros_like(pools[0].gain)),
             sum(p.square for p in pools), sum(p.dims for p in pools), pools[0].own,
+            functools.reduce(Alone.plus, (p.alone for p in pools)),
         )  # fmt: skip
 
     def plain(self) -> Pool:
         """The same without laws of another form."""
         P = self.own
-        return Pool(self.information[:P, :P], self.gain[:P], self.square, self.dims, P)
+        return Pool(self.information[:P, :P], self.gain[:P], self.square, self.dims, P, self.alone)
+
+    def in_units_of(self, usual: Array) -> Pool:
+        """The same with deviations in units of the root of `usual` (P,)."""
+        return dataclasses.replace(self, alone=dataclasses.replace(self.alone, usual=usual))
 
     def without(self, other: Pool) -> Pool:
         """Those of the runs that `other` does not have."""
         return Pool(
             self.information - other.information, self.gain - other.gain, self.square - other.square,
-            self.dims - other.dims, self.own,
+            self.dims - other.dims, self.own, self.alone.plus(other.alone, -1.0),
         )  # fmt: skip
 
     def with_other_forms(self, columns: Sequence[int]) -> tuple[NDArray[np.int64], Array]:

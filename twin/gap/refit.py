@@ -25,6 +25,7 @@ class Refit:
         columns: indices of the parameters.
         value, covariance: (k,) and (k, k) in typical sizes.
         explained: how much of the gap's square it takes away.
+        squares: (P,) of the deviations that it leaves (`Alone.squares`); none where the fit failed.
         errors: whitened errors of each run at the value; none where the fit failed.
         grounds: (S,) of each run beside it, typical sizes from the model's.
         failure: what went wrong, in words; "" where nothing did.
@@ -36,6 +37,7 @@ class Refit:
     explained: float
     errors: list[Array]
     grounds: tuple[Array, ...]
+    squares: Array
     failure: str
 
 

@@ -31,16 +31,18 @@ from terrafusion.twin.gap.signatures import (
 from terrafusion.twin.identify.log import Log
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
+from terrafusion.twin.vehicle import VehicleParams
 
 Array = NDArray[np.float64]
 
 SOIL_STATE = {"soil_strength/shear": 0.5, "soil_strength/bearing": 0.5, "motion_resistance/rolling": 0.3}
 """Columns that vary from run to run as the ground does, and their first 1 sigma in scales (assumed)."""
-OFFSETS = {
-    "yaw_rate_radps": 0.001, "accel_x_mps2": 0.02, "accel_y_mps2": 0.02,
-    "current_left_a": 0.05, "current_right_a": 0.05,
-}  # fmt: skip
-"""Channels with a turn-on offset, and its first 1 sigma (assumed)."""
+OFFSETS = {"yaw_rate_radps": 0.001, "accel_x_mps2": 0.02, "accel_y_mps2": 0.02}
+"""Channels of the IMU with a turn-on offset, and its first 1 sigma (assumed)."""
+CURRENTS = ("current_left_a", "current_right_a")
+"""Channels with an offset and a gain, drawn anew with every run, of the vehicle file's 1 sigma."""
+LEAST_OFFSET_A, LEAST_GAIN = 0.05, 1e-3
+"""Least 1 sigma of those (assumed)."""
 SAME_YAW_RAD = 0.2
 """Runs that were told the same share a signature where they set out within such a sector of headings."""
 MOST_SOIL = 4.0
@@ -160,15 +162,24 @@ def raw_of(
     soil = [keys.index(name) for name in SOIL_STATE if name in keys]
     error, state, change, probe, pose = [], [], [], [], []
     for observed, s in zip(log.observed, found, strict=True):
-        offsets = np.zeros((len(s.value), len(OFFSETS)))
-        if observed.channel in OFFSETS:
-            offsets[:, list(OFFSETS).index(observed.channel)] = OFFSETS[observed.channel]
         error.append(observed.value - s.value)
-        state.append(np.hstack([s.change[:, soil], offsets]))
+        state.append(np.hstack([s.change[:, soil], _sensor_states(observed.channel, s.value, model.vehicle)]))
         change.append(s.change)
         probe.append(probes.columns(log, model, observed, s, channels))
         pose.append(s.by_pose)
     return Raw(log, np.zeros(len(soil)), error, state, change, probe, pose)
+
+
+def _sensor_states(channel: str, predicted: Array, vehicle: VehicleParams) -> Array:
+    """Columns (n, 7) of a channel by what its sensor does anew in every run: offsets, then gains."""
+    columns = np.zeros((len(predicted), len(OFFSETS) + 2 * len(CURRENTS)))
+    if channel in OFFSETS:
+        columns[:, list(OFFSETS).index(channel)] = OFFSETS[channel]
+    if channel in CURRENTS:
+        at, current = len(OFFSETS) + CURRENTS.index(channel), vehicle.realism.current
+        columns[:, at] = max(current.offset_sigma_a, LEAST_OFFSET_A)
+        columns[:, at + len(CURRENTS)] = max(current.gain_sigma, LEAST_GAIN) * predicted
+    return columns
 
 
 def at_own_ground(
@@ -250,7 +261,7 @@ def without_probes(run: Raw) -> Raw:
 def state_sigmas(candidates: Candidates) -> Array:
     """First 1 sigma (T,) of the states, in units of their columns."""
     soil = [sigma for name, sigma in SOIL_STATE.items() if name in candidates.keys]
-    return np.array([*soil, *np.ones(len(OFFSETS))])
+    return np.array([*soil, *np.ones(len(OFFSETS) + 2 * len(CURRENTS))])
 
 
 def whitened_columns(log: Log, noise: Mapping[str, Noise], columns: Sequence[Array]) -> Array:

@@ -161,7 +161,7 @@ class Trials:
         mine = [[self.references[i] for i in c] for c in picks]
         pools = [Pool.of(a, learn(b, JUDGED)) for a, b in zip(mine, rest, strict=True)]
         self.floor = floor_of(pools, range(pools[0].own))
-        others = [judged(a, b, candidates)[1].statistic() for a, b in zip(mine, rest, strict=True)]
+        others = [beliefs(judged(a, b), candidates).statistic() for a, b in zip(mine, rest, strict=True)]
         self.threshold = float(np.quantile(others, 0.95))
         self.laws = [h for h in candidates.hypotheses if h.effect != SOIL]
 
@@ -188,7 +188,7 @@ class Trials:
             return None
         names = tuple(h.effect for h in truth)
         scores = [run.score for run in runs]
-        if judged(scores, self.references, candidates)[1].statistic() <= self.threshold:
+        if beliefs(judged(scores, self.references), candidates).statistic() <= self.threshold:
             return Trial(family, ratio, names, None)
         return Trial(family, ratio, names, self._verdict(runs, scores, candidates))
 
@@ -202,7 +202,7 @@ class Trials:
             return pool, None
 
         each = HeldOut(tuple(Pool.of([dataclasses.replace(s, other=None)], self.null) for s in scores))
-        search = Search(remaining, each, candidates, table)
+        search = Search(remaining, each, candidates, table, pool.alone)
         return judge(True, 0.01, pool, beliefs(pool, candidates), choice, {}, search, self.floor)
 
     def _with(self, runs: list[Run], law: Hypothesis, ratio: float) -> list[Run] | None:

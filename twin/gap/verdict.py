@@ -15,7 +15,7 @@ from terrafusion.twin.gap.choice import Choice, Told
 from terrafusion.twin.gap.classes import class_of, done
 from terrafusion.twin.gap.goodness import Goodness, goodness
 from terrafusion.twin.gap.ladder import bounds
-from terrafusion.twin.gap.posterior import WIDE, Beliefs, Pool, beliefs
+from terrafusion.twin.gap.posterior import WIDE, Alone, Beliefs, Pool, beliefs
 from terrafusion.twin.gap.refit import Refit
 
 Array = NDArray[np.float64]
@@ -123,7 +123,7 @@ class Found:
         forms: one of each effect.
         fit: of all together.
         explained: what they explain of the gap on runs left out.
-        left: what they leave in the channels.
+        left, squares: what they leave in the channels, and of deviations (see `Told`).
         goodness: how that is beside what references leave.
         factor: their log Bayes factor.
         beside: those of further effects.
@@ -133,6 +133,7 @@ class Found:
     fit: Refit | None
     explained: float
     left: Left
+    squares: Array
     goodness: Goodness
     factor: float
     beside: Beliefs
@@ -164,6 +165,7 @@ class Search:
     held_out: HeldOut
     candidates: Candidates
     table: Table
+    alone: Alone
 
     def best(self, choice: Choice, believed: Beliefs, linear: Beliefs) -> Found:
         """The likeliest effect, and others beside it by the catalogue's laws.
@@ -183,13 +185,15 @@ class Search:
         table = self.table
         if fit is not None and fit.errors:
             errors = table.products(fit.errors)
-            left = table.left(errors)
+            left, squares = table.left(errors), fit.squares
         else:
             value, left = table.linear(columns, *bounds(self.candidates, columns))
             errors = [block.moved(block.error, columns, value) for block in table.blocks]
+            squares = self.alone.squares(columns, value)
         mine = self.held_out.explained(columns, _explained(fit))
         good = goodness(table, errors, left.weight)
-        return Found(forms, fit, mine, left, good, factor, beliefs(pool.plain(), self.candidates, given))
+        more = beliefs(pool.plain(), self.candidates, given)
+        return Found(forms, fit, mine, left, squares, good, factor, more)
 
     def _extended(self, found: Found, alone: float, factors: Mapping[str, float]) -> Found:
         """Further effects beside those found, as long as they are called for.
@@ -257,7 +261,7 @@ def judge(
     found: Found | None = None
     if detected:
         found = search.best(choice, believed, beliefs(pool.plain(), candidates))
-        choice = choice.with_odds(_together(found, choice, pool)).after(found.goodness)
+        choice = choice.with_odds(_together(found, choice)).after(found.goodness)
     weight, unknown = choice.probabilities()
     p_unknown = (1.0 - p_null) * unknown if detected else 0.0
     known = (1.0 - p_null - p_unknown) / sum(weight.values())
@@ -269,14 +273,12 @@ def judge(
     return Verdict(kind, named, causes, p_null, p_unknown, fit, found.goodness if found is not None else None)
 
 
-def _together(found: Found, choice: Choice, pool: Pool) -> dict[str, float]:
+def _together(found: Found, choice: Choice) -> dict[str, float]:
     """Log odds of several effects found, each as what all of them leave, in the order in which they were."""
     if len(found.forms) < 2:
         return {}
-    columns = tuple(i for h in found.forms for i in h.columns)
-    odds = choice.by.cause(Told.of(found.left, pool, columns), choice.before) - SECOND_ODDS * (
-        len(found.forms) - 1
-    )
+    odds = choice.by.cause(Told.of(found.left, found.squares), choice.before)
+    odds -= SECOND_ODDS * (len(found.forms) - 1)
     return {name: max(odds, choice.odds[name]) - 1e-6 * i for i, name in enumerate(found.effects)}
 
 
@@ -284,12 +286,17 @@ def _kind(found: Found | None, causes: Sequence[Cause], unknown: float) -> str:
     """By the probability of an unknown cause, given that there is a gap."""
     if found is None:
         return "no_gap"
-    members = causes[0].members
     if unknown > UNKNOWN:
         return "unknown"
     if found.effects == (SOIL,):
         return "parameters"
-    return "ambiguous" if len(members) > 1 else "effect"
+    return "effect" if alike(causes, found.effects) is None else "ambiguous"
+
+
+def alike(causes: Sequence[Cause], named: Sequence[str]) -> Cause | None:
+    """The first of the causes named that has look-alikes; the very first of all where none is named."""
+    some = [c for c in causes if c.effect in named] or causes[:1]
+    return next((c for c in some if len(c.members) > 1), None)
 
 
 def _cause(

@@ -69,7 +69,7 @@ class Trial:
     Attributes:
         shape, drive, soil, severity: its truth.
         effect: true effect, or None where it is in no catalogue, or none at all.
-        told: what each effect's best law leaves (inside, outside, square), by effect; empty where no gap is
+        told: what each effect's best law leaves (inside, outside, most), by effect; empty where no gap is
         seen.
         before: the gap as it is.
         fits: of the likeliest effects: `left`, `above` and `quieter` of `Goodness`.
@@ -168,7 +168,7 @@ def _brief(answer: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _numbers(told: Told) -> tuple[float, float, float]:
-    return told.inside, told.outside, told.square
+    return told.inside, told.outside, told.most
 
 
 def utilities(trial: Trial, weights: Weights) -> dict[str | None, float]:

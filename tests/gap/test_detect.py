@@ -1,0 +1,70 @@
+"""The test for a gap: by each effect's own score and beside all others, and the tail of its p-value."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap.candidates import Candidates
+from terrafusion.twin.gap.detect import detect, judged
+from terrafusion.twin.gap.score import Score
+from terrafusion.twin.gap.trials import interval
+
+CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "wheel_radius_asymmetry", "slope"])
+P = len(CANDIDATES.keys) + 4
+ROWS, COLUMN = 200, 2
+SIGNATURES = np.random.default_rng(0).standard_normal((ROWS, P))
+
+
+def scores(rng: np.random.Generator, count: int, size: float = 0.0, scatter: float = 0.0) -> list[Score]:
+    """Runs with noise, one effect of that size, and a scatter of every column from run to run."""
+    out = []
+    for _ in range(count):
+        phi = scatter * rng.standard_t(3, P)
+        phi[COLUMN] += size
+        error = rng.standard_normal(ROWS) + SIGNATURES @ phi
+        out.append(Score(SIGNATURES.T @ error, SIGNATURES.T @ SIGNATURES, float(error @ error), ROWS))
+    return out
+
+
+def test_of_runs_that_are_alike_one_in_twenty_is_called_a_gap_at_most() -> None:
+    rng, count = np.random.default_rng(1), 150
+    alarms = 0
+    for i in range(count):
+        some = scores(rng, 12, scatter=0.2)
+        alarms += detect(some[:3], some[3:], CANDIDATES, i).p_value <= 0.05
+    assert interval(alarms, count)[0] <= 0.05
+
+
+def test_an_effect_is_seen_where_all_scatter_from_run_to_run() -> None:
+    """Few references do not tell how scores covary; each by itself shows it."""
+    rng = np.random.default_rng(2)
+    pairs = [(scores(rng, 3, 1.5, 0.2), scores(rng, 8, scatter=0.2)) for _ in range(30)]
+    seen = [detect(*pair, CANDIDATES, i).p_value for i, pair in enumerate(pairs)]
+    assert sum(p <= 0.05 for p in seen) >= 27
+
+
+def test_the_more_an_effect_stands_out_the_less_is_chance() -> None:
+    rng = np.random.default_rng(3)
+    normal = scores(rng, 12)
+    found = [detect(scores(rng, 3, size), normal, CANDIDATES, 0) for size in (0.0, 1.0, 10.0)]
+    tails = [d.tail() for d in found]
+    assert tails[0] == found[0].p_value > 0.05  # no gap: nothing is carried on
+    assert tails[0] > tails[1] > tails[2]
+    assert tails[2] < 1e-4 < found[2].p_value
+    assert found[2].statistic > 5.0 * found[1].statistic > 5.0 * found[0].statistic
+
+
+@pytest.mark.parametrize("size", [0.5, 3.0])
+def test_taking_an_effect_out_leaves_what_references_leave(size: float) -> None:
+    rng = np.random.default_rng(4)
+    normal, runs = scores(rng, 12), scores(rng, 3)
+    changed = [
+        Score(r.b + r.A[:, COLUMN] * size, r.A, r.square, r.rows) for r in runs
+    ]  # as the effect would change the same noise
+    alone = judged(changed, normal).alone
+    whole = alone.squares()
+    assert int(np.argmax(whole)) == COLUMN
+    np.testing.assert_allclose(
+        alone.squares([COLUMN], np.array([size])), judged(runs, normal).alone.squares(), rtol=1e-9, atol=1e-12
+    )
