@@ -32,7 +32,7 @@ SAME_ODDS, NEARLY = math.log(3.0), 0.9
 """Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
 other, either (assumed)."""
 MOST_EFFECTS = 3
-UNKNOWN = 0.3
+UNKNOWN = 0.4
 """Probability of an unknown cause, given a gap, above which the verdict is that. Set on development trials:
 of known and of unknown causes about the same share is then told wrongly."""
 CLASSES = 5
