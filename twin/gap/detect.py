@@ -122,7 +122,7 @@ def detect(
     greatest = np.sqrt(squares / usual).max(axis=1)
     p_value = float(np.mean(greatest >= greatest[0] * (1.0 - EXACT)))
     own = np.maximum(alone.mean(axis=0) if nulls else 0.0, LEAST_SQUARE)
-    statistic, *normal = (float(np.sqrt((some / own).max())) for some in (squares[0], *alone))
+    statistic, *normal = (max(float(np.sqrt((some / own).max())), EXACT) for some in (squares[0], *alone))
     P = len(runs[0].b)
     return Detection(statistic, p_value, 1.0 / len(tried), usual[:P], tuple(nulls), tuple(normal))
 
