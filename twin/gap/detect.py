@@ -138,8 +138,8 @@ def _squares(pool: Pool, candidates: Candidates) -> Array:
     own = pool.gain[: pool.own]
     information = np.diag(pool.information)[: pool.own]
     best = own / (information + 1.0 / WIDE**2)
-    alone = best * (2.0 * own - best * information)  # as `Pool.fit`, of each column by itself
+    explained = best * (2.0 * own - best * information)  # as `Pool.fit`, of each column
     forms = [h.columns for h in candidates.hypotheses]
-    joint = [alone[c[0]] if len(c) == 1 else pool.fit(c)[2] for c in forms]
+    joint = [explained[c[0]] if len(c) == 1 else pool.fit(c)[2] for c in forms]
     unknown = pool.log_factor(range(len(candidates.keys), pool.own), UNKNOWN_SIZES)
     return np.maximum([*pool.alone.squares(), *joint, 2.0 * unknown], 0.0)

@@ -294,9 +294,8 @@ def _kind(found: Found | None, causes: Sequence[Cause], unknown: float) -> str:
 
 
 def alike(causes: Sequence[Cause], named: Sequence[str]) -> Cause | None:
-    """The first of the causes named that has look-alikes; the very first of all where none is named."""
-    some = [c for c in causes if c.effect in named] or causes[:1]
-    return next((c for c in some if len(c.members) > 1), None)
+    """The likeliest of the causes named that has look-alikes."""
+    return next((c for c in causes if c.effect in named and len(c.members) > 1), None)
 
 
 def _cause(
