@@ -133,7 +133,8 @@ def simulate_run(
         noiseless: exact sensors (no noise, bias, quantisation, vibration, latency).
         backend: "c", "vm" or "auto", see `integrate.integrate`.
         soils: grounds by name, in place of the library's.
-        effects: optional effects by name, see docs/effects.md; what is not named is absent.
+        effects: optional effects by name, see docs/effects.md, beside those of the vehicle's file; others
+            are absent.
 
     Raises:
         ConfigError: unknown name, bad file, or a number out of range.
@@ -189,7 +190,7 @@ def set_up(
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect)
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
-    known = checked(effects or {})
+    known = checked({**vehicle.effects, **(effects or {})})
     plant = with_effects(Plant(parameters, route.table(seed)), known)
     return RunSetup(scenario, vehicle, route, plant, np.arange(count) / rate, known)
 

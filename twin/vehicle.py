@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Annotated
 
 from terrafusion.datasets.config import Quantity, structure
+from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Overrides
 from terrafusion.datasets.sensors import Rig, SensorSuite
 from terrafusion.twin.library import known_names, read_named
@@ -103,7 +104,9 @@ class Odometry:
 class VehicleParams:
     """A four-wheel differential-drive robot: body, drive, odometry and sensors.
 
-    Without a battery the motors are fed with `drive.supply_v`, whatever they draw.
+    Without a battery the motors are fed with `drive.supply_v`, whatever they draw. `effects` are optional
+    effects by key (docs/effects.md) that this robot, or what it drives on, is known to have, as `terrafusion
+    gap` finds them: the twin has them in every run.
     """
 
     name: str
@@ -116,6 +119,7 @@ class VehicleParams:
     realism: SensorRealism
     battery: Battery | None = None
     topics: dict[str, str] = field(default_factory=dict)
+    effects: dict[str, Annotated[float, Quantity("")]] = field(default_factory=dict)
 
     def rig(self) -> Rig:
         """What a reader or an estimator needs: odometry geometry, sensors and topic names."""
@@ -140,7 +144,15 @@ def load_vehicle(name_or_path: str | Path) -> VehicleParams:
             does not keep to the parameters' names, units and ranges.
     """
     raw, file = read_named("vehicles", name_or_path, kind="vehicle")
-    return structure(VehicleParams, raw, file=file)
+    found = structure(VehicleParams, raw, file=file)
+    if found.effects:
+        from terrafusion.twin.effects.catalogue import checked
+
+        try:
+            checked(found.effects)
+        except ConfigError as error:
+            raise ConfigError(error.what, file=file, channel="effects", remedy=error.remedy) from None
+    return found
 
 
 def with_payload(

@@ -116,13 +116,13 @@ def test_without_references_nothing_is_called_left() -> None:
 
 def test_a_law_with_which_the_twin_diverges_is_told_as_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     """It stays a cause, without sigma and share, and the notes say why."""
-    whole = refit.predictions
+    whole = refit.settled_predictions
 
-    def diverging(log, model, candidates, effects, start):  # type: ignore[no-untyped-def]
-        found = whole(log, model, candidates, effects, start)
+    def diverging(log, model, candidates, effects):  # type: ignore[no-untyped-def]
+        found = whole(log, model, candidates, effects)
         return [None if "wheel_radius/scale" in some else y for some, y in zip(effects, found, strict=True)]
 
-    monkeypatch.setattr(refit, "predictions", diverging)
+    monkeypatch.setattr(refit, "settled_predictions", diverging)
     given = runs(300, 2, {"wheel_radius/scale": 0.03})
     found = diagnose(given, runs(100, 6), load_vehicle("elevate"), effects=["wheel_radius", "track_width"])
     answer = found.to_json()

@@ -39,7 +39,9 @@ def test_a_late_row_is_an_earlier_one(log_and_model, key: str, late_s: float) ->
     """By whole slots: an IMU's rows over the borders of windows, too, fixes within each."""
     log, model = log_and_model
     effects = {key: late_s, "gyro_bias/constant": 0.05}
-    plain, late = predictions(log, model, CANDIDATES, [{"gyro_bias/constant": 0.05}, effects], log.start)
+    plain, late = predictions(
+        log, model, CANDIDATES, [{"gyro_bias/constant": 0.05}, effects], [log.start] * 2
+    )
     assert plain is not None
     assert late is not None
     for observed, now, then in zip(log.observed, plain, late, strict=True):
@@ -59,7 +61,7 @@ def test_a_late_row_is_an_earlier_one(log_and_model, key: str, late_s: float) ->
 
 def test_a_fix_before_its_window_goes_straight_on(log_and_model) -> None:
     log, model = log_and_model
-    plain, late = predictions(log, model, CANDIDATES, [{}, {"gnss_latency/both": 0.2}], log.start)
+    plain, late = predictions(log, model, CANDIDATES, [{}, {"gnss_latency/both": 0.2}], [log.start] * 2)
     assert plain is not None
     assert late is not None
     at = {o.channel: i for i, o in enumerate(log.observed)}

@@ -58,7 +58,7 @@ def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
     found = signatures(log, drive(log, model, CANDIDATES, log.start, keys))
     columns = [CANDIDATES.keys.index(k) for k in keys]
     sets = [{k: 0.1 * float(CANDIDATES.scale[c])} for k, c in zip(keys, columns, strict=True)]
-    plain, *with_effect = predictions(log, model, CANDIDATES, [{}, *sets], log.start)
+    plain, *with_effect = predictions(log, model, CANDIDATES, [{}, *sets], [log.start] * (1 + len(sets)))
     assert plain is not None
     for column, values in zip(columns, with_effect, strict=True):
         assert values is not None
@@ -92,9 +92,9 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model) -> N
     }  # fmt: skip
     sets = [{}, *({k: v} for k, v in alone.items()), {"mass/at_cg": 0.1, "gyro_bias/constant": 0.01}]
     sets += [{"wheel_radius/scale": 0.002 * k} for k in range(1, 9)]
-    together = predictions(log, model, CANDIDATES, sets, log.start)
+    together = predictions(log, model, CANDIDATES, sets, [log.start] * len(sets))
     for some, found in zip(sets, together, strict=True):
-        (by_itself,) = predictions(log, model, CANDIDATES, [some], log.start)
+        (by_itself,) = predictions(log, model, CANDIDATES, [some], [log.start])
         for observed, a, b in zip(log.observed, found, by_itself, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-3 * np.median(observed.sigma), err_msg=f"{some}")
     plain, biased, heavy = together[0], together[1], together[2]
@@ -103,17 +103,29 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model) -> N
     np.testing.assert_allclose(together[7][rate] - heavy[rate], 0.01, rtol=1e-9)
 
 
+def test_sets_may_start_from_poses_of_their_own(log_and_model) -> None:
+    log, model = log_and_model
+    moved, sets = log.start + np.array([0.0, 0.0, 0.3]), [{}, {}, {"gyro_bias/constant": 0.01}]
+    here, there, biased = predictions(log, model, CANDIDATES, sets, [log.start, moved, moved])
+    alone = predictions(log, model, CANDIDATES, sets[1:], [moved] * 2)
+    for i, observed in enumerate(log.observed):
+        np.testing.assert_allclose(there[i], alone[0][i], atol=1e-3 * np.median(observed.sigma))
+        np.testing.assert_allclose(biased[i], alone[1][i], atol=1e-3 * np.median(observed.sigma))
+    east = [o.channel for o in log.observed].index("gnss_east_m")
+    assert np.abs(here[east] - there[east]).max() > 0.1
+
+
 def test_graphs_hold_what_their_runs_need_and_every_run_once() -> None:
-    sets = [{}, {"gyro_bias/constant": 0.1}, *({"mass/at_cg": 0.01 * k} for k in range(1, 5))]
-    few = graphs(CANDIDATES, sets)
+    def of(*sets: dict[str, float]) -> dict[tuple[str, ...], list[int]]:
+        return graphs(CANDIDATES, [what_moves(CANDIDATES, some) for some in sets])
+
+    few = of({}, {"gyro_bias/constant": 0.1}, *({"mass/at_cg": 0.01 * k} for k in range(1, 5)))
     assert list(few) == [next(g for g in groups(CANDIDATES) if "mass/at_cg" in g)]
-    assert sorted(run for runs in few.values() for run in runs) == sorted(
-        {what_moves(CANDIDATES, some) for some in sets}
-    )
+    assert sorted(run for runs in few.values() for run in runs) == list(range(6))
     apart = [{k: 0.01} for k in ("mass/at_cg", "wheel_radius/scale", "slip_sinkage/linear", "slope/uniform")]
-    assert list(graphs(CANDIDATES, [{}, *apart])) == [CANDIDATES.moving]  # one vector of the whole graph
-    assert list(graphs(CANDIDATES, [{}, {"soil_strength/shear": 0.1}])) == [()]
-    assert list(graphs(CANDIDATES, [{"mass/at_cg": 0.1, "slope/uniform": 0.1}])) == [CANDIDATES.moving]
+    assert list(of({}, *apart)) == [CANDIDATES.moving]  # one vector of the whole graph
+    assert list(of({}, {"soil_strength/shear": 0.1})) == [()]
+    assert list(of({"mass/at_cg": 0.1, "slope/uniform": 0.1})) == [CANDIDATES.moving]
 
 
 def test_choices_are_all_others_where_there_are_few() -> None:

@@ -246,6 +246,53 @@ def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
     assert not after.detected
 
 
+ACROSS = {"cross_slope/uniform": 0.0873}
+"""The robot crabs: it points elsewhere than its track."""
+
+
+@pytest.fixture(scope="module")
+def across(references: list[Recording]) -> Diagnosis:
+    """On a slope of 5 deg to the left."""
+    return diagnose(runs(310, 2, ACROSS), references, VEHICLE)
+
+
+def test_a_slope_is_taken_in_the_direction_it_has_to_a_robot_that_crabs(across: Diagnosis) -> None:
+    answer = checked(across)
+    assert answer["named"] == ["cross_slope"]
+    assert values_of(across)["cross_slope/uniform"] == pytest.approx(0.0873, abs=0.0015)
+    assert across.shrinking is not None
+    assert across.shrinking.after < 0.93
+
+
+def test_an_effect_that_is_no_number_of_the_vehicle_goes_into_its_file(
+    across: Diagnosis, tmp_path: Path
+) -> None:
+    target, fresh = tmp_path / "corrected.yaml", runs(330, 2, ACROSS)
+    assert any("cross_slope/uniform" in line for line in write_corrected(across, "elevate", target))
+    corrected = load_vehicle(target)
+    assert corrected.effects == values_of(across)
+    before, after = (diagnose(fresh, [], vehicle) for vehicle in (VEHICLE, corrected))
+    assert after.detection.statistic < 0.1 * before.detection.statistic
+    assert before.shrinking is not None
+    assert after.shrinking is not None
+    assert before.shrinking.before > 5.0
+    assert after.shrinking.before < 1.0  # noise variances
+    assert not after.detected
+
+
+def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: Diagnosis) -> None:
+    on_it = dataclasses.replace(VEHICLE, effects=values_of(across))
+    found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], on_it, effects=("gyro_bias",))
+    assert found.bench.candidates.effects == ("gyro_bias", "cross_slope")
+    assert found.verdict.named
+
+
+def test_candidates_may_all_be_of_the_sensors() -> None:
+    found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], VEHICLE, effects=("gyro_bias",))
+    assert found.verdict.named == ("gyro_bias",)
+    assert values_of(found)["gyro_bias/constant"] == pytest.approx(0.05, abs=0.005)
+
+
 def test_nonsense_is_refused(references: list[Recording]) -> None:
     with pytest.raises(DataError, match="no run"):
         diagnose([], references, VEHICLE)

@@ -122,10 +122,14 @@ def all_effects():
 
 
 def derivatives(
-    values: dict[str, float], states: np.ndarray, inputs: np.ndarray, terrain: str = "mud"
+    values: dict[str, float],
+    states: np.ndarray,
+    inputs: np.ndarray,
+    terrain: str = "mud",
+    slope_rad: float = 0.08,
 ) -> np.ndarray:
-    """dx/dt (N, X) in the graph of all effects, on a slope."""
-    vehicle = plant(terrain, slope_rad=0.08).vehicle
+    """dx/dt (N, X) in the graph of all effects."""
+    vehicle = plant(terrain, slope_rad=slope_rad).vehicle
     return all_effects()(states.T, inputs.T, vehicle, soil(terrain), vector(values)).full().T
 
 

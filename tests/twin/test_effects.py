@@ -150,6 +150,21 @@ def test_a_form_alone_equals_itself_among_all_others(form) -> None:
         assert np.array_equal(rhs(names)(states.T, inputs.T, vehicle, ground, numbers).full(), plain)
 
 
+@pytest.mark.parametrize("form", [form for form in FORMS if not form.senses_only()], ids=named)
+def test_a_law_that_does_not_face_turns_with_the_robot(form) -> None:
+    states, inputs = samples()
+    east, north, yaw = (STATES.index(name) for name in ("x", "y", "yaw"))
+    turned, turn = states.copy(), 0.7
+    turned[:, yaw] += turn
+    first, there = (derivatives(at(form, "scale"), x, inputs, slope_rad=0.0) for x in (states, turned))
+    back = there.copy()
+    back[:, east] = np.cos(turn) * there[:, east] + np.sin(turn) * there[:, north]
+    back[:, north] = -np.sin(turn) * there[:, east] + np.cos(turn) * there[:, north]
+    same = np.allclose(back, first, rtol=1e-7, atol=1e-9 * np.abs(first).max())
+    assert same or form.world_fixed()
+    assert not same or form.key not in ("slope/uniform", "cross_slope/uniform", "aerodynamic_drag/wind")
+
+
 @pytest.mark.parametrize(("form", "which"), ENDS, ids=lambda x: x if isinstance(x, str) else x.key)
 def test_numbers_and_derivatives_are_finite_everywhere(form, which) -> None:
     states, inputs = samples()

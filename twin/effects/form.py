@@ -48,6 +48,11 @@ STAGES: dict[str, tuple[str, ...]] = {
 derivative of an output is known as `d_<output>`.
 """
 
+PLANE = frozenset(
+    {"x", "y", "wheel_x_m", "wheel_y_m", "yaw", "cos_yaw", "sin_yaw", "gravity_x_mps2", "gravity_y_mps2"}
+)
+"""By these a law tells places and directions of the plane apart."""
+
 SENSOR_STAGES = ("mounting", "measurement", "stamp")
 """Stages that change what is measured and not how the robot moves."""
 
@@ -116,6 +121,25 @@ class Form:
     def senses_only(self) -> bool:
         """Whether it leaves the robot's motion as it is."""
         return all(stage in SENSOR_STAGES for stage in self.terms)
+
+    def world_fixed(self) -> bool:
+        """Whether how the robot moves under it may depend on where in the plane it is or faces: a term reads
+        or sets one of `PLANE`."""
+        noted = _Noted()
+        values = [noted[f"e{i}"] for i in range(len(self.parameters))]
+        moving = [term for stage, term in self.terms.items() if stage not in SENSOR_STAGES]
+        changed = [name for term in moving for name in term(noted, *values)]
+        return not PLANE.isdisjoint([*noted, *changed])
+
+
+class _Noted(dict[str, Any]):
+    """Some number by any name, held from when it is first read: terms may branch on which wheel it is."""
+
+    def __missing__(self, name: str) -> Any:
+        import casadi as ca
+
+        self[name] = ca.DM(0.7)
+        return self[name]
 
 
 def one(unit: str, scale: float, low: float, high: float) -> tuple[Parameter, ...]:

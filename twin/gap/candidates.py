@@ -6,13 +6,13 @@ counted in its catalogue scale ("typical" size), so that all columns are compara
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.effects.catalogue import catalogue, moves, parameters
+from terrafusion.twin.effects.catalogue import catalogue, lookup, moves, parameters
 from terrafusion.twin.effects.form import Form
 
 Array = NDArray[np.float64]
@@ -40,6 +40,7 @@ class Candidates:
         units: of each.
         hypotheses: the forms, in the order of the catalogue.
         moving: keys that change how the robot moves, sorted as the engine wants them.
+        world_fixed: those of them that act by where in the plane the robot is or faces.
     """
 
     keys: tuple[str, ...]
@@ -49,14 +50,19 @@ class Candidates:
     units: tuple[str, ...]
     hypotheses: tuple[Hypothesis, ...]
     moving: tuple[str, ...]
+    world_fixed: frozenset[str]
 
     @classmethod
-    def of(cls, effects: Iterable[str] | None = None) -> Candidates:
-        """The named effects; None: all of the catalogue that are candidates, the user's own included."""
-        wanted = None if effects is None else set(effects)
+    def of(cls, effects: Iterable[str] | None = None, present: Iterable[str] = ()) -> Candidates:
+        """The named effects; None: all of the catalogue that are candidates, the user's own included.
+
+        Args:
+            present: keys of what the twin has already: their forms take part.
+        """
+        wanted, there = None if effects is None else set(effects), {lookup(key)[0].key for key in present}
 
         def taken(form: Form) -> bool:
-            return form.candidate if wanted is None else form.effect in wanted
+            return form.key in there or (form.candidate if wanted is None else form.effect in wanted)
 
         known = {k: v for k, v in parameters().items() if taken(v[0])}
         keys = tuple(known)
@@ -70,12 +76,17 @@ class Candidates:
             keys, np.array([p.scale for p in numbers]), np.array([p.low for p in numbers]),
             np.array([p.high for p in numbers]), tuple(p.unit for p in numbers), tuple(forms),
             tuple(sorted(key for key in keys if moves(key))),
+            frozenset(key for key in keys if known[key][0].world_fixed()),
         )  # fmt: skip
 
     @property
     def effects(self) -> tuple[str, ...]:
         """Names of the effects, in the order of the catalogue."""
         return tuple(dict.fromkeys(h.effect for h in self.hypotheses))
+
+    def stay(self, effects: Mapping[str, float]) -> bool:
+        """Whether these, by key, do something else at another place, or to a robot that faces elsewhere."""
+        return any(value != 0.0 and key in self.world_fixed for key, value in effects.items())
 
     def columns(self, effect: str) -> tuple[int, ...]:
         """All columns of an effect, whatever their form."""

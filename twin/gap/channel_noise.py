@@ -24,6 +24,8 @@ Array = NDArray[np.float64]
 Series = list[tuple[NDArray[np.int64], Array]]
 """Slots and residuals of a channel in each window."""
 
+ANY_SIZE = 30.0
+"""1 sigma of effects, in typical sizes, in a run that is judged by itself (assumed)."""
 LEAST_SCALE = 0.2
 """No channel is taken as better than this share of what its data sheet and scatter say (assumed)."""
 
@@ -41,23 +43,21 @@ def first_noise(runs: Sequence[Raw]) -> dict[str, Noise]:
 
 
 def learnt_noise(
-    runs: Sequence[Raw], every: Sequence[Raw], candidates: Candidates, jobs: int = 1
+    references: Sequence[Raw], judged: Sequence[Raw], candidates: Candidates, jobs: int = 1
 ) -> dict[str, Noise]:
     """Noise by channel, from residuals of reference runs that are fitted with all that could differ.
 
     What theta, a common set of effects and the poses explain is taken out (ridge, one typical size); what
-    is left is noise, its scale and its correlation in time.
-
-    Args:
-        runs: the references.
-        every: all runs, for the longest window.
-        jobs: threads.
+    is left is noise, its scale and its correlation in time. Without references the judged runs must tell it:
+    then effects of any size are taken out, or a large one would pass for noise.
     """
+    runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
+    every = [*judged, *references]
     noise, sigma, lags = first_noise(every), state_sigmas(candidates), _lags(every)
     with ThreadPoolExecutor(jobs) as pool:
         for _ in range(2):
             now, series = noise, dict[str, Series]()
-            for found in pool.map(lambda run, now=now: _left_over(run, now, sigma), runs):
+            for found in pool.map(lambda run, now=now: _left_over(run, now, sigma, size), runs):
                 for channel, pairs in found.items():
                     series.setdefault(channel, []).extend(pairs)
             noise = {c: _noise(c, series.get(c, []), every, now[c], lags[c]) for c in now}
@@ -107,12 +107,13 @@ def _whitened_series(noise: Noise, series: Series) -> Array:
     return np.concatenate(parts)
 
 
-def _left_over(run: Raw, noise: Mapping[str, Noise], sigma: Array) -> dict[str, Series]:
-    """Residuals of one run after its own fit, in first-guess sigmas, by channel and window."""
+def _left_over(run: Raw, noise: Mapping[str, Noise], sigma: Array, size: float) -> dict[str, Series]:
+    """Residuals of one run after its own fit, in first-guess sigmas, by channel and window; `size` is 1 sigma
+    of the effects."""
     plain = without_probes(run)
     white = whitened_columns(run.log, noise, stacked(plain))
     evidence = projected(plain, white)
-    prior = np.concatenate([1.0 / sigma**2, np.ones(run.change[0].shape[1])])
+    prior = np.concatenate([1.0 / sigma**2, np.full(run.change[0].shape[1], size**-2.0)])
     K = len(prior)
     fit = np.linalg.solve(evidence.gram[:K, :K] + np.diag(prior), evidence.gram[:K, -1])
     pose = _best_poses(evidence.window, white[:, -3:], white[:, K] - white[:, :K] @ fit)

@@ -1,4 +1,4 @@
-"""The vehicle's file with the effect in it, where that is one of its numbers."""
+"""The vehicle's file with the effects found in it: as numbers that it has, or in its section `effects`."""
 
 from __future__ import annotations
 
@@ -46,10 +46,9 @@ def values_of(diagnosis: Diagnosis) -> dict[str, float]:
 
 
 def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> list[str]:
-    """Write the vehicle's file with the effects named that are numbers of it; what was done, in sentences.
+    """Write the vehicle's file with the effects named; what was done, in sentences.
 
-    An effect that is no number of the vehicle cannot go into its file; the sentence says how to give it to
-    the twin.
+    The twin of that file has them: `terrafusion gap` and `simulate` with `--vehicle` as with `--effect`.
 
     Raises:
         ConfigError: the vehicle's file cannot be read.
@@ -57,18 +56,24 @@ def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> 
     """
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
     out, said = copy.deepcopy(raw), []
-    written = False
     for key, value in values_of(diagnosis).items():
-        if key not in FIELDS:
-            said.append(f"{key} is no number of a vehicle's file: use --effect {key}={value:.6g}")
-            continue
-        for path, how in FIELDS[key]:
+        for path, how in FIELDS.get(key, ()):
             said.append(_change(out, diagnosis.bench.model.vehicle, path, how, value))
-            written = True
-    if written:
-        write_yaml(target, out)
-        said.append(f"written to {target}")
-    return said or ["no effect was named: the vehicle's file stays as it is"]
+        if key not in FIELDS:
+            said.append(_added(out, diagnosis.bench.model.vehicle, key, value))
+    if not said:
+        return ["no effect was named: the vehicle's file stays as it is"]
+    write_yaml(target, out)
+    return [*said, f"written to {target}"]
+
+
+def _added(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) -> str:
+    """An effect that is no number of the vehicle, on top of what it has of it."""
+    before = vehicle.effects.get(key, 0.0)
+    after = before + value
+    source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
+    raw.setdefault("effects", {})[key] = {"value": after, "source": source}
+    return f"effects.{key}: {before:.6g} -> {after:.6g}"
 
 
 def _change(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, value: float) -> str:

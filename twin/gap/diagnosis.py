@@ -133,7 +133,7 @@ def diagnose(
     if not 0.0 < significance < 1.0:
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
     check_source(source)
-    candidates = _candidates(effects)
+    candidates = _candidates(effects, vehicle)
     bench = gather(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
     )
@@ -192,7 +192,7 @@ def diagnosed(
     )  # fmt: skip
 
 
-def _candidates(effects: Sequence[str] | None) -> Candidates:
+def _candidates(effects: Sequence[str] | None, vehicle: VehicleParams) -> Candidates:
     if effects is not None and not effects:
         raise ConfigError("no effect is named", remedy="name some, or none at all for the whole catalogue")
     from terrafusion.twin.effects.catalogue import effect_names
@@ -200,7 +200,7 @@ def _candidates(effects: Sequence[str] | None) -> Candidates:
     unknown = sorted(set(effects or ()) - set(effect_names()))
     if unknown:
         raise ConfigError(f"unknown effect '{unknown[0]}'", remedy="see docs/effects.md")
-    return Candidates.of(effects)
+    return Candidates.of(effects, vehicle.effects)
 
 
 def _too_few(references: int, runs: int, significance: float) -> str:

@@ -17,7 +17,6 @@ from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channel_noise import learnt_noise
 from terrafusion.twin.gap.outliers import bounded
-from terrafusion.twin.gap.poses import all_settled
 from terrafusion.twin.gap.residuals import (
     SOIL_STATE,
     Drives,
@@ -31,7 +30,7 @@ from terrafusion.twin.gap.residuals import (
     whitened_error,
     without_probes,
 )
-from terrafusion.twin.gap.signatures import Drive, predictions
+from terrafusion.twin.gap.signatures import Drive, settled_predictions
 from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
@@ -92,7 +91,7 @@ def starting_model(
     loaded = with_overrides(vehicle, recordings[0].overrides)
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
-        return Model(loaded, {soil.name: soil}), soil.name, []
+        return Model(loaded, {soil.name: soil}, loaded.effects), soil.name, []
     given, found, notes = dict(soils or {}), dict[str, SoilParams](), list[str]()
     for recording in recordings:
         for label in dict.fromkeys(grounds(recording, recording.start_ns)[0]):
@@ -106,7 +105,7 @@ def starting_model(
                     raise
                 found[label] = load_soil(GENERIC_GROUND)
                 notes.append(f"the ground '{label}' is not in the library: {GENERIC_GROUND} stands in")
-    return Model(loaded, found), None, notes
+    return Model(loaded, found, loaded.effects), None, notes
 
 
 def prepared(recordings: Sequence[Recording], model: Model, ground: str | None, source: str) -> list[Log]:
@@ -166,7 +165,7 @@ def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], job
     names = [name for name in SOIL_STATE if name in keys]
     soil = [keys.index(name) for name in names]
     raws = raws_of(logs[:BASE_RUNS], drives, channels, jobs, lambda: None)
-    noise = learnt_noise(raws, raws, candidates, jobs)
+    noise = learnt_noise(raws, [], candidates, jobs)
     white = [whitened(without_probes(run), noise) for run in raws]
     at, errors = (
         np.zeros(len(soil)),
@@ -205,8 +204,7 @@ def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Mode
 
 def _error_on(log: Log, drives: Drives, effects: Mapping[str, float]) -> list[Array] | None:
     """Errors of the log, by channel, against the twin on another ground; None where the twin diverges."""
-    told = predictions(log, drives.model, drives.candidates, [effects], log.start)
-    found = all_settled(log, told)[0]
+    found = settled_predictions(log, drives.model, drives.candidates, [effects])[0]
     return None if found is None else [o.value - y for o, y in zip(log.observed, found, strict=True)]
 
 
@@ -266,7 +264,7 @@ def gather(
             progress(0.7 * done[0] / len(logs))
 
     raws = raws_of(logs, drives, channels, jobs, told)
-    first = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
+    first = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs)
     with ThreadPoolExecutor(jobs) as pool:
         free = list(pool.map(lambda run: at_own_ground(run, drives, first), raws[len(runs) :]))
         most = reach(free, candidates)
@@ -276,7 +274,7 @@ def gather(
         limited = pool.map(lambda run: at_own_ground(run, drives, first, most), again)
         judged_raws = list(itertools.islice(limited, len(runs)))
         raws = judged_raws + [next(limited) if too else run for run, too in zip(free, far, strict=True)]
-        noise = learnt_noise(raws[len(runs) :] or raws, raws, candidates, jobs)
+        noise = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs)
         evidence = list(pool.map(lambda run: whitened(run, noise), raws))
     judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]

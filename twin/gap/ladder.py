@@ -141,7 +141,7 @@ class Fitter:
         ]
         sets = [effects_at(bench, law.columns, point) for law, point in points]
         table = dataclasses.replace(self.table, runs=self.table.runs[:1], blocks=self.table.blocks[:1])
-        half = -(-len(sets) // bench.jobs)
+        half = max(1, -(-len(sets) // bench.jobs))
         parts = [sets[i : i + half] for i in range(0, len(sets), half)]
         with ThreadPoolExecutor(bench.jobs) as threads:
             at = ([np.zeros(len(bench.reach))] * len(part) for part in parts)

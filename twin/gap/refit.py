@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.evidence import Bench
-from terrafusion.twin.gap.poses import all_settled
 from terrafusion.twin.gap.residuals import Evidence, Raw, carried_back, on_own_ground, whitened_error
 from terrafusion.twin.gap.score import Score
-from terrafusion.twin.gap.signatures import predictions
+from terrafusion.twin.gap.signatures import settled_predictions
 
 Array = NDArray[np.float64]
 
@@ -76,9 +75,9 @@ def errors_with(
     """
     grounds = [raw.own] * len(sets) if grounds is None else grounds
     driven = [on_own_ground(own, bench.drives, some) for own, some in zip(grounds, sets, strict=True)]
-    told = predictions(run.log, bench.model, bench.candidates, [some for some, _ in driven], run.log.start)
+    told = settled_predictions(run.log, bench.model, bench.candidates, [some for some, _ in driven])
     out: list[Array | None] = []
-    for (_, own), y in zip(driven, all_settled(run.log, told), strict=True):
+    for (_, own), y in zip(driven, told, strict=True):
         if y is None:
             out.append(None)
             continue

@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap import probes
 from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.poses import all_settled, settled_start
+from terrafusion.twin.gap.poses import settled_start
 from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.signatures import (
     Drive,
     Signature,
     drive,
     placed,
-    predictions,
+    settled_predictions,
     signatures,
 )
 from terrafusion.twin.identify.log import Log
@@ -150,8 +150,11 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
     """
     found = drives.of(log)
     own = placed(log, signatures(log, found), found.start, log.start)
-    start = settled_start(log, [s.value for s in own], log.start)
-    return raw_of(log, placed(log, own, log.start, start), drives.model, drives.candidates, channels)
+    start, before = settled_start(log, [s.value for s in own], log.start), log.start
+    if drives.candidates.stay(drives.model.effects):  # it does not turn as a whole
+        own = signatures(log, drive(log, drives.model, drives.candidates, start))
+        start, before = settled_start(log, [s.value for s in own], start), start
+    return raw_of(log, placed(log, own, before, start), drives.model, drives.candidates, channels)
 
 
 def raw_of(
@@ -202,8 +205,7 @@ def at_own_ground(
         step = _soil_step(evidence, gain, drives.candidates, len(own))
         tried = np.clip(own + step, -most, most)
         effects, tried = on_own_ground(tried, drives, {})
-        told = predictions(run.log, drives.model, drives.candidates, [effects], run.log.start)
-        found = all_settled(run.log, told)[0]
+        found = settled_predictions(run.log, drives.model, drives.candidates, [effects])[0]
         if found is None:
             break
         error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]

@@ -31,6 +31,8 @@ from terrafusion.twin.measurement import measured
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 Effects = Mapping[str, float]
+Moved = tuple[tuple[str, float], ...]
+"""Effects of a set that move the robot, with their values."""
 
 GROUND = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rolling")
 """Parameters by which ground differs from run to run: every graph has them."""
@@ -53,30 +55,28 @@ def groups(candidates: Candidates) -> list[tuple[str, ...]]:
     return [keys[first : first + TOGETHER] for first in range(0, len(keys), TOGETHER)]
 
 
-def graphs(
-    candidates: Candidates, sets: Sequence[Effects]
-) -> dict[tuple[str, ...], list[tuple[tuple[str, float], ...]]]:
-    """Runs by the group of effects whose graph drives them: `what_moves` of all sets, each once.
+def graphs(candidates: Candidates, runs: Sequence[Moved]) -> dict[tuple[str, ...], list[int]]:
+    """Runs, by number, by the group of effects whose graph drives them.
 
     A graph of all effects takes all runs together, those of groups cost less a run: what is cheaper, counted
     in vectors of `TOGETHER` runs.
     """
-    runs = list(dict.fromkeys(what_moves(candidates, some) for some in sets))
-    named = {run: {k for k, _ in run} - {*GROUND} for run in runs}
-    if not any(named.values()):
-        return {(): runs}
-    apart: dict[tuple[str, ...], list[tuple[tuple[str, float], ...]]] = {}
-    for run in sorted(runs, key=lambda run: not named[run]):
-        of = [g for g in (groups(candidates) if named[run] else apart) if named[run] <= {*g}]
+    named = [{k for k, _ in run} - {*GROUND} for run in runs]
+    if not any(named):
+        return {(): list(range(len(runs)))}
+    apart: dict[tuple[str, ...], list[int]] = {}
+    for i in sorted(range(len(runs)), key=lambda i: not named[i]):
+        of = [g for g in (groups(candidates) if named[i] else apart) if named[i] <= {*g}]
         group = max(of, key=lambda g: -len(apart.get(g, ())) % TOGETHER, default=candidates.moving)
-        apart.setdefault(group, []).append(run)
+        apart.setdefault(group, []).append(i)
     vectors = sum(
         -(-len(some) // TOGETHER) * (WHOLE if g == candidates.moving else 1.0) for g, some in apart.items()
     )
-    return apart if vectors < WHOLE * -(-len(runs) // TOGETHER) else {candidates.moving: runs}
+    few = vectors < WHOLE * -(-len(runs) // TOGETHER)
+    return apart if few else {candidates.moving: list(range(len(runs)))}
 
 
-def what_moves(candidates: Candidates, effects: Effects) -> tuple[tuple[str, float], ...]:
+def what_moves(candidates: Candidates, effects: Effects) -> Moved:
     """The effects of a set that move the robot: sets that differ in the sensors alone share a run."""
     return tuple((k, v) for k, v in sorted(effects.items()) if v != 0.0 and k in candidates.moving)
 
@@ -111,10 +111,10 @@ def inputs_of(log: Log, model: Model, sets: Sequence[Effects]) -> list[Array]:
 
 
 def driven(
-    log: Log, plants: Sequence[Plant], inputs: Sequence[Array], start: Array, every: Sequence[int]
+    log: Log, plants: Sequence[Plant], inputs: Sequence[Array], starts: Sequence[Array], every: Sequence[int]
 ) -> list[Array]:
-    """States (N, X) of each plant's run at every so many-th sample of all windows, a number a run: the least
-    of them, or a multiple of it."""
+    """States (N, X) of each plant's run from its poses (W, 3) at every so many-th sample of all windows, a
+    number a run: the least of them, or a multiple of it."""
     fleet = Fleet.of(plants, DT_S, order=ORDER)
     windows = [(int(a), int(b)) for a, b in log.windows]
     least = min(every)
@@ -122,13 +122,13 @@ def driven(
     kept = [0] * len(plants)
     x = _led_in(log, fleet, inputs)
     pose = [INDEX[name] for name in POSE]
-    for (begin, end), guess in zip(windows, start, strict=True):
+    for k, (begin, end) in enumerate(windows):
         count = (end - begin) // least + 1
         parts = []
         for states, step, done in zip(out, every, kept, strict=True):
             parts.append(states[done : done + count] if step == least else np.empty((count, len(STATES))))
-        for part, now in zip(parts, x, strict=True):
-            part[0], part[0, pose] = now, guess
+        for part, now, start in zip(parts, x, starts, strict=True):
+            part[0], part[0, pose] = now, start[k]
         whole = begin + (count - 1) * least
         fleet.drive([u[begin : whole + 1] for u in inputs], parts, begin * DT_S, least)
         x = [part[-1] for part in parts]

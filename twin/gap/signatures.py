@@ -15,10 +15,11 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.late import in_time, late_layout
-from terrafusion.twin.gap.poses import PAIRS
+from terrafusion.twin.gap.poses import PAIRS, all_settled, settled_start
 from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
     AS_IT_IS,
+    Moved,
     Sensors,
     driven,
     graphs,
@@ -72,26 +73,53 @@ class Signature:
     heading: Array
 
 
+def settled_predictions(
+    log: Log, model: Model, candidates: Candidates, effects: Sequence[Mapping[str, float]]
+) -> list[list[Array] | None]:
+    """As `predictions`, the track of every window turned and shifted onto the one observed.
+
+    What depends on the heading is driven once more, from the poses at which its own track lies so: a guess
+    has the heading of the track, and a robot that slides down a slope points elsewhere.
+    """
+    told = predictions(log, model, candidates, effects, [log.start] * len(effects))
+    facing = [candidates.stay({**model.effects, **some}) for some in effects]
+    own = {i: y for i, y in enumerate(told) if y is not None and facing[i]}
+    starts = [settled_start(log, y, log.start) for y in own.values()]
+    again = predictions(log, model, candidates, [effects[i] for i in own], starts) if own else []
+    for i, y in zip(own, again, strict=True):
+        told[i] = y
+    return all_settled(log, told)
+
+
 def predictions(
-    log: Log, model: Model, candidates: Candidates, effects: Sequence[Mapping[str, float]], start: Array
+    log: Log,
+    model: Model,
+    candidates: Candidates,
+    effects: Sequence[Mapping[str, float]],
+    starts: Sequence[Array],
 ) -> list[list[Array] | None]:
     """Channels of the log with each of several sets of effects on top of the model's own, side by side.
 
     None in place of a run that diverged.
+
+    Args:
+        starts: poses (W, 3) at the windows' starts of each; sets with the same array may share a run.
     """
     sets = [{**model.effects, **some} for some in effects]
-    alike: dict[tuple[tuple[str, float], ...], list[int]] = {}
-    for i, some in enumerate(sets):
-        alike.setdefault(what_moves(candidates, some), []).append(i)
+    alike: dict[tuple[Moved, int], list[int]] = {}
+    for i, (some, start) in enumerate(zip(sets, starts, strict=True)):
+        alike.setdefault((what_moves(candidates, some), id(start)), []).append(i)
+    every = list(alike.values())
     sensors = Sensors(log, model, candidates, samples_of(log, 1))
     out: list[list[Array] | None] = [None] * len(sets)
-    for group, runs in graphs(candidates, sets).items():
-        twin = [dict(run) for run in runs]
-        twin += twin[: len(group) > 0 and len(twin) == 1]  # one alone would have a graph compiled for one
+    for group, runs in graphs(candidates, [moved for moved, _ in alike]).items():
+        first = [every[run][0] for run in runs]
+        first += first[: len(group) > 0 and len(first) == 1]  # one alone would have a graph compiled for one
+        twin = [dict(what_moves(candidates, sets[i])) for i in first]
         plants, inputs = plants_of(log, model, candidates, twin, group), inputs_of(log, model, twin)
-        states = driven(log, plants, inputs, start, [1] * len(twin))
+        states = driven(log, plants, inputs, [starts[i] for i in first], [1] * len(twin))
         for run, x, plant, heard in zip(runs, states, plants, inputs, strict=False):
-            for i in alike[run] if np.isfinite(x).all() else ():
+            for i in every[run] if np.isfinite(x).all() else ():
                 y = sensors.read(x, plant, heard, in_time(sets[i]), group)
                 by_channel = zip(log.observed, late_layout(log, sets[i], layout(log)), strict=True)
                 out[i] = [means(at, _channel(y, o.channel)) for o, at in by_channel]
@@ -136,7 +164,7 @@ def _readings(
         some, whole = [sets[k] for k in keys], AS_IT_IS in keys
         plants, inputs = plants_of(log, model, candidates, some, group), inputs_of(log, model, some)
         steps = [1 if k == AS_IT_IS else EVERY for k in keys]
-        states = driven(log, plants, inputs, start, steps) if keys else []
+        states = driven(log, plants, inputs, [start] * len(keys), steps) if keys else []
         if whole:
             if not np.isfinite(states[0]).all():
                 raise TerrafusionError(

@@ -264,10 +264,10 @@ def _start(
                 f"it tells another geometry of the vehicle than {recordings[0].name}",
                 file=recording.name, remedy="calibrate logs of one vehicle only",
             )  # fmt: skip
-    loaded = with_overrides(loaded, recordings[0].overrides)
+    loaded, present = with_overrides(loaded, recordings[0].overrides), {**loaded.effects, **effects}
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
-        return Model(loaded, {soil.name: soil}, dict(effects)), soil.name
+        return Model(loaded, {soil.name: soil}, present), soil.name
     given = dict(soils or {})
     found = {}
     for recording in recordings:
@@ -278,7 +278,7 @@ def _start(
         raise ConfigError(
             f"no log drives on '{unmet[0]}'", channel="terrain", remedy=f"their grounds: {', '.join(found)}"
         )
-    return Model(loaded, found, dict(effects)), None
+    return Model(loaded, found, present), None
 
 
 def _soil(given: str | Path | SoilParams, label: str, recording: Recording) -> SoilParams:
