@@ -56,9 +56,7 @@ def table(blocks: list[Block]) -> Table:
     """A reference leaves unit variance: so many directions inside, the rest outside."""
     N = STATES + EFFECTS
     inside, outside = np.full(CHANNELS, float(N)), np.full(CHANNELS, float(ROWS - N))
-    return Table(
-        (), tuple(blocks), np.ones(STATES), np.zeros(EFFECTS), inside, outside, np.ones(STATES), NO_REFERENCES
-    )
+    return Table((), tuple(blocks), np.ones(STATES), inside, outside, np.ones(STATES), NO_REFERENCES)
 
 
 def test_taking_an_effect_out_is_what_it_is_in_full() -> None:

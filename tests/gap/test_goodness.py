@@ -60,9 +60,7 @@ def judged(
         blocks.append(block(J, e + np.einsum("cni,ci->cn", J, gap)))
         errors.append(block(J, e + np.einsum("cni,ci->cn", J, left)).error)
     floor = np.ones(CHANNELS)
-    table = Table(
-        (), tuple(blocks), SIGMA, np.zeros(EFFECTS), floor, floor, SIGMA, np.reshape(each, (-1, 2 * CHANNELS))
-    )
+    table = Table((), tuple(blocks), SIGMA, floor, floor, SIGMA, np.reshape(each, (-1, 2 * CHANNELS)))
     return goodness(table, errors, WEIGHT)
 
 

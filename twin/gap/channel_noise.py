@@ -43,19 +43,26 @@ def first_noise(runs: Sequence[Raw]) -> dict[str, Noise]:
 
 
 def learnt_noise(
-    references: Sequence[Raw], judged: Sequence[Raw], candidates: Candidates, jobs: int = 1
+    references: Sequence[Raw],
+    judged: Sequence[Raw],
+    candidates: Candidates,
+    jobs: int = 1,
+    before: dict[str, Noise] | None = None,
 ) -> dict[str, Noise]:
     """Noise by channel, from residuals of reference runs that are fitted with all that could differ.
 
     What theta, a common set of effects and the poses explain is taken out (ridge, one typical size); what
     is left is noise, its scale and its correlation in time. Without references the judged runs must tell it:
     then effects of any size are taken out, or a large one would pass for noise.
+
+    Args:
+        before: noise learnt from nearly the same residuals; None: from that of the data sheets in two rounds.
     """
     runs, size = (references, 1.0) if references else (judged, ANY_SIZE)
     every = [*judged, *references]
-    noise, sigma, lags = first_noise(every), state_sigmas(candidates), _lags(every)
+    noise, sigma, lags = before or first_noise(every), state_sigmas(candidates), _lags(every)
     with ThreadPoolExecutor(jobs) as pool:
-        for _ in range(2):
+        for _ in range(1 if before else 2):
             now, series = noise, dict[str, Series]()
             for found in pool.map(lambda run, now=now: _left_over(run, now, sigma, size), runs):
                 for channel, pairs in found.items():

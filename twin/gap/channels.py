@@ -14,6 +14,7 @@ channel.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -46,6 +47,39 @@ class Products:
 
 
 @dataclass(frozen=True, eq=False)
+class Columns:
+    """A run's N columns, by which errors enter.
+
+    Attributes:
+        J: (n, N).
+        common: (n,) what the references have in common.
+        channels: rows of each channel.
+    """
+
+    J: Array
+    common: Array
+    channels: tuple[slice, ...]
+
+    @classmethod
+    def of(cls, run: Evidence, channels: int, columns: int, offset: Array) -> Columns:
+        """Of a run; `offset` (P,) is what the references have in common, in all its columns and probes."""
+        ends = np.searchsorted(run.channel, np.arange(channels + 1))  # rows are in the order of channels
+        N, T = run.states + columns, run.states
+        parts = tuple(slice(int(a), int(b)) for a, b in itertools.pairwise(ends))
+        return cls(run.rows[:, :N].astype(float), run.rows[:, T:-1].astype(float) @ offset, parts)
+
+    def gram(self) -> Array:
+        """Inner products (C, N, N) of the columns, by channel."""
+        return np.stack([self.J[c].T @ self.J[c] for c in self.channels])
+
+    def products(self, error: Array) -> Products:
+        """Of a whitened error (n,), less what the references have in common."""
+        left = error - self.common
+        gain = np.stack([left[c] @ self.J[c] for c in self.channels])
+        return Products(gain, np.array([float(left[c] @ left[c]) for c in self.channels]))
+
+
+@dataclass(frozen=True, eq=False)
 class Block:
     """One run: inner products of its N columns (states, then effects) by channel, and its own error.
 
@@ -63,14 +97,12 @@ class Block:
     rows: Array
 
     @classmethod
-    def of(cls, run: Evidence, channels: int, columns: int, offset: Array) -> Block:
-        """Of a run; `offset` (P,) is what the references have in common, in all its columns and probes."""
-        N = run.states + columns
-        J = run.rows[:, :N].astype(float)
-        gram = np.stack([J[run.channel == c].T @ J[run.channel == c] for c in range(channels)])
-        inverse: Array = np.asarray(np.linalg.inv(gram + RIDGE * np.eye(N)))
-        rows = np.bincount(run.channel, minlength=channels).astype(float)
-        return cls(gram, inverse, _products(run, gram, offset), run.states, rows)
+    def of(cls, run: Evidence, columns: Columns) -> Block:
+        """Of a run with these columns."""
+        gram = columns.gram()
+        inverse: Array = np.asarray(np.linalg.inv(gram + RIDGE * np.eye(gram.shape[1])))
+        rows = np.array([float(c.stop - c.start) for c in columns.channels])
+        return cls(gram, inverse, columns.products(run.rows[:, -1].astype(float)), run.states, rows)
 
     def moved(self, error: Products, columns: Sequence[int], value: Array) -> Products:
         """The error once effects of such size are taken out of it, linearly."""
@@ -84,17 +116,6 @@ class Block:
         T = self.states
         H = np.einsum("c,cij->ij", weight, self.gram[:, :T, :T]) + np.diag(sigma**-2.0)
         return np.asarray(np.linalg.solve(H, weight @ error.gain[:, :T]))
-
-
-def _products(run: Evidence, gram: Array, offset: Array, error: Array | None = None) -> Products:
-    N, T = gram.shape[1], run.states
-    rows = run.rows[:, T:-1].astype(float)
-    left = (run.rows[:, -1].astype(float) if error is None else error) - rows @ offset
-    J, channels = run.rows[:, :N].astype(float), range(len(gram))
-    gain = np.stack([J[run.channel == c].T @ left[run.channel == c] for c in channels])
-    return Products(
-        gain, np.array([float(left[run.channel == c] @ left[run.channel == c]) for c in channels])
-    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,18 +138,16 @@ class Table:
     """The judged runs by channel.
 
     Attributes:
-        runs, blocks: of each judged run; `runs` is empty where there is no evidence but sums.
+        columns, blocks: of each judged run; `columns` is empty where there is no evidence but sums.
         sigma: (T,) 1 sigma of the states.
-        offset: (P,) what all references have in common.
         inside, outside: (C,) what a reference run leaves, on average.
         states: (T,) squares of its states, in units of their variance.
         each: (R, 2C) what every reference run leaves inside, then outside.
     """
 
-    runs: tuple[Evidence, ...]
+    columns: tuple[Columns, ...]
     blocks: tuple[Block, ...]
     sigma: Array
-    offset: Array
     inside: Array
     outside: Array
     states: Array
@@ -150,17 +169,19 @@ class Table:
         """
         channels = len(runs[0].limit)
         offset = common_offset(scores)
-        blocks = tuple(Block.of(run, channels, columns, offset) for run in runs)
+        own = tuple(Columns.of(run, channels, columns, offset) for run in runs)
+        blocks = tuple(Block.of(run, of) for run, of in zip(runs, own, strict=True))
 
         def against_others(i: int) -> Block:
             others = [s for j, s in enumerate(scores) if j != i]
-            return Block.of(references[i], channels, columns, common_offset(others))
+            of = Columns.of(references[i], channels, columns, common_offset(others))
+            return Block.of(references[i], of)
 
         with ThreadPoolExecutor(jobs) as pool:
             floors = list(pool.map(against_others, range(len(references) if len(scores) > 1 else 0)))
         each = [energy(floor, floor.error, sigma, np.ones(channels)) for floor in floors]
         left = floor_of(floors, blocks, sigma)
-        return cls(tuple(runs), blocks, sigma, offset, *left, np.array(each).reshape(-1, 2 * channels))
+        return cls(own, blocks, sigma, *left, np.array(each).reshape(-1, 2 * channels))
 
     def before(self) -> Left:
         """Of the gap as it is."""
@@ -168,10 +189,7 @@ class Table:
 
     def products(self, errors: Sequence[Array]) -> list[Products]:
         """Of other whitened errors of the runs."""
-        return [
-            _products(run, block.gram, self.offset, error)
-            for run, block, error in zip(self.runs, self.blocks, errors, strict=True)
-        ]
+        return [of.products(error) for of, error in zip(self.columns, errors, strict=True)]
 
     def left(self, errors: Sequence[Products], steps: int = 2) -> Left:
         """What these errors, one a run, leave once each run's states are adapted."""

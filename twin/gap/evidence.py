@@ -274,7 +274,7 @@ def gather(
         limited = pool.map(lambda run: at_own_ground(run, drives, first, most), again)
         judged_raws = list(itertools.islice(limited, len(runs)))
         raws = judged_raws + [next(limited) if too else run for run, too in zip(free, far, strict=True)]
-        noise = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs)
+        noise = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs, first)
         evidence = list(pool.map(lambda run: whitened(run, noise), raws))
     judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]

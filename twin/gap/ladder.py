@@ -11,9 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from itertools import repeat
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +22,7 @@ from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.late import DELAYS
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.refit import Refit, effects_at, errors_with, scored
+from terrafusion.twin.gap.refit import Refit, effects_at, errors_of, scored
 from terrafusion.twin.gap.residuals import SOIL_STATE, WITHIN
 from terrafusion.twin.gap.score import Score
 
@@ -140,14 +138,9 @@ class Fitter:
             for share in SCREEN
         ]
         sets = [effects_at(bench, law.columns, point) for law, point in points]
-        table = dataclasses.replace(self.table, runs=self.table.runs[:1], blocks=self.table.blocks[:1])
-        half = max(1, -(-len(sets) // bench.jobs))
-        parts = [sets[i : i + half] for i in range(0, len(sets), half)]
-        with ThreadPoolExecutor(bench.jobs) as threads:
-            at = ([np.zeros(len(bench.reach))] * len(part) for part in parts)
-            run, raw = repeat(bench.runs[0]), repeat(bench.raws[0])
-            of = threads.map(errors_with, repeat(bench), run, raw, parts, at)
-            errors = [error for part in of for error in part]
+        table = dataclasses.replace(self.table, columns=self.table.columns[:1], blocks=self.table.blocks[:1])
+        at = [np.zeros(len(bench.reach))] * len(sets)
+        errors = errors_of(bench, [0], sets, [at])[0]
         out = dict[Hypothesis, tuple[Array, float]]()
         for (law, point), error in zip(points, errors, strict=True):
             if error is not None:
@@ -281,8 +274,7 @@ class Fitter:
         sets = [effects_at(bench, law.columns, point) for law, point in points]
         own = {law: (np.zeros(len(bench.reach)),) * len(bench.runs) for law, _ in points} | own
         of = [[own[law][run] for law, _ in points] for run in range(len(bench.runs))]
-        with ThreadPoolExecutor(bench.jobs) as threads:
-            errors = list(threads.map(errors_with, repeat(bench), bench.runs, bench.raws, repeat(sets), of))
+        errors = errors_of(bench, range(len(bench.runs)), sets, of)
         out = dict(best)
         for i, (law, point) in enumerate(points):
             mine = [some[i] for some in errors]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.residuals import Evidence, Raw, carried_back, on_own_ground, whitened_error
 from terrafusion.twin.gap.score import Score
+from terrafusion.twin.gap.side_by_side import TOGETHER
 from terrafusion.twin.gap.signatures import settled_predictions
 
 Array = NDArray[np.float64]
@@ -58,6 +60,28 @@ def effects_at(bench: Bench, columns: Sequence[int], value: Array) -> dict[str, 
     for i, v in zip(columns, value, strict=True):
         base = bench.model.effects.get(c.keys[i], 0.0)
         out[c.keys[i]] = float(np.clip(base + v * c.scale[i], c.low[i], c.high[i]))
+    return out
+
+
+def errors_of(
+    bench: Bench,
+    runs: Sequence[int],
+    sets: Sequence[Mapping[str, float]],
+    grounds: Sequence[Sequence[Array]],
+) -> list[list[Array | None]]:
+    """`errors_with` of several judged runs, by number, each with its own `grounds`, in threads."""
+    parts = max(1, min(bench.jobs, len(sets) // (2 * TOGETHER)))  # a run by itself fills no vector
+    size = max(1, -(-len(sets) // parts))
+    tasks = [(k, slice(i, i + size)) for k in range(len(runs)) for i in range(0, len(sets), size)]
+
+    def one(task: tuple[int, slice]) -> list[Array | None]:
+        k, part = task
+        return errors_with(bench, bench.runs[runs[k]], bench.raws[runs[k]], sets[part], grounds[k][part])
+
+    out: list[list[Array | None]] = [[] for _ in runs]
+    with ThreadPoolExecutor(bench.jobs) as threads:
+        for (k, _), errors in zip(tasks, threads.map(one, tasks), strict=True):
+            out[k] += errors
     return out
 
 

@@ -268,13 +268,13 @@ def state_sigmas(candidates: Candidates) -> Array:
 
 def whitened_columns(log: Log, noise: Mapping[str, Noise], columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, one array a channel, in units and axes in which its noise is white."""
-    parts = []
-    for i, _, rows in layout(log).blocks:
+    out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
+    for i, rows, places in layout(log).alike:
         observed = log.observed[i]
-        parts.append(
-            noise[observed.channel].whiten(observed.slot[rows], observed.sigma[rows], columns[i][rows])
+        out[places] = noise[observed.channel].whiten_alike(
+            observed.slot[rows[0]], observed.sigma[rows], columns[i][rows]
         )
-    return np.concatenate(parts)
+    return out
 
 
 def whitened(run: Raw, noise: Mapping[str, Noise]) -> Evidence:

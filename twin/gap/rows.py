@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from weakref import WeakKeyDictionary
 
@@ -26,10 +27,13 @@ class Layout:
 
     Attributes:
         blocks: channel, window and rows of each stretch of a channel within one window, in all rows' order.
+        alike: stretches of a channel whose rows are as far apart: channel, rows (g, m) of each, and where
+            they are (g, m) among all rows.
         fine, coarse: samples (n, k) of the run, or of its `EVERY`-th ones, that make a row, with weights.
     """
 
     blocks: list[tuple[int, int, Rows]]
+    alike: list[tuple[int, Rows, Rows]]
     fine: list[tuple[Rows, Array]]
     coarse: list[tuple[Rows, Array]]
 
@@ -43,7 +47,9 @@ def layout(log: Log) -> Layout:
     if known is None:
         shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
         fine = [weighty(*averaging(o, log, shift)) for o in log.observed]
-        known = _KNOWN[log] = Layout(_blocks(log), fine, [_coarse(o, log) for o in log.observed])
+        blocks = _blocks(log)
+        coarse = [_coarse(o, log) for o in log.observed]
+        known = _KNOWN[log] = Layout(blocks, _alike(log, blocks), fine, coarse)
     return known
 
 
@@ -87,6 +93,16 @@ def _blocks(log: Log) -> list[tuple[int, int, Rows]]:
         of = window_of(observed, log.windows)
         out += [(i, int(k), np.flatnonzero(of == k)) for k in np.unique(of)]
     return out
+
+
+def _alike(log: Log, blocks: Sequence[tuple[int, int, Rows]]) -> list[tuple[int, Rows, Rows]]:
+    found: dict[tuple[int, bytes], list[Rows]] = {}
+    place = 0
+    for i, _, rows in blocks:
+        steps = np.diff(log.observed[i].slot[rows])
+        found.setdefault((i, steps.tobytes()), []).append(np.stack([rows, place + np.arange(len(rows))]))
+        place += len(rows)
+    return [(i, *np.stack(some, axis=1)) for (i, _), some in found.items()]
 
 
 def _coarse(observed: Observed, log: Log) -> tuple[Rows, Array]:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
-from terrafusion.twin.gap.channels import Block, Table
+from terrafusion.twin.gap.channels import Block, Columns, Table
 from terrafusion.twin.gap.choice import Choice, linear
 from terrafusion.twin.gap.detect import choices, detect, judged
 from terrafusion.twin.gap.discrepancy import modulated
@@ -153,7 +153,10 @@ class Trials:
         self.table = Table.of(evidence[:1], evidence, self.references, sigma, columns)
         channels = len(self.table.inside)
         self.held = [
-            dataclasses.replace(run, block=Block.of(run.evidence, channels, columns, self.null.offset))
+            dataclasses.replace(
+                run,
+                block=Block.of(run.evidence, Columns.of(run.evidence, channels, columns, self.null.offset)),
+            )
             for run in held
         ]
         picks = choices(REFERENCES, JUDGED, 0)[:20]
@@ -195,7 +198,7 @@ class Trials:
     def _verdict(self, runs: Sequence[Run], scores: Sequence[Score], candidates: Candidates) -> Verdict:
         pool = Pool.of(scores, self.null)
         blocks = tuple(run.block for run in runs if run.block is not None)
-        table = dataclasses.replace(self.table, runs=(), blocks=blocks)
+        table = dataclasses.replace(self.table, columns=(), blocks=blocks)
         choice = Choice.of(pool, table, linear(table, pool, candidates)[0])
 
         def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:

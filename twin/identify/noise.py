@@ -45,13 +45,20 @@ class Noise:
 
     def whiten(self, slots: Rows, sigma: Array, columns: Array) -> Array:
         """`columns` (n, k) in units and axes in which the noise is white with variance one."""
-        from scipy.linalg.lapack import dtrtrs  # `solve_triangular` checks longer than it solves
+        return self.whiten_alike(slots, sigma[None], columns[None])[0]
 
-        scaled = columns / (self.scale * sigma)[:, None]
+    def whiten_alike(self, slots: Rows, sigma: Array, columns: Array) -> Array:
+        """Several stretches (g, n, k), with sigma (g, n), whose rows are all as far apart as `slots` (n,)."""
+        from scipy.linalg.blas import dtrsm  # `solve_triangular` checks longer than it solves
+
+        scaled = columns / (self.scale * sigma)[..., None]
         if len(self.rho) == 1:
             return np.asarray(scaled)
+        g, n, k = columns.shape
         lower = _factor(self.rho, tuple((slots[1:] - slots[:-1]).tolist()))
-        return np.asarray(dtrtrs(lower, scaled, lower=1)[0])
+        side_by_side = scaled.transpose(1, 0, 2).reshape(n, g * k)
+        solved = dtrsm(1.0, lower, side_by_side.T, side=1, lower=1, trans_a=1).T
+        return np.asarray(solved.reshape(n, g, k).transpose(1, 0, 2))
 
 
 @functools.lru_cache(maxsize=4096)
