@@ -20,6 +20,7 @@ from terrafusion.twin.gap.evidence import prepared, starting_model
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool, beliefs
 from terrafusion.twin.gap.residuals import raw_of, state_sigmas, whitened
+from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.score import Score, score
 from terrafusion.twin.gap.side_by_side import graphs, groups, what_moves
 from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
@@ -101,6 +102,16 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model) -> N
     rate = [o.channel for o in log.observed].index("yaw_rate_radps")
     np.testing.assert_allclose(biased[rate] - plain[rate], 0.01, rtol=1e-9)
     np.testing.assert_allclose(together[7][rate] - heavy[rate], 0.01, rtol=1e-9)
+
+
+def test_stretches_that_are_alike_hold_every_row_once(log_and_model) -> None:
+    log, _ = log_and_model
+    found, rows = layout(log), sum(len(o.value) for o in log.observed)
+    assert sorted(np.concatenate([places.ravel() for _, _, places in found.alike])) == list(range(rows))
+    for i, of, places in found.alike:
+        for mine, at in zip(of, places, strict=True):
+            assert any(j == i and np.array_equal(some, mine) for j, _, some in found.blocks)
+            assert np.ptp(at) == len(at) - 1
 
 
 def test_sets_may_start_from_poses_of_their_own(log_and_model) -> None:

@@ -287,8 +287,10 @@ def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: Dia
     assert found.verdict.named
 
 
-def test_candidates_may_all_be_of_the_sensors() -> None:
-    found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], VEHICLE, effects=("gyro_bias",))
+@pytest.mark.parametrize("effects", [("gyro_bias",), None])
+def test_without_references_a_large_effect_does_not_pass_for_noise(effects: tuple[str, ...] | None) -> None:
+    """Also where all candidates are of the sensors."""
+    found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], VEHICLE, effects=effects)
     assert found.verdict.named == ("gyro_bias",)
     assert values_of(found)["gyro_bias/constant"] == pytest.approx(0.05, abs=0.005)
 

@@ -40,6 +40,15 @@ def test_correlation_is_learnt_and_whitened(rho: float) -> None:
     assert abs(np.mean(white[1:] * white[:-1])) < 0.06
 
 
+def test_stretches_are_whitened_together_as_each_by_itself() -> None:
+    rng = np.random.default_rng(4)
+    noise, slots = Noise(0.7, tuple(0.6**k for k in range(30))), np.array([0, 1, 2, 5, 6, 9])
+    sigma, columns = rng.uniform(0.5, 2.0, (3, 6)), rng.standard_normal((3, 6, 4))
+    together = noise.whiten_alike(slots, sigma, columns)
+    for one, s, c in zip(together, sigma, columns, strict=True):
+        np.testing.assert_allclose(one, noise.whiten(slots, s, c), rtol=1e-12)
+
+
 def test_whitening_bridges_missing_rows() -> None:
     """The Cholesky factor of rows with gaps is that of their own covariance."""
     slots, rho = np.array([0, 1, 4, 9]), gauss_markov(0.7, 2.0, 0.5, 10)
