@@ -206,7 +206,7 @@ class Trials:
 
         each = HeldOut(tuple(Pool.of([dataclasses.replace(s, other=None)], self.null) for s in scores))
         search = Search(remaining, each, candidates, table, pool.alone)
-        return judge(True, 0.01, pool, beliefs(pool, candidates), choice, {}, search, self.floor)
+        return judge(True, 0.01, pool, choice, {}, search, self.floor)
 
     def _with(self, runs: list[Run], law: Hypothesis, ratio: float) -> list[Run] | None:
         at = list(law.columns)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
-from terrafusion.twin.gap.channels import Left, Table
+from terrafusion.twin.gap.channels import Left, Products, Table
 from terrafusion.twin.gap.choice import Choice, Told
 from terrafusion.twin.gap.classes import class_of, done
 from terrafusion.twin.gap.goodness import Goodness, goodness
@@ -20,14 +20,14 @@ from terrafusion.twin.gap.refit import Refit
 
 Array = NDArray[np.float64]
 
-SECOND_FACTOR, SECOND_TRIED = 20.0, 3
-"""Log Bayes factor that a further effect must have beside those found, and all together over one effect with
-a law of another form (tuned on twin trials); and how many such, the greatest, are fitted with them."""
-SECOND_SHARE, SECOND_LEFT = 0.15, 1.0
-"""What a further effect must take away of that which the effects found leave in the channels: as a share,
-and in units of it (set on development trials, docs/gap-blind.md)."""
-SECOND_ODDS = 2.0
-"""Log odds that each further effect costs (assumed)."""
+FURTHER_TRIED = 2
+"""So many further effects are fitted with those found: the greatest by Bayes factor, and as many by what they
+would leave in the channels to first order."""
+FURTHER_ODDS = 3.0
+"""Log odds that each further effect costs."""
+FURTHER_SHARE, FURTHER_LEFT = 0.15, 0.5
+"""What it must take away of that which the effects found leave in the channels: as a share, and in units of
+it. These three are set on development trials, docs/gap-blind.md."""
 SAME_ODDS, NEARLY = math.log(3.0), 0.9
 """Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
 other, either (assumed)."""
@@ -124,9 +124,9 @@ class Found:
         fit: of all together.
         explained: what they explain of the gap on runs left out.
         left, squares: what they leave in the channels, and of deviations (see `Told`).
+        rest: products of the errors with them, a run each.
         goodness: how that is beside what references leave.
-        factor: their log Bayes factor.
-        beside: those of further effects.
+        beside: log Bayes factors of further effects.
     """
 
     forms: tuple[Hypothesis, ...]
@@ -134,8 +134,8 @@ class Found:
     explained: float
     left: Left
     squares: Array
+    rest: Sequence[Products]
     goodness: Goodness
-    factor: float
     beside: Beliefs
 
     @property
@@ -167,18 +167,18 @@ class Search:
     table: Table
     alone: Alone
 
-    def best(self, choice: Choice, believed: Beliefs, linear: Beliefs) -> Found:
-        """The likeliest effect, and others beside it by the catalogue's laws.
+    def best(self, choice: Choice) -> Found:
+        """The likeliest effect, and further ones beside it as long as they are called for."""
+        found = self._with((choice.laws[choice.first()],))
+        while len(found.forms) < MOST_EFFECTS:
+            further = self._further(found, choice)
+            if further is None:
+                break
+            found = self._exchanged(further, choice) if len(further.forms) == 2 else further
+        return found
 
-        Args:
-            believed, linear: Bayes factors with laws of another form and without.
-        """
-        first = choice.first()
-        alone = max(believed.effects.values())
-        return self._extended(self._with((choice.laws[first],), linear.effects[first]), alone, linear.effects)
-
-    def _with(self, forms: tuple[Hypothesis, ...], factor: float) -> Found:
-        """Effects of this log Bayes factor, with all that is judged of them."""
+    def _with(self, forms: tuple[Hypothesis, ...]) -> Found:
+        """Effects, with all that is judged of them."""
         pool, fit = self.remaining(forms)
         given = [i for h in forms for i in self.candidates.columns(h.effect)]
         columns = [i for h in forms for i in h.columns]
@@ -193,44 +193,47 @@ class Search:
         mine = self.held_out.explained(columns, _explained(fit))
         good = goodness(table, errors, left.weight)
         more = beliefs(pool.plain(), self.candidates, given)
-        return Found(forms, fit, mine, left, squares, good, factor, more)
+        return Found(forms, fit, mine, left, squares, errors, good, more)
 
-    def _extended(self, found: Found, alone: float, factors: Mapping[str, float]) -> Found:
-        """Further effects beside those found, as long as they are called for.
-
-        Args:
-            alone: log Bayes factor of one effect with a law of another form.
-            factors: of each effect by itself.
-        """
-        while len(found.forms) < MOST_EFFECTS:
-            further = self._further(found, alone)
-            if further is None:
-                break
-            found = self._exchanged(further, alone, factors) if len(further.forms) == 2 else further
-        return found
-
-    def _exchanged(self, found: Found, alone: float, factors: Mapping[str, float]) -> Found:
+    def _exchanged(self, found: Found, choice: Choice) -> Found:
         """Of two effects the first was chosen with the other unexplained: the best beside the other, where
         that leaves less."""
-        second = found.forms[1]
-        other = self._further(self._with((second,), factors[second.effect]), alone)
+        other = self._further(self._with((found.forms[1],)), choice)
         if other is None or {*other.effects} == {*found.effects}:
             return found
-        return other if other.left.total < found.left.total else found
+        return other if odds_of(other, choice) > odds_of(found, choice) else found
 
-    def _further(self, found: Found, alone: float) -> Found | None:
-        """With the one more effect that leaves least; None where none is called for.
+    def _further(self, found: Found, choice: Choice) -> Found | None:
+        """With the one more effect that is likeliest; None where none is called for.
 
         What one explains of the whole gap says little: a small effect is seen beside a large one by what it
-        takes away of the rest. By the channels the best is not always the one with the greatest factor.
+        takes away of the rest.
         """
-        gains = found.beside.effects
-        least = max(SECOND_FACTOR, alone + SECOND_FACTOR - found.factor)
-        names = sorted((k for k in gains if gains[k] >= least), key=lambda k: -gains[k])[:SECOND_TRIED]
-        tried = [self._with((*found.forms, found.beside.best[k]), found.factor + gains[k]) for k in names]
-        most = min((1.0 - SECOND_SHARE) * found.left.total, found.left.total - SECOND_LEFT)
+        tried = [self._with((*found.forms, law)) for law in self._promising(found)]
+        most = min((1.0 - FURTHER_SHARE) * found.left.total, found.left.total - FURTHER_LEFT)
+        least = odds_of(found, choice) + FURTHER_ODDS
         called = [t for t in tried if t.left.total <= most and t.explained > found.explained]
-        return min(called, key=lambda t: t.left.total, default=None)
+        best = max(called, key=lambda t: odds_of(t, choice), default=None)
+        return best if best is not None and odds_of(best, choice) >= least else None
+
+    def _promising(self, found: Found) -> list[Hypothesis]:
+        """Laws that are worth a fit beside those found."""
+        gains, left = found.beside.effects, dict[Hypothesis, float]()
+        for law in self.candidates.hypotheses:
+            if law.effect in gains:
+                ends = bounds(self.candidates, law.columns)
+                left[law] = self.table.linear(law.columns, *ends, found.rest)[1].total
+        seen = sorted(gains, key=lambda effect: -gains[effect])[:FURTHER_TRIED]
+        by_channels = {
+            law.effect: law for law in sorted(left, key=lambda law: -left[law])
+        }  # the best is last
+        least = sorted(by_channels, key=lambda effect: left[by_channels[effect]])[:FURTHER_TRIED]
+        return list(dict.fromkeys([found.beside.best[k] for k in seen] + [by_channels[k] for k in least]))
+
+
+def odds_of(found: Found, choice: Choice) -> float:
+    """Log odds of effects by what all of them leave, up to the constant that `Choice` has, too."""
+    return choice.by.cause(Told.of(found.left, found.squares), choice.before)
 
 
 def _explained(fit: Refit | None) -> float:
@@ -242,7 +245,6 @@ def judge(
     detected: bool,
     p_value: float,
     pool: Pool,
-    believed: Beliefs,
     choice: Choice,
     refits: Mapping[str, Refit],
     search: Search,
@@ -257,10 +259,9 @@ def judge(
         floor: mean and standard deviation of what is explained where nothing is wrong.
     """
     p_null = null_probability(p_value)
-    candidates = search.candidates
     found: Found | None = None
     if detected:
-        found = search.best(choice, believed, beliefs(pool.plain(), candidates))
+        found = search.best(choice)
         choice = choice.with_odds(_together(found, choice)).after(found.goodness)
     weight, unknown = choice.probabilities()
     p_unknown = (1.0 - p_null) * unknown if detected else 0.0
@@ -277,8 +278,7 @@ def _together(found: Found, choice: Choice) -> dict[str, float]:
     """Log odds of several effects found, each as what all of them leave, in the order in which they were."""
     if len(found.forms) < 2:
         return {}
-    odds = choice.by.cause(Told.of(found.left, found.squares), choice.before)
-    odds -= SECOND_ODDS * (len(found.forms) - 1)
+    odds = odds_of(found, choice) - FURTHER_ODDS * (len(found.forms) - 1)
     return {name: max(odds, choice.odds[name]) - 1e-6 * i for i, name in enumerate(found.effects)}
 
 
