@@ -84,7 +84,7 @@ class Candidates:
         """Names of the effects, in the order of the catalogue."""
         return tuple(dict.fromkeys(h.effect for h in self.hypotheses))
 
-    def stay(self, effects: Mapping[str, float]) -> bool:
+    def any_world_fixed(self, effects: Mapping[str, float]) -> bool:
         """Whether these, by key, do something else at another place, or to a robot that faces elsewhere."""
         return any(value != 0.0 and key in self.world_fixed for key, value in effects.items())
 

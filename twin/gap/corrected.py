@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from terrafusion.twin.effects.catalogue import lookup
 from terrafusion.twin.identify.files import write_yaml
 from terrafusion.twin.library import read_named
 from terrafusion.twin.vehicle import VehicleParams
@@ -69,8 +70,8 @@ def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> 
 
 def _added(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) -> str:
     """An effect that is no number of the vehicle, on top of what it has of it."""
-    before = vehicle.effects.get(key, 0.0)
-    after = before + value
+    before, number = vehicle.effects.get(key, 0.0), lookup(key)[1]
+    after = min(max(before + value, number.low), number.high)
     source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
     raw.setdefault("effects", {})[key] = {"value": after, "source": source}
     return f"effects.{key}: {before:.6g} -> {after:.6g}"

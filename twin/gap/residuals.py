@@ -151,7 +151,7 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
     found = drives.of(log)
     own = placed(log, signatures(log, found), found.start, log.start)
     start, before = settled_start(log, [s.value for s in own], log.start), log.start
-    if drives.candidates.stay(drives.model.effects):  # it does not turn as a whole
+    if drives.candidates.any_world_fixed(drives.model.effects):  # it does not turn as a whole
         own = signatures(log, drive(log, drives.model, drives.candidates, start))
         start, before = settled_start(log, [s.value for s in own], start), start
     return raw_of(log, placed(log, own, before, start), drives.model, drives.candidates, channels)

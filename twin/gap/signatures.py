@@ -78,12 +78,12 @@ def settled_predictions(
 ) -> list[list[Array] | None]:
     """As `predictions`, the track of every window turned and shifted onto the one observed.
 
-    What depends on the heading is driven once more, from the poses at which its own track lies so: a guess
-    has the heading of the track, and a robot that slides down a slope points elsewhere.
+    What depends on place or heading is driven once more, from the poses at which its own track lies so: a
+    guess has the heading of the track, and a robot that slides down a slope points elsewhere.
     """
     told = predictions(log, model, candidates, effects, [log.start] * len(effects))
-    facing = [candidates.stay({**model.effects, **some}) for some in effects]
-    own = {i: y for i, y in enumerate(told) if y is not None and facing[i]}
+    fixed = [candidates.any_world_fixed({**model.effects, **some}) for some in effects]
+    own = {i: y for i, y in enumerate(told) if y is not None and fixed[i]}
     starts = [settled_start(log, y, log.start) for y in own.values()]
     again = predictions(log, model, candidates, [effects[i] for i in own], starts) if own else []
     for i, y in zip(own, again, strict=True):
