@@ -45,6 +45,37 @@ def test_a_wrong_vehicle_file_is_told_by_key(tmp_path, old, new, message) -> Non
         load_vehicle(write(tmp_path / "v.yaml", text.replace(old, new, 1)))
 
 
+def with_effect(path: Path, effect: str) -> Path:
+    text = (PARAMS / "vehicles" / "elevate.yaml").read_text(encoding="utf-8")
+    return write(path, f"{text}\neffects:\n  {effect}\n")
+
+
+def test_effects_of_a_vehicles_file_are_in_its_runs_unless_others_are_given(tmp_path) -> None:
+    worn = with_effect(tmp_path / "v.yaml", "gyro_bias/constant: {value: 0.02, source: tried}")
+
+    def rate(vehicle: str | Path, **effects: dict[str, float]) -> np.ndarray:
+        imu = simulate_run("spin", vehicle=vehicle, noiseless=True, **effects).recording.imu
+        assert imu is not None
+        return imu.gyro_radps[:, 2]
+
+    plain = rate("elevate")
+    np.testing.assert_allclose(rate(worn) - plain, 0.02, atol=1e-9)
+    np.testing.assert_allclose(rate(worn, effects={"gyro_bias/constant": 0.05}) - plain, 0.05, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("effect", "message"),
+    [
+        ("slope/uniform: {value: 0.9, source: x}", "effects: effect 'slope/uniform' is 0.9, out of range"),
+        ("slop/uniform: {value: 0.1, source: x}", "unknown effect 'slop/uniform'; did you mean"),
+        ("slope/uniform: 0.1", "without a source"),
+    ],
+)
+def test_a_wrong_effect_of_a_vehicles_file_is_told(tmp_path, effect, message) -> None:
+    with pytest.raises(ConfigError, match=message):
+        load_vehicle(with_effect(tmp_path / "v.yaml", effect))
+
+
 def test_overrides_replace_the_geometry() -> None:
     rig = with_overrides(load_vehicle("generic"), Overrides(0.2, 0.9, (0.1, 0.0, 1.0), (0.0, 0.2, 0.3))).rig()
     assert (rig.wheel_radius_m, rig.track_m) == (0.2, 0.9)

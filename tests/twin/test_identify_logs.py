@@ -65,13 +65,16 @@ def test_a_reference_pose_sharpens() -> None:
         assert seeing[name].value == pytest.approx(value, rel=1e-4)
 
 
-def test_an_effect_is_a_parameter() -> None:
+def test_an_effect_is_a_parameter(tmp_path) -> None:
+    """It is written into the vehicle's file, whose twin has it."""
     key, value = "drivetrain_friction/coulomb", 1.5
     found = calibrate(drive(effect=(key, value)), "elevate", SOIL, (*NAMES, f"effects.{key}"))
     truth = {**TRUTH, f"effects.{key}": value}
     assert found.converged()
     assert found[f"effects.{key}"].status == "told"
     assert np.max(np.abs(scores(found, truth))) < 3.5
+    write_files(found, tmp_path, "elevate")
+    assert load_vehicle(tmp_path / "vehicle.yaml").effects == {key: found[f"effects.{key}"].value}
 
 
 @pytest.mark.parametrize("field", ["position_m", "quaternion"])

@@ -34,7 +34,8 @@ def write_files(
     if not calibration.converged():
         logs += " by a search that did not converge"
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
-    mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith("vehicle.")}
+    own = ("vehicle.", "effects.")
+    mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith(own)}
     written = [write_yaml(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]
     for name, soil in model.soils.items():
         given = str((soils or {}).get(name, name))
