@@ -7,6 +7,7 @@ import math
 from terrafusion.twin.gap.diagnosis import Diagnosis
 from terrafusion.twin.gap.next_run import BY_HAND
 from terrafusion.twin.gap.verdict import Cause
+from terrafusion.twin.gap.where import LEAST_REFERENCES
 
 MOST_LISTED = 4
 
@@ -82,6 +83,8 @@ def numbers(d: Diagnosis, cause: Cause | None = None) -> str:
 
 
 def _place(d: Diagnosis) -> str:
+    if len(d.references) < LEAST_REFERENCES:
+        return f"In which channel and regime it shows is not told: that takes {LEAST_REFERENCES} references."
     sure = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
     if not sure:
         return "It shows in no single channel and regime clearly enough to name one."
