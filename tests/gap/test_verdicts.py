@@ -299,6 +299,9 @@ def test_without_references_a_large_effect_does_not_pass_for_noise(effects: tupl
 def test_nonsense_is_refused(references: list[Recording]) -> None:
     with pytest.raises(DataError, match="no run"):
         diagnose([], references, VEHICLE)
+    renamed = dataclasses.replace(references[0], name="again")
+    with pytest.raises(DataError, match="again: the same log as run100; give each once"):
+        diagnose(references[:1], [renamed, *references[1:]], VEHICLE)
     with pytest.raises(ConfigError, match="unknown effect"):
         diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
     with pytest.raises(ConfigError, match="significance"):

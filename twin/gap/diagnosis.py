@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -124,7 +125,7 @@ def diagnose(
 
     Raises:
         ConfigError: an unknown effect, soil or source, no effect, a significance out of range.
-        DataError: a log without what the diagnosis needs.
+        DataError: a log without what the diagnosis needs, or given twice.
         TerrafusionError: the twin diverges on a log.
     """
     began = time.perf_counter()
@@ -133,6 +134,7 @@ def diagnose(
     if not 0.0 < significance < 1.0:
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
     check_source(source)
+    _check_each_once([*runs, *references])
     candidates = _candidates(effects, vehicle)
     bench = gather(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
@@ -201,6 +203,21 @@ def _candidates(effects: Sequence[str] | None, vehicle: VehicleParams) -> Candid
     if unknown:
         raise ConfigError(f"unknown effect '{unknown[0]}'", remedy="see docs/effects.md")
     return Candidates.of(effects, vehicle.effects)
+
+
+def _check_each_once(recordings: Sequence[Recording]) -> None:
+    """A log that counts twice would make the scatter from run to run look smaller than it is."""
+    known: dict[bytes, str] = {}
+    for recording in recordings:
+        content = hashlib.sha256()
+        for part in (recording.wheels, recording.imu, recording.gnss):
+            for value in vars(part).values() if part is not None else ():
+                if isinstance(value, np.ndarray):
+                    content.update(np.ascontiguousarray(value).tobytes())
+        digest = content.digest()
+        if digest in known:
+            raise DataError(f"the same log as {known[digest]}", file=recording.name, remedy="give each once")
+        known[digest] = recording.name
 
 
 def _too_few(references: int, runs: int, significance: float) -> str:
