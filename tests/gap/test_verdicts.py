@@ -285,7 +285,8 @@ def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: Dia
     on_it = dataclasses.replace(VEHICLE, effects=values_of(across))
     found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], on_it, effects=("gyro_bias",))
     assert found.bench.candidates.effects == ("gyro_bias", "cross_slope")
-    assert found.verdict.named
+    assert {*found.verdict.named} == {"gyro_bias", "cross_slope"}
+    assert values_of(found)["cross_slope/uniform"] < -0.07  # these runs are on level ground
 
 
 @pytest.mark.parametrize("effects", [("gyro_bias",), None])
@@ -302,6 +303,9 @@ def test_nonsense_is_refused(references: list[Recording]) -> None:
     renamed = dataclasses.replace(references[0], name="again")
     with pytest.raises(DataError, match="again: the same log as run100; give each once"):
         diagnose(references[:1], [renamed, *references[1:]], VEHICLE)
+    assert references[0].motor is not None
+    motor = dataclasses.replace(references[0].motor, current_a=references[0].motor.current_a + 1.0)
+    assert diagnose(references[:1], [dataclasses.replace(renamed, motor=motor)], VEHICLE).references
     with pytest.raises(ConfigError, match="unknown effect"):
         diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
     with pytest.raises(ConfigError, match="significance"):

@@ -11,7 +11,7 @@ import pytest
 from terrafusion.datasets.errors import ConfigError
 from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.effects.catalogue import effect_names
-from terrafusion.twin.effects.form import SENSOR_STAGES, STAGES
+from terrafusion.twin.effects.form import SENSOR_STAGES, STAGES, Form, one
 from terrafusion.twin.engine.integrate import MAX_STEP_S
 from terrafusion.twin.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS
 from terrafusion.twin.measurement import correction, measured, measurement
@@ -151,7 +151,7 @@ def test_a_form_alone_equals_itself_among_all_others(form) -> None:
 
 
 @pytest.mark.parametrize("form", [form for form in FORMS if not form.senses_only()], ids=named)
-def test_a_law_that_does_not_face_turns_with_the_robot(form) -> None:
+def test_a_law_that_is_not_fixed_to_the_plane_turns_with_the_robot(form) -> None:
     states, inputs = samples()
     east, north, yaw = (STATES.index(name) for name in ("x", "y", "yaw"))
     turned, turn = states.copy(), 0.7
@@ -163,6 +163,19 @@ def test_a_law_that_does_not_face_turns_with_the_robot(form) -> None:
     same = np.allclose(back, first, rtol=1e-7, atol=1e-9 * np.abs(first).max())
     assert same or form.world_fixed()
     assert not same or form.key not in ("slope/uniform", "cross_slope/uniform", "aerodynamic_drag/wind")
+
+
+def test_laws_that_are_fixed_to_the_plane() -> None:
+    """Along the track and camber turn with the robot, and are named all the same: they set its gravity."""
+    slopes = {"slope/uniform", "slope/along_track", "cross_slope/uniform", "cross_slope/camber"}
+    places = {"soil_drift/over_place", "left_right_friction/lane"}
+    assert {f.key for f in FORMS if f.world_fixed()} == slopes | places | {"aerodynamic_drag/wind"}
+    sided = Form(
+        "rut", "left", one("", 0.1, -1.0, 1.0),
+        {"ground": lambda q, e: {"shear_x_m": e * q["x"]} if (0, 1, 2)[q["side"] + 1] else {}},
+        "a law that acts on one side of the robot, by place",
+    )  # fmt: skip
+    assert sided.world_fixed()
 
 
 @pytest.mark.parametrize(("form", "which"), ENDS, ids=lambda x: x if isinstance(x, str) else x.key)

@@ -8,6 +8,7 @@ term at all.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -125,15 +126,18 @@ class Form:
     def world_fixed(self) -> bool:
         """Whether how the robot moves under it may depend on where in the plane it is or faces: a term reads
         or sets one of `PLANE`."""
-        noted = _Noted()
-        values = [noted[f"e{i}"] for i in range(len(self.parameters))]
         moving = [term for stage, term in self.terms.items() if stage not in SENSOR_STAGES]
-        changed = [name for term in moving for name in term(noted, *values)]
-        return not PLANE.isdisjoint([*noted, *changed])
+        for side, end in itertools.product((1, -1), repeat=2):  # a term may branch on which wheel it is
+            noted = _Noted(side=side, end=end)
+            values = [noted[f"e{i}"] for i in range(len(self.parameters))]
+            changed = [name for term in moving for name in term(noted, *values)]
+            if not PLANE.isdisjoint([*noted, *changed]):
+                return True
+        return False
 
 
 class _Noted(dict[str, Any]):
-    """Some number by any name, held from when it is first read: terms may branch on which wheel it is."""
+    """Some number by any name, held from when it is first read."""
 
     def __missing__(self, name: str) -> Any:
         import casadi as ca

@@ -210,10 +210,10 @@ def _check_each_once(recordings: Sequence[Recording]) -> None:
     known: dict[bytes, str] = {}
     for recording in recordings:
         content = hashlib.sha256()
-        for part in (recording.wheels, recording.imu, recording.gnss):
-            for value in vars(part).values() if part is not None else ():
-                if isinstance(value, np.ndarray):
-                    content.update(np.ascontiguousarray(value).tobytes())
+        for name, channel in recording.channels().items():
+            content.update(name.encode() + channel.t_ns.tobytes())
+            for column in channel.columns().values():
+                content.update(column.astype(str).tobytes() if column.dtype == object else column.tobytes())
         digest = content.digest()
         if digest in known:
             raise DataError(f"the same log as {known[digest]}", file=recording.name, remedy="give each once")

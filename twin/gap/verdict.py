@@ -197,7 +197,7 @@ class Search:
 
     def _exchanged(self, found: Found, choice: Choice) -> Found:
         """Of two effects the first was chosen with the other unexplained: the best beside the other, where
-        that leaves less."""
+        both then are likelier."""
         other = self._further(self._with((found.forms[1],)), choice)
         if other is None or {*other.effects} == {*found.effects}:
             return found
