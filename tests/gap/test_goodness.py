@@ -116,9 +116,9 @@ def test_a_law_with_which_the_twin_diverges_is_told_as_a_failure(monkeypatch: py
     """It stays a cause, without sigma and share, and the notes say why."""
     whole = refit.settled_predictions
 
-    def diverging(log, model, candidates, effects):  # type: ignore[no-untyped-def]
-        found = whole(log, model, candidates, effects)
-        return [None if "wheel_radius/scale" in some else y for some, y in zip(effects, found, strict=True)]
+    def diverging(asks, model, candidates, jobs):  # type: ignore[no-untyped-def]
+        found = whole(asks, model, candidates, jobs)
+        return [None if "wheel_radius/scale" in a.effects else y for a, y in zip(asks, found, strict=True)]
 
     monkeypatch.setattr(refit, "settled_predictions", diverging)
     given = runs(300, 2, {"wheel_radius/scale": 0.03})

@@ -14,7 +14,7 @@ from terrafusion.twin.gap.evidence import Bench, gather
 from terrafusion.twin.gap.ladder import Fitter, between
 from terrafusion.twin.gap.null import learn
 from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.refit import errors_with
+from terrafusion.twin.gap.refit import Tried, errors_of
 from terrafusion.twin.gap.residuals import SOIL_STATE, reach, state_sigmas, within_limits
 from terrafusion.twin.gap.score import learnt_sigma, score
 from terrafusion.twin.vehicle import load_vehicle
@@ -64,11 +64,13 @@ def test_a_run_looks_for_its_ground_where_the_references_are(bench: Bench) -> No
 
 def test_a_ground_beyond_its_range_is_neither_driven_nor_carried_back(bench: Bench) -> None:
     """Nothing rolls with less than no resistance: a run that asks for it is as on the references' ground."""
-    run, raw, k = bench.runs[0], bench.raws[0], list(SOIL_STATE).index("motion_resistance/rolling")
+    k = list(SOIL_STATE).index("motion_resistance/rolling")
     assert bench.model.effects["motion_resistance/rolling"] == 0.0
     below, above = np.zeros(len(SOIL_STATE)), np.zeros(len(SOIL_STATE))
     below[k], above[k] = -1.0, 1.0
-    none, same, other = errors_with(bench, run, raw, [{}] * 3, [np.zeros(len(SOIL_STATE)), below, above])
+    none, same, other = errors_of(
+        bench, [Tried(0, {}, own) for own in (np.zeros(len(SOIL_STATE)), below, above)]
+    )
     assert none is not None
     np.testing.assert_array_equal(none, same)
     assert np.abs(none - other).max() > 0.1

@@ -15,7 +15,7 @@ from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.residuals import state_sigmas
 from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.score import learnt_sigma, score
-from terrafusion.twin.gap.signatures import predictions
+from terrafusion.twin.gap.signatures import Ask, predictions
 from terrafusion.twin.identify.log import Log, window_of
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.vehicle import load_vehicle
@@ -39,9 +39,7 @@ def test_a_late_row_is_an_earlier_one(log_and_model, key: str, late_s: float) ->
     """By whole slots: an IMU's rows over the borders of windows, too, fixes within each."""
     log, model = log_and_model
     effects = {key: late_s, "gyro_bias/constant": 0.05}
-    plain, late = predictions(
-        log, model, CANDIDATES, [{"gyro_bias/constant": 0.05}, effects], [log.start] * 2
-    )
+    plain, late = predictions([Ask(log, {"gyro_bias/constant": 0.05}), Ask(log, effects)], model, CANDIDATES)
     assert plain is not None
     assert late is not None
     for observed, now, then in zip(log.observed, plain, late, strict=True):
@@ -61,7 +59,7 @@ def test_a_late_row_is_an_earlier_one(log_and_model, key: str, late_s: float) ->
 
 def test_a_fix_before_its_window_goes_straight_on(log_and_model) -> None:
     log, model = log_and_model
-    plain, late = predictions(log, model, CANDIDATES, [{}, {"gnss_latency/both": 0.2}], [log.start] * 2)
+    plain, late = predictions([Ask(log, {}), Ask(log, {"gnss_latency/both": 0.2})], model, CANDIDATES)
     assert plain is not None
     assert late is not None
     at = {o.channel: i for i, o in enumerate(log.observed)}

@@ -11,6 +11,7 @@ import pytest
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.effects.reece import second_terramechanics
+from terrafusion.twin.gap import side_by_side
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channel_noise import first_noise
 from terrafusion.twin.gap.classes import done, likeness
@@ -23,9 +24,10 @@ from terrafusion.twin.gap.residuals import raw_of, state_sigmas, whitened
 from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.score import Score, score
 from terrafusion.twin.gap.side_by_side import graphs, groups, what_moves
-from terrafusion.twin.gap.signatures import drive, placed, predictions, signatures
+from terrafusion.twin.gap.signatures import Ask, drive, placed, predictions, signatures
 from terrafusion.twin.gap.trials import calibration_error, interval
 from terrafusion.twin.gap.verdict import HeldOut, null_probability
+from terrafusion.twin.identify.inputs import DT_S
 from terrafusion.twin.vehicle import load_vehicle
 
 from .drives import run
@@ -40,7 +42,13 @@ def log_and_model():
     return prepared([recording], model, ground, "auto")[0], model
 
 
-def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model) -> None:
+@pytest.fixture
+def long_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs in 64 bits, where things are the same to the last digits or not at all."""
+    monkeypatch.setattr(side_by_side, "SHORT", False)
+
+
+def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, long_numbers) -> None:
     log, model = log_and_model
     moved = log.start + np.array([2.0, -1.0, 0.3])
     keys = ("gnss_lever_arm/offset/x", "wheel_radius/scale")
@@ -59,7 +67,7 @@ def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
     found = signatures(log, drive(log, model, CANDIDATES, log.start, keys))
     columns = [CANDIDATES.keys.index(k) for k in keys]
     sets = [{k: 0.1 * float(CANDIDATES.scale[c])} for k, c in zip(keys, columns, strict=True)]
-    plain, *with_effect = predictions(log, model, CANDIDATES, [{}, *sets], [log.start] * (1 + len(sets)))
+    plain, *with_effect = predictions([Ask(log, some) for some in ({}, *sets)], model, CANDIDATES)
     assert plain is not None
     for column, values in zip(columns, with_effect, strict=True):
         assert values is not None
@@ -84,7 +92,7 @@ def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> No
             assert not some.change[:, :, i].any()
 
 
-def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model) -> None:
+def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model, long_numbers) -> None:
     """Whatever graphs drive them, and though those of the sensors alone share a run."""
     log, model = log_and_model
     alone = {
@@ -93,15 +101,58 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model) -> N
     }  # fmt: skip
     sets = [{}, *({k: v} for k, v in alone.items()), {"mass/at_cg": 0.1, "gyro_bias/constant": 0.01}]
     sets += [{"wheel_radius/scale": 0.002 * k} for k in range(1, 9)]
-    together = predictions(log, model, CANDIDATES, sets, [log.start] * len(sets))
+    together = predictions([Ask(log, some) for some in sets], model, CANDIDATES)
     for some, found in zip(sets, together, strict=True):
-        (by_itself,) = predictions(log, model, CANDIDATES, [some], [log.start])
+        (by_itself,) = predictions([Ask(log, some)], model, CANDIDATES)
         for observed, a, b in zip(log.observed, found, by_itself, strict=True):
             np.testing.assert_allclose(a, b, atol=1e-3 * np.median(observed.sigma), err_msg=f"{some}")
     plain, biased, heavy = together[0], together[1], together[2]
     rate = [o.channel for o in log.observed].index("yaw_rate_radps")
     np.testing.assert_allclose(biased[rate] - plain[rate], 0.01, rtol=1e-9)
     np.testing.assert_allclose(together[7][rate] - heavy[rate], 0.01, rtol=1e-9)
+
+
+def test_numbers_of_32_bits_lose_less_than_steps_of_third_order(log_and_model, monkeypatch) -> None:
+    """In units of the sensors' noise, with effects of each kind."""
+    log, model = log_and_model
+    keys = (
+        "mass/at_cg",
+        "wheel_radius/scale",
+        "slip_sinkage/linear",
+        "backlash/lost_motion",
+        "slope/uniform",
+    )
+    asks = [Ask(log, {})]
+    asks += [Ask(log, {k: 0.3 * float(CANDIDATES.scale[CANDIDATES.keys.index(k)])}) for k in keys]
+    told = {}
+    for short, order in ((True, 3), (False, 3), (False, 4)):
+        monkeypatch.setattr(side_by_side, "SHORT", short)
+        monkeypatch.setattr(side_by_side, "ORDER", order)
+        found = predictions(asks, model, CANDIDATES)
+        told[short, order] = np.array(
+            [np.concatenate([y / o.sigma for o, y in zip(log.observed, ys, strict=True)]) for ys in found]
+        )
+    by_bits = told[True, 3] - told[False, 3]
+    by_order = told[False, 4] - told[False, 3]
+    assert 0.0 < np.abs(by_bits).max() < 0.02
+    assert np.square(by_bits).sum() < np.square(by_order).sum()
+
+
+def test_runs_of_several_logs_are_what_each_is_alone(log_and_model) -> None:
+    """To the bit, though they have windows of other lengths, start elsewhere and end sooner."""
+    log, model = log_and_model
+    ends = log.windows + np.array([[137, 89], [89, -61]])
+    begin_s, end_s = DT_S * ends[0, 0], DT_S * ends[-1, 1]
+    inside = tuple(o.select((o.begin_s > begin_s) & (o.end_s < end_s)) for o in log.observed)
+    start = log.start + np.array([3.0, 1.0, 0.5])
+    other = dataclasses.replace(log, windows=ends, start=start, observed=inside)
+    sets = [{}, {"mass/at_cg": 0.1}, {"gyro_bias/constant": 0.01}]
+    asks = [Ask(of, some) for some in sets for of in (log, other, log)]
+    together = predictions(asks, model, CANDIDATES, jobs=2)
+    for ask, found in zip(asks, together, strict=True):
+        alone = predictions([Ask(ask.log, some) for some in sets], model, CANDIDATES)[sets.index(ask.effects)]
+        for a, b in zip(found, alone, strict=True):
+            np.testing.assert_array_equal(a, b)
 
 
 def test_stretches_that_are_alike_hold_every_row_once(log_and_model) -> None:
@@ -117,8 +168,9 @@ def test_stretches_that_are_alike_hold_every_row_once(log_and_model) -> None:
 def test_sets_may_start_from_poses_of_their_own(log_and_model) -> None:
     log, model = log_and_model
     moved, sets = log.start + np.array([0.0, 0.0, 0.3]), [{}, {}, {"gyro_bias/constant": 0.01}]
-    here, there, biased = predictions(log, model, CANDIDATES, sets, [log.start, moved, moved])
-    alone = predictions(log, model, CANDIDATES, sets[1:], [moved] * 2)
+    asks = [Ask(log, some, at) for some, at in zip(sets, (log.start, moved, moved), strict=True)]
+    here, there, biased = predictions(asks, model, CANDIDATES)
+    alone = predictions(asks[1:], model, CANDIDATES)
     for i, observed in enumerate(log.observed):
         np.testing.assert_allclose(there[i], alone[0][i], atol=1e-3 * np.median(observed.sigma))
         np.testing.assert_allclose(biased[i], alone[1][i], atol=1e-3 * np.median(observed.sigma))

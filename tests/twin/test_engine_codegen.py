@@ -13,7 +13,8 @@ import pytest
 
 from terrafusion.twin.drive import told
 from terrafusion.twin.engine import codegen, compiler, native
-from terrafusion.twin.engine.codegen import LANES, SINGLE, Variant
+from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
+from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import CONST, UnsupportedOperationError, read
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.packing import packs
@@ -27,19 +28,17 @@ KERNELS = """
 void call_{0}(long n, const double *x, double *y) {{
   for (long i = 0; i < n; i += TF_RUNS) {{
     tf_real a;
-    memcpy(&a, x + i, sizeof a);
+    for (int k = 0; k < TF_RUNS; ++k) ((tf_number *)&a)[k] = (tf_number)x[i + k];
     a = tf_{0}_real(a);
-    memcpy(y + i, &a, sizeof a);
+    for (int k = 0; k < TF_RUNS; ++k) y[i + k] = ((tf_number *)&a)[k];
   }}
 }}
 """
 
 
-@pytest.fixture(scope="module")
-def kernel():
-    """kernel(name, x) -> values of a vector kernel, x a multiple of 8 long."""
-    names = ("exp", "log", "sin", "cos", "tanh", "sqrt", "root")
-    source = codegen._prelude(LANES) + "".join(KERNELS.format(name) for name in names)
+def kernels(kind: str, names: tuple[str, ...]):
+    """kernel(name, x) -> values of a vector kernel, x a multiple of 16 long."""
+    source = codegen._prelude(kind) + "".join(KERNELS.format(name) for name in names)
     command = compiler.find_compiler()
     assert command is not None
     library = ctypes.CDLL(str(compiler.compiled(source, command)))
@@ -50,6 +49,16 @@ def kernel():
         return y
 
     return call
+
+
+@pytest.fixture(scope="module")
+def kernel():
+    return kernels(LANES, ("exp", "log", "sin", "cos", "tanh", "sqrt", "root"))
+
+
+@pytest.fixture(scope="module")
+def kernel_32():
+    return kernels(LANES_32, ("exp", "log", "sin", "cos", "tanh", "sqrt"))
 
 
 @needs_compiler
@@ -67,6 +76,47 @@ def test_functions_are_right_to_four_units_in_the_last_place(kernel, name, low, 
     if name in ("sin", "cos"):  # near a zero the error is that of the argument
         ulp = np.maximum(ulp, 2.0**-60)
     assert float((np.abs(kernel(name, x) - exact) / ulp).max()) < 4.0
+
+
+@needs_compiler
+@pytest.mark.parametrize(
+    ("name", "low", "high"),
+    [("exp", -80.0, 80.0), ("exp", -1.0, 1.0), ("log", 1e-37, 1e37), ("log", 0.9, 1.1),
+     ("sin", -4.0, 4.0), ("cos", -4.0, 4.0), ("sin", -1e3, 1e3), ("cos", -1e3, 1e3),
+     ("tanh", -1.0, 1.0), ("tanh", -30.0, 30.0), ("sqrt", 0.0, 1e4)],
+)  # fmt: skip
+def test_functions_of_32_bits_are_right_to_four_units_in_the_last_place(kernel_32, name, low, high) -> None:
+    rng = np.random.default_rng(1)
+    x = np.geomspace(low, high, 1 << 15) if low == 1e-37 else rng.uniform(low, high, 1 << 15)
+    x = x.astype(np.float32).astype(float)
+    exact = getattr(np, name)(x)
+    ulp = np.spacing(np.abs(exact).astype(np.float32)).astype(float)
+    if name in ("sin", "cos"):
+        ulp = np.maximum(ulp, 2.0**-31)
+    assert float((np.abs(kernel_32(name, x) - exact) / ulp).max()) < 4.0
+
+
+@needs_compiler
+def test_functions_of_32_bits_at_the_edges(kernel_32) -> None:
+    edges = np.array([0.0, -1.0, np.nan, np.inf, -np.inf, 1.0, 100.0, -100.0] * 2)
+    at = kernel_32("exp", edges)
+    np.testing.assert_allclose(at[[0, 1, 5, 7]], [1.0, np.exp(-1.0), np.e, 0.0], rtol=1e-6, atol=1e-37)
+    assert at[6] > 1e38
+    np.testing.assert_array_equal(kernel_32("log", edges)[[0, 1, 2, 5]], [-np.inf, np.nan, np.nan, 0.0])
+    np.testing.assert_array_equal(kernel_32("tanh", edges)[[0, 3, 4, 6, 7]], [0.0, 1.0, -1.0, 1.0, -1.0])
+    for name in ("exp", "log", "sin", "cos", "tanh", "sqrt"):
+        assert np.isnan(kernel_32(name, edges)[2])
+
+
+def test_a_number_that_32_bits_do_not_hold_is_told() -> None:
+    graph, outputs = read(ca.Function("f", [x := ca.SX.sym("x")], [x + 1e-60], ["x"], ["dx"]), lambda n, i: i)
+    for short in (False, True):
+        emitter = Emitter(graph, outputs, {"x"}, (), lambda name, i: None, in_vectors=False, short=short)
+        if not short:
+            assert "1e-60;" in emitter.source()
+            continue
+        with pytest.raises(UnsupportedOperationError, match="1e-60"):
+            emitter.source()
 
 
 @needs_compiler

@@ -66,6 +66,45 @@ def test_a_run_has_the_same_bits_alone_and_among_others(jobs) -> None:
         np.testing.assert_array_equal(together[k], integrate(x0[k], inputs[k], DT_S, plant), err_msg=str(k))
 
 
+@needs_compiler
+@pytest.mark.parametrize("order", [3, 4])
+def test_in_32_bits_a_run_has_the_same_bits_alone_and_among_others(order: int) -> None:
+    some = plants()
+    inputs, x0 = commands(len(some)), starts(len(some))
+    together = integrate_many(x0, inputs, DT_S, some, order=order, short=True)
+    for k, plant in enumerate(some):
+        alone = integrate_many(x0[k : k + 1], inputs[k], DT_S, [plant], order=order, short=True)
+        np.testing.assert_array_equal(together[k], alone[0], err_msg=str(k))
+
+
+@needs_compiler
+def test_in_32_bits_a_run_that_was_stopped_goes_on_with_the_same_bits() -> None:
+    """What rounding has left over is kept in the states that are returned; grounds that change with time are
+    not stopped here."""
+    some = [plant for plant in plants() if plant.route.is_fixed()]
+    inputs, x0 = commands(len(some)), starts(len(some))
+    x0[:, INDEX["x"]] = 1e3 / 3.0
+    whole = integrate_many(x0, inputs, DT_S, some, short=True)
+    first = integrate_many(x0, inputs[:, :121], DT_S, some, short=True)
+    then = integrate_many(first[:, -1], inputs[:, 120:], DT_S, some, short=True)
+    np.testing.assert_array_equal(whole[:, :121], first)
+    np.testing.assert_array_equal(whole[:, 120:], then)
+
+
+@needs_compiler
+def test_32_bits_lose_less_than_a_millionth_of_each_state() -> None:
+    """Far from the origin, too, where a step is less than what 32 bits tell apart of the place."""
+    some = plants()
+    inputs, x0 = commands(len(some)), starts(len(some))
+    x0[:, INDEX["x"]] = 1e4
+    long, short = (integrate_many(x0, inputs, DT_S, some, short=s) for s in (False, True))
+    assert not np.array_equal(long, short)
+    moved = [INDEX["x"], INDEX["y"], INDEX["yaw"]]
+    assert np.abs(long - short)[:, :, moved].max() < 5e-5
+    scale = np.abs(long).max(axis=1, keepdims=True) + 1e-2
+    assert np.median(np.abs(long - short) / scale) < 1e-6
+
+
 @pytest.mark.parametrize("backend", ["vm", pytest.param("c", marks=needs_compiler)])
 def test_shared_inputs_and_every_so_many_th_sample(backend) -> None:
     some, inputs = plants()[:3], commands(1, 1.0)[0]

@@ -32,10 +32,20 @@ from terrafusion.twin.layout import (
 from terrafusion.twin.measurement import measurement
 from terrafusion.twin.version import model_sha256
 
-__all__ = ["LANES", "SINGLE", "TANGENT", "UnsupportedOperationError", "Variant", "source", "wheel_of"]
+__all__ = [
+    "LANES",
+    "LANES_32",
+    "SINGLE",
+    "TANGENT",
+    "UnsupportedOperationError",
+    "Variant",
+    "source",
+    "wheel_of",
+]
 
-SINGLE, LANES, TANGENT = "single", "lanes", "tangent"
-"""One run, its wheels side by side in a vector; several runs side by side; one run with its derivatives."""
+SINGLE, LANES, LANES_32, TANGENT = "single", "lanes", "lanes_32", "tangent"
+"""One run, its wheels side by side in a vector; several runs side by side; twice as many by numbers of 32
+bits; one run with its derivatives."""
 
 _ARGUMENTS = {
     "once": "const tf_real *vehicle, const tf_real *effects, const tf_real *soil, tf_real *held",
@@ -90,7 +100,8 @@ def source(variant: Variant) -> str:
             graph, outputs, _WIDE, late, lambda name, i: not _changes(active, name, i)
         )
     wide = _WIDE if kind == TANGENT else ()
-    emitter = Emitter(graph, outputs, late, wide, wheel_of, in_vectors=kind != LANES)
+    lanes = kind in (LANES, LANES_32)
+    emitter = Emitter(graph, outputs, late, wide, wheel_of, in_vectors=not lanes, short=kind == LANES_32)
     loops = [_text("driver.c"), _text("tangent.c")] if kind == TANGENT else [_text("driver.c")]
     if kind == TANGENT:
         loops.insert(0, _read_states(graph, outputs))
@@ -168,19 +179,24 @@ def _sizes(effects: tuple[str, ...], arguments: Mapping[str, str] = _ARGUMENTS) 
 def _prelude(kind: str) -> str:
     if kind == LANES:
         return _LANES_HEAD + _kernels("tf_real", "TF_RUNS", "real") + _text("root.h")
+    if kind == LANES_32:
+        return _LANES_32_HEAD + _kernels("tf_real", "TF_RUNS", "real", short=True)
     head = _SINGLE_HEAD + _kernels("tf_four", "TF_WHEELS", "four") + _FOURS + _scalar_calls()
     return head + _WIDE_TYPE if kind == TANGENT else head
 
 
-def _kernels(vector: str, width: str, suffix: str) -> str:
+def _kernels(vector: str, width: str, suffix: str, short: bool = False) -> str:
     names = {"VEC": vector, "INT": f"{vector}_int", "WIDTH": width, "FN(name)": f"tf_##name##_{suffix}"}
+    number, integer, size, text = (
+        ("float", "int", 4, "kernels_32.h") if short else ("double", "long long", 8, "kernels.h")
+    )
     types = (
-        f"typedef double {vector} __attribute__((vector_size(8 * {width}), may_alias));\n"
-        f"typedef long long {vector}_int __attribute__((vector_size(8 * {width}), may_alias));\n"
+        f"typedef {number} {vector} __attribute__((vector_size({size} * {width}), may_alias));\n"
+        f"typedef {integer} {vector}_int __attribute__((vector_size({size} * {width}), may_alias));\n"
     )
     defines = "".join(f"#define TF_{name} {value}\n" for name, value in names.items())
     undefines = "".join(f"#undef TF_{name.split('(')[0]}\n" for name in names)
-    return f"{types}{defines}{_text('kernels.h')}{undefines}"
+    return f"{types}{defines}{_text(text)}{undefines}"
 
 
 _HEAD = """
@@ -193,10 +209,23 @@ _LANES_HEAD = f"""{_HEAD}
 #else
 #define TF_RUNS 4
 #endif
+typedef double tf_number;
+"""
+_LANES_32_HEAD = f"""{_HEAD}
+#define TF_32
+#if defined(__AVX512F__)
+#define TF_RUNS 16
+#else
+#define TF_RUNS 8
+#endif
+typedef float tf_number;
+typedef double tf_double __attribute__((vector_size(8 * TF_RUNS)));
+#define TF_AS_DOUBLE(a) __builtin_convertvector(a, tf_double)
+#define TF_AS_NUMBER(a) __builtin_convertvector(a, tf_real)
 """
 _SINGLE_HEAD = f"""{_HEAD}
 #define TF_RUNS 1
-typedef double tf_real;
+typedef double tf_real, tf_number;
 """
 _WIDE_TYPE = """
 #define TF_DIRECTIONS 4

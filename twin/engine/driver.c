@@ -81,7 +81,7 @@ static tf_place tf_where(const tf_ground *ground, int wheel, double t, double tr
 }
 
 /* The soil under each wheel into soil[(parameter * TF_WHEELS + wheel) * stride]. */
-static void tf_soil(tf_ground *ground, double t, double travel, double *soil, int stride) {
+static void tf_soil(tf_ground *ground, double t, double travel, tf_number *soil, int stride) {
   const tf_plant *plant = ground->plant;
   for (int k = 0; k < TF_WHEELS; ++k) {
     const tf_place place = tf_where(ground, k, t, travel);
@@ -95,7 +95,7 @@ static void tf_soil(tf_ground *ground, double t, double travel, double *soil, in
         value *= ground->gain[k][i];
         value += ground->share[k] * (plant->patch_soil[i] - value);
       }
-      soil[(i * TF_WHEELS + k) * stride] = value;
+      soil[(i * TF_WHEELS + k) * stride] = (tf_number)value;
     }
   }
 }
@@ -105,9 +105,10 @@ typedef struct {
   tf_ground ground[TF_RUNS];
   int changing; /* whether the soil changes on the way */
   tf_real vehicle[TF_NV], effects[TF_NE + 1], soil[TF_NP * TF_WHEELS], held[TF_KEPT_HELD], local[TF_KEPT_LOCAL];
+  tf_real over[TF_NX]; /* by how much the states, as they are held, are too large (numbers of 32 bits) */
 } tf_runs;
 
-#define TF_LANE(values, lane) ((double *)(values) + (lane))
+#define TF_LANE(values, lane) ((tf_number *)(values) + (lane))
 
 static void tf_soils(tf_runs *runs, double t, const tf_real *x) {
   for (int i = 0; i < TF_RUNS; ++i)
@@ -125,8 +126,8 @@ static void tf_runs_start(tf_runs *runs, const tf_plant *const *plants, double t
   for (int i = 0; i < TF_RUNS; ++i) {
     tf_ground_start(&runs->ground[i], plants[i]);
     runs->changing |= plants[i]->knots > 1 || plants[i]->rows > 0;
-    for (int k = 0; k < TF_NV; ++k) *TF_LANE(runs->vehicle + k, i) = plants[i]->vehicle[k];
-    for (int k = 0; k < TF_NE; ++k) *TF_LANE(runs->effects + k, i) = plants[i]->effects[k];
+    for (int k = 0; k < TF_NV; ++k) *TF_LANE(runs->vehicle + k, i) = (tf_number)plants[i]->vehicle[k];
+    for (int k = 0; k < TF_NE; ++k) *TF_LANE(runs->effects + k, i) = (tf_number)plants[i]->effects[k];
   }
   tf_fields(runs, x);
   tf_soils(runs, t, x);
@@ -142,24 +143,38 @@ static void tf_slope(tf_runs *runs, double t, const tf_real *x, const tf_real *u
 static const double tf_stage_at[4] = {0.0, 0.5, 0.5, 1.0}, tf_third_at[3] = {0.0, 0.5, 1.0};
 static const int tf_stage_input[4] = {0, 1, 1, 2}, tf_third_input[3] = {0, 1, 2};
 
+/* What a step adds to a state. In 32 bits thousands of small steps would round the same way: what is lost is
+ * kept and added with the next (Kahan 1965, Further remarks on reducing truncation errors). */
+static inline void tf_add(tf_runs *runs, tf_real *x, int i, tf_real step) {
+#if defined(TF_32)
+  const tf_real more = step - runs->over[i], sum = x[i] + more;
+  runs->over[i] = (sum - x[i]) - more;
+  x[i] = sum;
+#else
+  (void)runs;
+  x[i] += step;
+#endif
+}
+
 /* A step of the classical method of fourth order, or of Kutta's of third (1901). */
-static void tf_step(tf_runs *runs, double t, double h, long order, tf_real *x, tf_real u[3][TF_NU]) {
+static void tf_step(tf_runs *runs, double t, tf_number h, long order, tf_real *x, tf_real u[3][TF_NU]) {
   tf_real k[4][TF_NX], y[TF_NX];
   const double *at = order == 3 ? tf_third_at : tf_stage_at;
+  const tf_number two = 2, four = 4, sixth = h / 6;
   const int *input = order == 3 ? tf_third_input : tf_stage_input;
   if (runs->changing) tf_fields(runs, x);
   for (int stage = 0; stage < order; ++stage) {
-    const double ahead = at[stage] * h;
+    const tf_number ahead = (tf_number)at[stage] * h;
     if (stage == 2 && order == 3)
-      for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + h * (2.0 * k[1][i] - k[0][i]);
+      for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + h * (two * k[1][i] - k[0][i]);
     else if (stage)
       for (int i = 0; i < TF_NX; ++i) y[i] = x[i] + ahead * k[stage - 1][i];
     tf_slope(runs, t + ahead, stage ? y : x, u[input[stage]], k[stage]);
   }
   if (order == 3)
-    for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k[0][i] + 4.0 * k[1][i] + k[2][i]);
+    for (int i = 0; i < TF_NX; ++i) tf_add(runs, x, i, sixth * (k[0][i] + four * k[1][i] + k[2][i]));
   else
-    for (int i = 0; i < TF_NX; ++i) x[i] += h / 6.0 * (k[0][i] + 2.0 * k[1][i] + 2.0 * k[2][i] + k[3][i]);
+    for (int i = 0; i < TF_NX; ++i) tf_add(runs, x, i, sixth * (k[0][i] + two * k[1][i] + two * k[2][i] + k[3][i]));
 }
 
 /* Inputs at the start, middle and end of step j of `substeps` after a sample. */
@@ -168,7 +183,7 @@ static void tf_inputs(const double *const *inputs, long sample, long j, long sub
     const double *a = inputs[i] + sample * TF_NU, *b = a + TF_NU;
     for (int m = 0; m < 3; ++m) {
       const double f = ((double)j + 0.5 * m) / (double)substeps;
-      for (int c = 0; c < TF_NU; ++c) *TF_LANE(u[m] + c, i) = a[c] + f * (b[c] - a[c]);
+      for (int c = 0; c < TF_NU; ++c) *TF_LANE(u[m] + c, i) = (tf_number)(a[c] + f * (b[c] - a[c]));
     }
   }
 }
@@ -179,11 +194,52 @@ static void tf_inputs(const double *const *inputs, long sample, long j, long sub
 #define TF_EXPORT __attribute__((visibility("default")))
 #endif
 
+/* Numbers of 32 bits that die away become subnormal soon, which many processors handle slowly: zero instead. */
+#if defined(TF_32) && defined(__SSE__)
+#include <immintrin.h>
+#define TF_WITHOUT_SUBNORMALS const unsigned tf_mode = _mm_getcsr(); _mm_setcsr(tf_mode | 0x8040);
+#define TF_AS_BEFORE _mm_setcsr(tf_mode);
+#else
+#define TF_WITHOUT_SUBNORMALS
+#define TF_AS_BEFORE
+#endif
+
 #if defined(TF_DIRECTIONS)
 TF_EXPORT const int tf_lanes = TF_DIRECTIONS;
 #else
 TF_EXPORT const int tf_lanes = TF_RUNS;
 #endif
+
+/* A state (TF_NX) of run k into the lanes, and out of them with what they lack. */
+static void tf_take(tf_runs *runs, tf_real *x, int k, const double *from) {
+  for (int c = 0; c < TF_NX; ++c) {
+    *TF_LANE(x + c, k) = (tf_number)from[c];
+    *TF_LANE(runs->over + c, k) = (tf_number)((double)*TF_LANE(x + c, k) - from[c]);
+  }
+}
+
+static void tf_give(const tf_runs *runs, const tf_real *x, int k, double *to) {
+  for (int c = 0; c < TF_NX; ++c) to[c] = *TF_LANE(x + c, k);
+#if defined(TF_32)
+  for (int c = 0; c < TF_NX; ++c) to[c] -= *TF_LANE(runs->over + c, k);
+#else
+  (void)runs;
+#endif
+}
+
+/* The states of all runs as if they had been given and taken: a run that is stopped at a sample and goes on from
+ * there has the bits of one that is not. */
+static void tf_through(tf_runs *runs, tf_real *x) {
+#if defined(TF_32)
+  for (int c = 0; c < TF_NX; ++c) {
+    const tf_double whole = TF_AS_DOUBLE(x[c]) - TF_AS_DOUBLE(runs->over[c]);
+    x[c] = TF_AS_NUMBER(whole);
+    runs->over[c] = TF_AS_NUMBER(TF_AS_DOUBLE(x[c]) - whole);
+  }
+#else
+  (void)runs, (void)x;
+#endif
+}
 
 /* Samples x(t0 + i dt), i = 0..n, of TF_RUNS runs; every `every`-th into outs[run] ((n / every + 1, TF_NX)),
  * whose first row holds x(t0) on entry, by Runge-Kutta steps of `order` 4 or 3. Two lanes may name the same run. */
@@ -192,16 +248,17 @@ TF_EXPORT void tf_simulate(const tf_plant *const *plants, long n, long substeps,
   tf_runs runs;
   tf_real x[TF_NX], u[3][TF_NU];
   const double h = dt / (double)substeps;
-  for (int i = 0; i < TF_RUNS; ++i)
-    for (int c = 0; c < TF_NX; ++c) *TF_LANE(x + c, i) = outs[i][c];
+  TF_WITHOUT_SUBNORMALS
+  for (int k = 0; k < TF_RUNS; ++k) tf_take(&runs, x, k, outs[k]);
   tf_runs_start(&runs, plants, t0, x);
   for (long i = 0; i < n; ++i) {
     for (long j = 0; j < substeps; ++j) {
       tf_inputs(inputs, i, j, substeps, u);
-      tf_step(&runs, t0 + (double)i * dt + (double)j * h, h, order, x, u);
+      tf_step(&runs, t0 + (double)i * dt + (double)j * h, (tf_number)h, order, x, u);
     }
+    tf_through(&runs, x);
     if ((i + 1) % every == 0)
-      for (int k = 0; k < TF_RUNS; ++k)
-        for (int c = 0; c < TF_NX; ++c) outs[k][(i + 1) / every * TF_NX + c] = *TF_LANE(x + c, k);
+      for (int k = 0; k < TF_RUNS; ++k) tf_give(&runs, x, k, outs[k] + (i + 1) / every * TF_NX);
   }
+  TF_AS_BEFORE
 }

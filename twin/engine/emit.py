@@ -14,12 +14,14 @@ import heapq
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
-from terrafusion.twin.engine.graph import BINARY, CONST, INPUT, Graph, Outputs
+from terrafusion.twin.engine.graph import BINARY, CONST, INPUT, Graph, Outputs, UnsupportedOperationError
 from terrafusion.twin.engine.packing import WHEELS, Atom, LaneOf, packs
 
 _LATENCY = {"sqrt": 21, "div": 13, "exp": 70, "log": 80, "sin": 60, "cos": 60}
 _LATENCY_ELSE = 4
 """Cycles until a result is there, about, on a processor of today."""
+LEAST_32, MOST_32 = 1.2e-38, 3.4e38
+"""Between these lie the normal numbers of 32 bits."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +51,7 @@ class Emitter:
         lane_of: how arguments belong to wheels.
         in_vectors: whether the four wheels' equal operations are one vector operation, or four that stand
             together (several runs already fill the vectors).
+        short: whether numbers have 32 bits.
     """
 
     graph: Graph
@@ -57,6 +60,7 @@ class Emitter:
     wide: Collection[str]
     lane_of: LaneOf
     in_vectors: bool
+    short: bool = False
     sizes: dict[str, int] = field(default_factory=dict)
     _roots: int = 0
 
@@ -200,7 +204,9 @@ class Emitter:
             value = f"-{args[0]}"
         else:
             self._roots += op == "sqrt"
-            by_product = op == "sqrt" and not self.in_vectors and self._roots % 2  # see root.h
+            by_product = (
+                op == "sqrt" and not (self.in_vectors or self.short) and self._roots % 2
+            )  # see root.h
             value = f"tf_{'root' if by_product else op}_{suffix}({', '.join(args)})"
         return f"const {kind} {_name(atom)} = {value};"
 
@@ -224,7 +230,7 @@ class Emitter:
     def _scalar(self, stage: Stage, n: int) -> str:
         """One node's value: the name of what was computed, a literal, an argument, or what was kept."""
         if self.graph.ops[n] == CONST:
-            value = repr(self.graph.values[n])
+            value = self._literal(self.graph.values[n])
             return f"({value})" if value.startswith("-") else value
         if self.graph.ops[n] == INPUT:
             name, i = self.graph.values[n]
@@ -233,6 +239,13 @@ class Emitter:
         if self._stage[n] != stage:
             return f"{self._stage[n].kept}[{self._slot[atom] + k}]"
         return f"{_name(atom)}[{k}]" if len(atom) > 1 else _name(atom)
+
+    def _literal(self, value: float) -> str:
+        if not self.short:
+            return repr(value)
+        if value and not LEAST_32 < abs(value) < MOST_32:
+            raise UnsupportedOperationError(f"{value!r} is no normal number of 32 bits")
+        return f"{value!r}f"
 
     def _output(self, stage: Stage, n: int) -> str:
         text = self._scalar(stage, n)

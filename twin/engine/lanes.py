@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.engine import vm
-from terrafusion.twin.engine.codegen import LANES, SINGLE, Variant
+from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
 from terrafusion.twin.engine.integrate import chosen, steps_a_sample
 from terrafusion.twin.engine.native import CPlant, Driver
 from terrafusion.twin.engine.plant import Plant
@@ -37,6 +37,7 @@ def integrate_many(
     every: int = 1,
     jobs: int = 1,
     order: int = 4,
+    short: bool = False,
 ) -> Array:
     """States (B, N // every + 1, X) of B runs; see `integrate.integrate`.
 
@@ -53,6 +54,7 @@ def integrate_many(
         every: only every so many-th sample is returned, from the first on.
         jobs: threads (compiled code runs outside Python's global lock).
         order: of the Runge-Kutta steps, 4 or 3 (a quarter less work).
+        short: whether numbers of 32 bits will do, twice as many side by side (compiled code only).
 
     Raises:
         ValueError: an array is misshapen, or there is no such order.
@@ -65,7 +67,7 @@ def integrate_many(
         raise ValueError(f"inputs {inputs.shape} are misshapen for {count} runs")
     out = np.empty((count, (shape[0] - 1) // every + 1, len(STATES)))
     out[:, 0] = x0
-    fleet = Fleet.of(plants, dt_s, backend, substeps, order)
+    fleet = Fleet.of(plants, dt_s, backend, substeps, order, short)
     fleet.drive([inputs] * count if shared else list(inputs), list(out), t0_s, every, jobs)
     blank_what_diverged(out)
     return out
@@ -97,6 +99,7 @@ class Fleet:
         backend: str = "auto",
         substeps: int | None = None,
         order: int = 4,
+        short: bool = False,
     ) -> Fleet:
         """Plants that share a graph and a step, as many together as a driver has lanes.
 
@@ -111,7 +114,8 @@ class Fleet:
             alike[plant.effect_names(), plant.route.is_fixed(), steps].append(i)
         tasks: list[_Task] = []
         for (effects, fixed, steps), runs in alike.items():
-            native = chosen(backend, Variant(LANES if len(runs) > 1 else SINGLE, effects, fixed))
+            kind = LANES_32 if short else LANES if len(runs) > 1 else SINGLE
+            native = chosen(backend, Variant(kind, effects, fixed))
             lanes = 1 if native is None else native.lanes
             for first in range(0, len(runs), lanes):
                 some = runs[first : first + lanes]

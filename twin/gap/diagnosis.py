@@ -260,32 +260,48 @@ class _Remaining:
     fitter: Fitter
     known: dict[tuple[Hypothesis, ...], Fitted | Refit]
 
-    def __call__(self, forms: Sequence[Hypothesis]) -> tuple[Pool, Refit]:
-        case, fitted = self.case, self._fitted(tuple(forms))
-        fit = fitted.fit if isinstance(fitted, Fitted) else fitted
-        if not fit.errors:
-            return case.pool, fit
+    def __call__(self, several: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[Pool, Refit]]:
+        case = self.case
+        fits = [f.fit if isinstance(f, Fitted) else f for f in self._fitted(several)]
+        return [(self._left_by(fit) if fit.errors else case.pool, fit) for fit in fits]
+
+    def _left_by(self, fit: Refit) -> Pool:
+        case = self.case
+        runs = zip(case.bench.runs, fit.errors, case.scores, strict=True)
         left = [
             dataclasses.replace(scored(run, case.sigma, error, own.A), other=own.other)
-            for run, error, own in zip(case.bench.runs, fit.errors, case.scores, strict=True)
+            for run, error, own in runs
         ]
-        return Pool.of(left, case.null), fit
+        return Pool.of(left, case.null)
 
-    def _fitted(self, forms: tuple[Hypothesis, ...]) -> Fitted | Refit:
-        """The last one beside those before it; the failure of those where they have none."""
-        if forms not in self.known:
-            self.known[forms] = self._now(forms)
-        return self.known[forms]
+    def _fitted(self, several: Sequence[tuple[Hypothesis, ...]]) -> list[Fitted | Refit]:
+        """Of each set the last one beside those before it, side by side where those are the same; the failure
+        of those before where they have none."""
+        together: dict[tuple[Hypothesis, ...], list[Hypothesis]] = {}
+        for forms in several:
+            if forms not in self.known:
+                together.setdefault(forms[:-1], []).append(forms[-1])
+        for first, more in together.items():
+            self._fit(first, more)
+        return [self.known[forms] for forms in several]
 
-    def _now(self, forms: tuple[Hypothesis, ...]) -> Fitted | Refit:
-        if len(forms) == 1:
-            return self.fitter.alone(forms[0])
-        before = self._fitted(forms[:-1])
-        if not isinstance(before, Fitted):
-            return before
-        effects, names = (" and ".join(h.effect for h in forms), " and ".join(h.form for h in forms))
-        columns = (*before.fit.columns, *forms[-1].columns)
-        return self.fitter.beside(before, Hypothesis(effects, names, columns))
+    def _fit(self, first: tuple[Hypothesis, ...], more: Sequence[Hypothesis]) -> None:
+        """Each of `more` beside the first ones."""
+        before = self._fitted([first])[0] if first else None
+        if isinstance(before, Refit):
+            self.known.update({(*first, law): before for law in more})
+        elif before is None:
+            self.known.update({(law,): self.fitter.alone(law) for law in more})
+        else:
+            joint = {law: _together((*first, law)) for law in more}
+            found = self.fitter.beside(before, list(joint.values()))
+            self.known.update({(*first, law): found[both] for law, both in joint.items()})
+
+
+def _together(forms: Sequence[Hypothesis]) -> Hypothesis:
+    """Several laws as one."""
+    effects, names = (" and ".join(h.effect for h in forms), " and ".join(h.form for h in forms))
+    return Hypothesis(effects, names, tuple(column for h in forms for column in h.columns))
 
 
 def _next_run(bench: Bench, sigma: Array, verdict: Verdict) -> NextRun | None:

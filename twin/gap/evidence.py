@@ -30,7 +30,7 @@ from terrafusion.twin.gap.residuals import (
     whitened_error,
     without_probes,
 )
-from terrafusion.twin.gap.signatures import Drive, settled_predictions
+from terrafusion.twin.gap.signatures import Ask, Drive, settled_predictions
 from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
@@ -173,22 +173,21 @@ def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], job
     )
     step = np.clip(_common_step(white, errors, candidates, soil), -MOST_STEP, MOST_STEP)
 
-    def tried(run: Raw, evidence: Evidence, effects: Mapping[str, float]) -> Array | None:
-        error = _error_on(run.log, drives, effects)
-        return None if error is None else whitened_error(run, evidence, noise, error)
-
-    with ThreadPoolExecutor(jobs) as pool:
-        for _ in range(BASE_STEPS):
-            if np.abs(step).max(initial=0.0) < BASE_MOVED:
-                break
-            effects = _ground(at + step, names, candidates, model)
-            moved = list(pool.map(tried, raws, white, [effects] * len(raws)))
-            now = [error for error in moved if error is not None]
-            if len(now) == len(raws) and _square(now) < _square(errors):
-                at, errors = at + step, now
-                step = np.clip(_common_step(white, errors, candidates, soil), -MOST_STEP, MOST_STEP)
-            else:
-                step = 0.4 * step
+    for _ in range(BASE_STEPS):
+        if np.abs(step).max(initial=0.0) < BASE_MOVED:
+            break
+        asks = [Ask(run.log, _ground(at + step, names, candidates, model)) for run in raws]
+        moved = settled_predictions(asks, model, candidates, jobs)
+        now = [
+            whitened_error(run, w, noise, [o.value - y for o, y in zip(run.log.observed, told, strict=True)])
+            for run, w, told in zip(raws, white, moved, strict=True)
+            if told is not None
+        ]
+        if len(now) == len(raws) and _square(now) < _square(errors):
+            at, errors = at + step, now
+            step = np.clip(_common_step(white, errors, candidates, soil), -MOST_STEP, MOST_STEP)
+        else:
+            step = 0.4 * step
     return dataclasses.replace(model, effects={**model.effects, **_ground(at, names, candidates, model)})
 
 
@@ -200,12 +199,6 @@ def _ground(at: Array, names: Sequence[str], candidates: Candidates, model: Mode
         value = model.effects.get(name, 0.0) + float(d * candidates.scale[i])
         out[name] = float(np.clip(value, 0.95 * candidates.low[i], 0.95 * candidates.high[i]))
     return out
-
-
-def _error_on(log: Log, drives: Drives, effects: Mapping[str, float]) -> list[Array] | None:
-    """Errors of the log, by channel, against the twin on another ground; None where the twin diverges."""
-    found = settled_predictions(log, drives.model, drives.candidates, [effects])[0]
-    return None if found is None else [o.value - y for o, y in zip(log.observed, found, strict=True)]
 
 
 def _square(errors: Sequence[Array]) -> float:
@@ -265,16 +258,16 @@ def gather(
 
     raws = raws_of(logs, drives, channels, jobs, told)
     first = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs)
+    free = at_own_ground(raws[len(runs) :], drives, first, jobs=jobs)
+    most = reach(free, candidates)
+    # One limit for all, or a run that is but a further reference would differ from them.
+    far = [not (abs(run.own) <= most).all() for run in free]
+    again = [*raws[: len(runs)], *itertools.compress(raws[len(runs) :], far)]
+    limited = iter(at_own_ground(again, drives, first, most, jobs))
+    judged_raws = list(itertools.islice(limited, len(runs)))
+    raws = judged_raws + [next(limited) if too else run for run, too in zip(free, far, strict=True)]
+    noise = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs, first)
     with ThreadPoolExecutor(jobs) as pool:
-        free = list(pool.map(lambda run: at_own_ground(run, drives, first), raws[len(runs) :]))
-        most = reach(free, candidates)
-        # One limit for all, or a run that is but a further reference would differ from them.
-        far = [not (abs(run.own) <= most).all() for run in free]
-        again = [*raws[: len(runs)], *itertools.compress(raws[len(runs) :], far)]
-        limited = pool.map(lambda run: at_own_ground(run, drives, first, most), again)
-        judged_raws = list(itertools.islice(limited, len(runs)))
-        raws = judged_raws + [next(limited) if too else run for run, too in zip(free, far, strict=True)]
-        noise = learnt_noise(raws[len(runs) :], raws[: len(runs)], candidates, jobs, first)
         evidence = list(pool.map(lambda run: whitened(run, noise), raws))
     judged, normal = bounded(evidence[: len(runs)], evidence[len(runs) :], state_sigmas(candidates), jobs)
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]

@@ -22,7 +22,7 @@ from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.late import DELAYS
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.refit import Refit, effects_at, errors_of, scored
+from terrafusion.twin.gap.refit import Refit, Tried, effects_at, errors_of, scored
 from terrafusion.twin.gap.residuals import SOIL_STATE, WITHIN
 from terrafusion.twin.gap.score import Score
 
@@ -44,11 +44,12 @@ ROUNDS, IMPROVED = 3, 5
 LATE = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Sizes of a delay that are tried on both sides, in that of its range: what fits beyond half a swing of the
 drive has nothing to do with a signature, and no further run of the twin is needed."""
-CLOSER = (0.2, 0.1, 0.05, 0.025)
-"""Shares of the best delay by which others are tried on both sides of it, one after the other; and of the
-best size of a silent law."""
-SILENT = 1.0
-"""A law is silent where its signature, at the ends of its range, makes a smaller square in all runs."""
+CLOSER = ((-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (-0.05, -0.025, 0.025, 0.05))
+"""Shares of the best delay by which others are tried on both sides of it, those near the best of these after
+them; and of the best size of a silent law."""
+SILENT = 10.0
+"""A law is silent where its signature, at the ends of its range, makes a smaller square in all runs; what
+numbers of 32 bits round away makes 3 at most (docs/gap.md)."""
 SPREAD = (0.4, 0.7, 0.85, 1.0)
 """Sizes of a silent law that are tried, in that of its range: it acts beyond a threshold, if at all."""
 SCREEN = (0.12, 0.4)
@@ -137,10 +138,11 @@ class Fitter:
             if end.any()
             for share in SCREEN
         ]
-        sets = [effects_at(bench, law.columns, point) for law, point in points]
         table = dataclasses.replace(self.table, columns=self.table.columns[:1], blocks=self.table.blocks[:1])
-        at = [np.zeros(len(bench.reach))] * len(sets)
-        errors = errors_of(bench, [0], sets, [at])[0]
+        ground = np.zeros(len(bench.reach))
+        errors = errors_of(
+            bench, [Tried(0, effects_at(bench, law.columns, point), ground) for law, point in points]
+        )
         out = dict[Hypothesis, tuple[Array, float]]()
         for (law, point), error in zip(points, errors, strict=True):
             if error is not None:
@@ -170,9 +172,9 @@ class Fitter:
         best = self._better({}, [*ladder, *further])
         most = self.gap.total - SPEAKS
         speak = delays + [law for law in silent if law in best and best[law].left.total < most]
-        for share in CLOSER:
+        for shares in CLOSER:
             found = {law: best[law].fit.value for law in speak if law in best}
-            closer = [(law, (1.0 + way * share) * at) for law, at in found.items() for way in (-1.0, 1.0)]
+            closer = [(law, (1.0 + share) * at) for law, at in found.items() for share in shares]
             best = self._better(best, [(law, self._inside(law, point)) for law, point in closer])
         best = self._improved(best)
         return best, {law: self._failed(law, value) for law, value in laws if law not in best}
@@ -183,19 +185,24 @@ class Fitter:
         best, failed = self.fits([(law, value)])
         return best[law] if law in best else failed[law]
 
-    def beside(self, found: Fitted, law: Hypothesis) -> Fitted | Refit:
-        """A law of several effects, whose first columns are those of `found`: from there, the further ones at
-        a ladder of sizes along their signatures in what is left; or its failure."""
-        known = len(found.fit.columns)
-        low, high = bounds(self.bench.candidates, law.columns)
+    def beside(self, found: Fitted, laws: Sequence[Hypothesis]) -> dict[Hypothesis, Fitted | Refit]:
+        """Laws of several effects, whose first columns are those of `found`: from there, the further ones at
+        a ladder of sizes along their signatures in what is left; or their failures."""
+        known, points, at = (
+            len(found.fit.columns),
+            list[tuple[Hypothesis, Array]](),
+            dict[Hypothesis, Array](),
+        )
         rest = self.table.products(found.fit.errors)
-        more, _ = self.table.linear(law.columns[known:], low[known:], high[known:], rest)
-        at = np.append(found.fit.value, np.zeros(len(more)))
-        step, _ = self.table.linear(law.columns, low - at, high - at, rest)
-        points = [at + step, *(np.append(found.fit.value, share * more) for share in LADDER)]
-        inside = [(law, self._inside(law, point)) for point in points]
-        best = self._improved(self._better({}, inside, {law: found.fit.grounds}))
-        return best[law] if law in best else self._failed(law, at)
+        for law in laws:
+            low, high = bounds(self.bench.candidates, law.columns)
+            more, _ = self.table.linear(law.columns[known:], low[known:], high[known:], rest)
+            at[law] = np.append(found.fit.value, np.zeros(len(more)))
+            step, _ = self.table.linear(law.columns, low - at[law], high - at[law], rest)
+            tried = [at[law] + step, *(np.append(found.fit.value, share * more) for share in LADDER)]
+            points += [(law, self._inside(law, point)) for point in tried]
+        best = self._improved(self._better({}, points, dict.fromkeys(laws, found.fit.grounds)))
+        return {law: best[law] if law in best else self._failed(law, at[law]) for law in laws}
 
     def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
         """The best laws, along their signatures from where they are, and between the sizes tried so far."""
@@ -273,11 +280,18 @@ class Fitter:
         bench, own = self.bench, {law: found.fit.grounds for law, found in best.items()} | dict(grounds or {})
         sets = [effects_at(bench, law.columns, point) for law, point in points]
         own = {law: (np.zeros(len(bench.reach)),) * len(bench.runs) for law, _ in points} | own
-        of = [[own[law][run] for law, _ in points] for run in range(len(bench.runs))]
-        errors = errors_of(bench, range(len(bench.runs)), sets, of)
+        count = len(bench.runs)
+        errors = errors_of(
+            bench,
+            [
+                Tried(run, some, own[law][run])
+                for (law, _), some in zip(points, sets, strict=True)
+                for run in range(count)
+            ],
+        )
         out = dict(best)
         for i, (law, point) in enumerate(points):
-            mine = [some[i] for some in errors]
+            mine = errors[i * count : (i + 1) * count]
             whole = [error for error in mine if error is not None]
             if len(whole) < len(mine):
                 continue

@@ -55,11 +55,6 @@ def settled(log: Log, values: Sequence[Array]) -> list[Array]:
     return out
 
 
-def all_settled(log: Log, many: Sequence[Sequence[Array] | None]) -> list[list[Array] | None]:
-    """Several predictions, None where the twin diverged."""
-    return [None if values is None else settled(log, values) for values in many]
-
-
 def settled_start(log: Log, values: Sequence[Array], start: Array) -> Array:
     """Poses (W, 3) at the windows' starts from which the predicted tracks would lie on those observed, for
     predictions from the poses `start`."""

@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.evidence import Bench
-from terrafusion.twin.gap.residuals import Evidence, Raw, carried_back, on_own_ground, whitened_error
+from terrafusion.twin.gap.residuals import Evidence, carried_back, on_own_ground, whitened_error
 from terrafusion.twin.gap.score import Score
-from terrafusion.twin.gap.side_by_side import TOGETHER
-from terrafusion.twin.gap.signatures import settled_predictions
+from terrafusion.twin.gap.signatures import Ask, settled_predictions
 
 Array = NDArray[np.float64]
 
@@ -63,48 +62,30 @@ def effects_at(bench: Bench, columns: Sequence[int], value: Array) -> dict[str, 
     return out
 
 
-def errors_of(
-    bench: Bench,
-    runs: Sequence[int],
-    sets: Sequence[Mapping[str, float]],
-    grounds: Sequence[Sequence[Array]],
-) -> list[list[Array | None]]:
-    """`errors_with` of several judged runs, by number, each with its own `grounds`, in threads."""
-    parts = max(1, min(bench.jobs, len(sets) // (2 * TOGETHER)))  # a run by itself fills no vector
-    size = max(1, -(-len(sets) // parts))
-    tasks = [(k, slice(i, i + size)) for k in range(len(runs)) for i in range(0, len(sets), size)]
+@dataclass(frozen=True, eq=False)
+class Tried:
+    """Effects in the twin beside a judged run, by number, on its own ground (S,), in typical sizes; None: the
+    ground that it had without them."""
 
-    def one(task: tuple[int, slice]) -> list[Array | None]:
-        k, part = task
-        return errors_with(bench, bench.runs[runs[k]], bench.raws[runs[k]], sets[part], grounds[k][part])
-
-    out: list[list[Array | None]] = [[] for _ in runs]
-    with ThreadPoolExecutor(bench.jobs) as threads:
-        for (k, _), errors in zip(tasks, threads.map(one, tasks), strict=True):
-            out[k] += errors
-    return out
+    run: int
+    effects: Mapping[str, float]
+    ground: Array | None = None
 
 
-def errors_with(
-    bench: Bench,
-    run: Evidence,
-    raw: Raw,
-    sets: Sequence[Mapping[str, float]],
-    grounds: Sequence[Array] | None = None,
-) -> list[Array | None]:
-    """Whitened errors of a run against the twin with each set of effects; None where it diverges.
+def errors_of(bench: Bench, tried: Sequence[Tried]) -> list[Array | None]:
+    """Whitened errors of the judged runs against the twin with these effects; None where it diverges."""
+    grounds = [bench.raws[t.run].own if t.ground is None else t.ground for t in tried]
+    driven = [on_own_ground(g, bench.drives, t.effects) for t, g in zip(tried, grounds, strict=True)]
+    asks = [Ask(bench.runs[t.run].log, some) for t, (some, _) in zip(tried, driven, strict=True)]
+    told = settled_predictions(asks, bench.model, bench.candidates, bench.jobs)
 
-    Args:
-        grounds: the run's ground (S,) beside each set, in typical sizes; None: `raw.own`.
-    """
-    grounds = [raw.own] * len(sets) if grounds is None else grounds
-    driven = [on_own_ground(own, bench.drives, some) for own, some in zip(grounds, sets, strict=True)]
-    told = settled_predictions(run.log, bench.model, bench.candidates, [some for some, _ in driven])
-    out: list[Array | None] = []
-    for (_, own), y in zip(driven, told, strict=True):
+    def whitened(i: int) -> Array | None:
+        y, k = told[i], tried[i].run
         if y is None:
-            out.append(None)
-            continue
+            return None
+        run, raw = bench.runs[k], bench.raws[k]
         error = [o.value - value for o, value in zip(run.log.observed, y, strict=True)]
-        out.append(whitened_error(raw, run, bench.noise, carried_back(raw, own, error)))
-    return out
+        return whitened_error(raw, run, bench.noise, carried_back(raw, driven[i][1], error))
+
+    with ThreadPoolExecutor(bench.jobs) as threads:
+        return list(threads.map(whitened, range(len(tried))))

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from threading import Lock
 
@@ -21,6 +22,7 @@ from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.poses import settled_start
 from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.signatures import (
+    Ask,
     Drive,
     Signature,
     drive,
@@ -185,38 +187,70 @@ def _sensor_states(channel: str, predicted: Array, vehicle: VehicleParams) -> Ar
     return columns
 
 
+@dataclass(eq=False)
+class _Search:
+    """A run on its way to its own ground: where it is, errors there and what they cost."""
+
+    run: Raw
+    evidence: Evidence
+    own: Array
+    errors: list[Array]
+    cost: float
+    gain: Array
+    going: bool = True
+
+    def take(self, tried: Array, found: Sequence[Array] | None, noise: Mapping[str, Noise]) -> None:
+        """A step is taken as long as it lowers the errors."""
+        self.going = False
+        if found is None:
+            return
+        error = [o.value - y for o, y in zip(self.run.log.observed, found, strict=True)]
+        white = whitened_error(self.run, self.evidence, noise, error)
+        now, before = float(white @ white), self.cost
+        if now < before:
+            self.gain = self.evidence.rows[:, :-1].astype(float).T @ white
+            self.own, self.errors, self.cost = tried, error, now
+            self.going = ENOUGH * before >= now >= GOOD * len(self.evidence.time_s)
+
+
 def at_own_ground(
-    run: Raw, drives: Drives, noise: Mapping[str, Noise], most: Array | float = MOST_SOIL
-) -> Raw:
-    """The run with errors linearised about its own ground, not about that of the references.
+    runs: Sequence[Raw],
+    drives: Drives,
+    noise: Mapping[str, Noise],
+    most: Array | float = MOST_SOIL,
+    jobs: int = 1,
+) -> list[Raw]:
+    """Runs with errors linearised about their own grounds, not about that of the references.
 
     Slip grows steeply with the ground's strength; to first order, a run on softer ground would show a gap.
-    The twin is run on the ground that suits this run, as long as that lowers the errors, and the way there
+    The twin is run on the ground that suits each run, as long as that lowers the errors, and the way there
     is carried back linearly.
 
     Args:
         most: the ground is looked for within so many typical sizes (S,).
     """
-    own, errors = run.own, run.error
-    evidence = whitened(without_probes(run), noise)
-    rows, cost = evidence.rows[:, :-1].astype(float), float(evidence.gram[-1, -1])
-    gain = evidence.gram[:-1, -1]
-    for _ in range(GROUND_STEPS):
-        step = _soil_step(evidence, gain, drives.candidates, len(own))
-        tried = np.clip(own + step, -most, most)
-        effects, tried = on_own_ground(tried, drives, {})
-        found = settled_predictions(run.log, drives.model, drives.candidates, [effects])[0]
-        if found is None:
-            break
-        error = [o.value - y for o, y in zip(run.log.observed, found, strict=True)]
-        white = whitened_error(run, evidence, noise, error)
-        now, before = float(white @ white), cost
-        if now >= before:
-            break
-        own, errors, cost, gain = tried, error, now, rows.T @ white
-        if now > ENOUGH * before or now < GOOD * len(evidence.time_s):
-            break
-    return dataclasses.replace(run, own=own, error=carried_back(run, own, errors))
+
+    def begun(run: Raw) -> _Search:
+        evidence = whitened(without_probes(run), noise)
+        cost, gain = float(evidence.gram[-1, -1]), evidence.gram[:-1, -1]
+        return _Search(run, evidence, run.own, run.error, cost, gain)
+
+    def tried(search: _Search) -> tuple[dict[str, float], Array]:
+        step = _soil_step(search.evidence, search.gain, drives.candidates, len(search.own))
+        return on_own_ground(np.clip(search.own + step, -most, most), drives, {})
+
+    with ThreadPoolExecutor(jobs) as threads:
+        searches = list(threads.map(begun, runs))
+        for _ in range(GROUND_STEPS):
+            going = [search for search in searches if search.going]
+            there = list(threads.map(tried, going))
+            asks = [Ask(s.run.log, effects) for s, (effects, _) in zip(going, there, strict=True)]
+            found = settled_predictions(asks, drives.model, drives.candidates, jobs)
+            for _ in threads.map(_Search.take, going, [own for _, own in there], found, [noise] * len(found)):
+                pass
+    return [
+        dataclasses.replace(s.run, own=s.own, error=carried_back(s.run, s.own, s.errors)) for s in searches
+    ]
 
 
 def carried_back(run: Raw, own: Array, errors: Sequence[Array]) -> list[Array]:

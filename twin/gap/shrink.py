@@ -7,7 +7,6 @@ out, and theta and poses adapted anew in both arms. One run alone is scored on i
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,7 +16,7 @@ from terrafusion.twin.gap.evidence import Bench
 from terrafusion.twin.gap.null import Null
 from terrafusion.twin.gap.posterior import Pool
 from terrafusion.twin.gap.probes import NAMES
-from terrafusion.twin.gap.refit import Refit, effects_at, errors_with
+from terrafusion.twin.gap.refit import Refit, Tried, effects_at, errors_of
 from terrafusion.twin.gap.residuals import Evidence
 from terrafusion.twin.gap.score import Score
 
@@ -86,18 +85,18 @@ def _left_out(
         return was
     whole, _, _ = Pool.of(scores, null).fit(fit.columns)
 
-    def one(i: int) -> Array:
-        run, raw = bench.runs[i], bench.raws[i]
+    tried = []
+    for i in range(len(bench.runs)):
         others = [s for k, s in enumerate(scores) if k != i] or list(scores)
         value, _, _ = Pool.of(others, null).fit(fit.columns)
         value = fit.value + (value - whole)  # the linear change on top of what the twin itself was fitted to
-        grounds = [fit.grounds[i]] if fit.grounds else None
-        error = errors_with(bench, run, raw, [effects_at(bench, fit.columns, value)], grounds)[0]
+        ground = fit.grounds[i] if fit.grounds else None
+        tried.append(Tried(i, effects_at(bench, fit.columns, value), ground))
+    out = []
+    for run, error, as_it_was in zip(bench.runs, errors_of(bench, tried), was, strict=True):
         common = run.rows[:, run.states : -1].astype(float) @ null.offset
-        return was[i] if error is None else error - common
-
-    with ThreadPoolExecutor(bench.jobs) as threads:
-        return list(threads.map(one, range(len(bench.runs))))
+        out.append(as_it_was if error is None else error - common)
+    return out
 
 
 def _share(

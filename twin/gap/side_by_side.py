@@ -8,7 +8,9 @@ which they are follows from the candidates alone: graphs are compiled once.
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,13 +38,15 @@ Moved = tuple[tuple[str, float], ...]
 
 GROUND = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rolling")
 """Parameters by which ground differs from run to run: every graph has them."""
-TOGETHER = 8
+TOGETHER = 16
 """Other effects in one graph: as many as vectors hold runs."""
 AS_IT_IS = ""
 """Stands for the twin without a further effect, in the first group."""
 ORDER = 3
 """Of the integrator's steps: on loose sand, where all is most sensitive, answers differ from those with steps
 of fourth order by no more than these do from those with half the step (docs/gap.md)."""
+SHORT = True
+"""Whether numbers have 32 bits: what they round away is less than the error of such steps (docs/gap.md)."""
 WHOLE = 1.8
 """Time of a run in the graph of all effects, in that of one of a group (measured)."""
 TINY = 1e-12
@@ -81,79 +85,96 @@ def what_moves(candidates: Candidates, effects: Effects) -> Moved:
     return tuple((k, v) for k, v in sorted(effects.items()) if v != 0.0 and k in candidates.moving)
 
 
-def plants_of(
-    log: Log, model: Model, candidates: Candidates, sets: Sequence[Effects], group: Sequence[str]
-) -> list[Plant]:
-    """The twin with each set of effects; those of the group and of the ground are in its graph."""
-    base, _ = plant_of(log, dataclasses.replace(model, effects={}), [])
+@dataclass(frozen=True, eq=False)
+class Lane:
+    """A run of the twin: on which log, by which plant, what it is told (N + 1, U), and its poses (W, 3) at
+    the windows' starts."""
+
+    log: Log
+    plant: Plant
+    inputs: Array
+    start: Array
+
+
+def lanes_of(
+    asked: Sequence[tuple[Log, Effects, Array]], model: Model, candidates: Candidates, group: Sequence[str]
+) -> list[Lane]:
+    """The twin on each log with the effects and from the poses (W, 3) asked for; those of the group and of
+    the ground are in its graph. Lanes that hear the same share the array."""
     scales = dict(zip(candidates.keys, candidates.scale, strict=True))
-    late, out = VEHICLE_PARAMETERS.index("dead_time_applied_s"), []
-    for some in sets:
+    late = VEHICLE_PARAMETERS.index("dead_time_applied_s")
+    bases, heard, out = dict[int, Plant](), dict[tuple[int, float], Array](), list[Lane]()
+    for log, some, start in asked:
+        if id(log) not in bases:
+            bases[id(log)], _ = plant_of(log, dataclasses.replace(model, effects={}), [])
         named = {*group, *GROUND, *some} & {*candidates.moving}
-        vehicle = base.vehicle.copy()
+        vehicle = bases[id(log)].vehicle.copy()
         vehicle[late] += some.get(DEAD_TIME, 0.0)
         present = {k: some.get(k, 0.0) or TINY * float(scales[k]) for k in sorted(named)}
-        out.append(Plant(vehicle, base.route, present))
+        late_s = _late_s(log, model, some)
+        if (id(log), late_s) not in heard:
+            heard[id(log), late_s] = np.ascontiguousarray(told(log.sides, DT_S, late_s))
+        plant = Plant(vehicle, bases[id(log)].route, present)
+        out.append(Lane(log, plant, heard[id(log), late_s], start))
     return out
 
 
-def inputs_of(log: Log, model: Model, sets: Sequence[Effects]) -> list[Array]:
-    """What the twin is told (N + 1, U) with each set of effects; those that hear it alike share the array."""
-    known: dict[float, Array] = {}
-    out = []
-    for some in sets:
-        late = some.get(DEAD_TIME, 0.0)
-        late = late if log.follows else as_driven(model.vehicle, {DEAD_TIME: late}).drive.dead_time_s
-        if late not in known:
-            known[late] = np.ascontiguousarray(told(log.sides, DT_S, late))
-        out.append(known[late])
-    return out
+def _late_s(log: Log, model: Model, some: Effects) -> float:
+    """By how much what the twin is told is late."""
+    late = some.get(DEAD_TIME, 0.0)
+    return late if log.follows else as_driven(model.vehicle, {DEAD_TIME: late}).drive.dead_time_s
 
 
-def driven(
-    log: Log, plants: Sequence[Plant], inputs: Sequence[Array], starts: Sequence[Array], every: Sequence[int]
-) -> list[Array]:
-    """States (N, X) of each plant's run from its poses (W, 3) at every so many-th sample of all windows, a
-    number a run: the least of them, or a multiple of it."""
-    fleet = Fleet.of(plants, DT_S, order=ORDER)
-    windows = [(int(a), int(b)) for a, b in log.windows]
-    least = min(every)
-    out = [np.empty((len(samples_of(log, step)), len(STATES))) for step in every]
-    kept = [0] * len(plants)
-    x = _led_in(log, fleet, inputs)
-    pose = [INDEX[name] for name in POSE]
-    for k, (begin, end) in enumerate(windows):
-        count = (end - begin) // least + 1
-        parts = []
-        for states, step, done in zip(out, every, kept, strict=True):
-            parts.append(states[done : done + count] if step == least else np.empty((count, len(STATES))))
-        for part, now, start in zip(parts, x, starts, strict=True):
-            part[0], part[0, pose] = now, start[k]
-        whole = begin + (count - 1) * least
-        fleet.drive([u[begin : whole + 1] for u in inputs], parts, begin * DT_S, least)
-        x = [part[-1] for part in parts]
-        for i, (part, step) in enumerate(zip(parts, every, strict=True)):
-            some = part[:: step // least]
-            if step != least:
-                out[i][kept[i] : kept[i] + len(some)] = some
-            kept[i] += len(some)
+def driven(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
+    """States (N, X) of each lane at every so many-th sample of all its windows.
+
+    Lanes of several logs go on side by side, from where a window of one of them begins or ends to the next
+    such place; all their samples are kept, and no ground of theirs changes with time.
+    """
+    fleet = _fleet(lanes)
+    x, spans = _led_in(lanes, fleet), [lane.log.windows - lane.log.windows[0, 0] for lane in lanes]
+    out = [np.empty((len(samples_of(lane.log, every)), len(STATES))) for lane in lanes]
+    row, pose = [0] * len(lanes), [INDEX[name] for name in POSE]
+    borders = np.unique(np.concatenate([span.ravel() for span in spans]))
+    for p, q in itertools.pairwise(borders.tolist()):
+        live = [i for i, span in enumerate(spans) if span[-1, 1] > p]
+        if len(live) < len(fleet.plants):
+            fleet = _fleet([lanes[i] for i in live])
+        count = (q - p) // every + 1
+        parts, inputs = list[Array](), list[Array]()
+        for i in live:
+            k = int(np.searchsorted(spans[i][:, 0], p, side="right")) - 1
+            part, first = out[i][row[i] : row[i] + count], int(lanes[i].log.windows[0, 0]) + p
+            if p == spans[i][k, 0]:
+                part[0] = x[i]
+                part[0, pose] = lanes[i].start[k]
+            parts.append(part)
+            inputs.append(lanes[i].inputs[first : first + (count - 1) * every + 1])
+            row[i] += count if q == spans[i][k, 1] else count - 1
+            x[i] = part[-1]  # once it is driven
+        fleet.drive(inputs, parts, (int(lanes[live[0]].log.windows[0, 0]) + p) * DT_S, every)
     for states in out:
         blank_what_diverged(states[None])
     return out
 
 
-def _led_in(log: Log, fleet: Fleet, inputs: Sequence[Array]) -> list[Array]:
-    """State (X,) of each run at the first window."""
+def _fleet(lanes: Sequence[Lane]) -> Fleet:
+    return Fleet.of([lane.plant for lane in lanes], DT_S, order=ORDER, short=SHORT)
+
+
+def _led_in(lanes: Sequence[Lane], fleet: Fleet) -> list[Array]:
+    """State (X,) of each lane at its first window."""
     known: dict[int, tuple[Array, Array]] = {}
-    lead = []
-    for plant, u in zip(fleet.plants, inputs, strict=True):
-        if id(u) not in known:
-            known[id(u)] = run_up(log, plant, u)
-        lead.append(known[id(u)])
-    whole = lead[0][1].shape[0] - 1
-    out = np.empty((len(lead), 2, len(STATES)))
-    out[:, 0] = [x for x, _ in lead]
-    fleet.drive([before for _, before in lead], list(out), -LEAD_S, whole)
+    for lane in lanes:
+        if id(lane.inputs) not in known:
+            known[id(lane.inputs)] = run_up(lane.log, lane.plant, lane.inputs)
+    up = [known[id(lane.inputs)] for lane in lanes]
+    out = np.empty((len(lanes), 2, len(STATES)))
+    out[:, 0] = [x for x, _ in up]
+    for length in dict.fromkeys(len(before) for _, before in up):
+        some = [i for i, (_, before) in enumerate(up) if len(before) == length]
+        alike = fleet if len(some) == len(lanes) else _fleet([lanes[i] for i in some])
+        alike.drive([up[i][1] for i in some], [out[i] for i in some], -LEAD_S, length - 1)
     return list(out[:, 1])
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +16,17 @@ from numpy.typing import NDArray
 from terrafusion.datasets.errors import TerrafusionError
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.late import in_time, late_layout
-from terrafusion.twin.gap.poses import PAIRS, all_settled, settled_start
+from terrafusion.twin.gap.poses import PAIRS, settled, settled_start
 from terrafusion.twin.gap.rows import EVERY, among_all, coarse_counts, layout, means, samples_of
 from terrafusion.twin.gap.side_by_side import (
     AS_IT_IS,
+    TOGETHER,
     Moved,
     Sensors,
     driven,
     graphs,
     groups,
-    inputs_of,
-    plants_of,
+    lanes_of,
     what_moves,
 )
 from terrafusion.twin.identify.log import Log, window_of
@@ -73,57 +74,81 @@ class Signature:
     heading: Array
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
+class Ask:
+    """What the twin is asked to predict: channels of a log with effects on top of the model's own, from poses
+    (W, 3) at the windows' starts; None: the log's own."""
+
+    log: Log
+    effects: Mapping[str, float]
+    start: Array | None = None
+
+
 def settled_predictions(
-    log: Log, model: Model, candidates: Candidates, effects: Sequence[Mapping[str, float]]
+    asks: Sequence[Ask], model: Model, candidates: Candidates, jobs: int = 1
 ) -> list[list[Array] | None]:
     """As `predictions`, the track of every window turned and shifted onto the one observed.
 
     What depends on place or heading is driven once more, from the poses at which its own track lies so: a
     guess has the heading of the track, and a robot that slides down a slope points elsewhere.
     """
-    told = predictions(log, model, candidates, effects, [log.start] * len(effects))
-    fixed = [candidates.any_world_fixed({**model.effects, **some}) for some in effects]
-    own = {i: y for i, y in enumerate(told) if y is not None and fixed[i]}
-    starts = [settled_start(log, y, log.start) for y in own.values()]
-    again = predictions(log, model, candidates, [effects[i] for i in own], starts) if own else []
-    for i, y in zip(own, again, strict=True):
+    told = predictions(asks, model, candidates, jobs)
+    fixed = [candidates.any_world_fixed({**model.effects, **ask.effects}) for ask in asks]
+    again = dict[int, Ask]()
+    for i, (ask, y) in enumerate(zip(asks, told, strict=True)):
+        if y is not None and fixed[i]:
+            start = ask.log.start if ask.start is None else ask.start
+            again[i] = dataclasses.replace(ask, start=settled_start(ask.log, y, start))
+    for i, y in zip(again, predictions(list(again.values()), model, candidates, jobs), strict=True):
         told[i] = y
-    return all_settled(log, told)
+    return [None if y is None else settled(ask.log, y) for ask, y in zip(asks, told, strict=True)]
 
 
 def predictions(
-    log: Log,
-    model: Model,
-    candidates: Candidates,
-    effects: Sequence[Mapping[str, float]],
-    starts: Sequence[Array],
+    asks: Sequence[Ask], model: Model, candidates: Candidates, jobs: int = 1
 ) -> list[list[Array] | None]:
-    """Channels of the log with each of several sets of effects on top of the model's own, side by side.
+    """Channels of what is asked, side by side; None in place of a run that diverged.
 
-    None in place of a run that diverged.
-
-    Args:
-        starts: poses (W, 3) at the windows' starts of each; sets with the same array may share a run.
+    Those that differ in the sensors alone, of the same log and from the same array of poses, share a run.
+    Every answer is what it is alone.
     """
-    sets = [{**model.effects, **some} for some in effects]
-    alike: dict[tuple[Moved, int], list[int]] = {}
-    for i, (some, start) in enumerate(zip(sets, starts, strict=True)):
-        alike.setdefault((what_moves(candidates, some), id(start)), []).append(i)
-    every = list(alike.values())
-    sensors = Sensors(log, model, candidates, samples_of(log, 1))
-    out: list[list[Array] | None] = [None] * len(sets)
-    for group, runs in graphs(candidates, [moved for moved, _ in alike]).items():
-        first = [every[run][0] for run in runs]
-        first += first[: len(group) > 0 and len(first) == 1]  # one alone would have a graph compiled for one
-        twin = [dict(what_moves(candidates, sets[i])) for i in first]
-        plants, inputs = plants_of(log, model, candidates, twin, group), inputs_of(log, model, twin)
-        states = driven(log, plants, inputs, [starts[i] for i in first], [1] * len(twin))
-        for run, x, plant, heard in zip(runs, states, plants, inputs, strict=False):
-            for i in every[run] if np.isfinite(x).all() else ():
-                y = sensors.read(x, plant, heard, in_time(sets[i]), group)
-                by_channel = zip(log.observed, late_layout(log, sets[i], layout(log)), strict=True)
+    sets = [{**model.effects, **ask.effects} for ask in asks]
+    starts = [ask.log.start if ask.start is None else ask.start for ask in asks]
+    alike: dict[tuple[int, Moved, int], list[int]] = {}
+    for i, (ask, some, start) in enumerate(zip(asks, sets, starts, strict=True)):
+        alike.setdefault((id(ask.log), what_moves(candidates, some), id(start)), []).append(i)
+    runs, moved = list(alike.values()), [key[1] for key in alike]
+    sensors = {id(a.log): Sensors(a.log, model, candidates, samples_of(a.log, 1)) for a in asks}
+    tasks = list[tuple[tuple[str, ...], list[int]]]()
+    for company in _companies([asks[some[0]].log for some in runs]):
+        for group, mine in graphs(candidates, [moved[run] for run in company]).items():
+            whose = [company[i] for i in mine]
+            tasks += [(group, whose[k : k + TOGETHER]) for k in range(0, len(whose), TOGETHER)]
+    out: list[list[Array] | None] = [None] * len(asks)
+
+    def one(task: tuple[tuple[str, ...], list[int]]) -> None:
+        group, some = task
+        first = [runs[run][0] for run in some]
+        asked = [(asks[i].log, dict(moved[run]), starts[i]) for i, run in zip(first, some, strict=True)]
+        lanes = lanes_of(asked, model, candidates, group)
+        for run, lane, x in zip(some, lanes, driven(lanes), strict=True):
+            for i in runs[run] if np.isfinite(x).all() else ():
+                y = sensors[id(lane.log)].read(x, lane.plant, lane.inputs, in_time(sets[i]), group)
+                rows = late_layout(lane.log, sets[i], layout(lane.log))
+                by_channel = zip(lane.log.observed, rows, strict=True)
                 out[i] = [means(at, _channel(y, o.channel)) for o, at in by_channel]
+
+    with ThreadPoolExecutor(jobs) as threads:
+        list(threads.map(one, tasks))
     return out
+
+
+def _companies(logs: Sequence[Log]) -> list[list[int]]:
+    """Runs, by number, that may go side by side: those on one ground, and those of each log on several."""
+    out: dict[int, list[int]] = {}
+    for i, log in enumerate(logs):
+        out.setdefault(id(log) if len(log.labels) > 1 else 0, []).append(i)
+    return list(out.values())
 
 
 def drive(
@@ -161,10 +186,9 @@ def _readings(
     sensors, read = Sensors(log, model, candidates, samples_of(log, EVERY)), dict[str, Array]()
     for group in groups(candidates):
         keys = [k for k in group if k in sets]
-        some, whole = [sets[k] for k in keys], AS_IT_IS in keys
-        plants, inputs = plants_of(log, model, candidates, some, group), inputs_of(log, model, some)
-        steps = [1 if k == AS_IT_IS else EVERY for k in keys]
-        states = driven(log, plants, inputs, [start] * len(keys), steps) if keys else []
+        whole = AS_IT_IS in keys
+        lanes = lanes_of([(log, sets[k], start) for k in keys], model, candidates, group)
+        states = driven(lanes, 1 if whole else EVERY) if keys else []
         if whole:
             if not np.isfinite(states[0]).all():
                 raise TerrafusionError(
@@ -173,13 +197,13 @@ def _readings(
                     remedy="check the vehicle's and the soil's numbers",
                 )
             every = Sensors(log, model, candidates, samples_of(log, 1))
-            fine = every.read(states[0], plants[0], inputs[0], some[0])
-            states[0] = coarse = states[0][among_all(log)]
-            twin = plants[0], inputs[0]
-        for k, x, plant, u in zip(keys, states, plants, inputs, strict=True):
-            read[k] = sensors.read(x, plant, u, sets[k], group)
+            fine = every.read(states[0], lanes[0].plant, lanes[0].inputs, sets[AS_IT_IS])
+            states = [x[among_all(log)] for x in states]
+            coarse, twin = states[0], lanes[0]
+        for k, x, lane in zip(keys, states, lanes, strict=True):
+            read[k] = sensors.read(x, lane.plant, lane.inputs, sets[k], group)
     for k in sets.keys() - read.keys():  # effects of the sensors alone
-        read[k] = sensors.read(coarse, *twin, sets[k])
+        read[k] = sensors.read(coarse, twin.plant, twin.inputs, sets[k])
     return fine, coarse, read
 
 

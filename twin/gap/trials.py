@@ -201,8 +201,8 @@ class Trials:
         table = dataclasses.replace(self.table, columns=(), blocks=blocks)
         choice = Choice.of(pool, table, linear(table, pool, candidates)[0])
 
-        def remaining(forms: Sequence[Hypothesis]) -> tuple[Pool, Refit | None]:
-            return pool, None
+        def remaining(several: Sequence[tuple[Hypothesis, ...]]) -> list[tuple[Pool, Refit | None]]:
+            return [(pool, None)] * len(several)
 
         each = HeldOut(tuple(Pool.of([dataclasses.replace(s, other=None)], self.null) for s in scores))
         search = Search(remaining, each, candidates, table, pool.alone)

@@ -153,8 +153,9 @@ class Found:
         return columns, self.fit.value[at], self.fit.covariance[np.ix_(at, at)]
 
 
-Remaining = Callable[[Sequence[Hypothesis]], tuple[Pool, Refit | None]]
-"""What is left of the gap once some effects, refitted together, are in the twin; and their fit."""
+Remaining = Callable[[Sequence[tuple[Hypothesis, ...]]], Sequence[tuple[Pool, Refit | None]]]
+"""What is left of the gap with each of several sets of effects, refitted together, in the twin; and their
+fits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +170,7 @@ class Search:
 
     def best(self, choice: Choice) -> Found:
         """The likeliest effect, and further ones beside it as long as they are called for."""
-        found = self._with((choice.laws[choice.first()],))
+        found = self._with([(choice.laws[choice.first()],)])[0]
         while len(found.forms) < MOST_EFFECTS:
             further = self._further(found, choice)
             if further is None:
@@ -177,9 +178,13 @@ class Search:
             found = self._exchanged(further, choice) if len(further.forms) == 2 else further
         return found
 
-    def _with(self, forms: tuple[Hypothesis, ...]) -> Found:
-        """Effects, with all that is judged of them."""
-        pool, fit = self.remaining(forms)
+    def _with(self, several: Sequence[tuple[Hypothesis, ...]]) -> list[Found]:
+        """Sets of effects, with all that is judged of them."""
+        return [
+            self._found(forms, *left) for forms, left in zip(several, self.remaining(several), strict=True)
+        ]
+
+    def _found(self, forms: tuple[Hypothesis, ...], pool: Pool, fit: Refit | None) -> Found:
         given = [i for h in forms for i in self.candidates.columns(h.effect)]
         columns = [i for h in forms for i in h.columns]
         table = self.table
@@ -198,7 +203,7 @@ class Search:
     def _exchanged(self, found: Found, choice: Choice) -> Found:
         """Of two effects the first was chosen with the other unexplained: the best beside the other, where
         both then are likelier."""
-        other = self._further(self._with((found.forms[1],)), choice)
+        other = self._further(self._with([(found.forms[1],)])[0], choice)
         if other is None or {*other.effects} == {*found.effects}:
             return found
         return other if odds_of(other, choice) > odds_of(found, choice) else found
@@ -209,8 +214,10 @@ class Search:
         What one explains of the whole gap says little: a small effect is seen beside a large one by what it
         takes away of the rest.
         """
-        tried = [self._with((*found.forms, law)) for law in self._promising(found)]
         most = min((1.0 - FURTHER_SHARE) * found.left.total, found.left.total - FURTHER_LEFT)
+        if most < 0.0:  # nothing leaves less than nothing
+            return None
+        tried = self._with([(*found.forms, law) for law in self._promising(found)])
         least = odds_of(found, choice) + FURTHER_ODDS
         called = [t for t in tried if t.left.total <= most and t.explained > found.explained]
         best = max(called, key=lambda t: odds_of(t, choice), default=None)
@@ -320,7 +327,7 @@ def _cause(
     if order.index(name) < CLASSES:
         whole = fit is not None and not failed
         law = choice.laws[name]
-        does, signal = done(pool, columns, lambda: search.remaining((law,))[0] if whole else pool)
+        does, signal = done(pool, columns, lambda: search.remaining([(law,)])[0][0] if whole else pool)
         alike = class_of(pool, candidates, name, does, signal, order)
         close = [k for k in order if abs(choice.odds[k] - choice.odds[name]) < SAME_ODDS]
         close = [k for k in class_of(pool, candidates, name, does, signal, close, NEARLY) if k in close]
