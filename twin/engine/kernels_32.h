@@ -1,6 +1,6 @@
 /* The functions of kernels.h for vectors of numbers of 32 bits (TF_INT: of 32-bit integers), for runs that need
  * no more: shorter series, half the bits, twice the lanes. The same rules hold. Largest errors measured
- * (docs/numerics.md): @@.
+ * (docs/numerics.md): exp 1.7 ulp, log 2.0, sin and cos 2.0 to 1000 rad, tanh 3.2.
  */
 static inline TF_VEC TF_FN(splat)(float a) {
   TF_VEC r;

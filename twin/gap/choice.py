@@ -52,7 +52,7 @@ class Told:
 
 LEAST = 0.5
 """A gap counts as no smaller than this (in the units of `Told`)."""
-LAPSE = 0.05
+LAPSE = 0.02
 """Probability that the odds do not hold (assumed): it is spread evenly over all causes."""
 
 

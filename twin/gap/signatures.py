@@ -121,9 +121,11 @@ def predictions(
     sensors = {id(a.log): Sensors(a.log, model, candidates, samples_of(a.log, 1)) for a in asks}
     tasks = list[tuple[tuple[str, ...], list[int]]]()
     for company in _companies([asks[some[0]].log for some in runs]):
-        for group, mine in graphs(candidates, [moved[run] for run in company]).items():
+        apart = graphs(candidates, [moved[run] for run in company])
+        for group, mine in apart.items():
+            size = min(TOGETHER, -(-len(mine) // jobs)) if len(apart) == 1 else TOGETHER
             whose = [company[i] for i in mine]
-            tasks += [(group, whose[k : k + TOGETHER]) for k in range(0, len(whose), TOGETHER)]
+            tasks += [(group, whose[k : k + size]) for k in range(0, len(whose), size)]
     out: list[list[Array] | None] = [None] * len(asks)
 
     def one(task: tuple[tuple[str, ...], list[int]]) -> None:

@@ -32,9 +32,9 @@ SAME_ODDS, NEARLY = math.log(3.0), 0.9
 """Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
 other, either (assumed)."""
 MOST_EFFECTS = 3
-UNKNOWN = 0.4
-"""Probability of an unknown cause, given a gap, above which the verdict is that. Set on development trials:
-of known and of unknown causes about the same share is then told wrongly."""
+UNKNOWN = 0.2
+"""Probability of an unknown cause, given a gap, above which the verdict is that: the share that such causes are
+taken to have before anything is seen (`blind.development.OUTSIDE_SHARE`)."""
 CLASSES = 5
 """Causes, the first ones, of which the class is told."""
 

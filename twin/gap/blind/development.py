@@ -39,7 +39,7 @@ from terrafusion.twin.gap.blind.shapes import (
     Shape,
     shapes,
 )
-from terrafusion.twin.gap.choice import LAPSE, Told, Weights, probabilities
+from terrafusion.twin.gap.choice import Told, Weights, probabilities
 from terrafusion.twin.gap.goodness import FITS, Goodness
 from terrafusion.twin.soil import load_soil
 from terrafusion.twin.vehicle import load_vehicle
@@ -56,8 +56,14 @@ SINGLES, OUTSIDERS, NULLS = 12, 6, 2
 """Trials of a site: effects of the catalogue, half of them shifted, causes outside it, and none at all."""
 NULL = "null"
 """Stands for the shape of a trial without a gap."""
-CROSSED = (0.2, 0.25, 0.3, 0.35, 0.4, 0.5)
+CROSSED = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 """Probabilities of an unknown cause above which `cross` counts trials."""
+OUTSIDE_SHARE = 0.2
+"""Of gaps, so many are taken to have a cause outside the catalogue, as in a blind check; a site has more of
+them, which count less in the training."""
+LAPSED = 0.1
+"""In training the odds are taken not to hold more often than that: a few trials that no law fits would else
+make all others unsure."""
 SHRINK = 0.002
 """Weight of the squares of the weights, against a log likelihood of one a trial (assumed)."""
 
@@ -179,13 +185,14 @@ def utilities(trial: Trial, weights: Weights) -> dict[str | None, float]:
     return odds
 
 
-def surprise(trials: Iterable[Trial], weights: Weights) -> float:
-    """Negative log likelihood of the true causes."""
+def surprise(trials: Iterable[Trial], weights: Weights, outside: float = 1.0) -> float:
+    """Negative log likelihood of the true causes; each one outside the catalogue counts `outside` times."""
     total = 0.0
     for trial in trials:
         odds = utilities(trial, weights)
         share = math.exp(odds[trial.effect] - float(np.logaddexp.reduce(list(odds.values()))))
-        total -= math.log((1.0 - LAPSE) * share + LAPSE / len(odds))
+        count = outside if trial.effect is None else 1.0
+        total -= count * math.log((1.0 - LAPSED) * share + LAPSED / len(odds))
     return total
 
 
@@ -194,9 +201,11 @@ def train(trials: Sequence[Trial]) -> Weights:
     from scipy.optimize import minimize
 
     some = [trial for trial in trials if trial.teaches()]
+    outsiders = sum(trial.effect is None for trial in some)
+    outside = OUTSIDE_SHARE / (1.0 - OUTSIDE_SHARE) * (len(some) - outsiders) / max(outsiders, 1)
 
     def cost(w: Array) -> float:
-        return surprise(some, Weights(*w.tolist())) + SHRINK * float(w @ w)
+        return surprise(some, Weights(*w.tolist()), outside) + SHRINK * float(w @ w)
 
     limits = [(0.0, 60.0), (0.0, 1.5), (-20.0, 20.0), (0.0, 10.0), (0.0, 10.0)]
     return Weights(*minimize(cost, [6.0, 0.8, 0.0, 1.0, 1.0], method="L-BFGS-B", bounds=limits).x.tolist())
