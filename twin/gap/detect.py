@@ -50,7 +50,6 @@ class Detection:
     Attributes:
         statistic: the greatest deviation of any effect, in units of what it usually is in references.
         p_value: of the permutation test.
-        least: the least that so many choices can show.
         usual: (P,) square of each column's deviation that is usual among the choices.
         nulls: some references judged by the others.
         normal: the statistic of each of them.
@@ -58,20 +57,21 @@ class Detection:
 
     statistic: float
     p_value: float
-    least: float
     usual: Array
     nulls: tuple[Pool, ...]
     normal: tuple[float, ...]
 
-    def tail(self) -> float:
-        """The p-value carried on beyond what so few choices resolve: for the odds of a gap, not for the test.
+    def tail(self, significance: float) -> float:
+        """The p-value, where there is a gap at this significance as references have it that others judge: for
+        the odds of a gap, not for the test.
 
-        Many of the choices hold judged runs, too, and show their gap. So what carries it on is the logarithm
-        of the statistic in references that others judge, taken as Student's t.
+        Most of the choices hold judged runs, too, and show their gap; one with two of three may show more of
+        it than all three do. So what counts is the logarithm of the statistic in references alone, taken as
+        Student's t.
         """
         from scipy.special import stdtr
 
-        if self.p_value > 1.5 * self.least or len(self.normal) < 3:
+        if self.p_value > significance or len(self.normal) < 3:
             return self.p_value
         others = np.log(self.normal)
         z = (math.log(self.statistic) - others.mean()) / max(float(others.std(ddof=1)), LEAST_SPREAD)
@@ -124,7 +124,7 @@ def detect(
     own = np.maximum(alone.mean(axis=0) if nulls else 0.0, LEAST_SQUARE)
     statistic, *normal = (max(float(np.sqrt((some / own).max())), EXACT) for some in (squares[0], *alone))
     P = len(runs[0].b)
-    return Detection(statistic, p_value, 1.0 / len(tried), usual[:P], tuple(nulls), tuple(normal))
+    return Detection(statistic, p_value, usual[:P], tuple(nulls), tuple(normal))
 
 
 def judged(runs: Sequence[Score], references: Sequence[Score]) -> Pool:

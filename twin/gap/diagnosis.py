@@ -177,7 +177,7 @@ def diagnosed(
     known |= {(law,): fit for law, fit in fits.items()}
     remaining = _Remaining(case, fitter, known)
     search = Search(remaining, held_out, candidates, table, pool.alone)
-    verdict = judge(detected, found.tail(), pool, choice, refits, search, floor)
+    verdict = judge(detected, found.tail(significance), pool, choice, refits, search, floor)
     if progress is not None:
         progress(0.9)
     shrinking = shrink(bench, scores, sigma, null, verdict.fit)
