@@ -33,8 +33,8 @@ SAME_ODDS, NEARLY = math.log(3.0), 0.9
 other, either (assumed)."""
 MOST_EFFECTS = 3
 UNKNOWN = 0.2
-"""Probability of an unknown cause, given a gap, above which the verdict is that: the share that such causes are
-taken to have before anything is seen (`blind.development.OUTSIDE_SHARE`)."""
+"""Probability of an unknown cause, given a gap, above which the verdict is that: the share that such causes
+are taken to have before anything is seen (`blind.development.OUTSIDE_SHARE`)."""
 CLASSES = 5
 """Causes, the first ones, of which the class is told."""
 
