@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
+from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channel_noise import learnt_noise
 from terrafusion.twin.gap.outliers import bounded
@@ -238,10 +239,13 @@ def gather(
 ) -> Bench:
     """Evidence of all runs; `kept` holds signatures for diagnoses to come with the same vehicle and soils.
 
+    Without a compiler there is one thread: CasADi's virtual machine is not safe in several.
+
     Raises:
         DataError: a log without what it needs.
         TerrafusionError: the twin diverges on every reference.
     """
+    jobs = jobs if compiled() else 1
     model, ground, notes = starting_model([*runs, *references], vehicle, soils)
     logs = prepared([*runs, *references], model, ground, source)
     channels = common_channels(logs)
