@@ -69,7 +69,8 @@ def plot_shrink(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     for y, floor in zip(at, floors, strict=True):
         if floor is not None:
             ax.plot([floor, floor], [y - 0.42, y + 0.42], color=SURE, linewidth=1.5)
-    ax.plot([], [], color=SURE, linewidth=1.5, label="references")
+    if d.references:
+        ax.plot([], [], color=SURE, linewidth=1.5, label="references")
     ax.set_yticks(at, names)
     ax.legend(fontsize=8, frameon=False)
     style.dress(ax, x="root mean square error, in sigmas of its noise")

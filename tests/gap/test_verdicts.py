@@ -12,6 +12,7 @@ import pytest
 
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
+from terrafusion.fusion.gap_page.plots import plot_shrink
 from terrafusion.fusion.gap_page.words import sentences
 from terrafusion.twin.gap import Diagnosis, diagnose
 from terrafusion.twin.gap.candidates import Candidates
@@ -214,6 +215,13 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
     assert any("that takes 2 references" in sentence for sentence in sentences(unreferred))
     assert answer["shrink"]["floor"] is None
     assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale", "grousers")
+
+
+def test_a_plot_names_references_where_there_are_any(wide: Diagnosis, unreferred: Diagnosis) -> None:
+    for found, labels in ((wide, ["before", "after", "references"]), (unreferred, ["before", "after"])):
+        legend = plot_shrink(found)[1].get_legend()
+        assert legend is not None
+        assert {text.get_text() for text in legend.get_texts()} == {*labels}
 
 
 @pytest.mark.parametrize("first", [410, 430])
