@@ -77,6 +77,12 @@ class Alone:
         left = self.gain if value is None else self.gain - self.moved[:, list(columns)] @ value
         return np.asarray(left**2 / (np.maximum(self.variance, 1e-9) * self.usual))
 
+    def sigmas(self, columns: Sequence[int]) -> Array:
+        """1 sigma (k,) of sizes as each column's own score has them: as they scatter in the references."""
+        at = list(columns)
+        moved = np.maximum(np.diag(self.moved)[at], 1e-9)
+        return np.minimum(np.sqrt(self.variance[at] * self.usual[at]) / moved, WIDE)
+
 
 @dataclass(frozen=True, eq=False)
 class Pool:

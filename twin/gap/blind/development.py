@@ -243,6 +243,21 @@ def scores(trials: Sequence[Trial]) -> dict[str, Any]:
     return score(planned, answers)
 
 
+def deviations(trials: Iterable[Trial]) -> list[float]:
+    """By how many of its sigmas each size that is told differs from the true one: of effects by the
+    catalogue's own law that come first, where one parameter tells them (no sign: a knob turns either way)."""
+    out = []
+    for trial in trials:
+        first = trial.answer["causes"][0]
+        if not trial.teaches() or not trial.shape.endswith(SAME) or first["effect"] != trial.effect:
+            continue
+        told = list(first["parameters"].values())
+        if len(told) == 1 and told[0]["sigma"] is not None:
+            true = _size(shapes()[trial.shape], trial.drive, trial.severity)
+            out.append((abs(told[0]["value"]) - true) / told[0]["sigma"])
+    return out
+
+
 def lines(found: Mapping[str, Any]) -> list[str]:
     """The scores that matter here, in words."""
     out = [
@@ -314,6 +329,9 @@ def main() -> None:
         return
     if given.command == "score":
         print("\n".join(lines(scores(read(given.sites)))))
+        far = np.abs(deviations(read(given.sites)))
+        for most in (1.0, 2.0, 3.0):
+            print(f"sizes within {most:g} sigma: {int((far < most).sum())} of {len(far)}")
         return
     if given.command == "cross":
         known, outside = crossed([read([path]) for path in sorted(given.sites)])
