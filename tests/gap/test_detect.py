@@ -78,3 +78,16 @@ def test_taking_an_effect_out_leaves_what_references_leave(size: float) -> None:
     np.testing.assert_allclose(
         alone.squares([COLUMN], np.array([size])), judged(runs, normal).alone.squares(), rtol=1e-9, atol=1e-12
     )
+
+
+@pytest.mark.parametrize("scatter", [0.0, 0.3])
+def test_sigmas_are_how_sizes_scatter_from_run_to_run(scatter: float) -> None:
+    """By each column's own score, fits of runs without an effect."""
+    rng = np.random.default_rng(6)
+    normal = scores(rng, 40, scatter=scatter)
+    groups = [judged(scores(rng, 3, scatter=scatter), normal).alone for _ in range(150)]
+    sizes = np.array([g.gain / np.diag(g.moved) for g in groups])
+    sigmas = np.array([g.sigmas(range(P)) for g in groups])
+    z = (sizes / sigmas)[:, : len(CANDIDATES.keys)]
+    assert 0.92 < float(np.mean(np.abs(z) < 2.0)) < 0.98  # .954 of a normal
+    assert (sigmas.mean() > 0.1) == (scatter > 0.0)
