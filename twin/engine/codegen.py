@@ -186,17 +186,20 @@ def _prelude(kind: str) -> str:
 
 
 def _kernels(vector: str, width: str, suffix: str, short: bool = False) -> str:
-    names = {"VEC": vector, "INT": f"{vector}_int", "WIDTH": width, "FN(name)": f"tf_##name##_{suffix}"}
-    number, integer, size, text = (
-        ("float", "int", 4, "kernels_32.h") if short else ("double", "long long", 8, "kernels.h")
+    number, integer, size, series, libm = (
+        ("float", "int", 4, "series_32.h", "name##f")
+        if short
+        else ("double", "long long", 8, "series_64.h", "name")
     )
+    names = {"VEC": vector, "INT": f"{vector}_int", "WIDTH": width, "FN(name)": f"tf_##name##_{suffix}"}
+    names |= {"NUMBER": number, "LIBM(name)": libm}
     types = (
         f"typedef {number} {vector} __attribute__((vector_size({size} * {width}), may_alias));\n"
         f"typedef {integer} {vector}_int __attribute__((vector_size({size} * {width}), may_alias));\n"
     )
     defines = "".join(f"#define TF_{name} {value}\n" for name, value in names.items())
     undefines = "".join(f"#undef TF_{name.split('(')[0]}\n" for name in names)
-    return f"{types}{defines}{_text(text)}{undefines}"
+    return f"{types}{defines}{_text(series)}{_text('kernels.h')}{undefines}"
 
 
 _HEAD = """
