@@ -17,6 +17,7 @@ from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import CONST, UnsupportedOperationError, read
 from terrafusion.twin.engine.integrate import compiled, integrate
+from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.packing import packs
 from terrafusion.twin.engine.plant import Plant, RouteTable
 from terrafusion.twin.layout import STATES, soil_vector, vehicle_vector
@@ -174,7 +175,7 @@ def test_arithmetic_of_constants_is_done_beforehand() -> None:
 @needs_compiler
 @pytest.mark.parametrize("flags", ["-O1", "-mno-avx512f"])
 def test_bits_do_not_depend_on_the_compiler_or_the_width_of_its_vectors(monkeypatch, tmp_path, flags) -> None:
-    """The same run by ziglang, with other optimisation or without the widest vectors."""
+    """The same runs by ziglang, with other optimisation or without the widest vectors."""
     if importlib.util.find_spec("ziglang") is None:
         pytest.skip("the package ziglang is not installed")
     here = short_run()
@@ -196,4 +197,7 @@ def short_run() -> np.ndarray:
     route = RouteTable("travel", np.zeros(1), soil_vector(load_soil("loose_sand"))[None])
     plant = Plant(vehicle_vector(load_vehicle("elevate"), slope_rad=0.05, aspect_rad=1.0), route)
     assert native.driver(Variant(SINGLE, (), True)) is not None
-    return integrate(np.zeros(len(STATES)), told(sides, 0.01), 0.01, plant, backend="c")
+    alone = integrate(np.zeros(len(STATES)), told(sides, 0.01), 0.01, plant, backend="c")
+    assert native.driver(Variant(LANES_32, (), True)) is not None
+    in_32_bits = integrate_many(alone[:1], told(sides, 0.01), 0.01, [plant], short=True)[0]
+    return np.concatenate([alone, in_32_bits])
