@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 FURTHER_TRIED = 2
 """So many further effects are fitted with those found: the greatest by Bayes factor, and as many by what they
 would leave in the channels to first order."""
-FURTHER_ODDS = 3.0
+FURTHER_ODDS = 4.0
 """Log odds that each further effect costs."""
 FURTHER_SHARE, FURTHER_LEFT = 0.15, 0.5
 """What it must take away of that which the effects found leave in the channels: as a share, and in units of
