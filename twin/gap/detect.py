@@ -51,6 +51,7 @@ class Detection:
         statistic: the greatest deviation of any effect, in units of what it usually is in references.
         p_value: of the permutation test.
         usual: (P,) square of each column's deviation that is usual among the choices.
+        scatter: (P,) the same in references judged by the others alone, at least one.
         nulls: some references judged by the others.
         normal: the statistic of each of them.
     """
@@ -58,6 +59,7 @@ class Detection:
     statistic: float
     p_value: float
     usual: Array
+    scatter: Array
     nulls: tuple[Pool, ...]
     normal: tuple[float, ...]
 
@@ -124,7 +126,8 @@ def detect(
     own = np.maximum(alone.mean(axis=0) if nulls else 0.0, LEAST_SQUARE)
     statistic, *normal = (max(float(np.sqrt((some / own).max())), EXACT) for some in (squares[0], *alone))
     P = len(runs[0].b)
-    return Detection(statistic, p_value, usual[:P], tuple(nulls), tuple(normal))
+    scatter = np.maximum(alone.mean(axis=0)[:P] if nulls else np.ones(P), 1.0)
+    return Detection(statistic, p_value, usual[:P], scatter, tuple(nulls), tuple(normal))
 
 
 def judged(runs: Sequence[Score], references: Sequence[Score]) -> Pool:

@@ -163,7 +163,7 @@ def diagnosed(
         normal = _filled(bench, sigma, normal, seed)
     found = detect(scores, normal, candidates, seed, bench.jobs)
     null = learn(normal, len(scores))
-    pool = Pool.of(scores, null).in_units_of(found.usual)
+    pool = Pool.of(scores, null).beside(found.usual, found.scatter)
     case = _Case(bench, scores, sigma, null, pool, beliefs(pool, candidates))
     floor = floor_of(found.nulls, range(pool.own))
     table = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys), bench.jobs)

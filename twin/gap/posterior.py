@@ -46,30 +46,33 @@ class Alone:
         gain: (P,) sum of u x, with u the change of a column's own score by it.
         moved: (P, P) the change of that by the columns.
         variance: (P,) sum of u^2 times the variance of x.
-        usual: (P,) square of a deviation that is usual.
+        usual: (P,) square of a deviation that is usual among all runs.
+        scatter: (P,) that in references judged by others, at least one.
     """
 
     gain: Array
     moved: Array
     variance: Array
     usual: Array
+    scatter: Array
 
     @classmethod
     def none(cls, P: int) -> Alone:
         """Of no run."""
-        return cls(np.zeros(P), np.zeros((P, P)), np.full(P, 1e-9), np.ones(P))
+        return cls(np.zeros(P), np.zeros((P, P)), np.full(P, 1e-9), np.ones(P), np.ones(P))
 
     @classmethod
     def of(cls, x: Array, U: Array, null: Null) -> Alone:
         """Of one run's standardised scores (P,) and their change by the columns (P, P)."""
         own = np.diag(U)
-        return cls(own * x, own[:, None] * U, own**2 * np.diag(null.covariance), np.ones(len(x)))
+        ones = np.ones(len(x))
+        return cls(own * x, own[:, None] * U, own**2 * np.diag(null.covariance), ones, ones)
 
     def plus(self, other: Alone, sign: float = 1.0) -> Alone:
         """With other runs, or without them."""
         return Alone(
             self.gain + sign * other.gain, self.moved + sign * other.moved,
-            self.variance + sign * other.variance, self.usual,
+            self.variance + sign * other.variance, self.usual, self.scatter,
         )  # fmt: skip
 
     def squares(self, columns: Sequence[int] = (), value: Array | None = None) -> Array:
@@ -81,7 +84,7 @@ class Alone:
         """1 sigma (k,) of sizes as each column's own score has them: as they scatter in the references."""
         at = list(columns)
         moved = np.maximum(np.diag(self.moved)[at], 1e-9)
-        return np.minimum(np.sqrt(self.variance[at] * self.usual[at]) / moved, WIDE)
+        return np.minimum(np.sqrt(self.variance[at] * self.scatter[at]) / moved, WIDE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,9 +141,9 @@ class Pool:
         P = self.own
         return Pool(self.information[:P, :P], self.gain[:P], self.square, self.dims, P, self.alone)
 
-    def in_units_of(self, usual: Array) -> Pool:
-        """The same with deviations in units of the root of `usual` (P,)."""
-        return dataclasses.replace(self, alone=dataclasses.replace(self.alone, usual=usual))
+    def beside(self, usual: Array, scatter: Array) -> Pool:
+        """The same with the squares (P,) of deviations that are usual, and as they scatter in references."""
+        return dataclasses.replace(self, alone=dataclasses.replace(self.alone, usual=usual, scatter=scatter))
 
     def without(self, other: Pool) -> Pool:
         """Those of the runs that `other` does not have."""
