@@ -53,6 +53,7 @@ def test_the_more_an_effect_stands_out_the_less_is_chance() -> None:
     assert tails[0] > tails[1] > tails[2]
     assert tails[2] < 1e-4 < found[2].p_value
     assert found[2].statistic > 5.0 * found[1].statistic > 5.0 * found[0].statistic
+    assert found[2].scatter[COLUMN] < 3.0 < 0.1 * found[2].usual[COLUMN]  # the gap is no scatter
 
 
 def test_a_choice_of_judged_runs_that_shows_more_of_the_gap_does_not_make_it_doubtful() -> None:
