@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml') pyproject.toml README.md
+SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml' -o -name '*.[ch]') pyproject.toml README.md
 
 .PHONY: demo test lint help clean
 
