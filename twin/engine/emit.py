@@ -204,9 +204,8 @@ class Emitter:
             value = f"-{args[0]}"
         else:
             self._roots += op == "sqrt"
-            by_product = (
-                op == "sqrt" and not (self.in_vectors or self.short) and self._roots % 2
-            )  # see root.h
+            in_lanes = not (self.in_vectors or self.short)
+            by_product = op == "sqrt" and in_lanes and self._roots % 2  # see root.h
             value = f"tf_{'root' if by_product else op}_{suffix}({', '.join(args)})"
         return f"const {kind} {_name(atom)} = {value};"
 

@@ -188,11 +188,8 @@ class Fitter:
     def beside(self, found: Fitted, laws: Sequence[Hypothesis]) -> dict[Hypothesis, Fitted | Refit]:
         """Laws of several effects, whose first columns are those of `found`: from there, the further ones at
         a ladder of sizes along their signatures in what is left; or their failures."""
-        known, points, at = (
-            len(found.fit.columns),
-            list[tuple[Hypothesis, Array]](),
-            dict[Hypothesis, Array](),
-        )
+        points = list[tuple[Hypothesis, Array]]()
+        at, known = dict[Hypothesis, Array](), len(found.fit.columns)
         rest = self.table.products(found.fit.errors)
         for law in laws:
             low, high = bounds(self.bench.candidates, law.columns)
