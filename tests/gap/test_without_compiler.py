@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from terrafusion.twin.effects import catalogue
+from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.engine import compiler, native
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
@@ -36,3 +38,13 @@ def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -
         difference = mine.rows - its.rows  # in units of the noise
         assert 0.0 < np.abs(difference).max() < 0.1
         assert np.sqrt(np.mean(difference**2)) < 3e-3
+
+
+def test_an_effect_that_is_not_written_as_c_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    import casadi as ca
+
+    monkeypatch.setattr(catalogue, "_OWN", {})
+    body = {"body": lambda q, e: {"body_force_x_n": q["body_force_x_n"] - ca.if_else(q["u"] > 0.5, e, 0.0)}}
+    catalogue.register(Form("trailer", "brake", one("N", 10.0, 0.0, 200.0), body, "force e beyond 0.5 m/s"))
+    given = runs(970, 1), runs(975, 1), load_vehicle("elevate"), None
+    assert gather(*given, Candidates.of(["trailer"]), jobs=2).jobs == 1

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.errors import ConfigError, DataError
 from terrafusion.datasets.recording import Recording
-from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.channel_noise import learnt_noise
 from terrafusion.twin.gap.outliers import bounded
@@ -31,6 +30,7 @@ from terrafusion.twin.gap.residuals import (
     whitened_error,
     without_probes,
 )
+from terrafusion.twin.gap.side_by_side import in_threads
 from terrafusion.twin.gap.signatures import Ask, Drive, settled_predictions
 from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model
@@ -239,13 +239,13 @@ def gather(
 ) -> Bench:
     """Evidence of all runs; `kept` holds signatures for diagnoses to come with the same vehicle and soils.
 
-    Without a compiler there is one thread: CasADi's virtual machine is not safe in several.
+    Where not all is compiled there is one thread (`side_by_side.in_threads`).
 
     Raises:
         DataError: a log without what it needs.
         TerrafusionError: the twin diverges on every reference.
     """
-    jobs = jobs if compiled() else 1
+    jobs = jobs if in_threads(candidates) else 1
     model, ground, notes = starting_model([*runs, *references], vehicle, soils)
     logs = prepared([*runs, *references], model, ground, source)
     channels = common_channels(logs)

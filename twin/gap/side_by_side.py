@@ -17,7 +17,11 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.drive import told
 from terrafusion.twin.effects.sensed import DEAD_TIME, as_driven
+from terrafusion.twin.engine import codegen
+from terrafusion.twin.engine.codegen import LANES, LANES_32, Variant
+from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.lanes import Fleet, blank_what_diverged
+from terrafusion.twin.engine.native import driver
 from terrafusion.twin.engine.plant import Plant
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.candidates import Candidates
@@ -78,6 +82,17 @@ def graphs(candidates: Candidates, runs: Sequence[Moved]) -> dict[tuple[str, ...
     )
     few = vectors < WHOLE * -(-len(runs) // TOGETHER)
     return apart if few else {candidates.moving: list(range(len(runs)))}
+
+
+def in_threads(candidates: Candidates) -> bool:
+    """Whether all that drives the twin is compiled: CasADi's virtual machine is not safe in several threads.
+
+    Effects of the catalogue are, where there is a compiler; one's own may hold what is not written as C.
+    """
+    if codegen.follows_from("", candidates.keys) is not None:
+        return compiled()
+    whole = Variant(LANES_32 if SHORT else LANES, candidates.moving, fixed_ground=True)
+    return driver(whole) is not None and reader(tuple(sorted(candidates.keys)), True) is not None
 
 
 def what_moves(candidates: Candidates, effects: Effects) -> Moved:
