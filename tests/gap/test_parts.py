@@ -42,13 +42,10 @@ def log_and_model():
     return prepared([recording], model, ground, "auto")[0], model
 
 
-@pytest.fixture
-def long_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs in 64 bits, where things are the same to the last digits or not at all."""
-    monkeypatch.setattr(side_by_side, "SHORT", False)
-
-
-def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, long_numbers) -> None:
+@pytest.mark.parametrize(("short", "within"), [(False, 1e-8), (True, 2e-6)])
+def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, monkeypatch, short, within) -> None:
+    """In 64 bits to the last digits; in the 32 that the diagnosis takes, as far as these go."""
+    monkeypatch.setattr(side_by_side, "SHORT", short)
     log, model = log_and_model
     moved = log.start + np.array([2.0, -1.0, 0.3])
     keys = ("gnss_lever_arm/offset/x", "wheel_radius/scale")
@@ -56,7 +53,7 @@ def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, long_nu
     here = placed(log, first, log.start, moved)
     for mine, its in zip(here, there, strict=True):
         for name in ("value", "change", "by_pose", "heading"):
-            np.testing.assert_allclose(getattr(mine, name), getattr(its, name), atol=1e-8)
+            np.testing.assert_allclose(getattr(mine, name), getattr(its, name), atol=within)
     east = [o.channel for o in log.observed].index("gnss_east_m")
     assert np.abs(here[east].change - first[east].change).max() > 1e-3
 
@@ -92,8 +89,13 @@ def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> No
             assert not some.change[:, :, i].any()
 
 
-def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model, long_numbers) -> None:
-    """Whatever graphs drive them, and though those of the sensors alone share a run."""
+@pytest.mark.parametrize(("short", "within"), [(False, 1e-3), (True, 0.05)])
+def test_sets_of_effects_side_by_side_are_what_each_is_alone(
+    log_and_model, monkeypatch, short, within
+) -> None:
+    """Whatever graphs drive them, and though those of the sensors alone share a run. In units of the noise;
+    32 bits may differ by more in a row where a wheel is about to slide, but not in all."""
+    monkeypatch.setattr(side_by_side, "SHORT", short)
     log, model = log_and_model
     alone = {
         "gyro_bias/constant": 0.01, "mass/at_cg": 0.1, "wheel_radius/scale": 0.02, "dead_time/transport": 0.1,
@@ -104,8 +106,11 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model, long
     together = predictions([Ask(log, some) for some in sets], model, CANDIDATES)
     for some, found in zip(sets, together, strict=True):
         (by_itself,) = predictions([Ask(log, some)], model, CANDIDATES)
+        square = 0.0
         for observed, a, b in zip(log.observed, found, by_itself, strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-3 * np.median(observed.sigma), err_msg=f"{some}")
+            np.testing.assert_allclose(a, b, atol=within * np.median(observed.sigma), err_msg=f"{some}")
+            square += float(np.sum(((a - b) / np.median(observed.sigma)) ** 2))
+        assert square < 0.01
     plain, biased, heavy = together[0], together[1], together[2]
     rate = [o.channel for o in log.observed].index("yaw_rate_radps")
     np.testing.assert_allclose(biased[rate] - plain[rate], 0.01, rtol=1e-9)
@@ -115,13 +120,8 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(log_and_model, long
 def test_numbers_of_32_bits_lose_less_than_steps_of_third_order(log_and_model, monkeypatch) -> None:
     """In units of the sensors' noise, with effects of each kind."""
     log, model = log_and_model
-    keys = (
-        "mass/at_cg",
-        "wheel_radius/scale",
-        "slip_sinkage/linear",
-        "backlash/lost_motion",
-        "slope/uniform",
-    )
+    keys = ("mass/at_cg", "wheel_radius/scale", "slip_sinkage/linear", "backlash/lost_motion")
+    keys += ("slope/uniform",)
     asks = [Ask(log, {})]
     asks += [Ask(log, {k: 0.3 * float(CANDIDATES.scale[CANDIDATES.keys.index(k)])}) for k in keys]
     told = {}

@@ -1,7 +1,8 @@
 """Many runs at once: vehicles, grounds and commands of their own, side by side in the lanes of vectors.
 
 Every lane does what `integrate.integrate` does, in the same order and with the same functions: a run has the
-same bits alone and among others.
+same bits alone and among others. Where numbers of 32 bits will do, twice as many go together; their bits are
+then their own, but again the same alone and among others.
 """
 
 from __future__ import annotations
@@ -101,7 +102,8 @@ class Fleet:
         order: int = 4,
         short: bool = False,
     ) -> Fleet:
-        """Plants that share a graph and a step, as many together as a driver has lanes.
+        """Plants that share a graph and a step, as many together as a driver has lanes; arguments as those of
+        `integrate_many`.
 
         Raises:
             ValueError: `order`, that of the Runge-Kutta steps, is not 3 or 4.

@@ -52,6 +52,9 @@ class Told:
 
 LEAST = 0.5
 """A gap counts as no smaller than this (in the units of `Told`)."""
+OUTSIDE_SHARE = 0.2
+"""Of gaps, so many are taken to have a cause outside the catalogue before anything is seen, as in a blind
+check."""
 LAPSE = 0.02
 """Probability that the odds do not hold (assumed): it is spread evenly over all causes."""
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.gap.candidates import SOIL, Candidates, Hypothesis
 from terrafusion.twin.gap.channels import Left, Products, Table
-from terrafusion.twin.gap.choice import Choice, Told
+from terrafusion.twin.gap.choice import OUTSIDE_SHARE, Choice, Told
 from terrafusion.twin.gap.classes import class_of, done
 from terrafusion.twin.gap.goodness import Goodness, goodness
 from terrafusion.twin.gap.ladder import bounds
@@ -32,9 +32,9 @@ SAME_ODDS, NEARLY = math.log(3.0), 0.9
 """Effects whose log odds differ by less, and whose signatures correlate by more, cannot be told from each
 other, either (assumed)."""
 MOST_EFFECTS = 3
-UNKNOWN = 0.2
-"""Probability of an unknown cause, given a gap, above which the verdict is that: the share that such causes
-are taken to have before anything is seen (`blind.development.OUTSIDE_SHARE`)."""
+UNKNOWN = OUTSIDE_SHARE
+"""Probability of an unknown cause, given a gap, above which the verdict is that: what was seen speaks for
+it."""
 LAW_MOVES, LAW_SENSES = 0.2, 0.03
 """1 sigma, as a share of its value, by which the size of an effect that moves the robot, and of one of the
 sensors alone, is wrong since the robot's law is not the twin's. Set on development trials

@@ -39,7 +39,7 @@ from terrafusion.twin.gap.blind.shapes import (
     Shape,
     shapes,
 )
-from terrafusion.twin.gap.choice import Told, Weights, probabilities
+from terrafusion.twin.gap.choice import OUTSIDE_SHARE, Told, Weights, probabilities
 from terrafusion.twin.gap.goodness import FITS, Goodness
 from terrafusion.twin.soil import load_soil
 from terrafusion.twin.vehicle import load_vehicle
@@ -58,9 +58,6 @@ NULL = "null"
 """Stands for the shape of a trial without a gap."""
 CROSSED = (0.1, 0.15, 0.2, 0.3, 0.4, 0.5)
 """Probabilities of an unknown cause above which `cross` counts trials."""
-OUTSIDE_SHARE = 0.2
-"""Of gaps, so many are taken to have a cause outside the catalogue, as in a blind check; a site has more of
-them, which count less in the training."""
 LAPSED = 0.1
 """In training the odds are taken not to hold more often than that: a few trials that no law fits would else
 make all others unsure."""
@@ -197,7 +194,10 @@ def surprise(trials: Iterable[Trial], weights: Weights, outside: float = 1.0) ->
 
 
 def train(trials: Sequence[Trial]) -> Weights:
-    """Weights of least surprise on trials in which a gap was seen."""
+    """Weights of least surprise on trials in which a gap was seen.
+
+    A site has more causes outside the catalogue than `OUTSIDE_SHARE`: each counts less.
+    """
     from scipy.optimize import minimize
 
     some = [trial for trial in trials if trial.teaches()]
