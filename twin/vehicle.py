@@ -106,7 +106,8 @@ class VehicleParams:
 
     Without a battery the motors are fed with `drive.supply_v`, whatever they draw. `effects` are optional
     effects by key (docs/effects.md) that this robot, or what it drives on, is known to have, as `terrafusion
-    gap` finds them: the twin has them in every run.
+    gap` finds them: the twin has them in every run. `measured` are numbers, by dotted name, that were found
+    for the body of this very robot: the geometry that a log assumes does not replace them.
     """
 
     name: str
@@ -120,6 +121,7 @@ class VehicleParams:
     battery: Battery | None = None
     topics: dict[str, str] = field(default_factory=dict)
     effects: dict[str, Annotated[float, Quantity("")]] = field(default_factory=dict)
+    measured: tuple[str, ...] = ()
 
     def rig(self) -> Rig:
         """What a reader or an estimator needs: odometry geometry, sensors and topic names."""
@@ -145,6 +147,13 @@ def load_vehicle(name_or_path: str | Path) -> VehicleParams:
     """
     raw, file = read_named("vehicles", name_or_path, kind="vehicle")
     found = structure(VehicleParams, raw, file=file)
+    for name in found.measured:
+        section, _, last = name.partition(".")
+        if not last or not isinstance(getattr(getattr(found, section, None), last, None), float):
+            raise ConfigError(
+                f"there is no number '{name}'", file=file, channel="measured",
+                remedy="give dotted names such as body.track_m",
+            )  # fmt: skip
     if found.effects:
         from terrafusion.twin.effects.catalogue import checked
 
@@ -183,15 +192,17 @@ def with_payload(
 def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParams:
     """The vehicle with what a log says of it: wheel radius, track, antenna and IMU position.
 
-    Radius and track replace the odometry's numbers and the body's: the log
+    Radius and track replace the odometry's numbers and, unless `measured`, the body's: the log
     knows one geometry only.
     """
     body, wheel, odometry, sensors = vehicle.body, vehicle.wheel, vehicle.odometry, vehicle.sensors
     if overrides.wheel_radius_m is not None:
-        wheel = dataclasses.replace(wheel, radius_m=overrides.wheel_radius_m)
+        if "wheel.radius_m" not in vehicle.measured:
+            wheel = dataclasses.replace(wheel, radius_m=overrides.wheel_radius_m)
         odometry = dataclasses.replace(odometry, wheel_radius_m=overrides.wheel_radius_m)
     if overrides.track_m is not None:
-        body = dataclasses.replace(body, track_m=overrides.track_m)
+        if "body.track_m" not in vehicle.measured:
+            body = dataclasses.replace(body, track_m=overrides.track_m)
         odometry = dataclasses.replace(odometry, track_m=overrides.track_m)
     if overrides.antenna_m is not None:
         gnss = dataclasses.replace(sensors.gnss, antenna_m=overrides.antenna_m)

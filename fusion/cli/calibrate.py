@@ -13,8 +13,8 @@ from terrafusion.fusion.cli.common import (
     RepairClockOption,
     StampsOption,
     TopicOption,
-    clock_accepted,
     load_rig,
+    opened,
     progress_bar,
     reading,
 )
@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from terrafusion.twin.identify.result import Calibration
 
 LogsArgument = Annotated[
-    list[str], typer.Argument(metavar="LOG...", help="Log folders, bags or catalogue names of one vehicle.")
+    list[str],
+    typer.Argument(
+        metavar="LOG...",
+        help="Log folders, bags or catalogue names of one vehicle; "
+        "LOG@60-105 is a piece of one, LOG@/45 all of its pieces of 45 s.",
+    ),
 ]
 OutOption = Annotated[
     Path, typer.Option("--out", help="Folder for calibration.json, YAML files, report.html.")
@@ -75,7 +80,6 @@ def calibrate(
 
     Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
     """
-    from terrafusion.datasets.readers import open_recordings
     from terrafusion.fusion.calibration.page import write_calibration
     from terrafusion.twin.identify.calibrate import PARAMETERS
     from terrafusion.twin.identify.calibrate import calibrate as fit
@@ -86,9 +90,7 @@ def calibrate(
     priors = dict(parse_prior(text) for text in prior or [])
     soils = parse_terrain(terrain)
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-    recordings = [r for log in logs for r in open_recordings(log, **options)]
-    if repair_clock:
-        recordings = [clock_accepted(r) for r in recordings]
+    recordings = opened(logs, options, repair_clock)
     with progress_bar("calibrating") as progress:
         found = fit(
             recordings, vehicle, soils, split(parameters) or PARAMETERS, priors=priors, source=source,

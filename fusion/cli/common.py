@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shlex
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -105,6 +105,19 @@ def reading(
         "columns": columns,
         "repair_clock": repair_clock,
     }
+
+
+def opened(names: Sequence[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
+    """The logs of some names, of which `LOG@60-105` is a piece and `LOG@/45` are all pieces of 45 s."""
+    from terrafusion.datasets.pieces import split_name
+    from terrafusion.datasets.readers import open_recordings
+
+    found: list[Recording] = []
+    for name in names:
+        log, cut = split_name(name)
+        for recording in open_recordings(log, **options):
+            found += [recording] if cut is None else cut.of(recording)
+    return [clock_accepted(r) for r in found] if repair_clock else found
 
 
 def clock_accepted(recording: Recording) -> Recording:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -14,8 +14,8 @@ from terrafusion.fusion.cli.common import (
     RepairClockOption,
     StampsOption,
     TopicOption,
-    clock_accepted,
     load_rig,
+    opened,
     progress_bar,
     reading,
 )
@@ -85,8 +85,8 @@ def gap(
     from terrafusion.twin.vehicle import load_vehicle
 
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-    judged = _opened(runs, options, repair_clock)
-    normal = _opened(reference or [], options, repair_clock)
+    judged = opened(runs, options, repair_clock)
+    normal = opened(reference or [], options, repair_clock)
     for target in (out, *([write_vehicle.parent] if write_vehicle else [])):
         check_folder(target)
     with progress_bar("comparing") as progress:
@@ -121,15 +121,3 @@ def _judged(
         ) if value is not None]  # fmt: skip
         print(f"{mark.mark}: " + ", ".join(f"{word} {value:.3g}" for word, value in told))
     return marks, failed
-
-
-def _opened(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
-    from terrafusion.datasets.readers import open_recordings
-    from terrafusion.twin.gap.pieces import split_name
-
-    found: list[Recording] = []
-    for name in names:
-        log, cut = split_name(name)
-        for recording in open_recordings(log, **options):
-            found += [recording] if cut is None else cut.of(recording)
-    return [clock_accepted(r) for r in found] if repair_clock else found

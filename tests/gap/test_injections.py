@@ -13,6 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.pieces import piece, pieces, split_name
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.twin.gap import injections
@@ -31,7 +32,6 @@ from terrafusion.twin.gap.injected import (
     turned_imu,
 )
 from terrafusion.twin.gap.injections import LogSet, Source, answered, cases, estimated, table, verdict_on
-from terrafusion.twin.gap.pieces import piece, pieces, split_name
 from terrafusion.twin.vehicle import load_vehicle
 
 HUSKY = load_vehicle("husky")

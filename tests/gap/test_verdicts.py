@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.recording import Overrides, Recording
 from terrafusion.fusion.gap_page.plots import plot_shrink
 from terrafusion.fusion.gap_page.words import sentences
 from terrafusion.twin.gap import Diagnosis, diagnose
@@ -19,7 +19,7 @@ from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.corrected import values_of, write_corrected
 from terrafusion.twin.gap.next_run import BY_HAND, DRIVES
 from terrafusion.twin.gap.verdict import LAW_MOVES, UNKNOWN
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.vehicle import load_vehicle, with_overrides
 
 from .drives import runs
 
@@ -246,6 +246,7 @@ def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
     shift = values_of(wide)["wheel_radius/scale"]
     assert corrected.wheel.radius_m == pytest.approx(VEHICLE.wheel.radius_m * (1.0 + shift))
     assert any("radius_m" in line for line in said)
+    assert with_overrides(corrected, Overrides(wheel_radius_m=0.175)).wheel == corrected.wheel
 
     after = diagnose(fresh, [], corrected)
     assert unreferred.detected

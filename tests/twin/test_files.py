@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from importlib import resources
 from pathlib import Path
 
@@ -45,9 +46,13 @@ def test_a_wrong_vehicle_file_is_told_by_key(tmp_path, old, new, message) -> Non
         load_vehicle(write(tmp_path / "v.yaml", text.replace(old, new, 1)))
 
 
-def with_effect(path: Path, effect: str) -> Path:
+def with_lines(path: Path, lines: str) -> Path:
     text = (PARAMS / "vehicles" / "elevate.yaml").read_text(encoding="utf-8")
-    return write(path, f"{text}\neffects:\n  {effect}\n")
+    return write(path, f"{text}\n{lines}\n")
+
+
+def with_effect(path: Path, effect: str) -> Path:
+    return with_lines(path, f"effects:\n  {effect}")
 
 
 def test_effects_of_a_vehicles_file_are_in_its_runs_unless_others_are_given(tmp_path) -> None:
@@ -82,6 +87,24 @@ def test_overrides_replace_the_geometry() -> None:
     assert rig.sensors.gnss.antenna_m == (0.1, 0.0, 1.0)
     assert rig.sensors.imu.position_m == (0.0, 0.2, 0.3)
     assert with_overrides(load_vehicle("husky"), Overrides()) == load_vehicle("husky")
+
+
+def test_a_log_does_not_replace_what_was_measured() -> None:
+    robot = load_vehicle("husky")
+    wide = dataclasses.replace(
+        robot, body=dataclasses.replace(robot.body, track_m=0.7), measured=("body.track_m",)
+    )
+    found = with_overrides(wide, Overrides(wheel_radius_m=0.2, track_m=0.9))
+    assert (found.body.track_m, found.odometry.track_m) == (0.7, 0.9)
+    assert (found.wheel.radius_m, found.odometry.wheel_radius_m) == (0.2, 0.2)
+    known = dataclasses.replace(wide, measured=("body.track_m", "wheel.radius_m"))
+    assert with_overrides(known, Overrides(0.2, 0.9)).wheel == robot.wheel
+
+
+@pytest.mark.parametrize("name", ["body", "body.trak_m", "track_m", "topics.imu", "name"])
+def test_a_measured_number_has_to_be_one(tmp_path, name) -> None:
+    with pytest.raises(ConfigError, match=f"there is no number '{name}'; give dotted names"):
+        load_vehicle(with_lines(tmp_path / "v.yaml", f"measured: [{name}]"))
 
 
 def test_husky_keeps_its_rotated_imu() -> None:

@@ -17,7 +17,7 @@ from terrafusion.twin.identify.model import Model
 from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.vehicle import load_vehicle, with_overrides
 
 SOIL, OTHER = "loose_sand", "asphalt"
 SHEAR = f"{SOIL}.shear.shear_modulus_m"
@@ -127,6 +127,19 @@ def test_logs_of_one_name_stay_apart_and_geometries_agree() -> None:
     other = dataclasses.replace(drive(), name="other", overrides=Overrides(track_m=0.5))
     with pytest.raises(DataError, match="another geometry"):
         calibrate([drive(), other], "elevate", SOIL, NAMES)
+
+
+def test_what_was_calibrated_holds_against_the_geometry_that_a_log_assumes(tmp_path) -> None:
+    log = dataclasses.replace(drive(), overrides=Overrides(wheel_radius_m=0.175, track_m=0.51))
+    found = calibrate(log, "elevate", SOIL, NAMES)
+    write_files(found, tmp_path, "elevate")
+    known = load_vehicle(tmp_path / "vehicle.yaml")
+    assert known == found.model.vehicle
+    assert known.measured == ("body.mass_kg", "wheel.radius_m")
+    assert with_overrides(known, log.overrides).wheel.radius_m == found["vehicle.wheel.radius_m"].value
+    assert with_overrides(known, Overrides(track_m=0.7)).body.track_m == 0.7
+    again = calibrate(log, known, SOIL, NAMES[:1])
+    assert again.before.vehicle.wheel.radius_m == pytest.approx(TRUTH["vehicle.wheel.radius_m"], rel=0.01)
 
 
 def test_a_search_that_is_cut_short_says_so_everywhere(monkeypatch, tmp_path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from terrafusion.twin.effects.catalogue import lookup
-from terrafusion.twin.identify.files import write_yaml
+from terrafusion.twin.identify.files import mark_measured, write_yaml
 from terrafusion.twin.library import read_named
 from terrafusion.twin.vehicle import VehicleParams
 
@@ -90,4 +90,5 @@ def _change(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, va
     source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
     kept: Mapping[str, Any] = {k: v for k, v in old.items() if k == "valid"} if isinstance(old, dict) else {}
     section[last] = {"value": after, **kept, "source": source}
+    mark_measured(raw, path)
     return f"{path}: {before:.6g} -> {after:.6g}"

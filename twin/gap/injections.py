@@ -23,11 +23,11 @@ import numpy as np
 
 from terrafusion.datasets.atomic import check_folder
 from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.pieces import piece, spans
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.recording import Recording
 from terrafusion.twin.gap.diagnosis import diagnose
 from terrafusion.twin.gap.injected import INJECTIONS, Injection, pose_as_gnss
-from terrafusion.twin.gap.pieces import piece, spans
 from terrafusion.twin.gap.signatures import Drive
 from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.version import model_sha256

@@ -189,9 +189,20 @@ def _answer(problem: Problem, solution: Solution, told: Identifiability, notes: 
     }
     return Calibration(
         tuple(fitted), cov / np.outer(sigma, sigma), cov * np.outer(rate, rate), told,
-        problem.model_at(point.w), problem.model, channel_fits(problem, solution), errors,
+        _marked(problem.model_at(point.w), fitted), problem.model, channel_fits(problem, solution), errors,
         solution.outcome, OUTCOMES[solution.outcome], solution.runs, problem.seconds(), tuple(notes),
     )  # fmt: skip
+
+
+def _marked(model: Model, fitted: Sequence[Fitted]) -> Model:
+    """The model whose vehicle knows which of its numbers the logs told (`VehicleParams.measured`)."""
+    told = {
+        f.name.removeprefix("vehicle.")
+        for f in fitted
+        if f.name.startswith("vehicle.") and f.status != UNTOLD
+    }
+    names = tuple(sorted({*model.vehicle.measured, *told}))
+    return dataclasses.replace(model, vehicle=dataclasses.replace(model.vehicle, measured=names))
 
 
 def _fitted(c: Coordinate, w: float, sigma: float, status: str, ratio: float) -> Fitted:

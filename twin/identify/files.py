@@ -36,7 +36,9 @@ def write_files(
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
     own = ("vehicle.", "effects.")
     mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith(own)}
-    written = [write_yaml(out / "vehicle.yaml", _updated(raw, model.vehicle, mine, logs))]
+    updated = _updated(raw, model.vehicle, mine, logs)
+    mark_measured(updated, *model.vehicle.measured)
+    written = [write_yaml(out / "vehicle.yaml", updated)]
     for name, soil in model.soils.items():
         given = str((soils or {}).get(name, name))
         raw = published_soil(given) if is_published(given) else read_named("soils", given, kind="terrain")[0]
@@ -86,6 +88,12 @@ def _overridden(raw: dict[str, Any], values: Any) -> None:
         elif entry["value"] != (list(value) if isinstance(value, tuple) else value):
             plain = list(value) if isinstance(value, tuple) else value
             raw[name] = _entry(entry, plain, "as the log says")
+
+
+def mark_measured(vehicle: dict[str, Any], *names: str) -> None:
+    """Note in a vehicle's file that numbers of it were found for this robot (`VehicleParams.measured`)."""
+    if names:
+        vehicle["measured"] = sorted({*vehicle.get("measured", ()), *names})
 
 
 def write_yaml(path: Path, content: dict[str, Any]) -> Path:
