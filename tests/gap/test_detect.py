@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.candidates import Candidates
 from terrafusion.twin.gap.detect import detect, judged
 from terrafusion.twin.gap.score import Score
-from terrafusion.twin.gap.trials import interval
 
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "wheel_radius_asymmetry", "slope"])
 P = len(CANDIDATES.keys) + 4
@@ -33,7 +33,7 @@ def test_of_runs_that_are_alike_one_in_twenty_is_called_a_gap_at_most() -> None:
     for i in range(count):
         some = scores(rng, 12, scatter=0.2)
         alarms += detect(some[:3], some[3:], CANDIDATES, i).p_value <= 0.05
-    assert interval(alarms, count)[0] <= 0.05
+    assert Rate(alarms, count).interval()[0] <= 0.05
 
 
 def test_an_effect_is_seen_where_all_scatter_from_run_to_run() -> None:

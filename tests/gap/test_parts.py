@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from terrafusion.twin.gap.rows import layout
 from terrafusion.twin.gap.score import Score, score
 from terrafusion.twin.gap.side_by_side import graphs, groups, what_moves
 from terrafusion.twin.gap.signatures import Ask, drive, placed, predictions, signatures
-from terrafusion.twin.gap.trials import calibration_error, interval
 from terrafusion.twin.gap.verdict import HeldOut, null_probability
 from terrafusion.twin.identify.inputs import DT_S
 from terrafusion.twin.vehicle import load_vehicle
@@ -281,15 +279,6 @@ def test_other_terramechanics_are_no_candidate_unless_asked_for(monkeypatch: pyt
     assert name in catalogue.effect_names()
     assert Candidates.of().keys == CANDIDATES.keys
     assert Candidates.of([name]).effects == (name,)
-
-
-def test_calibration_error_and_interval() -> None:
-    assert calibration_error([0.95] * 20, [True] * 19 + [False]) == pytest.approx(0.0, abs=1e-9)
-    assert calibration_error([1.0] * 10, [False] * 10) == pytest.approx(1.0)
-    low, high = interval(0, 60)
-    assert low == 0.0
-    assert high == pytest.approx(1.0 - 0.025 ** (1 / 60), rel=1e-6)
-    assert math.isclose(interval(60, 60)[1], 1.0)
 
 
 def test_factors_of_all_columns_are_those_of_each() -> None:
