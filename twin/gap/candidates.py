@@ -6,13 +6,15 @@ counted in its catalogue scale ("typical" size), so that all columns are compara
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.effects.catalogue import catalogue, lookup, moves, parameters
+from terrafusion.datasets.errors import ConfigError
+from terrafusion.twin.effects.catalogue import catalogue, effect_names, lookup, moves, parameters
 from terrafusion.twin.effects.form import Form
 
 Array = NDArray[np.float64]
@@ -58,7 +60,12 @@ class Candidates:
 
         Args:
             present: keys of what the twin has already: their forms take part.
+
+        Raises:
+            ConfigError: no effect, or one that is unknown; the nearest ones are named.
         """
+        effects = None if effects is None else tuple(effects)
+        _check(effects)
         wanted, there = None if effects is None else set(effects), {lookup(key)[0].key for key in present}
 
         def taken(form: Form) -> bool:
@@ -91,3 +98,13 @@ class Candidates:
     def columns(self, effect: str) -> tuple[int, ...]:
         """All columns of an effect, whatever their form."""
         return tuple(i for h in self.hypotheses if h.effect == effect for i in h.columns)
+
+
+def _check(effects: tuple[str, ...] | None) -> None:
+    if effects is not None and not effects:
+        raise ConfigError("no effect is named", remedy="name some, or none at all for the whole catalogue")
+    for name in effects or ():
+        if name not in effect_names():
+            near = difflib.get_close_matches(name, effect_names(), n=3, cutoff=0.5)
+            remedy = f"did you mean {' or '.join(near)}" if near else "see docs/effects.md"
+            raise ConfigError(f"unknown effect '{name}'", remedy=remedy)

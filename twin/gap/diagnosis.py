@@ -135,7 +135,7 @@ def diagnose(
         raise ConfigError(f"a significance of {significance:g} is out of range", remedy="give 0.001 to 0.5")
     check_source(source)
     _check_each_once([*runs, *references])
-    candidates = _candidates(effects, vehicle)
+    candidates = Candidates.of(effects, vehicle.effects)
     bench = gather(
         runs, references, vehicle, soils, candidates, source=source, jobs=jobs, progress=progress, kept=kept
     )
@@ -192,17 +192,6 @@ def diagnosed(
         sum(r.seconds for r in runs), found, significance, uncalibrated, where, choice, verdict, shrinking,
         following, refits, bench, tuple(notes), time.perf_counter() - began,
     )  # fmt: skip
-
-
-def _candidates(effects: Sequence[str] | None, vehicle: VehicleParams) -> Candidates:
-    if effects is not None and not effects:
-        raise ConfigError("no effect is named", remedy="name some, or none at all for the whole catalogue")
-    from terrafusion.twin.effects.catalogue import effect_names
-
-    unknown = sorted(set(effects or ()) - set(effect_names()))
-    if unknown:
-        raise ConfigError(f"unknown effect '{unknown[0]}'", remedy="see docs/effects.md")
-    return Candidates.of(effects, vehicle.effects)
 
 
 def _check_each_once(recordings: Sequence[Recording]) -> None:

@@ -1,0 +1,34 @@
+"""The table of all effects in the twin's own runs: what it holds, on two effects of it."""
+
+from __future__ import annotations
+
+import pytest
+
+from terrafusion.twin.gap.every_effect import first_forms, main
+
+
+def test_a_sensors_change_is_named_with_its_size(capsys: pytest.CaptureFixture[str]) -> None:
+    some = ["--effects", "gyro_scale", "gyro_bias", "--runs", "2", "--references", "5", "--sizes", "3"]
+    assert main(some) == 0
+    rows = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()[2:]]
+    assert [row[0] for row in rows] == ["`gyro_bias/constant`", "`gyro_scale/scale`"]
+    for (_, size, p, verdict, first, named, found), wanted in zip(
+        rows, ("gyro_bias", "gyro_scale"), strict=True
+    ):
+        assert float(p) <= 0.05
+        assert (verdict, named) == ("effect", wanted)
+        assert first.startswith(wanted)
+        value, sigma = map(float, found.split(" +- "))
+        assert abs(value - float(size.split()[0])) < 4.0 * sigma
+
+
+def test_every_effect_has_a_row() -> None:
+    assert len(first_forms()) == 37
+    assert all(key.startswith(f"{name}/") for name, key in first_forms().items())
+
+
+def test_an_unknown_effect_is_one_line_with_the_nearest(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--effects", "gyro_bais"]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err == "error: unknown effect 'gyro_bais'; did you mean gyro_bias or gyro_scale\n"
