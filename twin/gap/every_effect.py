@@ -3,8 +3,8 @@
     python -m terrafusion.twin.gap.every_effect --terrain medium_sand --sizes 1 3
 
 The first form of each effect, at multiples of its typical size, is put into three simulated runs with all
-sensor noise; twenty others have none. The ground's strength varies from run to run. The law is the twin's: this
-tells what a drive can show and what it cannot, and is an upper bound of everything else.
+sensor noise; twenty others have none. The ground's strength varies from run to run. The law is the twin's:
+this tells what a drive can show and what it cannot, and is an upper bound of everything else.
 """
 
 from __future__ import annotations
