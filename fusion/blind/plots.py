@@ -53,8 +53,9 @@ def plot_power(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:
         _errors(ax, [shift - 0.1], [alarms[drive]], fmt="s", color=NULL, label=f"no effect, {drive}")
         shift += 0.05
     ax.axhline(0.05, color=NULL, linewidth=0.8, linestyle=":")
-    ax.set_ylim(-0.03, 1.05)
-    ax.legend(fontsize=7, frameon=False, loc="lower right")
+    ax.set_ylim(-0.03, 1.38)  # room for the legend above all bars
+    ax.set_yticks(np.linspace(0.0, 1.0, 6))
+    ax.legend(fontsize=7, frameon=False, loc="upper left", ncol=3)
     style.dress(ax, x="severity, half-power points", y="share detected", title="Detected")
     return fig, ax
 
@@ -114,7 +115,7 @@ def plot_reliability(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Ax
     ax.set_xlim(0.0, 1.03)
     ax.set_ylim(-0.03, 1.05)
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=7, frameon=False, loc="upper left")
+        ax.legend(fontsize=7, frameon=False, loc="lower right")
     style.dress(ax, x="stated confidence of the first class", y="share that came true", title="Confidence")
     return fig, ax
 
