@@ -37,7 +37,7 @@ from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.scores.metrics import Outage, Scores, score
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.fusion.weights.policy import Policy, load_policy
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
+from terrafusion.twin.vehicle import VehicleParams, geometry_notes, load_vehicle, with_overrides
 
 Array = NDArray[np.float64]
 
@@ -85,10 +85,10 @@ def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParam
     """
     asked = name or recording.vehicle
     overrides = recording.overrides
-    given = [f"{k} = {v}" for k, v in dataclasses.asdict(overrides).items() if v is not None]
-    notes: tuple[str, ...] = (f"the log's own geometry is used: {', '.join(given)}",) if given else ()
+    loaded = load_vehicle(asked or "generic")
+    notes = geometry_notes(loaded, overrides)
     if asked:
-        return with_overrides(load_vehicle(asked), overrides), notes
+        return with_overrides(loaded, overrides), notes
     wheels = recording.wheels
     needs_radius = wheels is not None and wheels.unit == "radps"
     if overrides.track_m is None or (needs_radius and overrides.wheel_radius_m is None):
@@ -97,7 +97,7 @@ def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParam
             remedy="give --vehicle NAME, or wheel_radius_m and track_m in meta.yaml",
         )
     notes += ("no vehicle is named: a generic one is used, with its assumed sensor noise",)
-    return with_overrides(load_vehicle("generic"), overrides), notes
+    return with_overrides(loaded, overrides), notes
 
 
 def split_fixes(recording: Recording, outages: Sequence[Outage]) -> tuple[Gnss | None, Gnss | None]:

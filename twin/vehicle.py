@@ -211,3 +211,16 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
         imu = dataclasses.replace(sensors.imu, position_m=overrides.imu_m)
         sensors = dataclasses.replace(sensors, imu=imu)
     return dataclasses.replace(vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors)
+
+
+def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:
+    """What `with_overrides` takes from a log, and what it leaves, in a sentence; none if it tells nothing."""
+    told = {name: value for name, value in dataclasses.asdict(overrides).items() if value is not None}
+    if not told:
+        return ()
+    note = f"the log's own geometry is used: {', '.join(f'{name} = {value}' for name, value in told.items())}"
+    body = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
+    kept = [body[name] for name in told if body.get(name) in vehicle.measured]
+    if kept:
+        note += f"; measured on this robot before, and kept for its body: {', '.join(kept)}"
+    return (note,)

@@ -14,7 +14,7 @@ from terrafusion.datasets.recording import Overrides
 from terrafusion.twin.scenario import DriveSegment, load_scenario, scenario_names
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle, with_overrides
+from terrafusion.twin.vehicle import geometry_notes, load_vehicle, with_overrides
 
 PARAMS = resources.files("terrafusion.twin.params")
 
@@ -99,6 +99,17 @@ def test_a_log_does_not_replace_what_was_measured() -> None:
     assert (found.wheel.radius_m, found.odometry.wheel_radius_m) == (0.2, 0.2)
     known = dataclasses.replace(wide, measured=("body.track_m", "wheel.radius_m"))
     assert with_overrides(known, Overrides(0.2, 0.9)).wheel == robot.wheel
+
+
+def test_what_a_log_tells_of_the_geometry_is_said() -> None:
+    robot = load_vehicle("husky")
+    assert geometry_notes(robot, Overrides()) == ()
+    note = "the log's own geometry is used: wheel_radius_m = 0.2, track_m = 0.9"
+    assert geometry_notes(robot, Overrides(0.2, 0.9)) == (note,)
+    wide = dataclasses.replace(robot, measured=("body.track_m",))
+    assert geometry_notes(wide, Overrides(0.2)) == ("the log's own geometry is used: wheel_radius_m = 0.2",)
+    kept = "; measured on this robot before, and kept for its body: body.track_m"
+    assert geometry_notes(wide, Overrides(0.2, 0.9)) == (note + kept,)
 
 
 @pytest.mark.parametrize("name", ["body", "body.trak_m", "track_m", "topics.imu", "name"])

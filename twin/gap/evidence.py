@@ -36,7 +36,7 @@ from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
 from terrafusion.twin.soil import SoilParams, load_soil
-from terrafusion.twin.vehicle import VehicleParams, with_overrides
+from terrafusion.twin.vehicle import VehicleParams, geometry_notes, with_overrides
 
 Array = NDArray[np.float64]
 Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
@@ -90,10 +90,11 @@ def starting_model(
         ConfigError: a soil that was named is not known.
     """
     loaded = with_overrides(vehicle, recordings[0].overrides)
+    notes = list(geometry_notes(vehicle, recordings[0].overrides))
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
-        return Model(loaded, {soil.name: soil}, loaded.effects), soil.name, []
-    given, found, notes = dict(soils or {}), dict[str, SoilParams](), list[str]()
+        return Model(loaded, {soil.name: soil}, loaded.effects), soil.name, notes
+    given, found = dict(soils or {}), dict[str, SoilParams]()
     for recording in recordings:
         for label in dict.fromkeys(grounds(recording, recording.start_ns)[0]):
             if label in found:

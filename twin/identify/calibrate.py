@@ -26,7 +26,7 @@ from terrafusion.twin.identify.sandwich import scattered
 from terrafusion.twin.identify.solver import OUTCOMES, Solution, solve
 from terrafusion.twin.scenario import MAX_SLOPE_DEG
 from terrafusion.twin.soil import SoilParams, load_soil
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_overrides
+from terrafusion.twin.vehicle import VehicleParams, geometry_notes, load_vehicle, with_overrides
 
 Array = NDArray[np.float64]
 
@@ -95,7 +95,8 @@ def calibrate(
         ("slope_deg", "aspect_deg", "payload_kg"), (slope_deg, aspect_deg, payload_kg), GROUND, strict=True
     ):
         checked_number(value, quantity, file="the calibration", key=name)
-    start, ground = _start(logs_in, vehicle, soils, effects or {})
+    robot = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
+    start, ground = _start(logs_in, robot, soils, effects or {})
     start = dataclasses.replace(
         start, slope_rad=math.radians(slope_deg), aspect_rad=math.radians(aspect_deg), payload_kg=payload_kg
     )
@@ -115,7 +116,8 @@ def calibrate(
     _refuse_followed(numbers, logs)
     problem = Problem(logs, start, coordinates, robust=robust)
     solution, told = search(problem, progress)
-    notes = [f"{log.name}: {note}" for log in logs for note in log.notes]
+    notes = [*geometry_notes(robot, logs_in[0].overrides)]
+    notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return _answer(problem, solution, told, [*notes, *misfits(problem, solution), *assumptions(problem)])
 
 
@@ -263,19 +265,18 @@ def _named_apart(recordings: tuple[Recording, ...]) -> tuple[Recording, ...]:
 
 def _start(
     recordings: tuple[Recording, ...],
-    vehicle: str | Path | VehicleParams,
+    vehicle: VehicleParams,
     soils: Soils,
     effects: Mapping[str, float],
 ) -> tuple[Model, str | None]:
     """The model to start from, and the name of the one ground where there is one for all logs."""
-    loaded = vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
     for recording in recordings[1:]:
         if recording.overrides != recordings[0].overrides:
             raise DataError(
                 f"it tells another geometry of the vehicle than {recordings[0].name}",
                 file=recording.name, remedy="calibrate logs of one vehicle only",
             )  # fmt: skip
-    loaded, present = with_overrides(loaded, recordings[0].overrides), {**loaded.effects, **effects}
+    loaded, present = with_overrides(vehicle, recordings[0].overrides), {**vehicle.effects, **effects}
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
         return Model(loaded, {soil.name: soil}, present), soil.name
