@@ -35,12 +35,30 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
     assert radius["unit"] == "m"
     assert found["parameters"]["vehicle.body.cg_height_m"]["status"] == "not told"
     assert len(found["correlation"]) == 3
-    assert load_vehicle(out / "vehicle.yaml").wheel.radius_m == radius["value"]
+    robot = load_vehicle(out / "vehicle.yaml")
+    assert robot.wheel.radius_m == radius["value"]
+    assert robot.measured == ("wheel.radius_m",)
     rolling = found["parameters"]["asphalt.resistance.rolling"]["value"]
     assert load_soil(out / "soil.yaml").resistance.rolling == rolling
     page = (out / "report.html").read_text()
     assert "Twin against log" in page
     assert page.count("<figure>") == 3
+
+
+def test_pieces_of_a_log(terrafusion, good_log: Path, tmp_path: Path) -> None:
+    out = tmp_path / "fit"
+    names = "vehicle.wheel.radius_m"
+    done = terrafusion(
+        "calibrate", f"{good_log}@0-8", f"{good_log}@8-16", "--parameters", names, "--out", out
+    )
+    assert done.status == 0, done.err
+    found = json.loads((out / "calibration.json").read_text())
+    radius = found["parameters"]["vehicle.wheel.radius_m"]
+    assert radius["value"] == pytest.approx(0.175, abs=4.0 * radius["sigma"])
+    late = terrafusion("calibrate", f"{good_log}@900-950", "--parameters", names, "--out", out)
+    assert late.status == 1
+    assert "nothing was recorded from 900 to 950 s" in late.err
+    assert late.err.count("\n") == 1
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""Known changes in logs: what each does to a recording, pieces of a log, and one real log."""
+"""Known changes in logs: what each does to a recording, and one real log."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.pieces import piece, pieces, split_name
 from terrafusion.datasets.recording import Gnss, Imu, Recording, Terrain, Wheels
 from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.twin.gap import injections
@@ -167,44 +166,6 @@ def test_poses_stand_in_for_gnss_only_where_there_are_some() -> None:
     changed = pose_as_gnss(dataclasses.replace(CIRCLE, truth=path, truth_channels=("position",)), 0.05)
     assert changed.truth is None
     assert np.array_equal(changed.gnss.enu_m, path.position_m)
-
-
-def test_pieces_share_out_every_row_once() -> None:
-    parts = pieces(CIRCLE, 13.0)
-    for name in ("wheels", "imu", "gnss"):
-        joined = np.concatenate([p.channels()[name].t_ns for p in parts])
-        whole = CIRCLE.channels()[name].t_ns
-        assert np.array_equal(joined, whole[: len(joined)])
-        assert len(whole) - len(joined) <= 5 * RATE_HZ  # less than LEAST_S is left over
-
-
-def test_a_piece_keeps_the_ground_it_begins_on() -> None:
-    assert piece(CIRCLE, 10.0, 20.0).terrain.label.tolist() == ["grass"]
-    assert piece(CIRCLE, 25.0, 35.0).terrain.label.tolist() == ["grass", "gravel"]
-    late = piece(CIRCLE, 40.0, 50.0)
-    assert late.terrain.label.tolist() == ["gravel"]
-    assert late.start_ns == 40_000_000_000
-    assert late.terrain.t_ns[0] == late.start_ns
-
-
-def test_names_of_pieces() -> None:
-    assert split_name("set/log") == ("set/log", None)
-    assert split_name("me@home/log")[1] is None
-    name, cut = split_name("set/log@60-105")
-    assert name == "set/log"
-    assert (cut.begin_s, cut.end_s) == (60.0, 105.0)
-    assert split_name("set/log@/45")[1].every_s == 45.0
-
-
-@pytest.mark.parametrize("text", ["log@60-61", "log@60-50", "log@/2", "log@1.2.3-9"])
-def test_bad_pieces_are_refused(text: str) -> None:
-    with pytest.raises(DataError):
-        split_name(text)
-
-
-def test_a_piece_beyond_the_log_is_refused() -> None:
-    with pytest.raises(DataError, match="60 s"):
-        piece(CIRCLE, 100.0, 120.0)
 
 
 def answer(first: str, members: list[str], verdict: str = "effect", p: float = 0.01) -> dict:
