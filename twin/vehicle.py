@@ -9,16 +9,20 @@ midway between the four contact points.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
 from terrafusion.datasets.config import Quantity, structure
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import Overrides
+from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.recording import Overrides, Recording
 from terrafusion.datasets.sensors import Rig, SensorSuite
 from terrafusion.twin.library import known_names, read_named
 from terrafusion.twin.sensing.realism import SensorRealism
+
+GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
+"""What a log tells of its odometry, and the number of the body that it stands for, too, unless `measured`."""
 
 
 @dataclass(frozen=True)
@@ -197,11 +201,11 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
     """
     body, wheel, odometry, sensors = vehicle.body, vehicle.wheel, vehicle.odometry, vehicle.sensors
     if overrides.wheel_radius_m is not None:
-        if "wheel.radius_m" not in vehicle.measured:
+        if GEOMETRY["wheel_radius_m"] not in vehicle.measured:
             wheel = dataclasses.replace(wheel, radius_m=overrides.wheel_radius_m)
         odometry = dataclasses.replace(odometry, wheel_radius_m=overrides.wheel_radius_m)
     if overrides.track_m is not None:
-        if "body.track_m" not in vehicle.measured:
+        if GEOMETRY["track_m"] not in vehicle.measured:
             body = dataclasses.replace(body, track_m=overrides.track_m)
         odometry = dataclasses.replace(odometry, track_m=overrides.track_m)
     if overrides.antenna_m is not None:
@@ -213,14 +217,29 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
     return dataclasses.replace(vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors)
 
 
+def told_geometry(recordings: Sequence[Recording]) -> Overrides:
+    """What logs of one vehicle tell of its geometry.
+
+    Raises:
+        DataError: two of them tell another.
+    """
+    first = recordings[0]
+    for recording in recordings[1:]:
+        if recording.overrides != first.overrides:
+            raise DataError(
+                f"it tells another geometry of the vehicle than {first.name}", file=recording.name,
+                remedy="give logs of one vehicle, or the same wheel_radius_m, track_m, antenna_m and imu_m",
+            )  # fmt: skip
+    return first.overrides
+
+
 def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:
     """What `with_overrides` takes from a log, and what it leaves, in a sentence; none if it tells nothing."""
     told = {name: value for name, value in dataclasses.asdict(overrides).items() if value is not None}
     if not told:
         return ()
     note = f"the log's own geometry is used: {', '.join(f'{name} = {value}' for name, value in told.items())}"
-    body = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
-    kept = [body[name] for name in told if body.get(name) in vehicle.measured]
+    kept = [number for name, number in GEOMETRY.items() if name in told and number in vehicle.measured]
     if kept:
         note += f"; measured on this robot before, and kept for its body: {', '.join(kept)}"
     return (note,)

@@ -27,7 +27,11 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
     body = [
         _head(title, scores),
         _targets(scores),
-        figure(sheet, "Bars are 95 % intervals (Wilson). Severity 1 is the half-power point of each effect."),
+        figure(
+            sheet,
+            "Bars are 95 % intervals (Wilson). Severity 1 is where about half of all effects are seen; a "
+            "single one may be seen earlier or later.",
+        ),
         _verdicts(scores),
         _effects(scores),
         "<h2>Who was taken for whom</h2>",

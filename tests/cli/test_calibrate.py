@@ -53,7 +53,10 @@ def test_pieces_of_a_log(terrafusion, good_log: Path, tmp_path: Path) -> None:
     )
     assert done.status == 0, done.err
     found = json.loads((out / "calibration.json").read_text())
+    assert [name.partition("@")[2] for name in found["logs"]] == ["0-8", "8-16"]
+    assert 10.0 < found["seconds"] <= 16.0
     radius = found["parameters"]["vehicle.wheel.radius_m"]
+    assert 0.0 < radius["sigma"] < 0.005
     assert radius["value"] == pytest.approx(0.175, abs=4.0 * radius["sigma"])
     late = terrafusion("calibrate", f"{good_log}@900-950", "--parameters", names, "--out", out)
     assert late.status == 1

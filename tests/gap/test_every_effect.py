@@ -32,3 +32,17 @@ def test_an_unknown_effect_is_one_line_with_the_nearest(capsys: pytest.CaptureFi
     told = capsys.readouterr()
     assert told.out == ""
     assert told.err == "error: unknown effect 'gyro_bais'; did you mean gyro_bias or gyro_scale\n"
+
+
+def test_numbers_that_cannot_be_are_wrong_usage() -> None:
+    for words in (["--seed", "-1"], ["--runs", "0"], ["--references", "-2"]):
+        with pytest.raises(SystemExit) as stopped:
+            main(words)
+        assert stopped.value.code == 2
+
+
+def test_a_ground_that_is_not_known_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--terrain", "lava", "--effects", "gyro_bias"]) == 1
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert told.err.startswith("error: unknown terrain 'lava'; known are asphalt")

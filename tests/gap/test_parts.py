@@ -7,6 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.recording import Overrides
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.effects.reece import second_terramechanics
@@ -279,6 +281,20 @@ def test_other_terramechanics_are_no_candidate_unless_asked_for(monkeypatch: pyt
     assert name in catalogue.effect_names()
     assert Candidates.of().keys == CANDIDATES.keys
     assert Candidates.of([name]).effects == (name,)
+
+
+def test_the_geometry_that_logs_tell_is_said_and_has_to_be_one() -> None:
+    vehicle = load_vehicle("elevate")
+    plain = run(3)
+    told = dataclasses.replace(plain, name="told", overrides=Overrides(wheel_radius_m=0.17))
+    model, _, notes = starting_model([told, told], vehicle, None)
+    assert model.vehicle.wheel.radius_m == 0.17
+    assert notes == ["the log's own geometry is used: wheel_radius_m = 0.17"]
+    assert starting_model([plain], vehicle, None)[2] == []
+    with pytest.raises(
+        DataError, match=f"told: it tells another geometry of the vehicle than {plain.name}; give"
+    ):
+        starting_model([plain, told], vehicle, None)
 
 
 def test_factors_of_all_columns_are_those_of_each() -> None:

@@ -134,11 +134,13 @@ def test_what_was_calibrated_holds_against_the_geometry_that_a_log_assumes(tmp_p
     found = calibrate(log, "elevate", SOIL, NAMES)
     write_files(found, tmp_path, "elevate")
     known = load_vehicle(tmp_path / "vehicle.yaml")
+    assert "the log's own geometry is used: wheel_radius_m = 0.175, track_m = 0.51" in found.notes
     assert known == found.model.vehicle
     assert known.measured == ("body.mass_kg", "wheel.radius_m")
     assert with_overrides(known, log.overrides).wheel.radius_m == found["vehicle.wheel.radius_m"].value
     assert with_overrides(known, Overrides(track_m=0.7)).body.track_m == 0.7
     again = calibrate(log, known, SOIL, NAMES[:1])
+    assert any("kept for its body: wheel.radius_m" in note for note in again.notes)
     assert again.before.vehicle.wheel.radius_m == pytest.approx(TRUTH["vehicle.wheel.radius_m"], rel=0.01)
 
 

@@ -111,15 +111,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--references", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
+    if given.runs < 1 or min(given.references, given.seed) < 0:
+        parser.error("--runs is at least 1, --references and --seed at least 0")
     try:
         bench = Bench(load_vehicle(given.vehicle), given.terrain, given.runs, given.references, given.seed)
         cases = []
         for key in first_forms(given.effects).values():
             number = lookup(key)[1]
             cases += [(key, min(share * number.scale, number.high)) for share in given.sizes]
-        print("| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD))
+        head = "| " + " | ".join(HEAD) + " |\n|" + " --- |" * len(HEAD) + "\n"
         for (key, size), found in zip(cases, bench.diagnoses([dict([case]) for case in cases]), strict=True):
-            print(row(found, key, size), flush=True)
+            print(head + row(found, key, size), flush=True)
+            head = ""
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1

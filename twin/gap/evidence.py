@@ -36,7 +36,7 @@ from terrafusion.twin.identify.log import Log, grounds, prepare
 from terrafusion.twin.identify.model import Model
 from terrafusion.twin.identify.noise import Noise
 from terrafusion.twin.soil import SoilParams, load_soil
-from terrafusion.twin.vehicle import VehicleParams, geometry_notes, with_overrides
+from terrafusion.twin.vehicle import VehicleParams, geometry_notes, told_geometry, with_overrides
 
 Array = NDArray[np.float64]
 Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
@@ -88,9 +88,10 @@ def starting_model(
 
     Raises:
         ConfigError: a soil that was named is not known.
+        DataError: the logs tell different geometries.
     """
-    loaded = with_overrides(vehicle, recordings[0].overrides)
-    notes = list(geometry_notes(vehicle, recordings[0].overrides))
+    told = told_geometry(recordings)
+    loaded, notes = with_overrides(vehicle, told), list(geometry_notes(vehicle, told))
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
         return Model(loaded, {soil.name: soil}, loaded.effects), soil.name, notes

@@ -26,7 +26,13 @@ from terrafusion.twin.identify.sandwich import scattered
 from terrafusion.twin.identify.solver import OUTCOMES, Solution, solve
 from terrafusion.twin.scenario import MAX_SLOPE_DEG
 from terrafusion.twin.soil import SoilParams, load_soil
-from terrafusion.twin.vehicle import VehicleParams, geometry_notes, load_vehicle, with_overrides
+from terrafusion.twin.vehicle import (
+    VehicleParams,
+    geometry_notes,
+    load_vehicle,
+    told_geometry,
+    with_overrides,
+)
 
 Array = NDArray[np.float64]
 
@@ -116,7 +122,7 @@ def calibrate(
     _refuse_followed(numbers, logs)
     problem = Problem(logs, start, coordinates, robust=robust)
     solution, told = search(problem, progress)
-    notes = [*geometry_notes(robot, logs_in[0].overrides)]
+    notes = [*geometry_notes(robot, told_geometry(logs_in))]
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return _answer(problem, solution, told, [*notes, *misfits(problem, solution), *assumptions(problem)])
 
@@ -270,13 +276,7 @@ def _start(
     effects: Mapping[str, float],
 ) -> tuple[Model, str | None]:
     """The model to start from, and the name of the one ground where there is one for all logs."""
-    for recording in recordings[1:]:
-        if recording.overrides != recordings[0].overrides:
-            raise DataError(
-                f"it tells another geometry of the vehicle than {recordings[0].name}",
-                file=recording.name, remedy="calibrate logs of one vehicle only",
-            )  # fmt: skip
-    loaded, present = with_overrides(vehicle, recordings[0].overrides), {**vehicle.effects, **effects}
+    loaded, present = with_overrides(vehicle, told_geometry(recordings)), {**vehicle.effects, **effects}
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
         return Model(loaded, {soil.name: soil}, present), soil.name
