@@ -227,19 +227,27 @@ def told_geometry(recordings: Sequence[Recording]) -> Overrides:
     for recording in recordings[1:]:
         if recording.overrides != first.overrides:
             raise DataError(
-                f"it tells another geometry of the vehicle than {first.name}", file=recording.name,
+                f"it tells another geometry of the vehicle ({_listed(recording.overrides)}) than "
+                f"{first.name} ({_listed(first.overrides)})",
+                file=recording.name,
                 remedy="give logs of one vehicle, or the same wheel_radius_m, track_m, antenna_m and imu_m",
             )  # fmt: skip
     return first.overrides
 
 
+def _listed(overrides: Overrides) -> str:
+    """What a log tells of the geometry, in words."""
+    told = dataclasses.asdict(overrides).items()
+    return ", ".join(f"{name} = {value}" for name, value in told if value is not None) or "none"
+
+
 def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:
     """What `with_overrides` takes from a log, and what it leaves, in a sentence; none if it tells nothing."""
-    told = {name: value for name, value in dataclasses.asdict(overrides).items() if value is not None}
-    if not told:
+    if overrides == Overrides():
         return ()
-    note = f"the log's own geometry is used: {', '.join(f'{name} = {value}' for name, value in told.items())}"
-    kept = [number for name, number in GEOMETRY.items() if name in told and number in vehicle.measured]
+    note = f"the log's own geometry is used: {_listed(overrides)}"
+    told = [number for name, number in GEOMETRY.items() if getattr(overrides, name) is not None]
+    kept = [number for number in told if number in vehicle.measured]
     if kept:
         note += f"; measured on this robot before, and kept for its body: {', '.join(kept)}"
     return (note,)
