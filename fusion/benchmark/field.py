@@ -45,7 +45,7 @@ def logs_at_hand(starts: int) -> list[Log]:
 
 def drives_of(log: Log) -> list[Drive | Refusal]:
     """All drives of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
-    return each_drive(log.name, lambda name, recording: _drives(log, name, recording))
+    return each_drive(log.name, lambda name, _, recording: _drives(log, name, recording))
 
 
 def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:

@@ -40,6 +40,8 @@ UNUSED_WEIGHT = 0.01
 WHITE_SHARE = 0.2
 """Share of a fix's variance that is new at every fix; the rest drifts slowly. More is taken to be new
 where the fixes scatter more about the dead-reckoned path."""
+ALL_NEW = 0.75
+"""A share from which on all is taken to be new: the share heard is off by a tenth or two."""
 LIE = 2.0
 """Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
 OPTIMISM = 3.0
@@ -136,7 +138,7 @@ class GnssUpdater:
                 used |= self._place(chain, fix)
             else:
                 self.track.add(fix)
-                self._hear(self.track.scatter())
+                self._hear(self.track.scatter(), self.track.news())
                 if self.slide.grip is not None:
                     self.slide.grip.seen(fix, self.scale)
                 renewed = self._change_class(chain, k, fix)
@@ -157,10 +159,13 @@ class GnssUpdater:
         self.local, self.last_used_ns = False, fix.t_ns
         return True
 
-    def _hear(self, scatter: float) -> None:
-        """Take in how the fixes scatter about the path, over what they claim."""
+    def _hear(self, scatter: float, news: float) -> None:
+        """Take in how the fixes scatter about the path, and how much of that is new at every fix, over what
+        they claim."""
         self.scale = scatter if scatter > LIE else 1.0
-        self.white = WHITE_SHARE if math.isnan(scatter) else min(max(scatter**2, WHITE_SHARE), 1.0)
+        self.white = WHITE_SHARE if math.isnan(news) else max(news, WHITE_SHARE)
+        if self.white > ALL_NEW:
+            self.white = 1.0
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Let the drift start anew where the class of fix changes; True when it does.

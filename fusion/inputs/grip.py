@@ -36,8 +36,11 @@ Array = NDArray[np.float64]
 GRIPS_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
 """Grips that are told apart: mu g from ice to dry ground."""
 SLIPPERY_MPS2 = 2.0
-"""Up to this grip, of ice and of wet or snowy ground, friction leads; with more, wheels lead as well."""
+"""Up to this grip, of ice and wet or snowy ground, friction leads; with more, wheels lead nearly as well."""
 SLIPPERY = GRIPS_MPS2[GRIPS_MPS2 <= SLIPPERY_MPS2]
+SURE = 0.9999
+"""Probability of friction, whatever the grip, from which it leads on dry ground, too: what else bends a way
+(soft ground, a hill, a jump of fixes) passes for friction sooner than for rolling. Chosen on field logs."""
 USUAL_MPS2, USUAL_SPREAD = 1.0, 0.7
 """Grip of a robot that slides, before any fix, and standard deviation of its logarithm (assumed)."""
 HOLDS = 0.9
@@ -89,8 +92,15 @@ class Grip:
 
     @property
     def slides(self) -> bool:
-        """Whether fixes have shown that friction on slippery ground tells the robot's way best."""
-        return float(self._weights()[: len(SLIPPERY)].sum()) > 0.5
+        """Whether fixes have shown that friction tells the robot's way best."""
+        return self._leading() is not None
+
+    def _leading(self) -> slice | None:
+        """The grips that lead: those of slippery ground where they are likely, all where friction is sure."""
+        weight = self._weights()
+        if float(weight[: len(SLIPPERY)].sum()) > 0.5:
+            return slice(len(SLIPPERY))
+        return slice(len(GRIPS_MPS2)) if float(weight[:-1].sum()) > SURE else None
 
     @property
     def mps2(self) -> float:
@@ -105,9 +115,10 @@ class Grip:
 
     def _known(self) -> tuple[float, float]:
         """Mean and standard deviation of the grip, m/s2."""
-        weight = self._weights()[: len(SLIPPERY)]
-        mean = float(weight @ SLIPPERY / weight.sum())
-        return mean, math.sqrt(float(weight @ (SLIPPERY - mean) ** 2 / weight.sum()))
+        leading = self._leading() or slice(len(SLIPPERY))
+        weight, grips = self._weights()[leading], GRIPS_MPS2[leading]
+        mean = float(weight @ grips / weight.sum())
+        return mean, math.sqrt(float(weight @ (grips - mean) ** 2 / weight.sum()))
 
     def restart(self) -> None:
         """Forget the ways, not the grip: the robot was set elsewhere, or its wheels were silent."""
@@ -217,7 +228,7 @@ class Grip:
     def _note(self, t_ns: int) -> None:
         now, told = self.mps2 if self.slides else math.inf, self._told_mps2
         if now != told and (math.isinf(told) or abs(now - told) > TELL_STEP * told):
-            best = "friction of slippery ground" if self.slides else "rolling of the wheels"
+            best = "friction" if self.slides else "rolling of the wheels"
             why = f"grip: {best} tells the way between fixes best"
             self._tell(WeightChange(t_ns, "wheels", told, now, "m/s2", why))
             self._told_mps2 = now

@@ -27,6 +27,10 @@ SCATTER_FIXES = 21
 """Fixes over which a receiver's scatter is judged; the median bears ten wild ones."""
 RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
 """Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
+LEAST_NEWS, MOST_NEWS = 8.0, 300.0
+"""Second differences from which on the share of a fix that is new is known, and how many are remembered."""
+WILD = 3.0
+"""More than so many times the claim of its fixes a second difference tells no more than that much."""
 SLIP_CHANGE = 0.1
 """How far slip may change from fix to fix and so bend the dead-reckoned path (assumed)."""
 LEAST_RATIO, MOST_RATIO = 0.3, 1.7
@@ -82,6 +86,7 @@ class MotionTrack:
         self.pairs: list[Pair] = []
         self._yaw_chain = 0.0
         self._turned = 0
+        self._told = np.zeros(2)
 
     def step(self, chain: Chain) -> None:
         """Carry the path to the newest keyframe, by its wheels (or its speed, where they are refused)."""
@@ -107,7 +112,11 @@ class MotionTrack:
         old = bisect.bisect_left(self._t_ns, t_ns - round(KEPT_S * 1e9))
         if old > 50:
             del self._t_ns[:old], self._z[:old], self._yaw[:old]
-            self.pairs = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
+            kept = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
+            # The differences that go with them, which their two neighbours complete.
+            self._told += self._tell(self.pairs[: len(self.pairs) - len(kept) + 2])
+            self._told *= min(MOST_NEWS / max(self._told[1], 1.0), 1.0)
+            self.pairs = kept
 
     def add(self, fix: GnssFix) -> None:
         """Set a fix beside the path, in its place in time."""
@@ -131,17 +140,41 @@ class MotionTrack:
         recent = self.pairs[-SCATTER_FIXES:]
         if len(recent) < 8:
             return math.nan
-        z, fix = np.array([p.z for p in recent]), np.array([p.fix for p in recent])
-        t = np.array([p.t_ns - recent[0].t_ns for p in recent]) * 1e-9
-        gap = np.diff(t)
-        even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
-        if even.sum() < 6:
+        seen, bend, claimed = self._second_differences(recent)
+        if len(seen) < 6:
             return math.nan
+        return math.sqrt(_median(np.maximum(2.0 * seen / RAYLEIGH_MEDIAN - bend, 0.0) / claimed))
+
+    def news(self) -> float:
+        """Variance that is new at every fix, over what the fixes claim; NaN if too few tell.
+
+        The mean of the second differences (`scatter`), of which many more are remembered. Squares of white
+        noise are exponential, and those beyond `WILD` are censored there, so that wild fixes say no more than
+        others (Epstein and Sobel 1953, J. Am. Stat. Assoc. 48). Where slip may have bent the path by more
+        than the fixes claim, they tell nothing of the receiver.
+        """
+        total, counted = self._told + self._tell(self.pairs)
+        return float(total / counted) if counted >= LEAST_NEWS else math.nan
+
+    def _tell(self, pairs: list[Pair]) -> Array:
+        """Sum and number (2,) of second differences over the claims, for `news`."""
+        if len(pairs) < 3:
+            return np.zeros(2)
+        seen, bend, claimed = self._second_differences(pairs)
+        share = (seen / claimed)[bend < claimed]
+        return np.array([np.minimum(share, WILD).sum(), np.count_nonzero(share < WILD)])
+
+    def _second_differences(self, pairs: list[Pair]) -> tuple[Array, Array, Array]:
+        """Squares (m2, each axis) of second differences of fix minus path where fixes come evenly, what slip
+        may add to them, and what the claims would."""
+        z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
+        gap = np.diff(np.array([p.t_ns - pairs[0].t_ns for p in pairs]) * 1e-9)
+        even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
         rest = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
-        seen = np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2 / RAYLEIGH_MEDIAN
+        seen = 0.5 * np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2
         bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
-        claimed = 6.0 * np.array([p.sigma_m for p in recent])[1:-1] ** 2
-        return math.sqrt(_median(np.maximum(seen - bend, 0.0)[even] / claimed[even]))
+        claimed = 6.0 * np.array([p.sigma_m for p in pairs])[1:-1] ** 2
+        return seen[even], bend[even], claimed[even]
 
     def smooth_at(self, t_ns: int) -> bool:
         """Whether the fix of `t_ns` lies where the three before it lead, as they claim; False with fewer.

@@ -12,7 +12,15 @@ import numpy as np
 
 from terrafusion.datasets.atomic import write_atomically
 from terrafusion.fusion.report import style
-from terrafusion.fusion.scores.field_summary import OWN, Line, condense, in_order, verdicts
+from terrafusion.fusion.scores.field_summary import (
+    OWN,
+    Beside,
+    Line,
+    beside_each,
+    condense,
+    in_order,
+    verdicts,
+)
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,7 +39,7 @@ def write(out: Path, runs: Sequence[Run], refusals: Sequence[Refusal]) -> str:
         TerrafusionError: the folder cannot be written.
     """
     lines = condense(runs)
-    text = markdown(lines, refusals)
+    text = markdown(lines, refusals, beside_each(runs))
     for name, rows in (("runs", runs), ("lines", lines), ("refused", refusals)):
         write_atomically(out / f"{name}.csv", lambda path, rows=rows: _csv(path, rows))  # type: ignore[misc]
     write_atomically(out / "field_table.md", lambda path: path.write_text(text, encoding="utf-8"))
@@ -41,13 +49,17 @@ def write(out: Path, runs: Sequence[Run], refusals: Sequence[Refusal]) -> str:
     return text
 
 
-def markdown(lines: Sequence[Line], refusals: Sequence[Refusal]) -> str:
-    """Three tables (verdicts, scored logs, logs without reference) and the refused logs."""
+def markdown(lines: Sequence[Line], refusals: Sequence[Refusal], beside: Sequence[Beside] = ()) -> str:
+    """Four tables (verdicts, each baseline, scored logs, logs without reference) and the refused logs."""
     scored = [line for line in lines if line.error_m is not None]
     others = [line for line in lines if line.error_m is None]
     parts = []
     if any(line.mode == OWN and line.ratio is not None for line in lines):
         parts.append(f"## {OWN.capitalize()} beside the best baseline\n\n{_verdict_table(lines)}")
+    if beside:
+        head = [field.name.replace("_", " ") for field in dataclasses.fields(Beside)]
+        rows = [dataclasses.astuple(row) for row in beside]
+        parts.append(f"## {OWN.capitalize()} beside each baseline\n\n{_table(head, rows)}")
     if scored:
         parts.append(f"## Scored logs\n\n{_scored_table(scored)}")
     if others:
@@ -102,11 +114,12 @@ def _verdict_table(lines: Sequence[Line]) -> str:
         "logs",
         "better",
         "worse",
+        "surely worse",
         "mean of error over best baseline's",
         "largest",
         "% of distance",
     )
-    keys = ("ground", "test", "logs", "better", "worse", "mean_ratio", "worst", "percent")
+    keys = ("ground", "test", "logs", "better", "worse", "surely_worse", "mean_ratio", "worst", "percent")
     return _table(head, [[row[key] for key in keys] for row in verdicts(lines)])
 
 
@@ -118,7 +131,9 @@ def _scored_table(lines: Sequence[Line]) -> str:
     rows = []
     for by_mode in _by_test(lines):
         first, own = next(iter(by_mode.values())), by_mode.get(OWN)
-        ratio = "-" if own is None or own.ratio is None else f"{own.ratio:.2f} ({own.baseline})"
+        ratio = (
+            "-" if own is None or own.ratio is None else f"{own.ratio:.2f}{_interval(own)} ({own.baseline})"
+        )
         errors = [by_mode[mode].error_m if mode in by_mode else None for mode in modes]
         rows.append(
             [first.log, first.ground or "-", first.reference, first.test, first.runs, first.distance_m,
@@ -147,6 +162,10 @@ def _by_test(lines: Sequence[Line]) -> list[dict[str, Line]]:
     for line in lines:
         groups.setdefault((line.log, line.test), {})[line.mode] = line
     return list(groups.values())
+
+
+def _interval(line: Line) -> str:
+    return "" if line.ratio_low is None else f" [{line.ratio_low:.2f}, {line.ratio_high:.2f}]"
 
 
 def _diverged(by_mode: dict[str, Line]) -> str:

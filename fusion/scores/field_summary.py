@@ -15,6 +15,7 @@ OWN = "adaptive"
 """The mode that is compared; all others are baselines."""
 EVEN = 0.03
 """Ratios this close to 1 count as neither better nor worse."""
+DRAWS = 400
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,9 @@ class Line:
     """One log, test and mode: medians over its runs.
 
     `ratio` is its error over that of the best baseline of the same log and
-    test, `baseline` the name of that; `diverged` how many runs did.
+    test, `baseline` the name of that, `ratio_low` and `ratio_high` the 95 %
+    interval that outages and noise leave (None where there is one run);
+    `diverged` how many runs did.
     """
 
     log: str
@@ -36,6 +39,8 @@ class Line:
     percent: float | None
     nees: float | None
     ratio: float | None
+    ratio_low: float | None
+    ratio_high: float | None
     baseline: str
     diverged: int
     top_speed_mps: float
@@ -49,11 +54,37 @@ def condense(runs: Sequence[Run]) -> list[Line]:
     groups: dict[tuple[str, str], dict[str, list[Run]]] = {}
     for run in runs:
         groups.setdefault((run.log, run.test), {}).setdefault(run.mode, []).append(run)
-    return [
-        _line(mode, found, *_best_baseline(by_mode))
-        for by_mode in groups.values()
-        for mode, found in by_mode.items()
-    ]
+    out = []
+    for by_mode in groups.values():
+        baseline = _best_baseline(by_mode)
+        out += [_line(mode, found, baseline, by_mode.get(baseline, [])) for mode, found in by_mode.items()]
+    return out
+
+
+def ratio_of(own: Sequence[Run], other: Sequence[Run]) -> tuple[float | None, float | None, float | None]:
+    """Median error over that of another mode, and the ends of its 95 % interval.
+
+    The interval is a bootstrap over what the two ran both: outages (or drives) are drawn anew, then the
+    noise of each (Davison and Hinkley 1997, Bootstrap Methods, sec. 3.8). None where nothing can be drawn.
+    """
+    top, below = median([r.error_m for r in own]), median([r.error_m for r in other])
+    ratio = top / below if top is not None and below else None
+    theirs = {(r.drive, r.start_s, r.seed): r.error_m for r in other}
+    pairs: dict[tuple[int, float | None], list[tuple[float, float]]] = {}
+    for run in own:
+        error = theirs.get((run.drive, run.start_s, run.seed))
+        if run.error_m is not None and error is not None:
+            pairs.setdefault((run.drive, run.start_s), []).append((run.error_m, error))
+    clusters = [np.array(found) for found in pairs.values()]
+    if ratio is None or sum(map(len, clusters)) < 2:
+        return ratio, None, None
+    rng, drawn = np.random.default_rng(0), np.empty(DRAWS)
+    for i in range(DRAWS):
+        chosen = [clusters[j] for j in rng.integers(len(clusters), size=len(clusters))]
+        both = np.median(np.vstack([c[rng.integers(len(c), size=len(c))] for c in chosen]), axis=0)
+        drawn[i] = both[0] / max(both[1], 1e-9)
+    low, high = np.percentile(drawn, [2.5, 97.5])
+    return ratio, float(low), float(high)
 
 
 def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]:
@@ -67,10 +98,47 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
         ratios = np.array([line.ratio for line in found], dtype=float)
         row: dict[str, str | int | float | None] = {"ground": ground, "test": test, "logs": len(found)}
         row |= {"better": int((ratios < 1 - EVEN).sum()), "worse": int((ratios > 1 + EVEN).sum())}
+        row["surely_worse"] = sum((line.ratio_low or 0.0) > 1 + EVEN for line in found)
         row["mean_ratio"] = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
         row["worst"] = float(ratios.max())
         row["percent"] = median([line.percent for line in found])
         out.append(row)
+    return out
+
+
+@dataclass(frozen=True)
+class Beside:
+    """`OWN` beside one baseline on one kind of ground: `rows` are logs and tests; `better` and `worse` by
+    more than `EVEN`, `surely_worse` with the whole interval."""
+
+    ground: str
+    baseline: str
+    rows: int
+    mean_ratio: float
+    better: int
+    worse: int
+    surely_worse: int
+    worst: float
+
+
+def beside_each(runs: Sequence[Run]) -> list[Beside]:
+    """`OWN` beside every baseline, by ground."""
+    groups: dict[tuple[str, str], dict[str, list[Run]]] = {}
+    for run in runs:
+        groups.setdefault((run.log, run.test), {}).setdefault(run.mode, []).append(run)
+    found: dict[tuple[str, str], list[tuple[float, float]]] = {}
+    for by_mode in groups.values():
+        for mode, theirs in by_mode.items():
+            ratio, low, _ = ratio_of(by_mode.get(OWN, []), theirs) if mode != OWN else (None, None, None)
+            if ratio is not None:
+                found.setdefault((theirs[0].ground or "not labelled", mode), []).append((ratio, low or 0.0))
+    out = []
+    for (ground, baseline), pairs in sorted(found.items()):
+        ratios, lows = np.array(pairs).T
+        mean = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
+        better, worse, surely = ((ratios < 1 - EVEN), (ratios > 1 + EVEN), (lows > 1 + EVEN))
+        counts = int(better.sum()), int(worse.sum()), int(surely.sum())
+        out.append(Beside(ground, baseline, len(pairs), mean, *counts, float(ratios.max())))
     return out
 
 
@@ -85,15 +153,15 @@ def median(values: Sequence[float | None]) -> float | None:
     return float(np.median(known)) if known else None
 
 
-def _best_baseline(by_mode: dict[str, list[Run]]) -> tuple[float | None, str]:
+def _best_baseline(by_mode: dict[str, list[Run]]) -> str:
     errors = {mode: median([r.error_m for r in runs]) for mode, runs in by_mode.items() if mode != OWN}
     known = {mode: error for mode, error in errors.items() if error is not None}
-    best = min(known, key=lambda mode: known[mode], default="")
-    return known.get(best), best
+    return min(known, key=lambda mode: known[mode], default="")
 
 
-def _line(mode: str, runs: list[Run], best_m: float | None, baseline: str) -> Line:
+def _line(mode: str, runs: list[Run], baseline: str, best: list[Run]) -> Line:
     first, error = runs[0], median([r.error_m for r in runs])
+    ratio, low, high = ratio_of(runs, best) if mode != baseline else (1.0 if error else None, None, None)
     return Line(
         log=first.log,
         ground=first.ground,
@@ -105,7 +173,9 @@ def _line(mode: str, runs: list[Run], best_m: float | None, baseline: str) -> Li
         error_m=error,
         percent=median([r.percent for r in runs]),
         nees=median([r.nees for r in runs]),
-        ratio=error / best_m if error is not None and best_m else None,
+        ratio=ratio,
+        ratio_low=low,
+        ratio_high=high,
         baseline=baseline,
         diverged=sum(bool(r.diverged) for r in runs),
         top_speed_mps=float(np.max([r.top_speed_mps for r in runs])),

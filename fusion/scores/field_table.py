@@ -64,7 +64,7 @@ SET_GROUND = {"husky_parkinglot": "firm"}
 @dataclass(frozen=True)
 class Run:
     """One replay: of the whole log (`test` "whole"; "aided" with fixes made from its truth), or with one
-    outage ("outage 60 s" from `start_s`).
+    outage ("outage 60 s" from `start_s`); on the `drive`th drive of the log, made fixes with noise of `seed`.
 
     `error_m` is, whole and aided: the root mean square against truth, or the median
     distance from fixes kept back; in an outage: the error at its end.
@@ -90,6 +90,8 @@ class Run:
     seconds: float
     realtime: float
     latency_p99_ms: float
+    drive: int = 0
+    seed: int = 0
 
     @classmethod
     def read(cls, raw: dict[str, Any]) -> Run:
@@ -113,24 +115,32 @@ class Refusal:
 
 @dataclass(frozen=True)
 class Task:
-    """One log in one mode, so that tasks can run beside each other."""
+    """One log in one mode, so that tasks can run beside each other.
+
+    `again` runs what other noise changes: fixes made from the truth, no whole drives, no fixes of a receiver.
+    """
 
     log: str
     mode: str
     most_starts: int
     seed: int
+    again: bool = False
 
     @property
     def key(self) -> str:
         """Its name as that of a file."""
-        return f"{quote(self.log, safe='')}-{self.mode}-{self.most_starts}-{self.seed}"
+        name = f"{quote(self.log, safe='')}-{self.mode}-{self.most_starts}-{self.seed}"
+        return f"{name}-again" if self.again else name
 
 
-def tasks_of(logs: Sequence[str], modes: Sequence[str], most_starts: int, seed: int) -> list[Task]:
-    """The tasks in the order in which they are run: `FIRST_MODES` on all logs, then the others."""
+def tasks_of(
+    logs: Sequence[str], modes: Sequence[str], most_starts: int, seed: int, seeds: int = 1
+) -> list[Task]:
+    """The tasks in the order in which they are run: `FIRST_MODES` on all logs, the others, further seeds."""
     late = [mode not in FIRST_MODES for mode in modes]
     return [
-        Task(log, mode, most_starts, seed)
+        Task(log, mode, most_starts, seed + more, more > 0)
+        for more in range(seeds)
         for turn in (False, True)
         for log in logs
         for mode, is_late in zip(modes, late, strict=True)
@@ -159,14 +169,13 @@ def run_tasks(
             progress(f"{task.log}, {task.mode}")
 
 
-def collect(
-    logs: Sequence[str], modes: Sequence[str], most_starts: int, seed: int, out: Path
-) -> tuple[list[Run], list[Refusal], list[Task]]:
+def collect(tasks: Sequence[Task], out: Path) -> tuple[list[Run], list[Refusal], list[Task]]:
     """The runs that `out` holds, log by log, the logs that were refused, and the tasks still missing."""
     runs: list[Run] = []
     refusals: dict[Refusal, None] = {}
     missing: list[Task] = []
-    for task in (Task(log, mode, most_starts, seed) for log in logs for mode in modes):
+    logs, modes = list(dict.fromkeys(t.log for t in tasks)), list(dict.fromkeys(t.mode for t in tasks))
+    for task in sorted(tasks, key=lambda t: (logs.index(t.log), modes.index(t.mode), t.seed)):
         part = read_part(out, task.key, log_state(task.log))
         if part is None:
             missing.append(task)
@@ -190,11 +199,15 @@ def catalogued() -> list[str]:
 
 def run_task(task: Task) -> tuple[Task, list[Run | Refusal]]:
     """The task, and all runs of its log in its mode; what stops one becomes a line that says so."""
-    return task, each_drive(task.log, lambda log, drive: _runs(dataclasses.replace(task, log=log), drive))
+    return task, each_drive(
+        task.log, lambda log, n, drive: _runs(dataclasses.replace(task, log=log), n, drive)
+    )
 
 
-def each_drive(log: str, run: Callable[[str, Recording], Iterable[Found | Refusal]]) -> list[Found | Refusal]:
-    """What `run` gives for name and recording of every drive of a log; what stops it becomes a refusal."""
+def each_drive(
+    log: str, run: Callable[[str, int, Recording], Iterable[Found | Refusal]]
+) -> list[Found | Refusal]:
+    """What `run` gives for name, number and recording of every drive of a log; what stops it is a refusal."""
     out: list[Found | Refusal] = []
     try:
         recordings, joined = _drives(log)
@@ -204,7 +217,7 @@ def each_drive(log: str, run: Callable[[str, Recording], Iterable[Found | Refusa
         name = log if joined or len(recordings) == 1 else f"{log}#{i}"
         try:
             with errors_of(name):
-                out += run(name, recording)
+                out += run(name, i, recording)
         except (TerrafusionError, *UNFORESEEN) as error:
             out.append(_refusal(name, error))
     return out
@@ -239,22 +252,26 @@ def _drives(log: str) -> tuple[list[Recording], bool]:
     return drives, True
 
 
-def _runs(task: Task, recording: Recording) -> Iterator[Run | Refusal]:
+def _runs(task: Task, drive: int, recording: Recording) -> Iterator[Run | Refusal]:
     check_log(recording)
     reference = reference_of(recording)
-    yield _tried(task, recording, reference, "whole", None)
+    made = reference == "truth" and recording.gnss is None
+    if task.again and not made:
+        return
+    if not task.again:
+        yield _tried(task, drive, recording, reference, "whole", None)
     if reference == "none":
         return
-    if reference == "truth" and recording.gnss is None:
+    if made:
         recording, reference = aided_by_truth(recording, task.seed), "truth, fixes made from it"
-        yield _tried(task, recording, reference, "aided", None)
+        yield _tried(task, drive, recording, reference, "aided", None)
     for outage in outages_of(recording, task.most_starts):
         part, test = until(recording, outage.start_s + outage.seconds + 0.5), f"outage {outage.seconds:g} s"
-        yield _tried(task, part, reference, test, outage)
+        yield _tried(task, drive, part, reference, test, outage)
 
 
 def _tried(
-    task: Task, recording: Recording, reference: str, test: str, outage: Outage | None
+    task: Task, drive: int, recording: Recording, reference: str, test: str, outage: Outage | None
 ) -> Run | Refusal:
     """One replay; what stops it becomes a line of the table, so that one log does not cost all others."""
     where = f"{task.log}, {test}" + ("" if outage is None else f" from {outage.start_s:.1f} s")
@@ -264,7 +281,7 @@ def _tried(
         return _refusal(where, error)
     except UNFORESEEN as error:
         return _refusal(f"{where}, {task.mode}", error)
-    return _run(task, result, reference, test, outage)
+    return dataclasses.replace(_run(task, result, reference, test, outage), drive=drive, seed=task.seed)
 
 
 def check_log(recording: Recording) -> None:
@@ -378,25 +395,27 @@ def main() -> int:
     )
     parser.add_argument("--starts", type=int, default=4, help="outages of each length in a log, at most")
     parser.add_argument("--seed", type=int, default=1, help="of the noise on fixes made from truth")
+    parser.add_argument("--seeds", type=int, default=1, help="how many draws of that noise, from --seed on")
     parser.add_argument("--jobs", type=int, default=1, help="processes beside each other")
     parser.add_argument("--collect", action="store_true", help="run nothing, write what has been run")
     words = parser.parse_args()
+    if words.seeds < 1:
+        parser.error("--seeds must be 1 or more")
     logs = list(words.logs) if words.logs else catalogued()
+    tasks = tasks_of(logs, words.modes, words.starts, words.seed, words.seeds)
     try:
-        _table(words.out, words.modes, logs, words.starts, words.seed, None if words.collect else words.jobs)
+        _table(words.out, tasks, None if words.collect else words.jobs)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
     return 0
 
 
-def _table(
-    out: Path, modes: Sequence[str], logs: Sequence[str], most_starts: int, seed: int, jobs: int | None
-) -> None:
+def _table(out: Path, tasks: Sequence[Task], jobs: int | None) -> None:
     """Run what is missing, unless `jobs` is None, and write the tables of what is there."""
     from terrafusion.fusion.scores.field_page import write
 
-    if not logs:
+    if not tasks:
         raise DataError(
             "no field log is at hand", remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`"
         )
@@ -407,11 +426,11 @@ def _table(
             print(f"\r\x1b[K{time.monotonic() - begun:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
 
     if jobs is not None:
-        run_tasks(tasks_of(logs, modes, most_starts, seed), out, jobs=jobs, progress=progress)
+        run_tasks(tasks, out, jobs=jobs, progress=progress)
     progress("")
-    runs, refusals, missing = collect(logs, modes, most_starts, seed, out)
+    runs, refusals, missing = collect(tasks, out)
     print(write(out, runs, refusals))
-    rest = f"; {len(missing)} of {len(logs) * len(modes)} logs and modes not run yet" if missing else ""
+    rest = f"; {len(missing)} of {len(tasks)} logs and modes not run yet" if missing else ""
     print(f"{time.monotonic() - begun:.0f} s; written to {out}{rest}")
 
 

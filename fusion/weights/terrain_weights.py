@@ -61,12 +61,14 @@ class TerrainWeights:
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._told: Array | None = None
+        self._grade = 0.0
         fixed = config.tuning.fixed.of(config.policy.fixed)
         if model.slip_only:
             # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
-        self.row = self.policy.blend(self._probabilities) if self.adaptive else fixed
+        self._assumed = model.prior(self.detector.classes) if model.slip_only else None
+        self.row = self._blended() if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
         self._rig = config.rig
@@ -75,7 +77,6 @@ class TerrainWeights:
         self.single = weighting_for(config, self)
         self._before = self._probabilities
         self._next_ns = 0
-        self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
 
@@ -175,11 +176,25 @@ class TerrainWeights:
             slip_sigma=slip_sigma,
         )
 
+    def _blended(self) -> SensorNoise:
+        """The policy by the posterior.
+
+        For a robot that the model does not know, a ground counts by what evidence has added to its prior: the
+        pooled row, which holds without any, was fitted to all grounds, and has the doubt between them in it.
+        """
+        p = self._probabilities
+        if self._assumed is not None and self._told is None:
+            p = np.maximum(p - self._assumed, 0.0) / (1.0 - self._assumed)
+            unknown = self.detector.classes.index(UNKNOWN)
+            p[unknown] = 0.0
+            p[unknown] = 1.0 - p.sum()
+        return self.policy.blend(p, self._grade)
+
     def _reweight(self, t_ns: int) -> None:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.row = self.policy.blend(p, self._grade)
+        self.row = self._blended()
         if self._noted is None:  # not started yet: nothing to change from
             return
         before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)

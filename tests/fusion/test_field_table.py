@@ -254,17 +254,17 @@ def test_a_stopped_table_goes_on_and_what_it_has_can_be_collected(
     monkeypatch.setattr(field_table, "run_task", fake)
     with pytest.raises(KeyboardInterrupt):
         run_tasks(tasks, tmp_path)
-    runs, refusals, missing = collect(logs, modes, 1, 1, tmp_path)
+    runs, refusals, missing = collect(tasks, tmp_path)
     assert [(r.log, r.mode) for r in runs] == [("a", "adaptive")]
     assert missing == tasks[1:]
     run_tasks(tasks, tmp_path)
     assert begun == [tasks[0], tasks[1], *tasks[1:]]
-    runs, refusals, missing = collect(logs, modes, 1, 1, tmp_path)
+    runs, refusals, missing = collect(tasks, tmp_path)
     assert [(r.log, r.mode, r.error_m) for r in runs] == [("a", mode, 0.1 + 0.2) for mode in modes]
     assert np.isnan(runs[0].top_speed_mps)
     assert (refusals, missing) == ([Refusal("b", "has no wheels")], [])
     monkeypatch.setattr(parts, "sources_sha256", lambda: "other")
-    assert collect(logs, modes, 1, 1, tmp_path)[2] == tasks
+    assert collect(tasks, tmp_path)[2] == tasks
 
 
 def test_a_log_is_read_once_for_modes_that_follow_each_other(
