@@ -20,7 +20,14 @@ from terrafusion.datasets.errors import DataError
 from terrafusion.datasets.recording import Imu, Recording, Terrain, Wheels
 from terrafusion.fusion.scores import field_table, parts
 from terrafusion.fusion.scores.field_page import markdown, plot_lines, write
-from terrafusion.fusion.scores.field_summary import condense, in_order, verdicts
+from terrafusion.fusion.scores.field_summary import (
+    Beside,
+    beside_each,
+    condense,
+    in_order,
+    ratio_of,
+    verdicts,
+)
 from terrafusion.fusion.scores.field_table import (
     Refusal,
     Run,
@@ -42,6 +49,7 @@ from terrafusion.fusion.scores.outage_plan import (
     plan_outages,
     until,
 )
+from terrafusion.twin.simulate import simulate
 
 SECOND_NS = 1_000_000_000
 
@@ -176,6 +184,82 @@ def test_lines_are_medians_over_starts() -> None:
     runs = [made_run("a", "fixed", e, test="outage 30 s", start_s=float(i)) for i, e in enumerate(errors)]
     (line,) = condense(runs)
     assert (line.error_m, line.runs) == (2.0, 3)
+
+
+def test_the_interval_of_a_ratio_is_over_outages_and_noise() -> None:
+    def runs(mode: str, times: float, outages: int, seeds: int) -> list[Run]:
+        rng = np.random.default_rng(1)
+        return [
+            made_run("a", mode, times * e, test="outage 30 s", start_s=float(i), seed=seed)
+            for i in range(outages)
+            for seed, e in enumerate(rng.uniform(1.0, 3.0, seeds))
+        ]
+
+    def unlike(found: list[Run]) -> list[Run]:
+        rng = np.random.default_rng(2)
+        return [dataclasses.replace(r, error_m=float(rng.uniform(1.0, 3.0))) for r in found]
+
+    own, other = runs("adaptive", 1.5, 8, 3), runs("fixed", 1.0, 8, 3)
+    assert ratio_of(own, other) == pytest.approx((1.5, 1.5, 1.5))  # paired: the same draws of both
+    ratio, low, high = ratio_of(unlike(own), other)
+    assert ratio is not None
+    assert low is not None
+    assert high is not None
+    assert low < ratio < high
+    assert ratio_of(own[::-1], other)[1:] == pytest.approx(ratio_of(own, other)[1:])
+    assert ratio_of(own[:1], other[:1]) == (pytest.approx(1.5), None, None)
+    assert ratio_of(own, [])[0] is None
+
+
+def test_an_interval_holds_the_ratio_as_often_as_it_says() -> None:
+    """Both modes have errors of one distribution, twelve outages: 1 is inside in about 95 of 100."""
+    rng, inside, n = np.random.default_rng(3), 0, 200
+    for _ in range(n):
+        both = [
+            [
+                made_run("a", mode, float(np.exp(e)), start_s=float(i))
+                for i, e in enumerate(rng.normal(size=12))
+            ]
+            for mode in ("adaptive", "fixed")
+        ]
+        _, low, high = ratio_of(*both)
+        assert low is not None
+        assert high is not None
+        inside += low <= 1.0 <= high
+    assert inside / n > 0.88
+
+
+def test_own_mode_is_set_beside_each_baseline_by_ground() -> None:
+    runs = [
+        made_run("a", "adaptive", 1.0), made_run("a", "fixed", 2.0), made_run("a", "robust", 0.5),
+        made_run("b", "adaptive", 3.0, ground="slipping"), made_run("b", "fixed", 3.0, ground="slipping"),
+    ]  # fmt: skip
+    assert beside_each(runs) == [
+        Beside("firm", "fixed", 1, pytest.approx(0.5), 1, 0, 0, 0.5),
+        Beside("firm", "robust", 1, pytest.approx(2.0), 0, 1, 0, 2.0),
+        Beside("slipping", "fixed", 1, pytest.approx(1.0), 0, 0, 0, 1.0),
+    ]
+    sure = [
+        made_run("a", mode, e * times, start_s=float(i))
+        for mode, times in (("adaptive", 1.2), ("fixed", 1.0))
+        for i, e in enumerate((1.0, 2.0, 3.0))
+    ]
+    assert beside_each(sure)[0].surely_worse == 1
+    assert "| firm | fixed | 1 | 1.20 | 0 | 1 | 1 | 1.20 |" in markdown([], [], beside_each(sure))
+
+
+def test_further_noise_is_drawn_for_made_fixes_alone() -> None:
+    tasks = tasks_of(["a"], ["fixed", "robust"], 2, 5, seeds=3)
+    assert [(t.mode, t.seed, t.again) for t in tasks] == [
+        ("fixed", 5, False), ("robust", 5, False), ("fixed", 6, True), ("robust", 6, True),
+        ("fixed", 7, True), ("robust", 7, True),
+    ]  # fmt: skip
+    assert len({t.key for t in tasks}) == len(tasks)
+    with_fixes = simulate("straight", seed=1)
+    assert not list(field_table._runs(tasks[2], 0, dataclasses.replace(with_fixes, truth=None)))
+    runs = list(field_table._runs(tasks[2], 3, dataclasses.replace(with_fixes, gnss=None)))
+    assert {run.test for run in runs if isinstance(run, Run)} == {"aided", "outage 30 s"}
+    assert {(run.drive, run.seed) for run in runs if isinstance(run, Run)} == {(3, 6)}
 
 
 def test_ground_is_the_labels_then_the_sets_then_unknown(drive: Callable[..., Any]) -> None:

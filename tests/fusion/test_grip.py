@@ -315,3 +315,19 @@ def test_a_fix_that_comes_after_a_newer_one_judges_nothing() -> None:
     before = robot.grip.mps2
     robot.grip.seen(GnssFix(19 * 10**8, np.array([40.0, 9.0, 0.0]), np.full(3, 0.05)))
     assert robot.grip.mps2 == before
+
+
+@pytest.mark.parametrize(
+    ("best_mps2", "lead", "leads"),
+    [(4.0, 6.0, False), (4.0, 20.0, True), (1.0, 6.0, True), (None, 20.0, False)],
+)
+def test_on_dry_ground_friction_leads_only_where_it_is_sure(
+    best_mps2: float | None, lead: float, leads: bool
+) -> None:
+    """`lead` is the logarithm of how much better one grip, or rolling, told the way than all others."""
+    grip = Straight().grip
+    i = -1 if best_mps2 is None else int(np.flatnonzero(best_mps2 == grips.GRIPS_MPS2)[0])
+    grip._score[i] += lead
+    assert grip.slides == leads
+    if leads:
+        assert grip.mps2 == pytest.approx(best_mps2, rel=0.1)

@@ -15,8 +15,10 @@ from terrafusion.datasets.errors import ConfigError
 from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.benchmark.tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune
 from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimator import Estimator
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.fusion.scores.metrics import Outage
+from terrafusion.fusion.terrain.labels import GroundLabels
 from terrafusion.fusion.weights.innovation import SageHusa, Variational
 from terrafusion.fusion.weights.modes import ModeTuning, RowTuning, load_modes, write_modes
 from terrafusion.fusion.weights.policy import load_policy
@@ -229,3 +231,25 @@ def test_tuning_never_makes_the_training_loss_worse() -> None:
     drives = [Training("figure_eight", "mud", 0.0, 1002).lesson()]
     tuned = tune(drives, ModeTuning(), ["fixed"])
     assert loss(drives, "fixed", tuned) <= loss(drives, "fixed", ModeTuning())
+
+
+def test_a_robot_the_model_does_not_know_has_the_pooled_row_until_evidence_comes() -> None:
+    """That row was fitted to all grounds: the prior's share of sand and mud is in it already."""
+    weights = Estimator.for_vehicle("warthog").weights
+    assert weights.row == load_modes().fixed.of(load_policy().fixed)
+    classes = weights.detector.classes
+    sigmas = []
+    for _ in range(40):
+        weights.external(0, {name: float(name == "mud") for name in classes})
+        sigmas.append(weights.row.slip_sigma)
+    assert sigmas == sorted(sigmas)
+    assert weights.posterior()["mud"] > 0.99
+    assert weights.row.slip_sigma == pytest.approx(weights.policy.classes["mud"].slip_sigma, rel=0.02)
+
+
+def test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot() -> None:
+    config = Estimator.for_vehicle("warthog").config
+    told = dataclasses.replace(config, labels=GroundLabels((0,), ("mud",)))
+    weights = Estimator(told).weights
+    weights.begin(0)
+    assert weights.row == weights.policy.classes["mud"]
