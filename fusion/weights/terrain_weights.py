@@ -63,11 +63,11 @@ class TerrainWeights:
         self._told: Array | None = None
         self._grade = 0.0
         fixed = config.tuning.fixed.of(config.policy.fixed)
-        if model.slip_only:
+        self._pooled = model.slip_only
+        if self._pooled:
             # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
-        self._assumed = model.prior(self.detector.classes) if model.slip_only else None
         self.row = self._blended() if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
@@ -179,12 +179,12 @@ class TerrainWeights:
     def _blended(self) -> SensorNoise:
         """The policy by the posterior.
 
-        For a robot that the model does not know, a ground counts by what evidence has added to its prior: the
-        pooled row, which holds without any, was fitted to all grounds, and has the doubt between them in it.
+        For a robot that the model does not know, a ground counts as far as it is more likely than not: the
+        pooled row, which holds until then, was fitted to all grounds, and has the doubt between them in it.
         """
         p = self._probabilities
-        if self._assumed is not None and self._told is None:
-            p = np.maximum(p - self._assumed, 0.0) / (1.0 - self._assumed)
+        if self._pooled and self._told is None:
+            p = np.maximum(2.0 * p - 1.0, 0.0)
             unknown = self.detector.classes.index(UNKNOWN)
             p[unknown] = 0.0
             p[unknown] = 1.0 - p.sum()

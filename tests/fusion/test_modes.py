@@ -234,13 +234,15 @@ def test_tuning_never_makes_the_training_loss_worse() -> None:
 
 
 def test_a_robot_the_model_does_not_know_has_the_pooled_row_until_evidence_comes() -> None:
-    """That row was fitted to all grounds: the prior's share of sand and mud is in it already."""
-    weights = Estimator.for_vehicle("warthog").weights
-    assert weights.row == load_modes().fixed.of(load_policy().fixed)
+    """That row was fitted to all grounds, and has the doubt between them in it: it holds to the last bit
+    until one is more likely than not."""
+    weights, pooled = Estimator.for_vehicle("warthog").weights, load_modes().fixed.of(load_policy().fixed)
+    assert weights.row == pooled
     classes = weights.detector.classes
     sigmas = []
     for _ in range(40):
         weights.external(0, {name: float(name == "mud") for name in classes})
+        assert (weights.row == pooled) == (weights.posterior()["mud"] <= 0.5)
         sigmas.append(weights.row.slip_sigma)
     assert sigmas == sorted(sigmas)
     assert weights.posterior()["mud"] > 0.99
