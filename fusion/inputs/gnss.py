@@ -213,8 +213,7 @@ class GnssUpdater:
         chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
         chain.smooth(len(chain.nodes))
         self.track.restart()
-        if self.slide.grip is not None:
-            self.slide.grip.restart()
+        self.slide.restart()
         self.turned += 1
         return True
 

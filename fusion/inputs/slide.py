@@ -113,6 +113,13 @@ class Slide:
         chain.smooth(chain.last - begin + 1)
         return True
 
+    def restart(self) -> None:
+        """Forget the slide: the robot was set elsewhere, and what refuted the wheels was its wrong heading."""
+        self.rate_m2ps = 0.0
+        self._before = (0.0, [])
+        if self.grip is not None:
+            self.grip.restart()
+
     def put_back(self, chain: Chain) -> None:
         """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
         self.rate_m2ps, passed = self._before
