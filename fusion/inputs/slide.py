@@ -114,7 +114,7 @@ class Slide:
         return True
 
     def restart(self) -> None:
-        """Forget the slide: the robot was set elsewhere; what had refuted the wheels was its wrong heading."""
+        """Forget the slide: the robot was set elsewhere, and a wrong heading had refuted the wheels."""
         self.rate_m2ps = 0.0
         self._before = (0.0, [])
         if self.grip is not None:
