@@ -51,11 +51,8 @@ class Line:
 
 def condense(runs: Sequence[Run]) -> list[Line]:
     """Lines in the order of the runs; where a mode lacks a run that others have, it has fewer `runs`."""
-    groups: dict[tuple[str, str], dict[str, list[Run]]] = {}
-    for run in runs:
-        groups.setdefault((run.log, run.test), {}).setdefault(run.mode, []).append(run)
     out = []
-    for by_mode in groups.values():
+    for by_mode in _rows(runs):
         baseline = _best_baseline(by_mode)
         out += [_line(mode, found, baseline, by_mode.get(baseline, [])) for mode, found in by_mode.items()]
     return out
@@ -123,11 +120,8 @@ class Beside:
 
 def beside_each(runs: Sequence[Run]) -> list[Beside]:
     """`OWN` beside every baseline, by ground."""
-    groups: dict[tuple[str, str], dict[str, list[Run]]] = {}
-    for run in runs:
-        groups.setdefault((run.log, run.test), {}).setdefault(run.mode, []).append(run)
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for by_mode in groups.values():
+    for by_mode in _rows(runs):
         for mode, theirs in by_mode.items():
             ratio, low, _ = ratio_of(by_mode.get(OWN, []), theirs) if mode != OWN else (None, None, None)
             if ratio is not None:
@@ -136,8 +130,7 @@ def beside_each(runs: Sequence[Run]) -> list[Beside]:
     for (ground, baseline), pairs in sorted(found.items()):
         ratios, lows = np.array(pairs).T
         mean = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
-        better, worse, surely = ((ratios < 1 - EVEN), (ratios > 1 + EVEN), (lows > 1 + EVEN))
-        counts = int(better.sum()), int(worse.sum()), int(surely.sum())
+        counts = [int(n.sum()) for n in (ratios < 1 - EVEN, ratios > 1 + EVEN, lows > 1 + EVEN)]
         out.append(Beside(ground, baseline, len(pairs), mean, *counts, float(ratios.max())))
     return out
 
@@ -151,6 +144,14 @@ def median(values: Sequence[float | None]) -> float | None:
     """Median of the known ones; None where there is none."""
     known = [v for v in values if v is not None and np.isfinite(v)]
     return float(np.median(known)) if known else None
+
+
+def _rows(runs: Sequence[Run]) -> list[dict[str, list[Run]]]:
+    """The runs of each log and test by mode."""
+    groups: dict[tuple[str, str], dict[str, list[Run]]] = {}
+    for run in runs:
+        groups.setdefault((run.log, run.test), {}).setdefault(run.mode, []).append(run)
+    return list(groups.values())
 
 
 def _best_baseline(by_mode: dict[str, list[Run]]) -> str:
