@@ -130,8 +130,9 @@ def beside_each(runs: Sequence[Run]) -> list[Beside]:
     for (ground, baseline), pairs in sorted(found.items()):
         ratios, lows = np.array(pairs).T
         mean = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
-        counts = [int(n.sum()) for n in (ratios < 1 - EVEN, ratios > 1 + EVEN, lows > 1 + EVEN)]
-        out.append(Beside(ground, baseline, len(pairs), mean, *counts, float(ratios.max())))
+        beyond = ratios < 1 - EVEN, ratios > 1 + EVEN, lows > 1 + EVEN
+        better, worse, surely = (int(rows.sum()) for rows in beyond)
+        out.append(Beside(ground, baseline, len(pairs), mean, better, worse, surely, float(ratios.max())))
     return out
 
 
