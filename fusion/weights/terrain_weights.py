@@ -61,22 +61,22 @@ class TerrainWeights:
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._told: Array | None = None
-        self._grade = 0.0
         fixed = config.tuning.fixed.of(config.policy.fixed)
         self._pooled = model.slip_only
         if self._pooled:
             # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
-        self.row = self._blended() if self.adaptive else fixed
+        self.row = self.policy.blend(self._shares) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
         self._rig = config.rig
         # Only where gyro and wheels both tell yaw does their difference say something of the ground.
         self._two_yaws = config.inputs.sides and config.inputs.yaw == "gyro"
         self.single = weighting_for(config, self)
-        self._before = self._probabilities
+        self._before = self._shares
         self._next_ns = 0
+        self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
 
@@ -91,10 +91,10 @@ class TerrainWeights:
         return taken
 
     def take_switch(self) -> float:
-        """Probability mass that changed class since the last call (total variation); 0 with fixed weights."""
+        """Share that changed class since the last call (total variation); 0 with fixed weights."""
         if not self.adaptive:
             return 0.0
-        p = self._probabilities
+        p = self._shares
         moved = 0.5 * float(np.abs(p - self._before).sum())
         self._before = p
         return moved
@@ -176,8 +176,9 @@ class TerrainWeights:
             slip_sigma=slip_sigma,
         )
 
-    def _blended(self) -> SensorNoise:
-        """The policy by the posterior.
+    @property
+    def _shares(self) -> Array:
+        """What each ground counts, (k,): its probability.
 
         For a robot that the model does not know, a ground counts as far as it is more likely than not: the
         pooled row, which holds until then, was fitted to all grounds, and has the doubt between them in it.
@@ -188,13 +189,13 @@ class TerrainWeights:
             unknown = self.detector.classes.index(UNKNOWN)
             p[unknown] = 0.0
             p[unknown] = 1.0 - p.sum()
-        return self.policy.blend(p, self._grade)
+        return p
 
     def _reweight(self, t_ns: int) -> None:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.row = self._blended()
+        self.row = self.policy.blend(self._shares, self._grade)
         if self._noted is None:  # not started yet: nothing to change from
             return
         before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)

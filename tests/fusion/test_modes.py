@@ -255,3 +255,12 @@ def test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot() -> None:
     weights = Estimator(told).weights
     weights.begin(0)
     assert weights.row == weights.policy.classes["mud"]
+
+
+def test_without_such_evidence_adaptive_is_fixed_to_the_last_bit() -> None:
+    """Six axes, so no grip is heard: a robot that the model does not know, on a firm winding drive."""
+    log = simulate("figure_eight", vehicle="warthog", terrain="asphalt", seed=2)
+    outage = [Outage(40.0, 20.0)]
+    one, other = (replay(log, mode=mode, outages=outage).estimate for mode in ("adaptive", "fixed"))
+    assert one.trajectory.position_m.tobytes() == other.trajectory.position_m.tobytes()
+    assert one.terrain.tobytes() == other.terrain.tobytes()
