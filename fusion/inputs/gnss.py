@@ -213,7 +213,8 @@ class GnssUpdater:
         chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
         chain.smooth(len(chain.nodes))
         self.track.restart()
-        self.slide.restart()
+        if self.slide.grip is not None:
+            self.slide.grip.restart()
         self.turned += 1
         return True
 

@@ -113,13 +113,6 @@ class Slide:
         chain.smooth(chain.last - begin + 1)
         return True
 
-    def restart(self) -> None:
-        """Forget the slide: the robot was set elsewhere, and a wrong heading had refuted the wheels."""
-        self.rate_m2ps = 0.0
-        self._before = (0.0, [])
-        if self.grip is not None:
-            self.grip.restart()
-
     def put_back(self, chain: Chain) -> None:
         """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
         self.rate_m2ps, passed = self._before

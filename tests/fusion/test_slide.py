@@ -193,20 +193,3 @@ def test_a_refutation_that_does_not_help_keeps_no_fix_out() -> None:
     assert max(map(len, runs)) <= 4
     assert found.rejected_gnss <= 16
     assert rms_m(found) < 0.1
-
-
-def test_what_a_wrong_heading_taught_of_the_wheels_is_forgotten_with_it() -> None:
-    """A start 50 deg off: fixes refute the wheels first, and the heading once the motion has shown it."""
-    log = thinned(simulate("staircase", terrain="asphalt", seed=3), 5, False)
-    assert log.truth is not None
-    estimator = Estimator.for_vehicle("elevate")
-    estimator.set_start(log.truth.position_m[0], log.truth.yaw_rad()[0] + 0.9, yaw_sigma_rad=0.12)
-    learnt = 0.0
-    for give in given(log):
-        give(estimator)
-        if estimator.gnss.turned:
-            break
-        learnt = max(learnt, estimator.gnss.slide.rate_m2ps)
-    assert estimator.gnss.turned == 1
-    assert learnt > 0.0
-    assert estimator.gnss.slide.rate_m2ps == 0.0
