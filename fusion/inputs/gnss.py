@@ -41,7 +41,8 @@ WHITE_SHARE = 0.2
 """Share of a fix's variance that is new at every fix; the rest drifts slowly. More is taken to be new
 where the fixes scatter more about the dead-reckoned path."""
 ALL_NEW = 0.75
-"""A share from which on all is taken to be new: the share heard is off by a tenth or two."""
+"""A share from which on all is taken to be new: the share heard is off by a tenth or two
+(assumed)."""
 LIE = 2.0
 """Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
 OPTIMISM = 3.0

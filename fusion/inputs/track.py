@@ -28,9 +28,11 @@ SCATTER_FIXES = 21
 RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
 """Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
 LEAST_NEWS, MOST_NEWS = 8.0, 300.0
-"""Second differences from which on the share of a fix that is new is known, and how many are remembered."""
+"""Second differences from which on the share of a fix that is new is known, and how many are remembered
+(assumed)."""
 WILD = 3.0
-"""More than so many times the claim of its fixes a second difference tells no more than that much."""
+"""A second difference whose square is more than so many times what the claims would make counts as so much
+(assumed)."""
 SLIP_CHANGE = 0.1
 """How far slip may change from fix to fix and so bend the dead-reckoned path (assumed)."""
 LEAST_RATIO, MOST_RATIO = 0.3, 1.7

@@ -16,6 +16,7 @@ OWN = "adaptive"
 EVEN = 0.03
 """Ratios this close to 1 count as neither better nor worse."""
 DRAWS = 400
+"""Of the bootstrap of a ratio."""
 
 
 @dataclass(frozen=True)
