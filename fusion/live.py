@@ -22,13 +22,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError, TerrafusionError
-from terrafusion.datasets.frames import quaternion_to_matrix
-from terrafusion.datasets.recording import Imu, Recording, Wheels
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import State
-from terrafusion.fusion.estimator import Estimator
-from terrafusion.fusion.front import complete_rows, imu_kind, inputs_of
+from terrafusion.datasets.core.errors import DataError, TerrafusionError
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.sensor_config import complete_rows, imu_kind, inputs_of
 
 Array = NDArray[np.float64]
 

@@ -13,13 +13,16 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import gtsam_to_ros_covariance
-from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import Estimate, State
-from terrafusion.fusion.estimator import Estimator
-from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
+from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.fusion.estimate.estimate import Estimate, State
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.estimator.map_alignment import Placement
+from terrafusion.fusion.estimator.sensor_config import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.estimator.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
@@ -31,13 +34,10 @@ from terrafusion.fusion.graph.key_state import (
     linear_sigma,
     quaternion_of,
 )
-from terrafusion.fusion.history import History
-from terrafusion.fusion.inputs.placement import Placement
-from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
-from terrafusion.fusion.scores.metrics import Outage, Scores, score
+from terrafusion.fusion.metrics.metrics import Outage, Scores, score
+from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.fusion.terrain.external import external_probabilities
-from terrafusion.fusion.weights.policy import Policy, load_policy
-from terrafusion.twin.vehicle import VehicleParams, geometry_notes, load_vehicle, with_overrides
+from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, load_vehicle, with_overrides
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Recording
 
 ENTRY = "from terrafusion.fusion.cli.main import main; main()"
 NO_ZIG = "import sys; sys.modules['ziglang'] = None; "

@@ -11,26 +11,26 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.frames import matrix_to_quaternion
-from terrafusion.datasets.recording import Command, Fix, Recording, Terrain
-from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.twin import sensors
-from terrafusion.twin.drive import Driven, drive
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.frames import matrix_to_quaternion
+from terrafusion.datasets.core.recording import Command, Fix, Recording, Terrain
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
 from terrafusion.twin.effects.catalogue import checked
-from terrafusion.twin.effects.sensed import as_driven, sensed, true_motion, with_effects
 from terrafusion.twin.engine.integrate import compiled, integrate
-from terrafusion.twin.engine.plant import Plant
-from terrafusion.twin.ground import patch_share
-from terrafusion.twin.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
-from terrafusion.twin.library import assumed
-from terrafusion.twin.motion import Motion, motion_of, wheel_shares
-from terrafusion.twin.route import Route
-from terrafusion.twin.scenario import Scenario, load_scenario
-from terrafusion.twin.soil import SoilParams
-from terrafusion.twin.summary import RunSummary, slip_ratios, summarise
-from terrafusion.twin.validity import check_ground, check_slip
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle, with_payload
+from terrafusion.twin.model.ground import patch_share
+from terrafusion.twin.model.library import assumed
+from terrafusion.twin.model.motion import Motion, motion_of, wheel_shares
+from terrafusion.twin.model.plant import Plant
+from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_payload
+from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.scenario.commands import Driven, drive
+from terrafusion.twin.scenario.route import Route
+from terrafusion.twin.scenario.scenario import Scenario, load_scenario
+from terrafusion.twin.scenario.validity import check_ground, check_slip
+from terrafusion.twin.sensors import suite as sensors
+from terrafusion.twin.sensors.effects import as_driven, sensed, true_motion, with_effects
 
 Array = NDArray[np.float64]
 

@@ -12,10 +12,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.readers.csv_table import Table
-from terrafusion.datasets.readers.log_meta import Meta
-from terrafusion.datasets.recording import (
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import (
     Barometer,
     Command,
     Fix,
@@ -26,7 +24,9 @@ from terrafusion.datasets.recording import (
     Terrain,
     Wheels,
 )
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.readers.csv_table import Table
+from terrafusion.datasets.readers.log_meta import Meta
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
 

@@ -17,9 +17,9 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.config import shown
-from terrafusion.datasets.errors import ClockError, DataError
-from terrafusion.datasets.trajectory import seconds_to_ns
+from terrafusion.datasets.core.config import shown
+from terrafusion.datasets.core.errors import ClockError, DataError
+from terrafusion.datasets.core.trajectory import seconds_to_ns
 
 Array = NDArray[np.float64]
 

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 
-from terrafusion.datasets.conventions import Conventions
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.sensors import Rig
+from terrafusion.datasets.core.conventions import Conventions
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 
 HEAD_BYTES = 4096
 MAP_SUFFIX = ".columns.yaml"

@@ -15,14 +15,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.clock import in_order, repair_together
-from terrafusion.datasets.errors import ClockError, DataError
+from terrafusion.datasets.core.clock import in_order, repair_together
+from terrafusion.datasets.core.errors import ClockError, DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import ChannelReader
 from terrafusion.datasets.readers.csv_table import Table, read_table, read_times
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.trajectory import Trajectory
 
 META = "meta.yaml"
 TimesNs = NDArray[np.int64]

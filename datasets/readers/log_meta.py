@@ -7,9 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.config import Quantity, checked_number, read_yaml, shown
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import ClockJump, Overrides
+from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml, shown
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import ClockJump, Overrides
 
 TEXT_KEYS = (
     "name",

@@ -8,12 +8,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.catalog import CatalogFile, load_catalog, locate
-from terrafusion.datasets.conventions import BODY_AXES, Conventions, apply
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog, locate
+from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, apply
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers.formats import Format, Request, format_of
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.sensors import Rig
 
 STAMPS = ("header", "receipt")
 

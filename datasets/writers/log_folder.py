@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.config import MAX_BYTES
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.config import MAX_BYTES
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording, Wheels
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
-from terrafusion.datasets.recording import Recording, Wheels
 from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
 
 BLOCK_ROWS = 100_000

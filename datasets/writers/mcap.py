@@ -12,17 +12,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Fix, Gnss, Imu, Recording, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import META
-from terrafusion.datasets.recording import Fix, Gnss, Imu, Recording, Wheels
-from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
 from terrafusion.datasets.writers.mcap_file import Definition, Topic, write_mcap_file
 from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
 
 if TYPE_CHECKING:
-    from terrafusion.datasets.sensors import Rig
+    from terrafusion.datasets.core.sensors import Rig
 
 NOMINAL_DATUM = (0.0, 0.0, 0.0)
 """ENU origin of a recording that has none: latitude, longitude (deg), height (m)."""

@@ -10,7 +10,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.cdr import Layout, split
 from terrafusion.datasets.writers.mcap_file import Topic

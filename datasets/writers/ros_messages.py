@@ -11,10 +11,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.frames import enu_to_geodetic, rpy_to_quaternion
+from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
+from terrafusion.datasets.core.recording import (
+    Barometer,
+    Command,
+    Fix,
+    Gnss,
+    Imu,
+    Magnetometer,
+    Terrain,
+    Wheels,
+)
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
-from terrafusion.datasets.recording import Barometer, Command, Fix, Gnss, Imu, Magnetometer, Terrain, Wheels
-from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers.cdr import Layout, split
 from terrafusion.datasets.writers.mcap_file import Topic
 

@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Imu, Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,
     COVARIANCE,
@@ -21,8 +23,6 @@ from terrafusion.datasets.readers.channel_tables import (
     rows_with_values,
 )
 from terrafusion.datasets.readers.log_meta import parse_meta
-from terrafusion.datasets.recording import Imu, Recording
-from terrafusion.datasets.trajectory import Trajectory
 
 PLANAR_TWIST = ("u_mps", "v_mps", "r_radps")
 

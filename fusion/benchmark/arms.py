@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.noise.modes import ModeTuning
+from terrafusion.fusion.noise.policy import Policy, SensorNoise, load_policy
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 from terrafusion.fusion.terrain.external import TRUE_SOURCES
-from terrafusion.fusion.terrain.labels import GroundLabels
-from terrafusion.fusion.weights.modes import ModeTuning
-from terrafusion.fusion.weights.policy import Policy, SensorNoise, load_policy
 
 SHEET = {
     "slip_mean": 0.0,

@@ -16,16 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.arms import true_labels
-from terrafusion.fusion.scores.metrics import Outage
-from terrafusion.fusion.terrain.drives import GROUNDS, SOIL_SCATTER, scattered_soil
-from terrafusion.fusion.terrain.labels import GroundLabels
-from terrafusion.twin.effects.reece import second_terramechanics
-from terrafusion.twin.ground import Variation
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.training.drives import GROUNDS, SOIL_SCATTER, scattered_soil
+from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
+from terrafusion.twin.model.ground import Variation
+from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import SoilParams, load_soil
 
 FIRST_SEED = 200_000
 PERTURBATION = 0.3

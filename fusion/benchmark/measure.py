@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.benchmark.arms import Arm, replay_options
 from terrafusion.fusion.benchmark.drives import Drive
+from terrafusion.fusion.metrics.consistency import estimated_ground_at, position, summarise
+from terrafusion.fusion.metrics.error_series import Errors
+from terrafusion.fusion.metrics.health import examine_estimate
+from terrafusion.fusion.metrics.metrics import OutageScore
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.scores.consistency import estimated_ground_at, position, summarise
-from terrafusion.fusion.scores.error_series import Errors
-from terrafusion.fusion.scores.field_table import UNFORESEEN
-from terrafusion.fusion.scores.health import examine_estimate
-from terrafusion.fusion.scores.metrics import OutageScore
 from terrafusion.fusion.terrain.classifier import UNKNOWN
-from terrafusion.fusion.weights.policy import load_policy
+from tests.studies.field_table.table import UNFORESEEN
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]

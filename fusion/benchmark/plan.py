@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.benchmark.arms import ARMS
 from terrafusion.fusion.benchmark.drives import FAMILIES, FIELD, FIRST_SEED, PLANTS, Case
-from terrafusion.fusion.benchmark.field import Log, logs_at_hand
+from terrafusion.fusion.benchmark.field_logs import Log, logs_at_hand
 
 SEEDS = 20
 MOST_SEEDS = 10_000

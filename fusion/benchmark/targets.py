@@ -11,8 +11,8 @@ from terrafusion.fusion.benchmark.arms import BASE, OWN
 from terrafusion.fusion.benchmark.compare import Contrast, Interval, Share, contrasts, median_interval, shares
 from terrafusion.fusion.benchmark.drives import FIELD
 from terrafusion.fusion.benchmark.measure import Row
-from terrafusion.fusion.scores.consistency import Consistency
-from terrafusion.fusion.scores.twin_consistency import Cell, pool
+from terrafusion.fusion.metrics.consistency import Consistency
+from tests.studies.twin_consistency import Cell, pool
 
 REACHED, OPEN, MISSED = "reached", "open", "missed"
 """By the whole interval; by neither of its ends; by no part of it."""

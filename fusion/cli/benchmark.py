@@ -41,16 +41,16 @@ def benchmark(
     """
     import joblib
 
-    from terrafusion.fusion.benchmark.outputs import (
+    from terrafusion.fusion.benchmark.plan import Plan, families_of
+    from terrafusion.fusion.benchmark.run import run_benchmark
+    from terrafusion.fusion.reports.benchmark.outputs import (
         at_the_end,
         document_head,
         origin_of,
         write_benchmark,
         write_document,
     )
-    from terrafusion.fusion.benchmark.plan import Plan, families_of
-    from terrafusion.fusion.benchmark.run import run_benchmark
-    from terrafusion.fusion.benchmark.text import markdown
+    from terrafusion.fusion.reports.benchmark.text import markdown
 
     plan = Plan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]

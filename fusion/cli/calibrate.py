@@ -20,8 +20,8 @@ from terrafusion.fusion.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from terrafusion.twin.identify.coordinates import Prior
-    from terrafusion.twin.identify.result import Calibration
+    from terrafusion.twin.calibrate.coordinates import Prior
+    from terrafusion.twin.calibrate.result import Calibration
 
 LogsArgument = Annotated[
     list[str],
@@ -80,10 +80,10 @@ def calibrate(
 
     Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
     """
-    from terrafusion.fusion.calibration.page import write_calibration
-    from terrafusion.twin.identify.calibrate import PARAMETERS
-    from terrafusion.twin.identify.calibrate import calibrate as fit
-    from terrafusion.twin.scenario import MAX_SLOPE_DEG
+    from terrafusion.fusion.reports.calibration.page import write_calibration
+    from terrafusion.twin.calibrate.calibrate import PARAMETERS
+    from terrafusion.twin.calibrate.calibrate import calibrate as fit
+    from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
 
     if not 0.0 <= slope_deg <= MAX_SLOPE_DEG:
         raise typer.BadParameter(f"{slope_deg:g} is not in 0 to {MAX_SLOPE_DEG:g}", param_hint="--slope-deg")
@@ -102,7 +102,7 @@ def calibrate(
     for line in summary(found):
         print(line)
     if suggest:
-        from terrafusion.twin.identify.suggest import suggest as tried
+        from terrafusion.twin.calibrate.suggest import suggest as tried
 
         for suggestion in tried(found):
             print(suggestion.sentence())
@@ -134,7 +134,7 @@ def named_soils(soils: str | dict[str, str] | None, found: Calibration) -> dict[
 
 def parse_prior(text: str) -> tuple[str, Prior]:
     """`NAME=VALUE+-SIGMA`; a malformed one is wrong usage (exit status 2)."""
-    from terrafusion.twin.identify.coordinates import Prior
+    from terrafusion.twin.calibrate.coordinates import Prior
 
     name, _, rest = text.partition("=")
     value, _, sigma = rest.partition("+-")

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from terrafusion.datasets.doctor import Finding
-    from terrafusion.datasets.recording import Recording
-    from terrafusion.datasets.sensors import Rig
+    from terrafusion.datasets.checks import Finding
+    from terrafusion.datasets.core.recording import Recording
+    from terrafusion.datasets.core.sensors import Rig
 
 LogArgument = Annotated[
     str,
@@ -77,7 +77,7 @@ def load_rig(vehicle: str | None) -> Rig | None:
     """
     if vehicle is None:
         return None
-    from terrafusion.twin.vehicle import load_vehicle
+    from terrafusion.twin.model.vehicle import load_vehicle
 
     return load_vehicle(vehicle).rig()
 
@@ -86,7 +86,7 @@ def rig_of(recording: Recording, rig: Rig | None) -> Rig | None:
     """`rig`, else that of the vehicle the log itself names, where it is known here."""
     if rig is not None or not recording.vehicle:
         return rig
-    from terrafusion.datasets.errors import ConfigError
+    from terrafusion.datasets.core.errors import ConfigError
 
     try:
         return load_rig(recording.vehicle)
@@ -109,7 +109,7 @@ def reading(
 
 def opened(names: Sequence[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
     """The logs of some names, of which `LOG@60-105` is a piece and `LOG@/45` are all pieces of 45 s."""
-    from terrafusion.datasets.pieces import split_name
+    from terrafusion.datasets.core.segments import split_name
     from terrafusion.datasets.readers import open_recordings
 
     found: list[Recording] = []
@@ -138,7 +138,7 @@ def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> None:
     Raises:
         DataError: the first such finding, with its evidence and what to do.
     """
-    from terrafusion.datasets.doctor import examine
+    from terrafusion.datasets.checks import run as examine
 
     _refuse(log, examine(recording, rig_of(recording, rig)))
 
@@ -149,13 +149,13 @@ def refuse_impossible(log: str, recording: Recording) -> None:
     Raises:
         DataError: the first of them.
     """
-    from terrafusion.datasets.doctor import Patient, check_magnitude
+    from terrafusion.datasets.checks import Patient, check_magnitude
 
     _refuse(log, list(check_magnitude(Patient(recording, None))))
 
 
 def _refuse(log: str, findings: list[Finding]) -> None:
-    from terrafusion.datasets.errors import DataError
+    from terrafusion.datasets.core.errors import DataError
 
     errors = [finding for finding in findings if finding.severity == "error"]
     if not errors:

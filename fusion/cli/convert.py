@@ -22,9 +22,9 @@ from terrafusion.fusion.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from terrafusion.datasets.doctor import Finding
-    from terrafusion.datasets.recording import Recording
-    from terrafusion.datasets.sensors import Rig
+    from terrafusion.datasets.checks import Finding
+    from terrafusion.datasets.core.recording import Recording
+    from terrafusion.datasets.core.sensors import Rig
 
 
 def convert(
@@ -57,7 +57,8 @@ def convert(
     """
     import dataclasses
 
-    from terrafusion.datasets.doctor import examine, treat
+    from terrafusion.datasets.checks import run as examine
+    from terrafusion.datasets.checks import treat
     from terrafusion.datasets.readers import open_recording
 
     rig = load_rig(vehicle)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
-    from terrafusion.datasets.catalog import Catalog, CatalogFile
+    from terrafusion.datasets.catalog.catalog import Catalog, CatalogFile
 
 
 def fetch(
@@ -40,7 +40,7 @@ def fetch(
     """
     import json
 
-    from terrafusion.datasets.catalog import load_catalog
+    from terrafusion.datasets.catalog.catalog import load_catalog
 
     catalog = load_catalog()
     if not names:
@@ -54,7 +54,7 @@ def fetch(
 
 
 def _row(catalog: Catalog, name: str) -> dict[str, Any]:
-    from terrafusion.datasets.catalog import data_folders
+    from terrafusion.datasets.catalog.catalog import data_folders
 
     known = catalog.sets[name]
     files = [entry for entry in catalog.files if entry.set_name == name]
@@ -94,7 +94,7 @@ def _print_catalog(rows: list[dict[str, Any]]) -> None:
 def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool, as_json: bool) -> None:
     import json
 
-    from terrafusion.datasets.fetch import entries_of, fetch
+    from terrafusion.datasets.catalog.fetch import entries_of, fetch
 
     wanted = {entry.file: entry for name in names for entry in entries_of(catalog, name)}
     done = []

@@ -21,9 +21,9 @@ from terrafusion.fusion.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from terrafusion.datasets.recording import Recording
-    from terrafusion.twin.gap.as_judged import Compared
-    from terrafusion.twin.gap.diagnosis import Diagnosis
+    from terrafusion.datasets.core.recording import Recording
+    from terrafusion.fusion.benchmark.estimator_gap import Compared
+    from terrafusion.twin.gap.diagnose import Diagnosis
 
 RunsArgument = Annotated[
     list[str],
@@ -78,11 +78,11 @@ def gap(
 
     Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
     """
-    from terrafusion.datasets.atomic import check_folder
-    from terrafusion.fusion.gap_page.page import write_diagnosis
-    from terrafusion.fusion.gap_page.words import sentences
-    from terrafusion.twin.gap.diagnosis import diagnose
-    from terrafusion.twin.vehicle import load_vehicle
+    from terrafusion.datasets.core.files import check_folder
+    from terrafusion.fusion.reports.gap.page import write_diagnosis
+    from terrafusion.fusion.reports.gap.words import sentences
+    from terrafusion.twin.gap.diagnose import diagnose
+    from terrafusion.twin.model.vehicle import load_vehicle
 
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
     judged = opened(runs, options, repair_clock)
@@ -100,7 +100,7 @@ def gap(
     for line in sentences(found):
         print(line)
     if write_vehicle is not None:
-        from terrafusion.twin.gap.corrected import write_corrected
+        from terrafusion.twin.gap.answer.corrected import write_corrected
 
         for line in write_corrected(found, vehicle, write_vehicle):
             print(line)
@@ -110,8 +110,8 @@ def gap(
 def _judged(
     found: Diagnosis, runs: list[Recording], references: list[Recording], vehicle: str, seed: int
 ) -> tuple[list[Compared], list[str]]:
-    from terrafusion.fusion.gap_page.judge import estimator_judge
-    from terrafusion.twin.gap.as_judged import judged
+    from terrafusion.fusion.benchmark.estimator_gap import judged
+    from terrafusion.fusion.benchmark.judge import estimator_judge
 
     marks, failed = judged(found, runs, references, estimator_judge(vehicle), seed)
     for mark in marks:

@@ -35,8 +35,8 @@ def gap_blind(
 
       terrafusion gap-blind --share 0.2 --jobs 2 --out blind
     """
-    from terrafusion.datasets.atomic import check_folder
-    from terrafusion.fusion.blind.page import summary, write_blind
+    from terrafusion.datasets.core.files import check_folder
+    from terrafusion.fusion.reports.blind.page import summary, write_blind
     from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.check import run_blind_check
     from terrafusion.twin.gap.blind.plan import FULL

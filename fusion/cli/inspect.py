@@ -47,8 +47,8 @@ def inspect(
 
       terrafusion inspect my_log_folder --json
     """
-    from terrafusion.fusion.cli.page import page_lines, print_lines
-    from terrafusion.fusion.cli.trials import trials_lines, trials_of
+    from terrafusion.fusion.cli.inspect_page import page_lines, print_lines
+    from terrafusion.fusion.cli.single_wheel_page import trials_lines, trials_of
 
     load_rig(vehicle)
     reading(None, topic, stamps, columns, repair_clock=True)  # wrong usage is told whatever the log is
@@ -67,10 +67,10 @@ def examined(
     stamps: str = "header",
     columns: Path | None = None,
 ) -> dict[str, Any]:
-    """The page as plain data; see `terrafusion.datasets.doctor.summary`."""
-    from terrafusion.datasets.doctor import examine
-    from terrafusion.datasets.doctor.measures import measure
-    from terrafusion.datasets.doctor.summary import summarise, summarise_all
+    """The page as plain data; see `terrafusion.datasets.checks.summary`."""
+    from terrafusion.datasets.checks import run as examine
+    from terrafusion.datasets.checks.measures import measure
+    from terrafusion.datasets.checks.summary import summarise, summarise_all
     from terrafusion.datasets.readers import open_recordings
 
     rig = load_rig(vehicle)

@@ -12,7 +12,7 @@ from typing import Annotated
 
 import typer
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli import (
     benchmark,
     calibrate,

@@ -45,9 +45,9 @@ def fit(
     Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
     """
     from terrafusion.fusion.cli.terrain import checked_output, progress
-    from terrafusion.fusion.terrain.drives import GROUNDS
-    from terrafusion.fusion.weights.policy_fit import Logged, default_grid, fit_policy, write_policy
-    from terrafusion.fusion.weights.policy_logs import read_logs
+    from terrafusion.fusion.training.drives import GROUNDS
+    from terrafusion.fusion.training.policy_fit import Logged, default_grid, fit_policy, write_policy
+    from terrafusion.fusion.training.policy_logs import read_logs
 
     checked_output(out)
     grounds = chosen("soils", "soil", tuple(dict.fromkeys(ground or GROUNDS)))
@@ -74,8 +74,8 @@ def chosen(folder: str, kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
     Raises:
         ConfigError: another name.
     """
-    from terrafusion.datasets.errors import ConfigError
-    from terrafusion.twin.library import known_names
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.twin.model.library import known_names
 
     known = known_names(folder)
     for name in names:

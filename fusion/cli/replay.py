@@ -105,14 +105,14 @@ def replay(
 
     Example: terrafusion replay drive.bag --vehicle husky --calibrate --batch --out calibrated
     """
-    from terrafusion.datasets.atomic import check_folder
-    from terrafusion.datasets.errors import errors_of
+    from terrafusion.datasets.core.errors import errors_of
+    from terrafusion.datasets.core.files import check_folder
     from terrafusion.datasets.readers import open_recording
-    from terrafusion.fusion.config import MODES
+    from terrafusion.fusion.estimator.config import MODES
+    from terrafusion.fusion.metrics.metrics import parse_outage
     from terrafusion.fusion.replay import replay as run
-    from terrafusion.fusion.report.rerun_log import require_rerun, write_rerun
-    from terrafusion.fusion.report.results import write_replay
-    from terrafusion.fusion.scores.metrics import parse_outage
+    from terrafusion.fusion.reports.replay.rerun_log import require_rerun, write_rerun
+    from terrafusion.fusion.reports.replay.results import write_replay
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
@@ -151,7 +151,7 @@ def replay(
 def _write_bag(result: Replay, path: Path) -> None:
     """The log and the estimate beside it; prints what is not in standard messages."""
     from terrafusion.datasets.writers.mcap import write_mcap
-    from terrafusion.fusion.report.ros_estimate import written_estimate
+    from terrafusion.fusion.reports.replay.ros_estimate import written_estimate
 
     written = written_estimate(result.estimate)
     for part in write_mcap(result.recording, path, written, rig=result.vehicle.rig(), overwrite=True):
@@ -160,8 +160,8 @@ def _write_bag(result: Replay, path: Path) -> None:
 
 def summary(result: Replay) -> list[str]:
     """The result in a few lines of text."""
-    from terrafusion.fusion.report.linear_states import calibration, cells
-    from terrafusion.fusion.report.outputs import final_status
+    from terrafusion.fusion.reports.replay.linear_states import calibration, cells
+    from terrafusion.fusion.reports.replay.outputs import final_status
 
     scores = result.scores
     status = final_status(result.estimate)

@@ -11,8 +11,8 @@ import typer
 from terrafusion.fusion.cli.effects import effect_values, listed
 
 if TYPE_CHECKING:
+    from terrafusion.twin.analysis.summary import RunSummary
     from terrafusion.twin.simulate import SimulatedRun
-    from terrafusion.twin.summary import RunSummary
 
 
 def simulate(

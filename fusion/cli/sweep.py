@@ -12,7 +12,7 @@ import typer
 from terrafusion.fusion.cli.common import progress_bar
 
 if TYPE_CHECKING:
-    from terrafusion.twin.sweep import Sweep
+    from terrafusion.twin.sweep.run import Sweep
 
 RecordingsOption = Annotated[
     list[str] | None,
@@ -45,7 +45,7 @@ def sweep(
 
     Example: terrafusion sweep friction_slope --out results --jobs 2
     """
-    from terrafusion.twin.sweep import check_runs, load_sweep, run_sweep, write_recordings
+    from terrafusion.twin.sweep.run import check_runs, load_sweep, run_sweep, write_recordings
 
     if backend not in ("loky", "dask"):
         raise typer.BadParameter(f"'{backend}' is neither 'loky' nor 'dask'", param_hint="--backend")
@@ -71,7 +71,7 @@ def sweep(
                 plan, chosen, out / "recordings", form=recordings_format, jobs=count, progress=progress
             )
     if plots:
-        from terrafusion.fusion.sweep.report import write_sweep_report
+        from terrafusion.fusion.reports.sweep.page import write_sweep_report
 
         write_sweep_report(out, plan, table, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     statuses, errors = (table.column(name).to_pylist() for name in ("status", "error"))
@@ -84,7 +84,7 @@ def sweep(
 
 def summary_lines(statuses: Sequence[str], errors: Sequence[str | None]) -> list[str]:
     """How the runs ended, in a line; where some failed, why the first did."""
-    from terrafusion.twin.sweeping.rows import STATUSES
+    from terrafusion.twin.sweep.rows import STATUSES
 
     told = [f"{statuses.count(word)} {word}" for word in STATUSES if word in statuses]
     lines = [f"{len(statuses)} run{'s' if len(statuses) != 1 else ''}: {', '.join(told)}"]

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 
 if TYPE_CHECKING:
-    from terrafusion.fusion.terrain.evaluate import Scores
+    from terrafusion.fusion.training.evaluate import Scores
 
 app = typer.Typer(help="The terrain detector: train its model, score it.", no_args_is_help=True)
 
@@ -43,8 +43,8 @@ def train(
         no_seeds(seeds)
         train_on_logs(logs, out)
         return
-    from terrafusion.fusion.terrain.train import Plan, write_model
-    from terrafusion.fusion.terrain.train import train as run
+    from terrafusion.fusion.training.train import Plan, write_model
+    from terrafusion.fusion.training.train import train as run
 
     plan = Plan() if seeds is None else Plan(seeds=seeds)
     with progress("drives", plan.drives()) as tick:
@@ -58,7 +58,7 @@ def train_on_logs(logs: list[str], out: Path) -> None:
     """Fit, calibrate and write a learner of labelled logs."""
     import dataclasses
 
-    from terrafusion.fusion.terrain.labelled import check_runs, hashes_of, open_runs, train_on
+    from terrafusion.fusion.training.labelled import check_runs, hashes_of, open_runs, train_on
 
     runs = open_runs(logs)
     check_runs(runs)
@@ -113,8 +113,8 @@ def evaluate(
         return
     if test or out is not None:
         raise TerrafusionError("--test and --out are of labelled logs", remedy="name the logs to train on")
-    from terrafusion.fusion.terrain import trials
     from terrafusion.fusion.terrain.classifier import load_terrain_model
+    from terrafusion.fusion.training import trials
 
     loaded = load_terrain_model(model)
     with progress("drives", trials.count(seeds or 1)) as tick:
@@ -126,8 +126,8 @@ def evaluate(
 
 def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
     """Print the figures of labelled logs, and write them."""
-    from terrafusion.fusion.terrain.labelled import hashes_of, open_runs
-    from terrafusion.fusion.terrain.surface_report import STEPS, lines_of, report_on
+    from terrafusion.fusion.training.labelled import hashes_of, open_runs
+    from terrafusion.fusion.training.surface_report import STEPS, lines_of, report_on
 
     runs, others = open_runs(logs), open_runs(test) if test else []
     with progress("steps", STEPS) as tick:
@@ -138,9 +138,9 @@ def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
 
 def evaluate_learner(model: Path, logs: list[str], out: Path | None) -> None:
     """Print how a learner does on labelled logs that it has not seen, and write it."""
-    from terrafusion.fusion.terrain.labelled import hashes_of, open_runs
-    from terrafusion.fusion.terrain.softmax import read_softmax
-    from terrafusion.fusion.terrain.surface_report import figures_lines, score
+    from terrafusion.fusion.training.labelled import hashes_of, open_runs
+    from terrafusion.fusion.training.softmax import read_softmax
+    from terrafusion.fusion.training.surface_report import figures_lines, score
 
     learner, inputs = read_softmax(model), hashes_of(logs)
     known = sorted(name for name, sha256 in inputs.items() if sha256 in learner.inputs.values())
@@ -157,7 +157,7 @@ def evaluate_learner(model: Path, logs: list[str], out: Path | None) -> None:
 
 def write_figures(report: dict[str, Any], out: Path | None) -> None:
     """Write figures as JSON where a file is asked for."""
-    from terrafusion.fusion.report.outputs import to_json
+    from terrafusion.fusion.reports.replay.outputs import to_json
 
     if out is not None:
         out.write_text(to_json(report, indent=1) + "\n", encoding="utf-8")

@@ -16,6 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import V
 from numpy.typing import NDArray
 
+from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
     ANTENNA,
@@ -34,7 +35,6 @@ from terrafusion.fusion.graph.key_state import (
     WHEEL_DELAY,
     YAW_SCALE,
 )
-from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement

@@ -7,9 +7,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.graph.key_state import DIM, VELOCITY
-from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
 

@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 

@@ -8,10 +8,10 @@ import math
 import gtsam
 import numpy as np
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.datasets.sensors import ImuSpec
-from terrafusion.fusion.inputs.streams import ImuSegment
-from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.sensors import ImuSpec
+from terrafusion.fusion.estimator.streams import ImuSegment
+from terrafusion.fusion.noise.policy import SensorNoise
 
 INTEGRATION_SIGMA_M = 1e-4
 """Position error of the integration itself, m/sqrt(s): keeps the square root full rank."""

@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.graph.gauss_markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, SURGE_SLIP, YAW_SCALE
-from terrafusion.fusion.graph.markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.weights.policy import SensorNoise
+from terrafusion.fusion.noise.policy import SensorNoise
 
 if TYPE_CHECKING:
     from terrafusion.fusion.graph.chain import Chain

@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.config import Quantity, checked_number, read_yaml
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.terrain.features import FEATURES, SLIP
 
 Array = NDArray[np.float64]

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, extract
 from terrafusion.fusion.terrain.sequence import PatchFilter

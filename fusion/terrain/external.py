@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafusion.datasets.recording import Terrain
+from terrafusion.datasets.core.recording import Terrain
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 TRUE_SOURCES = ("annotation", "simulation")

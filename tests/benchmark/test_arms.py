@@ -16,9 +16,9 @@ from terrafusion.fusion.benchmark.arms import (
     shuffled,
     true_labels,
 )
-from terrafusion.fusion.terrain.labels import GroundLabels
-from terrafusion.fusion.weights.policy import load_policy
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.noise.policy import load_policy
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import START_NS, simulate
 
 POLICY = load_policy()

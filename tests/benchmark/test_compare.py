@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 from terrafusion.fusion.benchmark.compare import contrasts, median_interval, shares
 from terrafusion.fusion.benchmark.measure import GroundRow, Row, switch_delay_s
-from terrafusion.fusion.benchmark.plots import plot_ratios
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, nees_cells, targets
-from terrafusion.fusion.benchmark.text import markdown, tables
+from terrafusion.fusion.reports.benchmark.plots import plot_ratios
+from terrafusion.fusion.reports.benchmark.text import markdown, tables
 
 
 def rows(arm: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[Row]:

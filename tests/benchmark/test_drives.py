@@ -17,14 +17,14 @@ from terrafusion.fusion.benchmark.drives import (
     soils_of,
 )
 from terrafusion.fusion.benchmark.measure import measure
-from terrafusion.fusion.benchmark.tuning import DRIVES, MIXED
-from terrafusion.fusion.scores import twin_consistency
-from terrafusion.fusion.terrain import train, trials
-from terrafusion.fusion.terrain.drives import SOIL_SCATTER
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.terrain.external import external_probabilities
-from terrafusion.fusion.weights.policy import load_policy
-from terrafusion.fusion.weights.policy_fit import default_grid
-from terrafusion.twin.soil import load_soil
+from terrafusion.fusion.training import train, trials
+from terrafusion.fusion.training.drives import SOIL_SCATTER
+from terrafusion.fusion.training.policy_fit import default_grid
+from terrafusion.twin.model.soil import load_soil
+from tests.studies import twin_consistency
+from tests.studies.mode_tuning import DRIVES, MIXED
 
 SHORT = Case("outages", "twin", FIRST_SEED + 2)
 

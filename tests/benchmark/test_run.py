@@ -9,17 +9,19 @@ from types import SimpleNamespace
 
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, TerrafusionError
-from terrafusion.fusion.benchmark import field, outputs, plan, run
+from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
+from terrafusion.fusion.benchmark import field_logs as field
+from terrafusion.fusion.benchmark import parts, plan, run
 from terrafusion.fusion.benchmark.arms import ARMS
 from terrafusion.fusion.benchmark.drives import FIRST_SEED, Case
-from terrafusion.fusion.benchmark.field import Log
+from terrafusion.fusion.benchmark.field_logs import Log
 from terrafusion.fusion.benchmark.measure import Row
-from terrafusion.fusion.benchmark.outputs import MARK, write_benchmark, write_document
 from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
 from terrafusion.fusion.benchmark.run import Found, run_benchmark
-from terrafusion.fusion.scores import field_table, parts
-from terrafusion.fusion.scores.field_table import Refusal
+from terrafusion.fusion.reports.benchmark import outputs
+from terrafusion.fusion.reports.benchmark.outputs import MARK, write_benchmark, write_document
+from tests.studies.field_table import table as field_table
+from tests.studies.field_table.table import Refusal
 
 FEW = ("fixed", "adaptive", "oracle")
 JOB = Job(Case("outages", "twin", FIRST_SEED + 2), FEW)

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
 
 NAMES = "soil.resistance.rolling,vehicle.wheel.radius_m,vehicle.body.cg_height_m"
 

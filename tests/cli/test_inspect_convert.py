@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import typer
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import formats, open_recording
-from terrafusion.datasets.recording import Recording
 from terrafusion.fusion.cli import convert, inspect
 
 FILES = {
@@ -229,7 +229,7 @@ def test_absent_catalogue_name(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("TERRAFUSION_DATA", str(tmp_path))
-    monkeypatch.setattr("terrafusion.datasets.catalog.cache_folder", lambda: tmp_path)
+    monkeypatch.setattr("terrafusion.datasets.catalog.catalog.cache_folder", lambda: tmp_path)
     status, _, err = run(capsys, "inspect", "husky_parkinglot/test1")
     assert (status, err.count("\n")) == (1, 1)
     assert "terrafusion fetch husky_parkinglot" in err

@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from ruamel.yaml import YAML
 
-from terrafusion.datasets.catalog import CATALOG_VARIABLE, FILE_COLUMNS, HERE, sha256_of
-from terrafusion.datasets.config import read_yaml
-from terrafusion.datasets.frames import rpy_to_quaternion
-from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Motor, Recording, Terrain, Wheels
-from terrafusion.datasets.sensors import GnssSpec, ImuSpec, Rig, SensorSuite, WheelSpec
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, FILE_COLUMNS, HERE, sha256_of
+from terrafusion.datasets.core.config import read_yaml
+from terrafusion.datasets.core.frames import rpy_to_quaternion
+from terrafusion.datasets.core.recording import Command, Fix, Gnss, Imu, Motor, Recording, Terrain, Wheels
+from terrafusion.datasets.core.sensors import GnssSpec, ImuSpec, Rig, SensorSuite, WheelSpec
+from terrafusion.datasets.core.trajectory import Trajectory
 
 START_NS = 1_700_000_000_123_456_789
 TRACK_M = 0.555

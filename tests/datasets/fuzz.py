@@ -149,10 +149,11 @@ def mutated(rng: np.random.Generator, sample: Path, folder: Path) -> Path:
 
 def open_and_examine(path: Path, repair_clock: bool) -> None:
     """What `inspect` and `convert --apply-fixes` do with a log; a pickle's hash counts as known."""
-    from terrafusion.datasets.conventions import Conventions, apply
-    from terrafusion.datasets.doctor import examine, treat
+    from terrafusion.datasets.checks import run as examine
+    from terrafusion.datasets.checks import treat
+    from terrafusion.datasets.core.conventions import Conventions, apply
     from terrafusion.datasets.readers.formats import Request, format_of
-    from terrafusion.datasets.single_wheel import read_wheel_trials
+    from terrafusion.datasets.readers.sets.single_wheel import read_wheel_trials
 
     form = format_of(path)
     if form.name == "single_wheel_mat":  # trials, not a drive
@@ -184,7 +185,7 @@ def outcome_of(path: Path, repair_clock: bool) -> str:
 def _in_child(path: Path, repair_clock: bool) -> int:
     import warnings
 
-    from terrafusion.datasets.errors import TerrafusionError
+    from terrafusion.datasets.core.errors import TerrafusionError
 
     now = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (now + MEMORY_BYTES, now + MEMORY_BYTES))

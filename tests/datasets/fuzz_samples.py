@@ -36,8 +36,8 @@ def _sides(v: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 
 def _recording() -> Any:
-    from terrafusion.datasets.frames import rpy_to_quaternion
-    from terrafusion.datasets.recording import (
+    from terrafusion.datasets.core.frames import rpy_to_quaternion
+    from terrafusion.datasets.core.recording import (
         Command,
         Gnss,
         Imu,
@@ -47,7 +47,7 @@ def _recording() -> Any:
         Terrain,
         Wheels,
     )
-    from terrafusion.datasets.trajectory import Trajectory
+    from terrafusion.datasets.core.trajectory import Trajectory
 
     t_imu, gyro, accel = _inertial(50)
     t, v, rate, place = _drive(10)

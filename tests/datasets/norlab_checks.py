@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.lag import Lag, lag_between
-from terrafusion.datasets.recording import Imu, Recording, Wheels
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.core.lag import Lag, lag_between
+from terrafusion.datasets.core.recording import Imu, Recording, Wheels
 
 RADIUS_M, TRACK_M = 0.3, 1.08
 START_NS = 1_722_278_749_529_941_023

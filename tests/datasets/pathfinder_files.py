@@ -7,8 +7,8 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from terrafusion.datasets.frames import enu_to_geodetic
-from terrafusion.datasets.gnss_time import GPS_EPOCH_S
+from terrafusion.datasets.core.frames import enu_to_geodetic
+from terrafusion.datasets.core.gnss_time import GPS_EPOCH_S
 
 START_S = 1_600_000_000.25
 SECONDS = 60.0

@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.conventions import Conventions, apply
-from terrafusion.datasets.doctor.finding import Patient
-from terrafusion.datasets.doctor.measures import measure
-from terrafusion.datasets.doctor.mounting import heading
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.measures import measure
+from terrafusion.datasets.checks.mounting import heading
+from terrafusion.datasets.core.conventions import Conventions, apply
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import TERRAINS, Recording, differences
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import borealtc_csv
-from terrafusion.datasets.recording import TERRAINS, Recording, differences
 
 IMU_HEADER, PRO_HEADER = "time,wx,wy,wz,ax,ay,az", "time,curL,curR,velL,velR"
 SECONDS, TRACK_M = 60.0, 0.8

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.datasets import catalog
-from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.catalog import catalog
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.formats import FORMATS
 

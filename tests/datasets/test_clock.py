@@ -7,9 +7,9 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.clock import in_order, repair, repair_together
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import ClockJump
+from terrafusion.datasets.core.clock import in_order, repair, repair_together
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import ClockJump
 
 START_NS = 1_600_000_000_000_000_000
 MS, S = 10**6, 10**9

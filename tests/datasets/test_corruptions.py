@@ -12,16 +12,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine, treat
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import enu_to_geodetic
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import treat
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import enu_to_geodetic
+from terrafusion.datasets.core.recording import Channel, Recording, Wheels
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Channel, Recording, Wheels
-from terrafusion.datasets.sensors import Rig
 from terrafusion.datasets.writers import write_log_folder
-from terrafusion.twin.scenario import Scenario, load_scenario
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import Scenario, load_scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 SCENARIO = """\
 description: straights, turns both ways, a stop, a stretch in reverse

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets import decimals
-from terrafusion.datasets.decimals import NS_PER, NotADecimal, to_ns
+from terrafusion.datasets.core import decimals
+from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, to_ns
 
 NUMBERS = st.from_regex(r"\A[+-]?\d{1,12}(\.\d{0,14})?\Z") | st.from_regex(r"\A-?\d\.\d{0,9}[eE][+-]?\d\Z")
 

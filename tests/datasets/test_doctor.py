@@ -8,9 +8,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.sensors import Rig
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 
 
 def test_clean_drive_has_no_finding(drive: Recording, husky_rig: Rig) -> None:

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.recording import Imu, Recording
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.core.recording import Imu, Recording
 
 from .test_doctor_physics import (
     EFFECTIVE_TRACK_M,

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.datasets import doctor
+from terrafusion.datasets import checks as doctor
 
 TEXT = (Path(__file__).parents[2] / "docs" / "doctor.md").read_text(encoding="utf-8")
 MODULES = [f"{doctor.__name__}.{module.name}" for module in pkgutil.iter_modules(doctor.__path__)]

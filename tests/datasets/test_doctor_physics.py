@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine, treat
-from terrafusion.datasets.frames import enu_to_geodetic, rpy_to_quaternion
-from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Overrides, Recording, Wheels
-from terrafusion.datasets.sensors import Rig, axes_matrix
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import treat
+from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
+from terrafusion.datasets.core.recording import Command, Fix, Gnss, Imu, Overrides, Recording, Wheels
+from terrafusion.datasets.core.sensors import Rig, axes_matrix
+from terrafusion.datasets.core.trajectory import Trajectory
 
 START_NS = 1_700_000_000_000_000_000
 SECONDS, REST_S = 90.0, 6.0

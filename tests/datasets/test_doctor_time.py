@@ -10,13 +10,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import Finding, Patient, examine, treat
-from terrafusion.datasets.doctor.offsets import _finding
-from terrafusion.datasets.doctor.pairs import far_lag, signal_pairs
-from terrafusion.datasets.lag import Lag
+from terrafusion.datasets.checks import Finding, Patient, treat
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks.delays import _finding
+from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
+from terrafusion.datasets.core.lag import Lag
+from terrafusion.datasets.core.recording import ClockJump, Imu, Recording, Wheels
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import ClockJump, Imu, Recording, Wheels
-from terrafusion.datasets.sensors import Rig
 
 Spoil = Callable[[Recording], Recording]
 START_NS = 1_700_000_000_123_456_789

@@ -8,13 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine, treat
-from terrafusion.datasets.doctor.environment import circle
-from terrafusion.datasets.doctor.summary import summarise
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import treat
+from terrafusion.datasets.checks.environment import circle
+from terrafusion.datasets.checks.summary import summarise
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Barometer, Imu, Magnetometer, Recording, differences
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Barometer, Imu, Magnetometer, Recording, differences
-from terrafusion.datasets.sensors import Rig
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 
 from .ros_bags import MAKE1, MAKE2, T0, Make, Message, imu_messages, write_ros1, write_ros2
@@ -107,7 +108,7 @@ def test_a_field_is_as_long_as_its_clock() -> None:
 
 
 def test_inspect_shows_them() -> None:
-    from terrafusion.datasets.doctor.measures import measure
+    from terrafusion.datasets.checks.measures import measure
 
     recording = turning()
     page = summarise(recording, measure([recording]), [])

@@ -12,8 +12,8 @@ from typing import Any, ClassVar
 
 import pytest
 
-from terrafusion.datasets import catalog, fetch
-from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.catalog import catalog, fetch
+from terrafusion.datasets.core.errors import ConfigError, DataError
 
 CONTENT = bytes(range(256)) * 2000
 

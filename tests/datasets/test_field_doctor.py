@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine, treat
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import treat
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.readers import open as opening
-from terrafusion.datasets.recording import Overrides, Recording
 
 
 @pytest.fixture

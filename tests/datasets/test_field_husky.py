@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.conventions import Conventions, apply
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.doctor.measures import measure
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks.measures import measure
+from terrafusion.datasets.core.conventions import Conventions, apply
+from terrafusion.datasets.core.recording import Fix, Imu, Overrides, Recording, differences
+from terrafusion.datasets.core.sensors import AXES, Rig, axes_matrix
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Fix, Imu, Overrides, Recording, differences
-from terrafusion.datasets.sensors import AXES, Rig, axes_matrix
 from terrafusion.datasets.writers import write_log_folder
 
 TRACK_M = 0.555

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.lag import held_rows, lag_between
+from terrafusion.datasets.core.lag import held_rows, lag_between
 
 Array = np.ndarray
 

@@ -12,10 +12,19 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import (
+    Command,
+    Fix,
+    Gnss,
+    Imu,
+    Recording,
+    Terrain,
+    Wheels,
+    differences,
+)
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import csv_table, open_recording
-from terrafusion.datasets.recording import Command, Fix, Gnss, Imu, Recording, Terrain, Wheels, differences
-from terrafusion.datasets.trajectory import Trajectory
 from terrafusion.datasets.writers import log_folder, write_log_folder
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"

@@ -20,11 +20,11 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_typestore
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import Imu, Overrides, Recording, Wheels, differences
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Imu, Overrides, Recording, Wheels, differences
-from terrafusion.datasets.sensors import Rig
-from terrafusion.datasets.trajectory import write_tum
 from terrafusion.datasets.writers import ros_messages, write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 

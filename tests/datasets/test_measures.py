@@ -9,12 +9,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.doctor.measures import measure
-from terrafusion.datasets.doctor.summary import summarise, summarise_all
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.sensors import Rig
-from terrafusion.fusion.cli.page import WIDTH, page_lines
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks.measures import measure
+from terrafusion.datasets.checks.summary import summarise, summarise_all
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.cli.inspect_page import WIDTH, page_lines
 
 
 def cut(recording: Recording, seconds: float) -> list[Recording]:

@@ -13,10 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import enu_to_geodetic, geodetic_to_enu
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
+from terrafusion.datasets.core.recording import Fix, Recording
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Fix, Recording
 
 DATUM = (48.1, 11.5, 520.0)
 START = "2024-02-29T23:59:58"

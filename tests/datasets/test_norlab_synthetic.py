@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recording, open_recordings
 
 from .conftest import CatalogWith

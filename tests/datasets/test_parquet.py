@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recording
 
 from .test_table import GYRO_MAP, START_NS

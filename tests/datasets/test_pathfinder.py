@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.lag import lag_between
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.core.lag import lag_between
+from terrafusion.datasets.core.recording import Fix, Recording
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Fix, Recording
 
 from .conftest import CatalogWith
 from .pathfinder_files import DATUM, RADIUS_M, SECONDS, START_S, TRACK_M, WEEK_START_S, fixes, save, workspace

@@ -12,7 +12,7 @@ import h5py
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recordings
 
 from .pathfinder_files import fixes, save, workspace

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.pieces import LEAST_S, piece, pieces, split_name
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.segments import LEAST_S, piece, pieces, split_name
 
 
 def test_pieces_share_out_every_row_once(drive: Recording) -> None:

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.ros.joints import wheel_of_joint
-from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.datasets.sensors import Rig
 
 from .ros_bags import MAKE1, MAKE2, T0, Message, imu_messages, odometry_messages, write_ros1, write_ros2
 

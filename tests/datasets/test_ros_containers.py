@@ -16,7 +16,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.ros.raw import BagError, Container, decompress, zstd
 from terrafusion.datasets.readers.ros.ros1_file import Ros1File

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import ClockJump, Recording
 
 from .ros_bags import MAKE1, MAKE2, T0, Message, write_ros1, write_ros2
 

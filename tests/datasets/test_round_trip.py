@@ -13,8 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import (
+from terrafusion.datasets.core.recording import (
     Barometer,
     ClockJump,
     Command,
@@ -28,7 +27,8 @@ from terrafusion.datasets.recording import (
     Wheels,
     differences,
 )
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 
 S = 10**9

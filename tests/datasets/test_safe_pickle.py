@@ -15,7 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.readers.sets.pickled_frame import ALLOWED
 from terrafusion.datasets.readers.sets.safe_pickle import numbers, read_table

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import open_recordings
-from terrafusion.datasets.single_wheel import FIELDS, WheelTrials, read_wheel_trials
+from terrafusion.datasets.readers.sets.single_wheel import FIELDS, WheelTrials, read_wheel_trials
 
 COUNT = 12
 DTYPE = [(name, object) for name in [*sorted(FIELDS), "polyx"]]
@@ -100,7 +100,7 @@ def test_axes_and_signs(smooth: Path) -> None:
 
 
 def test_axes_as_the_file_has_them_are_seen(smooth: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from terrafusion.datasets import single_wheel
+    from terrafusion.datasets.readers.sets import single_wheel
 
     for name, check in (("Fy", "a locked wheel drags"), ("Fz", "the load presses"), ("Z", "it sinks")):
         with monkeypatch.context() as patch:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.datasets import survey
-from terrafusion.datasets.catalog import DATA_VARIABLE, load_catalog
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.survey_facts import FACTS, Fact, Instead
+from terrafusion.datasets.catalog.catalog import DATA_VARIABLE, load_catalog
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers import write_log_folder
+from tests.studies.survey import survey
+from tests.studies.survey.published import FACTS, Fact, Instead
 
 
 @pytest.fixture

@@ -13,12 +13,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError, DataError, TerrafusionError
-from terrafusion.datasets.frames import enu_to_geodetic, geodetic_to_enu
+from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
+from terrafusion.datasets.core.recording import Fix, Recording
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.text.column_map import FIELDS, starter_map
 from terrafusion.datasets.readers.text.units import UNITS, units_of
-from terrafusion.datasets.recording import Fix, Recording
 
 START_NS = 1_700_000_000_123_456_789
 GYRO_MAP = "time: {column: t}\nchannels: {imu: {gyro_z_radps: wz}}\n"

@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import differences
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import umich_text
 from terrafusion.datasets.readers.text import number_rows
-from terrafusion.datasets.recording import differences
 
 START_S = 1_652_300_000
 FAMILY = ("trial4_wheel_imu.txt", "trial4_wheel_vel.txt", "trial4_loop_center.txt", "trial4_loop_front.txt")

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.catalog import load_catalog
-from terrafusion.datasets.conventions import Conventions, apply
-from terrafusion.datasets.doctor.finding import Patient
-from terrafusion.datasets.doctor.measures import measure
-from terrafusion.datasets.doctor.mounting import heading
-from terrafusion.datasets.lag import lag_between
+from terrafusion.datasets.catalog.catalog import load_catalog
+from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.measures import measure
+from terrafusion.datasets.checks.mounting import heading
+from terrafusion.datasets.core.conventions import Conventions, apply
+from terrafusion.datasets.core.lag import lag_between
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.trajectory import Trajectory
 
 START_S = 1_652_300_000
 SECONDS = 60.0

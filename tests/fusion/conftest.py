@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from terrafusion.datasets.frames import rpy_to_quaternion
-from terrafusion.datasets.recording import Fix, Gnss, Recording, Wheels
-from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.fusion.estimate import Estimate, Innovation, WeightChange
+from terrafusion.datasets.core.frames import rpy_to_quaternion
+from terrafusion.datasets.core.recording import Fix, Gnss, Recording, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.estimate.estimate import Estimate, Innovation, WeightChange
 
 START_NS = 1_700_000_000_000_000_000
 CLASSES = ("asphalt", "loose_sand", "mud", "unknown")

@@ -10,19 +10,19 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import quaternion_to_matrix
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.sensors import BarometerSpec, MagnetometerSpec
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.scores.metrics import Outage
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
-from terrafusion.twin.sensing.environment import DECLINATION_RAD
-from terrafusion.twin.sensing.realism import BarometerRealism, MagnetometerRealism
+from terrafusion.twin.model.sensor_realism import BarometerRealism, MagnetometerRealism
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.sensors.environment import DECLINATION_RAD
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 ASPHALT = (RouteLeg("asphalt"),)
 WEST_OF_NORTH_DEG = 110.0

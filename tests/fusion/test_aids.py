@@ -12,12 +12,12 @@ from gtsam.symbol_shorthand import X
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.atmosphere import pressure_at
-from terrafusion.datasets.errors import DataError
-from terrafusion.fusion.estimate import Innovation
-from terrafusion.fusion.inputs.alignment import Start
-from terrafusion.fusion.inputs.barometer import HeightAid, height_factor, height_jacobian
-from terrafusion.fusion.inputs.magnetometer import (
+from terrafusion.datasets.core.atmosphere import pressure_at
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.estimator.alignment import Start
+from terrafusion.fusion.estimator.barometer import HeightAid, height_factor, height_jacobian
+from terrafusion.fusion.estimator.magnetometer import (
     CHANCES,
     PATIENCE,
     HeadingAid,
@@ -28,7 +28,7 @@ from terrafusion.fusion.inputs.magnetometer import (
     yaw_jacobian,
     yaw_of,
 )
-from terrafusion.fusion.inputs.slow_bias import AHEAD_NS, SlowBias, split
+from terrafusion.fusion.estimator.slow_bias import AHEAD_NS, SlowBias, split
 
 ANGLES = st.floats(-3.1, 3.1)
 TILTS = st.floats(-0.5, 0.5)

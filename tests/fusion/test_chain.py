@@ -10,12 +10,13 @@ import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gnss_factor, markov, velocity_factor, wheel_factor
+from terrafusion.fusion.graph import gauss_markov as markov
+from terrafusion.fusion.graph import gnss_factor, velocity_factor, wheel_factor
 from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.gauss_markov import markov_step
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
-from terrafusion.fusion.graph.markov import markov_step
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 

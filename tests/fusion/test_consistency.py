@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.datasets.recording import Terrain
-from terrafusion.fusion.estimate import Innovation
-from terrafusion.fusion.scores import consistency as c
-from terrafusion.fusion.scores import twin_consistency as twin
-from terrafusion.fusion.scores.metrics import score
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Terrain
+from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.metrics import consistency as c
+from terrafusion.fusion.metrics.metrics import score
+from tests.studies import twin_consistency as twin
 
 
 def gauss_markov(n: int, a: float, rng: np.random.Generator, columns: int = 2) -> np.ndarray:

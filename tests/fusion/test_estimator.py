@@ -7,18 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.datasets.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
-from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import Estimate
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import choose_vehicle, replay, split_fixes
-from terrafusion.fusion.scores.metrics import Outage
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 
 @pytest.fixture(scope="module")

@@ -16,11 +16,22 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Imu, Recording, Terrain, Wheels
-from terrafusion.fusion.scores import field_table, parts
-from terrafusion.fusion.scores.field_page import markdown, plot_lines, write
-from terrafusion.fusion.scores.field_summary import (
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Imu, Recording, Terrain, Wheels
+from terrafusion.fusion.benchmark import parts
+from terrafusion.fusion.benchmark.outage_plan import (
+    AID_HZ,
+    AID_SIGMA_M,
+    TAIL_S,
+    aided_by_truth,
+    plan_outages,
+    until,
+)
+from terrafusion.fusion.metrics.health import examine_estimate, rolled_m
+from terrafusion.twin.simulate import simulate
+from tests.studies.field_table import table as field_table
+from tests.studies.field_table.page import markdown, plot_lines, write
+from tests.studies.field_table.summary import (
     Beside,
     beside_each,
     condense,
@@ -28,7 +39,7 @@ from terrafusion.fusion.scores.field_summary import (
     ratio_of,
     verdicts,
 )
-from terrafusion.fusion.scores.field_table import (
+from tests.studies.field_table.table import (
     Refusal,
     Run,
     Task,
@@ -40,16 +51,6 @@ from terrafusion.fusion.scores.field_table import (
     run_tasks,
     tasks_of,
 )
-from terrafusion.fusion.scores.health import examine_estimate, rolled_m
-from terrafusion.fusion.scores.outage_plan import (
-    AID_HZ,
-    AID_SIGMA_M,
-    TAIL_S,
-    aided_by_truth,
-    plan_outages,
-    until,
-)
-from terrafusion.twin.simulate import simulate
 
 SECOND_NS = 1_000_000_000
 
@@ -375,7 +376,7 @@ def test_a_real_log_with_one_outage_and_a_log_that_is_refused(tmp_path: Path) ->
         pytest.skip("TERRAFUSION_DATA names no folder with umich_husky: the field logs are not at hand")
     logs = ["umich_husky/mair_mocap/trial7", "umich_husky/mair_mocap/trial2"]
     words = ["--out", str(tmp_path), "--modes", "fixed", "--starts", "1", "--logs", *logs]
-    command = [sys.executable, "-m", "terrafusion.fusion.scores.field_table", *words]
+    command = [sys.executable, "-m", "tests.studies.field_table.table", *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     with (tmp_path / "runs.csv").open(encoding="utf-8", newline="") as file:
@@ -430,7 +431,7 @@ def test_the_command_shares_logs_among_processes(tmp_path: Path) -> None:
         log.mkdir()
         (log / "wheels.csv").write_text("t_s,left_mps,right_mps\n0.0,0.1,0.1\n0.1,0.1,0.1\n")
     words = ["--out", "out", "--jobs", "2", "--modes", "fixed", "--logs", *map(str, logs)]
-    command = [sys.executable, "-m", "terrafusion.fusion.scores.field_table", *words]
+    command = [sys.executable, "-m", "tests.studies.field_table.table", *words]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr + done.stdout
     refused = (tmp_path / "out" / "refused.csv").read_text()

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from terrafusion.fusion.graph.friction import SLIP_SPEED_MPS, slid
+from terrafusion.fusion.graph.coulomb import SLIP_SPEED_MPS, slid
 
 Array = NDArray[np.float64]
 

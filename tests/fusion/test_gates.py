@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from terrafusion.fusion.estimator.gates import GnssGate, Verdict, WheelGate
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.gates import GnssGate, Verdict, WheelGate
 
 GATE = float(chi2.ppf(0.999, 2))
 

@@ -10,22 +10,22 @@ import gtsam
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import WeightChange
-from terrafusion.fusion.estimator import Estimator
-from terrafusion.fusion.front import Inputs, inputs_of
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import aided_by_truth
+from terrafusion.fusion.estimate.estimate import WeightChange
+from terrafusion.fusion.estimator import friction as grips
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.friction import Grip, grip_of
+from terrafusion.fusion.estimator.sensor_config import Inputs, inputs_of
+from terrafusion.fusion.estimator.streams import GnssFix, ImuSegment
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs import grip as grips
-from terrafusion.fusion.inputs.grip import Grip, grip_of
-from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.live import messages
+from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, choose_vehicle, replay
-from terrafusion.fusion.scores.metrics import Outage
-from terrafusion.fusion.scores.outage_plan import aided_by_truth
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import load_soil
 
 FRICTION = 0.1
 """Of rubber on ice: 0.98 m/s2."""
@@ -138,7 +138,7 @@ def test_ground_that_holds_costs_nothing(asphalt: Recording, monkeypatch: pytest
     _, slides, _ = followed(asphalt)
     assert not any(slides)
     heard = replay(asphalt)
-    monkeypatch.setattr("terrafusion.fusion.estimator.grip_of", lambda *_: None)
+    monkeypatch.setattr("terrafusion.fusion.estimator.estimator.grip_of", lambda *_: None)
     assert places(heard) == places(replay(asphalt))
 
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import replay
-from terrafusion.fusion.terrain.labels import GroundLabels
-from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import START_NS, simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 CLASSES = load_policy().names()
 SWITCH_NS = START_NS + 15 * 10**9

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion import estimator
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimator import estimator
+from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import replay
-from terrafusion.fusion.scores.metrics import Outage
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
 IN_AND_OUT_OF_SAND = Scenario(

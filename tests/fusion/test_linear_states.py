@@ -15,16 +15,16 @@ from typer.testing import CliRunner
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.cli.main import app
-from terrafusion.fusion.estimate import Estimate
+from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
-from terrafusion.fusion.report.linear_states import QUANTITIES, calibration, cells, series
-from terrafusion.fusion.report.outputs import build_metrics, estimate_columns, final_status, to_json
-from terrafusion.fusion.report.plots_states import drawn, plot_skid_steering
-from terrafusion.fusion.report.report import ReportRun, write_report
-from terrafusion.fusion.report.ros_estimate import written_estimate
-from terrafusion.fusion.scores.metrics import score
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.fusion.metrics.metrics import score
+from terrafusion.fusion.reports.replay.linear_states import QUANTITIES, calibration, cells, series
+from terrafusion.fusion.reports.replay.outputs import build_metrics, estimate_columns, final_status, to_json
+from terrafusion.fusion.reports.replay.page import ReportRun, write_report
+from terrafusion.fusion.reports.replay.plots_states import drawn, plot_skid_steering
+from terrafusion.fusion.reports.replay.ros_estimate import written_estimate
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
 SCHEMA = Path(__file__).parents[2] / "docs" / "schemas" / "metrics.schema.json"

@@ -13,16 +13,16 @@ import numpy as np
 import pymap3d
 import pytest
 
-from terrafusion.datasets.frames import quaternion_to_matrix
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import State
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.odometry import transition
 from terrafusion.fusion.live import main, messages, repeated, run
-from terrafusion.fusion.propagate import transition
 from terrafusion.fusion.replay import replay
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import DATUM, simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 PAGE = Path(__file__).parents[2] / "docs" / "integration.md"
 

@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.datasets.frames import rpy_to_quaternion
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.fusion.scores.error_series import Errors, travelled_m
-from terrafusion.fusion.scores.metrics import (
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.frames import rpy_to_quaternion
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.metrics.error_series import Errors, travelled_m
+from terrafusion.fusion.metrics.metrics import (
     Outage,
     Scores,
     parse_outage,

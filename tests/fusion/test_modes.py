@@ -11,22 +11,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize_scalar
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.benchmark.tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.noise.modes import ModeTuning, RowTuning, load_modes, write_modes
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.scores.metrics import Outage
-from terrafusion.fusion.terrain.labels import GroundLabels
-from terrafusion.fusion.weights.innovation import SageHusa, Variational
-from terrafusion.fusion.weights.modes import ModeTuning, RowTuning, load_modes, write_modes
-from terrafusion.fusion.weights.policy import load_policy
-from terrafusion.fusion.weights.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
-from terrafusion.fusion.weights.terrain_weights import TerrainWeights
-from terrafusion.fusion.weights.weighting import Surprise
+from terrafusion.fusion.weighting.adaptive import TerrainWeights
+from terrafusion.fusion.weighting.innovation import SageHusa, Variational
+from terrafusion.fusion.weighting.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
+from terrafusion.fusion.weighting.weighting import Surprise
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
+from tests.studies.mode_tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune
 
 METHODS = ("cauchy", "gnc", "sage_husa", "variational")
 

@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.datasets.sensors import Rig
-from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
-from terrafusion.fusion.monitor import SPINNING, STALLED, MotionMonitor
-from terrafusion.fusion.rest import CREEP_MPS, RestDetector, likelihood_ratio, shaking
-from terrafusion.fusion.scores.slip_trials import alarms, poisson_interval, spinning_hill, stuck_trial
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.estimator.slip_monitor import SPINNING, STALLED, MotionMonitor
+from terrafusion.fusion.estimator.stationarity import CREEP_MPS, RestDetector, likelihood_ratio, shaking
+from terrafusion.fusion.estimator.streams import ImuStream, WheelStream
+from terrafusion.twin.model.vehicle import load_vehicle
+from tests.studies.slip_trials import alarms, poisson_interval, spinning_hill, stuck_trial
 
 RADIUS_M, DT_S = 0.175, 0.1
 COARSE_RAD = 0.02

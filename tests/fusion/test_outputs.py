@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from jsonschema import Draft202012Validator
 
-from terrafusion.datasets.atomic import write_atomically
-from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.datasets.trajectory import read_tum
-from terrafusion.fusion.report.outputs import (
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.readers.text.tum import read_tum
+from terrafusion.fusion.metrics.metrics import HeldOut, Outage, Scores, score
+from terrafusion.fusion.reports.replay.outputs import (
     MODES,
     build_metrics,
     final_status,
@@ -24,7 +25,6 @@ from terrafusion.fusion.report.outputs import (
     to_json,
     write_outputs,
 )
-from terrafusion.fusion.scores.metrics import HeldOut, Outage, Scores, score
 
 SCHEMA = json.loads(
     (Path(__file__).parents[2] / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8")

@@ -7,15 +7,15 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.frames import wrap_angle
-from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import State
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.frames import wrap_angle
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 from tests.fusion.test_aided_drives import aided
 
 WITHOUT_S = 50.0

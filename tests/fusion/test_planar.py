@@ -10,21 +10,21 @@ import gtsam
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.datasets.frames import GRAVITY_MPS2, wrap_angle
-from terrafusion.datasets.recording import Imu, Recording, Wheels
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2, wrap_angle
+from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import write_log_folder
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimator import Estimator
-from terrafusion.fusion.front import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.sensor_config import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.estimator.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, in_a_turn, yaw_of_wheels
-from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 REDUCED = ("gyro z", "no accelerometer", "no imu", "body speed")
 

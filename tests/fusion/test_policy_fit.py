@@ -8,17 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.terrain.drives import Grid
-from terrafusion.fusion.weights.policy import Policy, load_policy, within_ranges
-from terrafusion.fusion.weights.policy_evidence import (
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.noise.policy import Policy, load_policy, within_ranges
+from terrafusion.fusion.training.drives import Grid
+from terrafusion.fusion.training.policy_evidence import (
     LAG_S,
     SLIP_S,
     STUCK_COUNTS_S,
     Evidence,
     evidence_of,
 )
-from terrafusion.fusion.weights.policy_fit import (
+from terrafusion.fusion.training.policy_fit import (
     RADIUS_SIGMA,
     UNKNOWN_SPREAD,
     default_grid,
@@ -27,7 +27,7 @@ from terrafusion.fusion.weights.policy_fit import (
     row_of,
     write_policy,
 )
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
 GRID = Grid(("staircase",), (3.0,), (0.0,), (5,))

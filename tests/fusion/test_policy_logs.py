@@ -12,19 +12,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from terrafusion.datasets.errors import DataError, TerrafusionError
-from terrafusion.datasets.frames import rpy_to_quaternion
-from terrafusion.datasets.recording import Recording, Terrain, Wheels
-from terrafusion.datasets.trajectory import Trajectory
+from terrafusion.datasets.core.errors import DataError, TerrafusionError
+from terrafusion.datasets.core.frames import rpy_to_quaternion
+from terrafusion.datasets.core.recording import Recording, Terrain, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.cli.main import app
-from terrafusion.fusion.terrain.drives import Grid
-from terrafusion.fusion.weights import policy_fit
-from terrafusion.fusion.weights.policy import load_policy
-from terrafusion.fusion.weights.policy_evidence import SLIP_S, evidence_of
-from terrafusion.fusion.weights.policy_fit import Logged, fingerprint_of, fit_policy, informed
-from terrafusion.fusion.weights.policy_logs import MEAN_S, logged_evidence, motion_of, read_logs
+from terrafusion.fusion.noise.policy import load_policy
+from terrafusion.fusion.training import policy_fit
+from terrafusion.fusion.training.drives import Grid
+from terrafusion.fusion.training.policy_evidence import SLIP_S, evidence_of
+from terrafusion.fusion.training.policy_fit import Logged, fingerprint_of, fit_policy, informed
+from terrafusion.fusion.training.policy_logs import MEAN_S, logged_evidence, motion_of, read_logs
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 START_NS = 1_700_000_000_000_000_000
 TRACK_M = load_vehicle("warthog").rig().track_m

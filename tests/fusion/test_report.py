@@ -11,14 +11,19 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Fix, Gnss, Recording, Terrain
-from terrafusion.fusion.estimate import WeightChange
-from terrafusion.fusion.report import plots, plots_filter, plots_map
-from terrafusion.fusion.report.outputs import build_metrics, final_status, rejected_counts, terrain_shares
-from terrafusion.fusion.report.report import ReportRun, write_report
-from terrafusion.fusion.report.style import colour_of, plain, thin
-from terrafusion.fusion.report.text import Row, head_of_many, number, pick_pair, table_rows
-from terrafusion.fusion.scores.metrics import Outage, score
+from terrafusion.datasets.core.recording import Fix, Gnss, Recording, Terrain
+from terrafusion.fusion.estimate.estimate import WeightChange
+from terrafusion.fusion.metrics.metrics import Outage, score
+from terrafusion.fusion.reports.replay import plots, plots_filter, plots_map
+from terrafusion.fusion.reports.replay.outputs import (
+    build_metrics,
+    final_status,
+    rejected_counts,
+    terrain_shares,
+)
+from terrafusion.fusion.reports.replay.page import ReportRun, write_report
+from terrafusion.fusion.reports.replay.text import Row, head_of_many, number, pick_pair, table_rows
+from terrafusion.fusion.reports.style import colour_of, plain, thin
 
 HOSTILE = '<script>alert("x")</script>&_$\\frac{'
 OUTAGES = (Outage(40.0, 30.0),)

@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
-from terrafusion.datasets.frames import quaternion_to_matrix
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.datasets.core.recording import differences
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.recording import differences
 from terrafusion.datasets.writers import write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level
-from terrafusion.fusion.report.ros_estimate import told_rows, written_estimate
+from terrafusion.fusion.reports.replay.ros_estimate import told_rows, written_estimate
 
 
 def with_outage(d: Any, first: int = 405, last: int = 705) -> Any:

@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given as drawn
 from hypothesis import strategies as st
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.benchmark.tuning import DRIVES
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.skid import Slide
+from terrafusion.fusion.estimator.streams import GnssFix
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.inputs.slide import Slide
-from terrafusion.fusion.inputs.streams import GnssFix
-from terrafusion.fusion.inputs.track import MotionTrack
 from terrafusion.fusion.live import messages
 from terrafusion.fusion.replay import Replay, replay
+from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate, simulate_run
-from terrafusion.twin.soil import load_soil
+from tests.studies.mode_tuning import DRIVES
 
 FRICTION = 0.1
 """Of rubber on ice."""

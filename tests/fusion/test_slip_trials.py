@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from terrafusion.fusion.scores.slip_trials import (
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate
+from tests.studies.slip_trials import (
     MOVING_MPS,
     Told,
     delays_text,
@@ -12,9 +15,6 @@ from terrafusion.fusion.scores.slip_trials import (
     poisson_interval,
     true_slip,
 )
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
-from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 
 def test_slip_of_a_keyframe_is_the_mean_of_its_span_and_unknown_at_rest() -> None:

@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
-from terrafusion.fusion.graph.markov import MarkovStep
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.fusion.noise.policy import load_policy
 
 ROWS = load_policy().classes
 SAND = ROWS["loose_sand"]

@@ -17,10 +17,10 @@ import gtsam
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.fusion import snapshot
-from terrafusion.fusion.estimate import State
-from terrafusion.fusion.estimator import Estimator
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator import snapshot
+from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.graph.factor_numbers import factor_from, numbers_of
 from terrafusion.fusion.live import Message, messages
 from terrafusion.twin.simulate import simulate
@@ -164,7 +164,9 @@ def resigned(data: bytes, change) -> bytes:  # type: ignore[no-untyped-def]
     return signed(len(text).to_bytes(8, "little") + text + data[head + length :])
 
 
-@pytest.mark.parametrize("name", ["os:system", "builtins:eval", "terrafusion.fusion.snapshot:sys", "x"])
+@pytest.mark.parametrize(
+    "name", ["os:system", "builtins:eval", "terrafusion.fusion.estimator.snapshot:sys", "x"]
+)
 def test_a_file_cannot_name_what_is_built(data: bytes, name: str) -> None:
     def change(state: dict) -> None:
         state["parts"]["imu"]["object"] = name

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.fusion.config import EstimatorConfig
+from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.graph.batch import Batch
-from terrafusion.fusion.scores import speed_gtsam
-from terrafusion.fusion.scores.speed import Live, batch_parts, first_part, initial, live
-from terrafusion.fusion.scores.speed_gtsam import Graph
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
+from tests.studies.speed import gtsam_graph as speed_gtsam
+from tests.studies.speed.gtsam_graph import Graph
+from tests.studies.speed.speed import Live, batch_parts, first_part, initial, live
 
 
 @pytest.fixture(scope="module")

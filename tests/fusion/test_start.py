@@ -9,17 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import quaternion_to_matrix, wrap_angle
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.config import EstimatorConfig
-from terrafusion.fusion.estimate import State
-from terrafusion.fusion.estimator import Estimator
-from terrafusion.fusion.front import Inputs
-from terrafusion.fusion.inputs.alignment import turn_between
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.alignment import turn_between
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.sensor_config import Inputs
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 WAVE = {"yaw_rate_amplitude_radps": 0.3, "period_s": 8.0}
 DRIVES = {

@@ -12,13 +12,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel, load_terrain_model
-from terrafusion.fusion.terrain.drives import Grid
 from terrafusion.fusion.terrain.features import FEATURES, SLIP, YAW_SLIP
-from terrafusion.fusion.terrain.mixture import fit, fit_best, shrink
 from terrafusion.fusion.terrain.sequence import PatchFilter
-from terrafusion.fusion.terrain.train import Plan, fingerprint_of, write_model
+from terrafusion.fusion.training.drives import Grid
+from terrafusion.fusion.training.mixture import fit, fit_best, shrink
+from terrafusion.fusion.training.train import Plan, fingerprint_of, write_model
 
 D = len(FEATURES)
 CLASSES = ("asphalt", "medium_sand", "loose_sand", "mud", "unknown")
@@ -174,7 +174,7 @@ BROKEN = [
 
 @pytest.fixture(scope="module")
 def content(model: TerrainModel, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    from terrafusion.datasets.config import read_yaml
+    from terrafusion.datasets.core.config import read_yaml
 
     path = tmp_path_factory.mktemp("model") / "model.yaml"
     write_model(model, path)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli import policy, terrain
-from terrafusion.fusion.terrain.evaluate import Scores
+from terrafusion.fusion.training.evaluate import Scores
 
 
 @pytest.mark.parametrize(("app", "command"), [(terrain.app, "train"), (policy.app, "fit")])

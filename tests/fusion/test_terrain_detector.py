@@ -11,14 +11,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.terrain.classifier import TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector
-from terrafusion.fusion.terrain.drives import Condition, Grid, windows_of
-from terrafusion.fusion.terrain.evaluate import Route, changes_in, evaluate, splice
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
-from terrafusion.fusion.terrain.train import Plan, calibrate, drives_of, train
-from terrafusion.fusion.weights.policy import load_policy
+from terrafusion.fusion.training.drives import Condition, Grid, windows_of
+from terrafusion.fusion.training.evaluate import Route, changes_in, evaluate, splice
+from terrafusion.fusion.training.train import Plan, calibrate, drives_of, train
 from terrafusion.twin.simulate import simulate
 
 CLASSES = load_policy().names()

@@ -16,9 +16,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
-from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.cli.terrain import app
-from terrafusion.fusion.terrain.labelled import (
+from terrafusion.fusion.training.labelled import (
     FOLDS,
     Run,
     check_runs,
@@ -29,9 +29,9 @@ from terrafusion.fusion.terrain.labelled import (
     train_on,
     window_ms,
 )
-from terrafusion.fusion.terrain.softmax import SoftmaxModel, read_softmax
-from terrafusion.fusion.terrain.spliced import changes_seen, spliced
-from terrafusion.fusion.terrain.surface import (
+from terrafusion.fusion.training.softmax import SoftmaxModel, read_softmax
+from terrafusion.fusion.training.spliced import changes_seen, spliced
+from terrafusion.fusion.training.surface_features import (
     GROUPS,
     SURFACE_FEATURES,
     Signals,
@@ -39,7 +39,7 @@ from terrafusion.fusion.terrain.surface import (
     surface_windows,
     window_features,
 )
-from terrafusion.fusion.terrain.surface_report import (
+from terrafusion.fusion.training.surface_report import (
     figures_lines,
     leaking,
     lines_of,
@@ -72,7 +72,7 @@ def made_run(label: str, seed: int, **how: float) -> Run:
 
 @pytest.fixture(autouse=True)
 def short_routes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("terrafusion.fusion.terrain.spliced.PATCHES", 6)
+    monkeypatch.setattr("terrafusion.fusion.training.spliced.PATCHES", 6)
 
 
 @pytest.fixture(scope="module")

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.fusion.weights.policy import SCHEMA, Policy, SensorNoise, load_policy
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.fusion.noise.policy import SCHEMA, Policy, SensorNoise, load_policy
 
 FIELDS = [f.name for f in dataclasses.fields(SensorNoise)]
 ZERO_MEAN = [

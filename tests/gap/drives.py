@@ -7,8 +7,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
 SEGMENTS = (

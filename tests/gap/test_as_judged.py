@@ -8,15 +8,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Recording
-from terrafusion.fusion.gap_page.judge import ERROR, NIS, estimator_judge
-from terrafusion.twin.gap.as_judged import judged, scenario_of, twin_of
-from terrafusion.twin.gap.refit import Refit
-from terrafusion.twin.identify.log import Log, prepare
-from terrafusion.twin.identify.model import Model
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.estimator_gap import judged, scenario_of, twin_of
+from terrafusion.fusion.benchmark.judge import ERROR, NIS, estimator_judge
+from terrafusion.twin.calibrate.log import Log, prepare
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.infer.refit import Refit
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import run
 

@@ -8,10 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.gap import choice as choice_module
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.gap.answer.verdict import UNKNOWN
 from terrafusion.twin.gap.blind import plan
-from terrafusion.twin.gap.blind.development import (
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.residuals import state_sigmas
+from terrafusion.twin.gap.infer import cause_posterior as choice_module
+from terrafusion.twin.gap.infer.cause_posterior import Told, Weights, probabilities, weights
+from terrafusion.twin.gap.infer.channels import RIDGE, Block, Products, Table
+from terrafusion.twin.gap.infer.evidence import gather
+from terrafusion.twin.gap.infer.goodness_of_fit import Goodness
+from terrafusion.twin.gap.infer.nonlinear_refit import Fitter, bounds, sizes
+from terrafusion.twin.gap.infer.posterior import Pool
+from terrafusion.twin.gap.null.null import learn
+from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.model.vehicle import load_vehicle
+from tests.studies.blind.development import (
     Trial,
     crossed,
     read,
@@ -21,18 +33,6 @@ from terrafusion.twin.gap.blind.development import (
     utilities,
     write,
 )
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.channels import RIDGE, Block, Products, Table
-from terrafusion.twin.gap.choice import Told, Weights, probabilities, weights
-from terrafusion.twin.gap.evidence import gather
-from terrafusion.twin.gap.goodness import Goodness
-from terrafusion.twin.gap.ladder import Fitter, bounds, sizes
-from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.residuals import state_sigmas
-from terrafusion.twin.gap.score import learnt_sigma, score
-from terrafusion.twin.gap.verdict import UNKNOWN
-from terrafusion.twin.vehicle import load_vehicle
 
 from .drives import runs
 

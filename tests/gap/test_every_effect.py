@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from terrafusion.twin.gap.every_effect import first_forms, main
+from tests.studies.effect_sweep import first_forms, main
 
 
 def test_a_sensors_change_is_named_with_its_size(capsys: pytest.CaptureFixture[str]) -> None:

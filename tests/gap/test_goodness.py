@@ -9,11 +9,12 @@ import jsonschema
 import numpy as np
 import pytest
 
-from terrafusion.twin.gap import diagnose, refit
-from terrafusion.twin.gap.channels import RIDGE, Block, Products, Table, energy
-from terrafusion.twin.gap.goodness import FEWEST, FITS, LEVEL, MOST_ABOVE, Goodness, goodness
-from terrafusion.twin.gap.ladder import DIVERGED
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.gap import diagnose
+from terrafusion.twin.gap.infer import refit
+from terrafusion.twin.gap.infer.channels import RIDGE, Block, Products, Table, energy
+from terrafusion.twin.gap.infer.goodness_of_fit import FEWEST, FITS, LEVEL, MOST_ABOVE, Goodness, goodness
+from terrafusion.twin.gap.infer.nonlinear_refit import DIVERGED
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import runs
 

@@ -7,17 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.channels import Table
-from terrafusion.twin.gap.choice import linear
-from terrafusion.twin.gap.evidence import Bench, gather
-from terrafusion.twin.gap.ladder import Fitter, between
-from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.refit import Tried, errors_of
-from terrafusion.twin.gap.residuals import SOIL_STATE, reach, state_sigmas, within_limits
-from terrafusion.twin.gap.score import learnt_sigma, score
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.residuals import SOIL_STATE, reach, state_sigmas, within_limits
+from terrafusion.twin.gap.infer.cause_posterior import linear
+from terrafusion.twin.gap.infer.channels import Table
+from terrafusion.twin.gap.infer.evidence import Bench, gather
+from terrafusion.twin.gap.infer.nonlinear_refit import Fitter, between
+from terrafusion.twin.gap.infer.posterior import Pool
+from terrafusion.twin.gap.infer.refit import Tried, errors_of
+from terrafusion.twin.gap.null.null import learn
+from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import runs
 

@@ -12,13 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Gnss, Imu, Recording, Terrain, Wheels
-from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.twin.gap import injections
-from terrafusion.twin.gap.diagnosis import diagnose
-from terrafusion.twin.gap.effective_track import blocks_of, effective_track
-from terrafusion.twin.gap.injected import (
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Terrain, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.twin.gap.diagnose import diagnose
+from terrafusion.twin.model.vehicle import load_vehicle
+from tests.studies.effective_track import blocks_of, effective_track
+from tests.studies.fault_injection import table as injections
+from tests.studies.fault_injection.faults import (
     INJECTIONS,
     biased_gyro,
     late_fixes,
@@ -30,7 +31,7 @@ from terrafusion.twin.gap.injected import (
     scaled_wheels,
     turned_imu,
 )
-from terrafusion.twin.gap.injections import (
+from tests.studies.fault_injection.table import (
     SEVERITIES,
     LogSet,
     Source,
@@ -40,7 +41,6 @@ from terrafusion.twin.gap.injections import (
     table,
     verdict_on,
 )
-from terrafusion.twin.vehicle import load_vehicle
 
 HUSKY = load_vehicle("husky")
 RATE_HZ, SECONDS, SPEED_MPS, TURN_RADPS = 20, 60, 1.0, 0.2
@@ -210,7 +210,7 @@ def test_a_crash_is_a_wrong_answer_in_the_table(monkeypatch: pytest.MonkeyPatch)
     def crash(*_: object, **__: object) -> None:
         raise ZeroDivisionError("x")
 
-    monkeypatch.setattr("terrafusion.twin.gap.injections.diagnose", crash)
+    monkeypatch.setattr("tests.studies.fault_injection.table.diagnose", crash)
     source = Source(HUSKY, [CIRCLE], [(0, 0.0, 20.0), (0, 20.0, 40.0)])
     row = answered(source, LOGS, GYRO, 1.0, 0)
     assert row["right"] is False

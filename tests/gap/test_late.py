@@ -5,20 +5,20 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.channels import Table
-from terrafusion.twin.gap.evidence import gather, prepared, starting_model
-from terrafusion.twin.gap.ladder import Fitter, bounds
-from terrafusion.twin.gap.late import DELAYS, GROWING, IMU, in_time, late_layout
-from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import Pool
-from terrafusion.twin.gap.residuals import state_sigmas
-from terrafusion.twin.gap.rows import layout
-from terrafusion.twin.gap.score import learnt_sigma, score
-from terrafusion.twin.gap.signatures import Ask, predictions
-from terrafusion.twin.identify.log import Log, window_of
-from terrafusion.twin.identify.model import Model
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.residuals import state_sigmas
+from terrafusion.twin.gap.data.samples import layout
+from terrafusion.twin.gap.infer.channels import Table
+from terrafusion.twin.gap.infer.evidence import gather, prepared, starting_model
+from terrafusion.twin.gap.infer.nonlinear_refit import Fitter, bounds
+from terrafusion.twin.gap.infer.posterior import Pool
+from terrafusion.twin.gap.null.null import learn
+from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.gap.rollout.delay import DELAYS, GROWING, IMU, in_time, late_layout
+from terrafusion.twin.gap.rollout.sensitivities import Ask, predictions
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import run, runs
 

@@ -7,28 +7,28 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Overrides
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Overrides
+from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.effects import catalogue
+from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.effects.reece import second_terramechanics
-from terrafusion.twin.gap import side_by_side
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.channel_noise import first_noise
-from terrafusion.twin.gap.classes import done, likeness
-from terrafusion.twin.gap.detect import choices
-from terrafusion.twin.gap.discrepancy import FUNCTIONS, modulated
-from terrafusion.twin.gap.evidence import prepared, starting_model
-from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import Pool, beliefs
-from terrafusion.twin.gap.residuals import raw_of, state_sigmas, whitened
-from terrafusion.twin.gap.rows import layout
-from terrafusion.twin.gap.score import Score, score
-from terrafusion.twin.gap.side_by_side import graphs, groups, what_moves
-from terrafusion.twin.gap.signatures import Ask, drive, placed, predictions, signatures
-from terrafusion.twin.gap.verdict import HeldOut, null_probability
-from terrafusion.twin.identify.inputs import DT_S
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.gap.answer.classes import done, likeness
+from terrafusion.twin.gap.answer.verdict import HeldOut, null_probability
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.residuals import raw_of, state_sigmas, whitened
+from terrafusion.twin.gap.data.samples import layout
+from terrafusion.twin.gap.infer.discrepancy import FUNCTIONS, modulated
+from terrafusion.twin.gap.infer.evidence import prepared, starting_model
+from terrafusion.twin.gap.infer.posterior import Pool, beliefs
+from terrafusion.twin.gap.null.channel_noise import first_noise
+from terrafusion.twin.gap.null.detect import choices
+from terrafusion.twin.gap.null.null import learn
+from terrafusion.twin.gap.null.score import Score, score
+from terrafusion.twin.gap.rollout import batch as side_by_side
+from terrafusion.twin.gap.rollout.batch import graphs, groups, what_moves
+from terrafusion.twin.gap.rollout.sensitivities import Ask, drive, placed, predictions, signatures
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import run
 

@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Recording
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.evidence import prepared, starting_model
-from terrafusion.twin.gap.poses import PAIRS, settled, settled_start, turns
-from terrafusion.twin.gap.residuals import Drives, raw
-from terrafusion.twin.identify.log import Log
-from terrafusion.twin.identify.model import Model
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.poses import PAIRS, settled, settled_start, turns
+from terrafusion.twin.gap.data.residuals import Drives, raw
+from terrafusion.twin.gap.infer.evidence import prepared, starting_model
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import run
 

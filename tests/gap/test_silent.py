@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import pytest
 
-from terrafusion.twin.gap import choosing
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.channels import Table
-from terrafusion.twin.gap.choice import linear
-from terrafusion.twin.gap.evidence import gather
-from terrafusion.twin.gap.ladder import Fitter
-from terrafusion.twin.gap.null import learn
-from terrafusion.twin.gap.posterior import Pool, beliefs
-from terrafusion.twin.gap.residuals import state_sigmas
-from terrafusion.twin.gap.score import learnt_sigma, score
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.residuals import state_sigmas
+from terrafusion.twin.gap.infer import candidate_selection as choosing
+from terrafusion.twin.gap.infer.cause_posterior import linear
+from terrafusion.twin.gap.infer.channels import Table
+from terrafusion.twin.gap.infer.evidence import gather
+from terrafusion.twin.gap.infer.nonlinear_refit import Fitter
+from terrafusion.twin.gap.infer.posterior import Pool, beliefs
+from terrafusion.twin.gap.null.null import learn
+from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import runs
 

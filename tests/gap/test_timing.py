@@ -6,9 +6,9 @@ import time
 
 import pytest
 
-from terrafusion.twin.gap.blind.development import RUNS, specs
 from terrafusion.twin.gap.blind.plant import run as plant
-from terrafusion.twin.gap.blind.timing import timed, trials_of
+from tests.studies.blind.development import RUNS, specs
+from tests.studies.blind.timing import timed, trials_of
 
 
 def test_each_trial_is_timed_with_its_own_runs_and_the_references(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,16 +10,16 @@ import jsonschema
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.datasets.recording import Overrides, Recording
-from terrafusion.fusion.gap_page.plots import plot_shrink
-from terrafusion.fusion.gap_page.words import sentences
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.fusion.reports.gap.plots import plot_shrink
+from terrafusion.fusion.reports.gap.words import sentences
 from terrafusion.twin.gap import Diagnosis, diagnose
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.corrected import values_of, write_corrected
-from terrafusion.twin.gap.next_run import BY_HAND, DRIVES
-from terrafusion.twin.gap.verdict import LAW_MOVES, UNKNOWN
-from terrafusion.twin.vehicle import load_vehicle, with_overrides
+from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
+from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES
+from terrafusion.twin.gap.answer.verdict import LAW_MOVES, UNKNOWN
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 
 from .drives import runs
 

@@ -10,9 +10,9 @@ from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.engine import compiler, native
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
-from terrafusion.twin.gap.candidates import Candidates
-from terrafusion.twin.gap.evidence import Bench, gather
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.infer.evidence import Bench, gather
+from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import runs
 

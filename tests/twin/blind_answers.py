@@ -14,8 +14,8 @@ from terrafusion.twin.gap.blind.answers import Case
 from terrafusion.twin.gap.blind.plan import Trial
 from terrafusion.twin.gap.blind.plant.run import record
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
 
 
 @dataclass(frozen=True)

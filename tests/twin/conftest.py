@@ -8,12 +8,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.twin.drive import told
 from terrafusion.twin.engine.integrate import integrate
-from terrafusion.twin.engine.plant import Plant, RouteTable
-from terrafusion.twin.layout import STATES, soil_vector, vehicle_vector
-from terrafusion.twin.soil import SoilParams, load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.plant import Plant, RouteTable
+from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import STATES, soil_vector, vehicle_vector
+from terrafusion.twin.scenario.commands import told
 
 
 @pytest.fixture

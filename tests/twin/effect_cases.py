@@ -6,13 +6,15 @@ import functools
 
 import numpy as np
 
-from terrafusion.twin.drive import follow, told
-from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.effects.form import Form
 from terrafusion.twin.engine.integrate import integrate
-from terrafusion.twin.engine.plant import Plant, RouteTable
-from terrafusion.twin.layout import (
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.model.measurement import measured
+from terrafusion.twin.model.plant import Plant, RouteTable
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import (
     INDEX,
     INPUTS,
     STATES,
@@ -21,9 +23,7 @@ from terrafusion.twin.layout import (
     state_slice,
     vehicle_vector,
 )
-from terrafusion.twin.measurement import measured
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.scenario.commands import follow, told
 
 ELEVATE = load_vehicle("elevate")
 RADIUS_M = ELEVATE.wheel.radius_m

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.twin.allan import allan_deviation, command, expected_deviation, inertial_noise
-from terrafusion.twin.sensing.imu import at_rest
-from terrafusion.twin.sensing.noise import Noise, flicker, white_and_walk
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.analysis.allan import allan_deviation, command, expected_deviation, inertial_noise
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.sensors.imu import at_rest
+from terrafusion.twin.sensors.noise import Noise, flicker, white_and_walk
 
 RATE_HZ = 100.0
 
@@ -100,4 +100,4 @@ def test_the_command_tells_an_unknown_vehicle_in_one_line_and_helps(capsys) -> N
     with pytest.raises(SystemExit) as ended:
         command(["--help"])
     assert ended.value.code == 0
-    assert "example: python -m terrafusion.twin.allan elevate" in capsys.readouterr().out
+    assert "example: python -m terrafusion.twin.analysis.allan elevate" in capsys.readouterr().out

@@ -14,20 +14,20 @@ import pytest
 from hypothesis import given
 from hypothesis.strategies import integers
 
-from terrafusion.datasets.errors import ConfigError, DataError
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.answers import answered, cases
 from terrafusion.twin.gap.blind.check import run_blind_check
 from terrafusion.twin.gap.blind.drives import DURATION_S, KINDS, drive
 from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, from_text, plan, specs, to_text
-from terrafusion.twin.gap.blind.plant.knobs import KNOBS
-from terrafusion.twin.gap.blind.power import half_power_multiple
+from terrafusion.twin.gap.blind.plant.parameters import KNOBS
 from terrafusion.twin.gap.blind.rates import Rate, reliability
 from terrafusion.twin.gap.blind.score import score
 from terrafusion.twin.gap.blind.severity import Observer, half_power, size_for
 from terrafusion.twin.gap.blind.shapes import IN_CATALOGUE, OUT_OF_CATALOGUE, SAME, SHIFTED, shapes
 from terrafusion.twin.gap.blind.verdicts import judge
+from tests.studies.blind.power import half_power_multiple
 
 from . import blind_answers as fake
 

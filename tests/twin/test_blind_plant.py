@@ -13,17 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.strategies import floats, sampled_from
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import differences
-from terrafusion.twin.gap.blind.compare import steady_differences
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import differences
 from terrafusion.twin.gap.blind.plant import contact
 from terrafusion.twin.gap.blind.plant.field import Patches
-from terrafusion.twin.gap.blind.plant.knobs import KNOBS
 from terrafusion.twin.gap.blind.plant.machine import Machine, motor_current
+from terrafusion.twin.gap.blind.plant.parameters import KNOBS
 from terrafusion.twin.gap.blind.plant.run import record, simulate
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment, side_by_side
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
+from tests.studies.blind.plant_against_twin import steady_differences
 
 PLANT = Path(__file__).parents[2] / "twin" / "gap" / "blind" / "plant"
 DRIVE = (Segment(1.0), Segment(3.0, 1.0), Segment(3.0, 0.8, 0.5), Segment(2.0, 0.0, -0.8), Segment(1.0))
@@ -45,7 +45,7 @@ def machine(soil: str, **state: float) -> Machine:
 
 def test_it_takes_only_records_from_the_twin() -> None:
     """No equation of the twin: vehicle and soil records, nothing else."""
-    allowed = {"terrafusion.twin.soil", "terrafusion.twin.vehicle"}
+    allowed = {"terrafusion.twin.model.soil", "terrafusion.twin.model.vehicle"}
     for path in PLANT.glob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("terrafusion.twin."):

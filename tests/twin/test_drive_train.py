@@ -13,14 +13,21 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.twin.drive import Driven, told
+from terrafusion.twin.analysis.summary import (
+    MOTOR_STALLED,
+    TRACTION_LOST,
+    Energy,
+    energy_of,
+    slip_ratios,
+    summarise,
+)
 from terrafusion.twin.engine.integrate import integrate
-from terrafusion.twin.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
-from terrafusion.twin.motors import battery, gear_loss, motor_current, motor_torque
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.model.vehicle import Battery, VehicleParams, load_vehicle
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.physics.motors import battery, gear_loss, motor_current, motor_torque
+from terrafusion.twin.scenario.commands import Driven, told
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
 from terrafusion.twin.simulate import drive_through, set_up, simulate_run
-from terrafusion.twin.summary import MOTOR_STALLED, TRACTION_LOST, Energy, energy_of, slip_ratios, summarise
-from terrafusion.twin.vehicle import Battery, VehicleParams, load_vehicle
 
 ELEVATE = load_vehicle("elevate")
 P = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(ELEVATE).tolist(), strict=True))

@@ -7,13 +7,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.dynamics import wheel_loads
-from terrafusion.twin.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
-from terrafusion.twin.motors import motor_current
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.vehicle import load_vehicle
-from terrafusion.twin.wheel import Ground, WheelShape, footprint
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.twin.model.dynamics import wheel_loads
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.physics.motors import motor_current
+from terrafusion.twin.physics.wheel import Ground, WheelShape, footprint
 
 ELEVATE = load_vehicle("elevate")
 RADIUS_M = ELEVATE.wheel.radius_m

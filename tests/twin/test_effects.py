@@ -8,13 +8,13 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.dynamics import rhs
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.catalogue import effect_names
 from terrafusion.twin.effects.form import SENSOR_STAGES, STAGES, Form, one
 from terrafusion.twin.engine.integrate import MAX_STEP_S
-from terrafusion.twin.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS
-from terrafusion.twin.measurement import correction, measured, measurement
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.model.measurement import correction, measured, measurement
+from terrafusion.twin.physics.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS
 
 from .effect_cases import (
     FORMS,

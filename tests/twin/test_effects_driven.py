@@ -10,11 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.twin.drive import told
-from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
-from terrafusion.twin.layout import (
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.physics.layout import (
     INDEX,
     OUTPUTS,
     SOIL_PARAMETERS,
@@ -22,6 +21,7 @@ from terrafusion.twin.layout import (
     VEHICLE_PARAMETERS,
     state_slice,
 )
+from terrafusion.twin.scenario.commands import told
 
 from .effect_cases import (
     DT_S,

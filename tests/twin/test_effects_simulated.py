@@ -11,17 +11,17 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.cli.effects import effect_lines, effect_values
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, Parameter, one
-from terrafusion.twin.ground import Variation, under_wheels
-from terrafusion.twin.layout import OUTPUTS, mounting_vector
-from terrafusion.twin.measurement import measured
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.model.ground import Variation, under_wheels
+from terrafusion.twin.model.measurement import measured
+from terrafusion.twin.physics.layout import OUTPUTS, mounting_vector
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import drive_through, set_up, simulate, simulate_run
 
 DOCS = Path(__file__).parents[2] / "docs" / "effects.md"

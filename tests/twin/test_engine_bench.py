@@ -7,9 +7,9 @@ import importlib.util
 import numpy as np
 import pytest
 
-from terrafusion.twin.engine import bench
 from terrafusion.twin.engine.integrate import compiled, integrate
-from terrafusion.twin.layout import STATES
+from terrafusion.twin.physics.layout import STATES
+from tests.studies import engine_speed as bench
 
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
 

@@ -11,7 +11,6 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from terrafusion.twin.drive import told
 from terrafusion.twin.engine import codegen, compiler, native
 from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
 from terrafusion.twin.engine.emit import Emitter
@@ -19,10 +18,11 @@ from terrafusion.twin.engine.graph import CONST, UnsupportedOperationError, read
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.packing import packs
-from terrafusion.twin.engine.plant import Plant, RouteTable
-from terrafusion.twin.layout import STATES, soil_vector, vehicle_vector
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.plant import Plant, RouteTable
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import STATES, soil_vector, vehicle_vector
+from terrafusion.twin.scenario.commands import told
 
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
 KERNELS = """

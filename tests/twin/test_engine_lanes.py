@@ -8,16 +8,16 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 
-from terrafusion.twin.drive import told
 from terrafusion.twin.effects.catalogue import moves, parameters
 from terrafusion.twin.engine import native
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.lanes import integrate_many
-from terrafusion.twin.engine.plant import Plant, RouteTable, SoilField
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
-from terrafusion.twin.layout import INDEX, SOIL_PARAMETERS, STATES, soil_vector, vehicle_vector
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.vehicle import load_vehicle, vehicle_names
+from terrafusion.twin.model.plant import Plant, RouteTable, SoilField
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
+from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, soil_vector, vehicle_vector
+from terrafusion.twin.scenario.commands import told
 
 DT_S = 0.01
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")

@@ -8,10 +8,17 @@ import pytest
 from terrafusion.twin.effects.catalogue import parameters
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
-from terrafusion.twin.layout import INPUTS, STATES, WHEELS, mounting_vector, soil_vector, vehicle_vector
-from terrafusion.twin.measurement import measured
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.measurement import measured
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import (
+    INPUTS,
+    STATES,
+    WHEELS,
+    mounting_vector,
+    soil_vector,
+    vehicle_vector,
+)
 
 pytestmark = pytest.mark.skipif(not compiled(), reason="no C compiler")
 

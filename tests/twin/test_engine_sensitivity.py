@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import TerrafusionError
-from terrafusion.twin.drive import told
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine.integrate import compiled, integrate
-from terrafusion.twin.engine.plant import Plant, RouteTable, SoilField
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
-from terrafusion.twin.layout import (
+from terrafusion.twin.model.plant import Plant, RouteTable, SoilField
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import (
     INDEX,
     SOIL_PARAMETERS,
     STATES,
@@ -20,8 +21,7 @@ from terrafusion.twin.layout import (
     soil_vector,
     vehicle_vector,
 )
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.scenario.commands import told
 
 DT_S = 0.01
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")

@@ -11,17 +11,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import terrafusion.twin.params
-from terrafusion.datasets.atmosphere import height_of, height_per_pa, pressure_at
-from terrafusion.datasets.doctor import examine
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.frames import quaternion_to_matrix
-from terrafusion.datasets.recording import Recording, differences
-from terrafusion.datasets.sensors import BarometerSpec, MagnetometerSpec
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
-from terrafusion.twin.sensing.environment import DECLINATION_RAD, FIELD_SIZE_T, earth_field_t
-from terrafusion.twin.sensing.realism import BarometerRealism, MagnetometerRealism
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.core.atmosphere import height_of, height_per_pa, pressure_at
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.datasets.core.recording import Recording, differences
+from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
+from terrafusion.twin.model.sensor_realism import BarometerRealism, MagnetometerRealism
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.sensors.environment import DECLINATION_RAD, FIELD_SIZE_T, earth_field_t
 from terrafusion.twin.simulate import DATUM, simulate
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 CIRCLE = Scenario("circle", 60.0, drive=(DriveSegment(60.0, 1.0, 0.2),), route=(RouteLeg("asphalt"),))
 

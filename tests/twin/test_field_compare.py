@@ -12,18 +12,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.twin.field import compare, summary
-from terrafusion.twin.field.forks import N_FUTURE, N_PAST, Forks, forks_of
-from terrafusion.twin.field.models import BEST_KINEMATIC, TWIN, Hold
-from terrafusion.twin.field.runs import DT_S, FieldRun, field_runs
-from terrafusion.twin.field.scores import METRICS, interval, medians, scores
-from terrafusion.twin.field.slip import MEASURED, slip_rows
-from terrafusion.twin.field.sources import read
-from terrafusion.twin.field.splits import evenly, folds
+from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
+from tests.studies.twin_field import compare, summary
+from tests.studies.twin_field.forks import N_FUTURE, N_PAST, Forks, forks_of
+from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, Hold
+from tests.studies.twin_field.runs import DT_S, FieldRun, field_runs
+from tests.studies.twin_field.scores import METRICS, interval, medians, scores
+from tests.studies.twin_field.slip import MEASURED, slip_rows
+from tests.studies.twin_field.sources import read
+from tests.studies.twin_field.splits import evenly, folds
 
 SAMPLES = N_PAST + N_FUTURE + 1
 
@@ -198,7 +198,7 @@ def test_a_folder_without_drives_is_refused(tmp_path):
 
 
 def test_command_refuses_in_one_line(tmp_path):
-    words = [sys.executable, "-m", "terrafusion.twin.field", str(tmp_path), "--out", str(tmp_path / "out")]
+    words = [sys.executable, "-m", "tests.studies.twin_field", str(tmp_path), "--out", str(tmp_path / "out")]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import Overrides
-from terrafusion.twin.scenario import DriveSegment, load_scenario, scenario_names
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import Overrides
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
+from terrafusion.twin.scenario.scenario import DriveSegment, load_scenario, scenario_names
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import geometry_notes, load_vehicle, with_overrides
 
 PARAMS = resources.files("terrafusion.twin.params")
 

@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.engine.plant import SoilField
-from terrafusion.twin.ground import Patches, Variation, gaussian_field, soil_field, value_at
-from terrafusion.twin.layout import INDEX, SOIL_PARAMETERS, soil_vector
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.model.ground import Patches, Variation, gaussian_field, soil_field, value_at
+from terrafusion.twin.model.plant import SoilField
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, soil_vector
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import load_soil
 
 CELLS, CELL_M, LENGTH_M = 128, 0.25, 1.5
 STRAIGHT = Scenario(

@@ -8,19 +8,19 @@ import functools
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, DataError
-from terrafusion.datasets.recording import Recording
-from terrafusion.twin.identify.calibrate import calibrate
-from terrafusion.twin.identify.coordinates import Coordinate, Prior
-from terrafusion.twin.identify.files import write_files
-from terrafusion.twin.identify.log import prepare
-from terrafusion.twin.identify.model import Model, resolve
-from terrafusion.twin.identify.problem import Point, Problem
-from terrafusion.twin.identify.suggest import suggest
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.calibrate import calibrate
+from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
+from terrafusion.twin.calibrate.files import write_files
+from terrafusion.twin.calibrate.log import prepare
+from terrafusion.twin.calibrate.model import Model, resolve
+from terrafusion.twin.calibrate.problem import Point, Problem
+from terrafusion.twin.calibrate.suggest import suggest
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
 
 SOIL = "loose_sand"
 FACTORS = {

@@ -8,16 +8,16 @@ import functools
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Overrides, Recording
-from terrafusion.twin.identify import solver
-from terrafusion.twin.identify.calibrate import calibrate
-from terrafusion.twin.identify.files import write_files
-from terrafusion.twin.identify.model import Model
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.twin.calibrate import solver
+from terrafusion.twin.calibrate.calibrate import calibrate
+from terrafusion.twin.calibrate.files import write_files
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle, with_overrides
 
 SOIL, OTHER = "loose_sand", "asphalt"
 SHEAR = f"{SOIL}.shear.shear_modulus_m"

@@ -10,15 +10,15 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.config import Quantity
-from terrafusion.twin.identify.coordinates import Coordinate
-from terrafusion.twin.identify.coverage import Case, interval, outcomes
-from terrafusion.twin.identify.identifiability import COMBINED, TOLD, UNTOLD, examine
-from terrafusion.twin.identify.log import Log
-from terrafusion.twin.identify.noise import Noise, autoregressive, gauss_markov
-from terrafusion.twin.identify.observations import Observed, binned
-from terrafusion.twin.identify.predict import averaging
-from terrafusion.twin.identify.sandwich import long_run_variance
+from terrafusion.datasets.core.config import Quantity
+from terrafusion.twin.calibrate.coordinates import Coordinate
+from terrafusion.twin.calibrate.identifiability import COMBINED, TOLD, UNTOLD, examine
+from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.noise import Noise, autoregressive, gauss_markov
+from terrafusion.twin.calibrate.observations import Observed, binned
+from terrafusion.twin.calibrate.predict import averaging
+from terrafusion.twin.calibrate.sandwich import long_run_variance
+from tests.studies.coverage import Case, interval, outcomes
 
 
 def series(rho: float, count: int, seed: int) -> np.ndarray:

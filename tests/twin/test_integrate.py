@@ -7,16 +7,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin import simulate
-from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.engine import codegen, compiler, integrate, native
 from terrafusion.twin.engine.codegen import SINGLE, Variant
-from terrafusion.twin.layout import INDEX, INPUTS, soil_vector, vehicle_vector
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
+from terrafusion.twin.physics.layout import INDEX, INPUTS, soil_vector, vehicle_vector
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.vehicle import load_vehicle, vehicle_names
 
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")
 A_MINUTE = dataclasses.replace(load_scenario("mixed_terrain"), duration_s=60.0)
@@ -53,7 +53,7 @@ def test_order_of_convergence_is_four_where_inputs_are_smooth(run) -> None:
 
 
 def test_longer_lag_allows_longer_steps_and_shorter_lag_asks_for_shorter() -> None:
-    from terrafusion.twin.layout import VEHICLE_PARAMETERS
+    from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS
 
     vehicle = np.ones(len(VEHICLE_PARAMETERS))
     lag = VEHICLE_PARAMETERS.index("lag_s")

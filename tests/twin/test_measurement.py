@@ -7,8 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.layout import (
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.twin.model.measurement import corrections, measured, measured_jacobians
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.physics.layout import (
     INDEX,
     INPUTS,
     OUTPUTS,
@@ -18,11 +21,8 @@ from terrafusion.twin.layout import (
     soil_vector,
     vehicle_vector,
 )
-from terrafusion.twin.measurement import corrections, measured, measured_jacobians
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
 from terrafusion.twin.simulate import SimulatedRun, simulate_run
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 SLOPE_DEG, ASPECT_DEG = 8.0, 35.0
 Y = {name: i for i, name in enumerate(OUTPUTS)}

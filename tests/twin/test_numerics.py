@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from terrafusion.twin.engine import numerics
+from tests.studies import engine_accuracy as numerics
 
 
 def test_half_the_step_is_nearer_to_the_reference() -> None:

@@ -11,13 +11,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.frames import GRAVITY_MPS2, quaternion_to_matrix
-from terrafusion.datasets.recording import Fix
-from terrafusion.twin.dynamics import wheel_loads
-from terrafusion.twin.layout import VEHICLE_PARAMETERS, vehicle_vector
-from terrafusion.twin.motion import wheel_shares
-from terrafusion.twin.scenario import (
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
+from terrafusion.datasets.core.recording import Fix
+from terrafusion.twin.model.dynamics import wheel_loads
+from terrafusion.twin.model.motion import wheel_shares
+from terrafusion.twin.model.vehicle import load_vehicle, with_payload
+from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS, vehicle_vector
+from terrafusion.twin.scenario.scenario import (
     Canopy,
     DriveSegment,
     Interval,
@@ -28,7 +29,6 @@ from terrafusion.twin.scenario import (
     load_scenario,
 )
 from terrafusion.twin.simulate import set_up, simulate, simulate_run
-from terrafusion.twin.vehicle import load_vehicle, with_payload
 
 ELEVATE = load_vehicle("elevate")
 PARKED = Scenario("parked", 20.0, drive=(DriveSegment(20.0),), route=(RouteLeg("asphalt"),))

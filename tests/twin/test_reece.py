@@ -9,15 +9,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
-from terrafusion.twin.dynamics import rhs
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.effects import catalogue
-from terrafusion.twin.effects.reece import PLATE_M, hyperbolic_share, reece_modulus, second_terramechanics
-from terrafusion.twin.layout import INDEX, STATES
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.effects.alternative_terramechanics import (
+    PLATE_M,
+    hyperbolic_share,
+    reece_modulus,
+    second_terramechanics,
+)
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.physics.layout import INDEX, STATES
+from terrafusion.twin.physics.terramechanics import WheelShape, static_sinkage
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.terramechanics import WheelShape, static_sinkage
-from terrafusion.twin.vehicle import load_vehicle
 
 from .effect_cases import plant, samples, soil
 

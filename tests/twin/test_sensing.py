@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.twin.layout import state_slice
-from terrafusion.twin.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
-from terrafusion.twin.sensing.encoders import counted
-from terrafusion.twin.sensing.gnss import LADDERS, Sky, fix_classes
-from terrafusion.twin.sensing.imu import triad
-from terrafusion.twin.sensing.noise import Noise, gauss_markov
-from terrafusion.twin.sensing.realism import GnssRealism
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.twin.model.sensor_realism import GnssRealism
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.physics.layout import state_slice
+from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
+from terrafusion.twin.sensors.encoders import counted
+from terrafusion.twin.sensors.gnss import LADDERS, Sky, fix_classes
+from terrafusion.twin.sensors.imu import triad
+from terrafusion.twin.sensors.noise import Noise, gauss_markov
 from terrafusion.twin.simulate import simulate, simulate_run
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle
 
 ELEVATE = load_vehicle("elevate")
 ARCMIN = np.pi / 180.0 / 60.0

@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.frames import GRAVITY_MPS2, quaternion_to_matrix
-from terrafusion.datasets.recording import Fix
-from terrafusion.datasets.trajectory import Trajectory
-from terrafusion.twin import sensors
-from terrafusion.twin.scenario import DriveSegment, Interval, RouteLeg, Scenario, load_scenario
+from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
+from terrafusion.datasets.core.recording import Fix
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, Interval, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.sensors import suite as sensors
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.vehicle import load_vehicle
 
 PARKED = Scenario("parked", 400.0, drive=(DriveSegment(400.0),), route=(RouteLeg("asphalt"),))
 

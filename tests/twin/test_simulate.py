@@ -7,14 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.frames import quaternion_to_matrix
-from terrafusion.datasets.recording import TERRAINS, Recording
-from terrafusion.twin.layout import INDEX
-from terrafusion.twin.scenario import Interval, load_scenario, scenario_names
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.datasets.core.recording import TERRAINS, Recording
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
+from terrafusion.twin.physics.layout import INDEX
+from terrafusion.twin.scenario.scenario import Interval, load_scenario, scenario_names
 from terrafusion.twin.simulate import simulate, simulate_run
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.vehicle import load_vehicle, vehicle_names
 
 
 def same(a: Recording, b: Recording) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
-from terrafusion.twin.drive import follow, told
+from terrafusion.twin.scenario.commands import follow, told
 
 SPEEDS = st.floats(-3.0, 3.0).map(lambda v: round(v, 2))
 

@@ -12,18 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.config import read_yaml
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import TERRAINS
-from terrafusion.twin.layout import SOIL_PARAMETERS, STATES, soil_vector, state_slice
-from terrafusion.twin.route import Route
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.datasets.core.config import read_yaml
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import TERRAINS
+from terrafusion.twin.model.soil import Validity, load_soil, soil_names
+from terrafusion.twin.model.soil_table import published_soils
+from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, soil_vector, state_slice
+from terrafusion.twin.physics.wheel import Ground, WheelShape, steady_contact
+from terrafusion.twin.scenario.route import Route
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.scenario.validity import check_slip, check_wheel, ground_pressure_pa
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import Validity, load_soil, soil_names
-from terrafusion.twin.soil_table import published_soils
-from terrafusion.twin.validity import check_slip, check_wheel, ground_pressure_pa
-from terrafusion.twin.vehicle import load_vehicle, vehicle_names
-from terrafusion.twin.wheel import Ground, WheelShape, steady_contact
 
 SOILS = resources.files("terrafusion.twin.params") / "soils"
 ELEVATE = load_vehicle("elevate")

@@ -7,12 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.recording import Imu
+from terrafusion.datasets.core.recording import Imu
+from terrafusion.twin.analysis import speeds as processing
+from terrafusion.twin.analysis.speeds import Profiles, differenced_speed, imu_speed, low_pass, match
 from terrafusion.twin.simulate import simulate
-from terrafusion.twin.study import measures, processing
+from terrafusion.twin.study import measures
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
 from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun, fit_noise, mean_error, rate_for
-from terrafusion.twin.study.processing import Profiles, differenced_speed, imu_speed, low_pass, match
 from terrafusion.twin.study.published import CASES
 from terrafusion.twin.study.robot import platform_figures
 from terrafusion.twin.study.spread import spread

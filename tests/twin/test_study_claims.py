@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.study.agreement import BASES, NOT_EXAMINED, PREDICTED, Claim, counts, judge
 from terrafusion.twin.study.claims import load_claims
 from terrafusion.twin.study.criteria import (

@@ -17,9 +17,9 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, TerrafusionError
-from terrafusion.twin import pools
-from terrafusion.twin.sweep import Sweep, load_sweep, run_sweep
+from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
+from terrafusion.twin import executors as pools
+from terrafusion.twin.sweep.run import Sweep, load_sweep, run_sweep
 
 pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
 

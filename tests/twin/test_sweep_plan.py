@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.scenario import load_scenario
-from terrafusion.twin.sweep import Sweep, load_sweep, sweep_names
-from terrafusion.twin.sweeping.plan import Axis, at_speed, top_speed_mps
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.sweep.plan import Axis, at_speed, top_speed_mps
+from terrafusion.twin.sweep.run import Sweep, load_sweep, sweep_names
 
 
 def written(folder: Path, text: str) -> Sweep:

@@ -18,11 +18,11 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 
-from terrafusion.datasets.errors import ConfigError, TerrafusionError
-from terrafusion.twin import sweep as module
-from terrafusion.twin.pools import open_pool
-from terrafusion.twin.sweep import Case, Sweep, load_sweep, read_table, run_sweep, write_recordings
-from terrafusion.twin.sweeping.rows import columns
+from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
+from terrafusion.twin.executors import open_pool
+from terrafusion.twin.sweep import run as module
+from terrafusion.twin.sweep.rows import columns
+from terrafusion.twin.sweep.run import Case, Sweep, load_sweep, read_table, run_sweep, write_recordings
 
 SWEEP = """\
 scenario: drive.yaml
@@ -31,7 +31,9 @@ axes:
   friction: {from: 0.2, to: 0.8, count: 8}
   slope_deg: [0, 3, 6, 9]
 """
-PROGRAM = "import sys; from terrafusion.twin.sweep import *; run_sweep(load_sweep(sys.argv[1]), sys.argv[2])"
+PROGRAM = (
+    "import sys; from terrafusion.twin.sweep.run import *; run_sweep(load_sweep(sys.argv[1]), sys.argv[2])"
+)
 
 
 @pytest.fixture
@@ -190,7 +192,7 @@ def test_a_sweep_of_another_version_is_refused(
 ) -> None:
     run_sweep(load_sweep(file), tmp_path / "out")
     for name in ("plan", "store"):
-        monkeypatch.setattr(f"terrafusion.twin.sweeping.{name}.model_sha256", lambda: "f" * 64)
+        monkeypatch.setattr(f"terrafusion.twin.sweep.{name}.model_sha256", lambda: "f" * 64)
     with pytest.raises(ConfigError, match="another version of terrafusion"):
         run_sweep(load_sweep(file), tmp_path / "out")
 

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.twin.drive import Driven
+from terrafusion.twin.scenario.commands import Driven
 from terrafusion.twin.simulate import drive_through, set_up, simulate_run
-from terrafusion.twin.sweep import Sweep, load_sweep
-from terrafusion.twin.sweeping import batch
-from terrafusion.twin.sweeping import rows as rows_module
-from terrafusion.twin.sweeping.rows import DONE, FAILED, IMMOBILISED, Row, arguments, columns, run_chunk
+from terrafusion.twin.sweep import batch
+from terrafusion.twin.sweep import rows as rows_module
+from terrafusion.twin.sweep.rows import DONE, FAILED, IMMOBILISED, Row, arguments, columns, run_chunk
+from terrafusion.twin.sweep.run import Sweep, load_sweep
 
 DRIVE = """\
 drive:

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.twin.layout import SOIL_PARAMETERS, soil_vector
-from terrafusion.twin.soil import load_soil, soil_names
-from terrafusion.twin.wheel import Contact, Ground, WheelShape, contact, footprint, steady_contact
+from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS, soil_vector
+from terrafusion.twin.physics.wheel import Contact, Ground, WheelShape, contact, footprint, steady_contact
 
 LOAD_N = 80.0
 SMOOTH = WheelShape(0.175, 0.145)

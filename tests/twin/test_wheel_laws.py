@@ -9,12 +9,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.twin import terramechanics as tm
-from terrafusion.twin.layout import INDEX
-from terrafusion.twin.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.physics import terramechanics as tm
+from terrafusion.twin.physics.layout import INDEX
+from terrafusion.twin.physics.smooth import saturate
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.smooth import saturate
-from terrafusion.twin.soil import load_soil
 
 SHAPE = tm.WheelShape(0.175, 0.145)
 EXPONENTS = st.floats(0.1, 1.6)

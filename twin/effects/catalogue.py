@@ -8,7 +8,7 @@ import math
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.form import STAGES, Form, Parameter
 
 _OWN: dict[str, Form] = {}

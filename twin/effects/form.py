@@ -13,8 +13,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.physics.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 Quantities = Mapping[str, Any]
 """What a stage knows, by name: CasADi expressions."""

@@ -7,9 +7,9 @@ from typing import Any
 
 import casadi as ca
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.effects.form import Form, Parameter, Quantities, one, two
-from terrafusion.twin.smooth import grown, smooth_abs
+from terrafusion.twin.physics.smooth import grown, smooth_abs
 
 WHEEL_SPEEDS = ("wheel_left_radps", "wheel_right_radps")
 ACCELS = ("accel_x_mps2", "accel_y_mps2")

@@ -8,8 +8,8 @@ from typing import Any
 import casadi as ca
 
 from terrafusion.twin.effects.form import Form, Quantities, one
-from terrafusion.twin.smooth import grown, saturate, smooth_abs
-from terrafusion.twin.wheel import RESISTANCE_SPEED_MPS
+from terrafusion.twin.physics.smooth import grown, saturate, smooth_abs
+from terrafusion.twin.physics.wheel import RESISTANCE_SPEED_MPS
 
 # Constants of the laws, assumed unless a source is given; the equations below tell them.
 RATE_SPEED_MPS = 0.01

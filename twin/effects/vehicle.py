@@ -6,10 +6,10 @@ from typing import Any
 
 import casadi as ca
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.effects.form import Form, Parameter, Quantities, one
-from terrafusion.twin.layout import WHEELS
-from terrafusion.twin.smooth import grown
+from terrafusion.twin.physics.layout import WHEELS
+from terrafusion.twin.physics.smooth import grown
 
 # Constants of the laws, assumed unless a source is given; the equations below tell them.
 SHORTEST_LAG_S = 0.002

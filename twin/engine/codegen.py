@@ -6,7 +6,6 @@ from collections.abc import Collection, Mapping
 from importlib import metadata, resources
 from typing import Any, NamedTuple
 
-from terrafusion.twin.dynamics import rhs
 from terrafusion.twin.effects.catalogue import built_in
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import (
@@ -19,7 +18,10 @@ from terrafusion.twin.engine.graph import (
     with_reciprocals,
 )
 from terrafusion.twin.engine.linear import eliminated
-from terrafusion.twin.layout import (
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.model.measurement import measurement
+from terrafusion.twin.model.version import model_sha256
+from terrafusion.twin.physics.layout import (
     INDEX,
     INPUTS,
     MOUNTING,
@@ -29,8 +31,6 @@ from terrafusion.twin.layout import (
     VEHICLE_PARAMETERS,
     WHEELS,
 )
-from terrafusion.twin.measurement import measurement
-from terrafusion.twin.version import model_sha256
 
 __all__ = [
     "LANES",

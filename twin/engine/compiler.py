@@ -21,8 +21,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from terrafusion.datasets.atomic import write_atomically
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.files import write_atomically
 
 LOG = logging.getLogger("terrafusion.twin")
 

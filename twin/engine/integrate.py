@@ -11,12 +11,12 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import TerrafusionError
+from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.engine.native import Driver, driver
-from terrafusion.twin.engine.plant import Plant
-from terrafusion.twin.layout import INPUTS, STATES, VEHICLE_PARAMETERS
+from terrafusion.twin.model.plant import Plant
+from terrafusion.twin.physics.layout import INPUTS, STATES, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 

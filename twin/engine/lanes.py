@@ -20,8 +20,8 @@ from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import LANES, LANES_32, SINGLE, Variant
 from terrafusion.twin.engine.integrate import chosen, steps_a_sample
 from terrafusion.twin.engine.native import CPlant, Driver
-from terrafusion.twin.engine.plant import Plant
-from terrafusion.twin.layout import INPUTS, STATES
+from terrafusion.twin.model.plant import Plant
+from terrafusion.twin.physics.layout import INPUTS, STATES
 
 Array = NDArray[np.float64]
 

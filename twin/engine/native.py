@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.engine import codegen, compiler
 from terrafusion.twin.engine.codegen import Variant
-from terrafusion.twin.engine.plant import Plant
+from terrafusion.twin.model.plant import Plant
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("terrafusion.twin")

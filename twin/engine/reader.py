@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.engine import codegen, compiler
 from terrafusion.twin.engine.native import BUILDING
-from terrafusion.twin.layout import OUTPUTS
+from terrafusion.twin.physics.layout import OUTPUTS
 
 Array = NDArray[np.float64]
 LOG = logging.getLogger("terrafusion.twin")

@@ -17,8 +17,8 @@ from terrafusion.twin.engine import vm
 from terrafusion.twin.engine.codegen import TANGENT, Variant
 from terrafusion.twin.engine.integrate import checked, chosen, raise_if_diverged, steps_a_sample
 from terrafusion.twin.engine.native import MAX_BLOCKS, Driver
-from terrafusion.twin.engine.plant import Plant
-from terrafusion.twin.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
+from terrafusion.twin.model.plant import Plant
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.dynamics import rhs
-from terrafusion.twin.engine.plant import Plant, SoilField
-from terrafusion.twin.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
+from terrafusion.twin.model.dynamics import rhs
+from terrafusion.twin.model.plant import Plant, SoilField
+from terrafusion.twin.physics.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.soil import SoilParams, load_soil
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE
 from terrafusion.twin.study.published import FRICTION
 

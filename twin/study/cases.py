@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.ground import Variation
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.analysis.speeds import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
+from terrafusion.twin.model.ground import Variation
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.simulate import RunSummary, simulate_run
-from terrafusion.twin.study.processing import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
 from terrafusion.twin.study.published import Case
-from terrafusion.twin.vehicle import load_vehicle
 
 Array = NDArray[np.float64]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from importlib import resources
 from typing import Any
 
-from terrafusion.datasets.config import read_yaml
+from terrafusion.datasets.core.config import read_yaml
 from terrafusion.twin.study.agreement import Claim
 from terrafusion.twin.study.criteria import AtLeast, AtMost, Criterion, Near, Published
 

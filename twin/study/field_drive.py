@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.frames import enu_to_geodetic
-from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.twin.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
+from terrafusion.datasets.core.frames import enu_to_geodetic
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.twin.analysis.speeds import CUTOFF_HZ, imu_speed, low_pass
+from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.study.cases import UNEVEN, VEHICLE
-from terrafusion.twin.study.processing import CUTOFF_HZ, imu_speed, low_pass
 
 Array = NDArray[np.float64]
 

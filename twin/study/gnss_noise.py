@@ -16,8 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.study.cases import CaseRun
-from terrafusion.twin.study.processing import (
+from terrafusion.twin.analysis.speeds import (
     OTHERS,
     USUAL,
     Assumed,
@@ -26,6 +25,7 @@ from terrafusion.twin.study.processing import (
     match,
     mean_percent,
 )
+from terrafusion.twin.study.cases import CaseRun
 
 Array = NDArray[np.float64]
 

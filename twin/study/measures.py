@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.twin.analysis.speeds import MOVING_MPS, Profiles, mean_percent
 from terrafusion.twin.study.cases import CaseRun, between, set_off_s, stopped_s
-from terrafusion.twin.study.processing import MOVING_MPS, Profiles, mean_percent
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

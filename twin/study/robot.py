@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.twin.scenario import load_scenario
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import load_scenario
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE
-from terrafusion.twin.vehicle import load_vehicle
 
 _RPM = 30.0 / math.pi
 

@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.pools import open_pool
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.executors import open_pool
 from terrafusion.twin.study.agreement import Row, judge
 from terrafusion.twin.study.batch import CellResult, grid, run_cell, slip_cells
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case

@@ -5,10 +5,10 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 
+from terrafusion.twin.analysis.speeds import OTHERS, USUAL
 from terrafusion.twin.study.agreement import PREDICTED, Row, counts
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.gnss_noise import DATA_SHEET_M, rate_for
-from terrafusion.twin.study.processing import OTHERS, USUAL
 from terrafusion.twin.study.published import CASES, Case
 from terrafusion.twin.study.spread import spread
 from terrafusion.twin.study.study import Study

@@ -8,7 +8,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros.channels import Builder
 from terrafusion.datasets.readers.ros.exact import META, restore
@@ -18,7 +19,6 @@ from terrafusion.datasets.readers.ros.raw import BagError, Container
 from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
 from terrafusion.datasets.readers.ros.times import Timing, timing_of
 from terrafusion.datasets.readers.ros.topics import JOINTS, Topic, choose_topics, said_joints
-from terrafusion.datasets.recording import Overrides, Recording
 
 if TYPE_CHECKING:
     from terrafusion.datasets.readers.formats import Request

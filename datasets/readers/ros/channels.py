@@ -9,15 +9,24 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.conventions import BODY_AXES, Conventions
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import geodetic_to_enu
+from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import geodetic_to_enu
+from terrafusion.datasets.core.recording import (
+    Barometer,
+    Command,
+    Fix,
+    Gnss,
+    Imu,
+    Magnetometer,
+    Terrain,
+    Wheels,
+)
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.joints import holding, joint_names, joint_values, wheel_joints
 from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE, Stream, poses, twists
-from terrafusion.datasets.recording import Barometer, Command, Fix, Gnss, Imu, Magnetometer, Terrain, Wheels
-from terrafusion.datasets.sensors import Rig
-from terrafusion.datasets.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]

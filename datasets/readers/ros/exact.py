@@ -18,8 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.conventions import Conventions
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.conventions import Conventions
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording, Wheels
 from terrafusion.datasets.readers.channel_tables import ChannelReader, Layouts
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
@@ -35,7 +36,6 @@ from terrafusion.datasets.readers.ros.topics import (
     STRING,
     TWIST_STAMPED,
 )
-from terrafusion.datasets.recording import Recording, Wheels
 
 Key = tuple[str, str]
 """Name and type of a topic."""

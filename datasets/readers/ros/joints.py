@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.recording import Wheels
 from terrafusion.datasets.readers.ros.messages import Stream
-from terrafusion.datasets.recording import Wheels
 
 Array = NDArray[np.float64]
 

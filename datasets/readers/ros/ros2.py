@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros.bag import read_bag
 from terrafusion.datasets.readers.ros.raw import Container
-from terrafusion.datasets.recording import Recording
 
 REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
 

@@ -10,10 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.clock import in_order, repair_together
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.clock import in_order, repair_together
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.ros.messages import Stream
-from terrafusion.datasets.recording import ClockJump
 
 TimesNs = NDArray[np.int64]
 Times = dict[str, TimesNs]

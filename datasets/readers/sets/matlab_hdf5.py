@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 
 Array = NDArray[np.float64]
 

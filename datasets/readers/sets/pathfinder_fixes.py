@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.gnss_time import GPS_EPOCH_S, WEEK_S, gps_to_unix_ns
-from terrafusion.datasets.lag import lag_between
+from terrafusion.datasets.core.gnss_time import GPS_EPOCH_S, WEEK_S, gps_to_unix_ns
+from terrafusion.datasets.core.lag import lag_between
+from terrafusion.datasets.core.recording import Fix
 from terrafusion.datasets.readers.sets.matlab_hdf5 import MatlabFile
-from terrafusion.datasets.recording import Fix
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError, errors_of
-from terrafusion.datasets.frames import geodetic_to_enu
+from terrafusion.datasets.core.errors import DataError, errors_of
+from terrafusion.datasets.core.frames import geodetic_to_enu
+from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.sets.matlab_hdf5 import MatlabFile, is_hdf5, opened, variables
 from terrafusion.datasets.readers.sets.pathfinder_fixes import (
@@ -18,7 +19,6 @@ from terrafusion.datasets.readers.sets.pathfinder_fixes import (
     times_by_rows,
     times_in_file,
 )
-from terrafusion.datasets.recording import Gnss, Imu, Recording, Wheels
 
 Array = NDArray[np.float64]
 

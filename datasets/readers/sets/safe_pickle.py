@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.config import shown
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.config import shown
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.sets.pickled_frame import ALLOWED, MAX_CELLS, Frame, Partial, StandIn
 
 LARGEST = 1e30

@@ -5,10 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import NoReturn
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.sets.matlab_v5 import is_v5, structures_with
-from terrafusion.datasets.single_wheel import FIELDS, read_wheel_trials
+from terrafusion.datasets.readers.sets.single_wheel import FIELDS, read_wheel_trials
 
 
 def claims(path: Path, head: bytes) -> bool:

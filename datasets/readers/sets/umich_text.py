@@ -15,13 +15,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import wrap_angle, yaw_of
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import wrap_angle, yaw_of
+from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.text.number_rows import Rows, are_numbers, put_in_time, read_rows
-from terrafusion.datasets.recording import Imu, Recording, Wheels
-from terrafusion.datasets.trajectory import Trajectory
 
 POSE = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 COLUMNS = {

@@ -10,10 +10,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.config import Quantity, checked_number, read_yaml, shown, structure
-from terrafusion.datasets.conventions import BODY_AXES, Conventions
-from terrafusion.datasets.decimals import NS_PER, NotADecimal, dates_to_ns
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml, shown, structure
+from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
+from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.readers import log_meta
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,
@@ -29,7 +30,6 @@ from terrafusion.datasets.readers.channel_tables import (
 )
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.text.units import units_of
-from terrafusion.datasets.sensors import axes_matrix
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 WHEEL_FIELDS = tuple(dict.fromkeys(f"{n}_{unit}" for names, unit in WHEEL_LAYOUTS for n in names))

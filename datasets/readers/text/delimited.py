@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.config import shown
-from terrafusion.datasets.decimals import NotADecimal, to_ns
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.config import shown
+from terrafusion.datasets.core.decimals import NotADecimal, to_ns
+from terrafusion.datasets.core.errors import DataError
 
 Array = NDArray[np.float64]
 

@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.delimited import MAX_BYTES
 from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, Epochs, collect
 from terrafusion.datasets.readers.text.row_times import row_times
-from terrafusion.datasets.recording import Fix, Recording
-from terrafusion.datasets.sensors import ASSUMED_SIGMA_M
 
 Array = NDArray[np.float64]
 

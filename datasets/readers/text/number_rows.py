@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.clock import in_order, repair_together
-from terrafusion.datasets.config import shown
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.clock import in_order, repair_together
+from terrafusion.datasets.core.config import shown
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.text.delimited import (
     BLANKS,
     MAX_LINE,
@@ -25,7 +26,6 @@ from terrafusion.datasets.readers.text.delimited import (
     read_text,
     split,
 )
-from terrafusion.datasets.recording import ClockJump
 
 Array = NDArray[np.float64]
 

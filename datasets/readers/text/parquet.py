@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.decimals import NS_PER
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.decimals import NS_PER
+from terrafusion.datasets.core.errors import DataError
 
 MAX_VALUES = 2**27
 """A gigabyte of numbers."""

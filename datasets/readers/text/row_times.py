@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.clock import in_order, repair
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.clock import in_order, repair
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.recording import ClockJump
 
 TimesNs = NDArray[np.int64]
 

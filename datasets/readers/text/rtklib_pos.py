@@ -12,9 +12,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.decimals import NS_PER, NotADecimal, dates_to_ns
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns, leap_note
+from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns, leap_note
+from terrafusion.datasets.core.recording import Fix, Gnss, Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.delimited import (
     BLANKS,
@@ -27,7 +28,6 @@ from terrafusion.datasets.readers.text.delimited import (
 )
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
-from terrafusion.datasets.recording import Fix, Gnss, Recording
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]

@@ -11,11 +11,12 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.conventions import apply
-from terrafusion.datasets.decimals import NotADecimal, dates_to_ns
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import rpy_to_quaternion
-from terrafusion.datasets.gnss_time import gps_to_unix_ns, leap_note
+from terrafusion.datasets.core.conventions import apply
+from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import rpy_to_quaternion
+from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
+from terrafusion.datasets.core.recording import Fix, Gnss, Recording
 from terrafusion.datasets.readers.channel_tables import GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
@@ -35,7 +36,6 @@ from terrafusion.datasets.readers.text.parquet import ParquetColumns
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
 from terrafusion.datasets.readers.text.text_columns import TextColumns
 from terrafusion.datasets.readers.text.units import units_of
-from terrafusion.datasets.recording import Fix, Gnss, Recording
 
 Array = NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.text.column_map import TEXT_FIELDS, ColumnMap
 from terrafusion.datasets.readers.text.delimited import (
     Columns,

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.text.delimited import BLANKS, Layout, head_lines, read_columns, read_text
 from terrafusion.datasets.readers.text.row_times import row_times
-from terrafusion.datasets.recording import Recording
-from terrafusion.datasets.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
@@ -66,6 +66,19 @@ def read(request: Request) -> list[Recording]:
         clock_jumps=times.jumps,
     )
     return [recording]
+
+
+def read_tum(path: Path) -> Trajectory:
+    """Read a TUM trajectory; lines that start with # are comments.
+
+    Raises:
+        DataError: missing file, a line that is not eight finite numbers, or time not increasing.
+    """
+    t_ns, table, _ = tum_rows(path)
+    try:
+        return Trajectory(t_ns, table[:, :3], table[:, 3:])
+    except DataError as error:
+        raise DataError(error.what, file=path, time_s=error.time_s, remedy=error.remedy) from None
 
 
 def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 
 DEG = math.pi / 180.0
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.text.delimited import Columns
 
 TimesNs = NDArray[np.int64]

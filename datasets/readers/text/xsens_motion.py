@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.frames import rpy_to_quaternion
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import rpy_to_quaternion
+from terrafusion.datasets.core.recording import Imu
 from terrafusion.datasets.readers.text.delimited import Columns
-from terrafusion.datasets.recording import Imu
 
 Array = NDArray[np.float64]
 

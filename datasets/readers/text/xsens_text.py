@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Fix, Gnss, Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.delimited import (
     Columns,
@@ -30,7 +31,6 @@ from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
 from terrafusion.datasets.readers.text.row_times import row_times
 from terrafusion.datasets.readers.text.xsens_clock import UTC, clock_of
 from terrafusion.datasets.readers.text.xsens_motion import ACC, ATTITUDES, GYR, INCREMENTS, inertial
-from terrafusion.datasets.recording import Fix, Gnss, Recording
 
 Array = NDArray[np.float64]
 

@@ -12,12 +12,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from terrafusion.datasets.atomic import write_atomically
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.executors import open_pool
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.plan import VEHICLE, Trial, specs
-from terrafusion.twin.pools import open_pool
-from terrafusion.twin.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
 ORACLE = "oracle.jsonl"
 LANES = 160

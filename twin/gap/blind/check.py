@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.atomic import write_atomically
-from terrafusion.datasets.errors import ConfigError
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.answers import Diagnose, answer_all, answered, ask_oracle
 from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, Trial, from_text, plan, to_text

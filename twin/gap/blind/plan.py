@@ -15,8 +15,8 @@ from terrafusion.twin.gap.blind.drives import KINDS, drive
 from terrafusion.twin.gap.blind.plant.spec import RunSpec
 from terrafusion.twin.gap.blind.severity import half_power
 from terrafusion.twin.gap.blind.shapes import IN_CATALOGUE, OUT_OF_CATALOGUE, SAME, SHIFTED, Shape, shapes
-from terrafusion.twin.soil import load_soil
-from terrafusion.twin.vehicle import load_vehicle
+from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vehicle import load_vehicle
 
 VEHICLE = "elevate"
 SOILS = ("medium_sand", "grass", "gravel", "loose_sand")

@@ -22,8 +22,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.atomic import write_atomically
-from terrafusion.datasets.errors import DataError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.files import write_atomically
 
 LABELS, KEY, COMMITMENT = "labels.sealed", "labels.key", "commitment.json"
 ANSWERS, CLOSED, OPENED = "answers.jsonl", "answers.closed.json", "labels.opened.json"

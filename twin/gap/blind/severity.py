@@ -23,8 +23,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import DataError
-from terrafusion.datasets.recording import Recording
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
 
@@ -64,7 +64,7 @@ def observed(key: str, kind: str) -> float:
 
 @functools.cache
 def _stored() -> dict[str, Any]:
-    from terrafusion.datasets.config import read_yaml
+    from terrafusion.datasets.core.config import read_yaml
 
     with resources.as_file(resources.files("terrafusion.twin.gap.blind") / "severity.yaml") as path:
         return read_yaml(path)
@@ -175,8 +175,8 @@ def _base(kind: str, soil: str, seed: int) -> Any:
     """Makes specs of one drive and heading with given seed, knobs and noise."""
     from terrafusion.twin.gap.blind.drives import drive
     from terrafusion.twin.gap.blind.plant.spec import RunSpec
-    from terrafusion.twin.soil import load_soil
-    from terrafusion.twin.vehicle import load_vehicle
+    from terrafusion.twin.model.soil import load_soil
+    from terrafusion.twin.model.vehicle import load_vehicle
 
     vehicle, ground = load_vehicle("elevate"), load_soil(soil)
     segments = drive(kind, np.random.default_rng([seed, 8]))
@@ -194,14 +194,14 @@ def _features(specs: Sequence[Any]) -> tuple[Array, Array]:
 
 def write(path: Path, seed: int) -> None:
     """Measures all points and writes them."""
-    from terrafusion.datasets.atomic import write_atomically
+    from terrafusion.datasets.core.files import write_atomically
     from terrafusion.twin.gap.blind.drives import KINDS
 
     points = {kind: measure(kind, seed) for kind in KINDS}
     lines = [
         "# Half-power points of the blind check's shapes, in the unit of each knob (see shapes.py).",
         f"# Points made by: python -m terrafusion.twin.gap.blind.severity --seed {seed}",
-        "# Scale made by: python -m terrafusion.twin.gap.blind.power --shapes 7",
+        "# Scale made by: python -m tests.studies.blind.power --shapes 7",
         "scale: {" + ", ".join(f"{kind}: {_stored()['scale'][kind]}" for kind in KINDS) + "}",
         "points:",
     ]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.gap.blind.plant import contact as law
 from terrafusion.twin.gap.blind.plant.field import Patches
 

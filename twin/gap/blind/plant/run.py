@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.datasets.recording import Command, Recording, Terrain
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import Command, Recording, Terrain
 from terrafusion.twin.gap.blind.plant import sensors
+from terrafusion.twin.gap.blind.plant.commands import side_commands, wanted_twist
 from terrafusion.twin.gap.blind.plant.field import Patches
 from terrafusion.twin.gap.blind.plant.machine import Machine
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, side_by_side
-from terrafusion.twin.gap.blind.plant.told import side_commands, wanted_twist
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.errors import ConfigError
-from terrafusion.twin.gap.blind.plant.knobs import KNOBS
-from terrafusion.twin.soil import SoilParams
-from terrafusion.twin.vehicle import VehicleParams
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.gap.blind.plant.parameters import KNOBS
+from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vehicle import VehicleParams
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,165 @@
+"""Barometer and magnetometer: units, range, hard iron. None is an error: the others do without them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.core.recording import Recording
+
+Array = NDArray[np.float64]
+
+PRESSURE_PA = (30e3, 110e3)
+"""Static pressure where robots drive: 9 km high (ISA) to below the Dead Sea."""
+CODES = {"barometer": "pressure-unit", "magnetometer": "field-unit"}
+PRESSURE_UNITS = {"hPa": 1e2, "kPa": 1e3}
+FIELD_T = (15e-6, 80e-6)
+"""Size of the field: Earth's is 22 to 67 uT (World Magnetic Model 2020), widened by iron of the robot."""
+FIELD_UNITS = {"uT": 1e-6, "gauss": 1e-4, "milligauss": 1e-7, "nT": 1e-9}
+NORMALISED = (0.85, 1.25)
+"""Lengths of fields that were divided by the local field's size, as Xsens devices give them."""
+LEAST_ROWS = 20
+LEAST_COVER = 0.75
+"""Share of the directions, in sectors of 30 deg, that must be seen to tell an offset from a heading."""
+HARD_IRON = 0.1
+"""Horizontal offset over the horizontal field from which the heading errs by up to 6 deg."""
+
+
+def check_pressure(patient: Patient) -> Iterator[Finding]:
+    """Pressures must be those of the atmosphere, in pascal."""
+    barometer = patient.recording.barometer
+    known = (
+        barometer.pressure_pa[np.isfinite(barometer.pressure_pa)] if barometer is not None else np.empty(0)
+    )
+    if not known.size:
+        return
+    size = float(np.median(known))
+    yield from _range(
+        "barometer", "pressure", size, PRESSURE_PA, PRESSURE_UNITS, "Pa", "name the unit of the pressures"
+    )
+    beyond = (known < PRESSURE_PA[0]) | (known > PRESSURE_PA[1])
+    if PRESSURE_PA[0] <= size <= PRESSURE_PA[1] and beyond.any():
+        yield Finding(
+            "pressure-range",
+            "warning",
+            "barometer",
+            f"{int(beyond.sum())} of {len(known)} pressures are none of the atmosphere",
+            f"from {known.min():.6g} to {known.max():.6g} Pa",
+            "leave these rows out",
+            _without_rows,
+        )
+
+
+def check_field(patient: Patient) -> Iterator[Finding]:
+    """Fields must be as long as Earth's, in tesla, and turn about zero when the robot turns."""
+    magnetometer = patient.recording.magnetometer
+    if magnetometer is None:
+        return
+    field = magnetometer.field_t[np.isfinite(magnetometer.field_t).all(axis=1)]
+    if not len(field):
+        return
+    size = float(np.median(np.linalg.norm(field, axis=1)))
+    normalised = NORMALISED[0] < size < NORMALISED[1]
+    fix = (
+        "give the field in tesla: only its direction is known" if normalised else "name the unit of the field"
+    )
+    found = list(_range("magnetometer", "field", size, FIELD_T, FIELD_UNITS, "T", fix))
+    yield from found
+    if not found:
+        yield from _hard_iron(field)
+
+
+def _range(
+    channel: str,
+    quantity: str,
+    size: float,
+    limits: tuple[float, float],
+    units: Mapping[str, float],
+    unit: str,
+    fix: str,
+) -> Iterator[Finding]:
+    if limits[0] <= size <= limits[1]:
+        return
+    meant = next((u for u, factor in units.items() if limits[0] <= size * factor <= limits[1]), None)
+    yield Finding(
+        CODES[channel],
+        "warning",
+        channel,
+        f"the {quantity} looks like {meant}, not {unit}" if meant else f"the {quantity} is none of Earth's",
+        f"median size {size:.4g}; possible are {limits[0]:g} to {limits[1]:g} {unit}",
+        f"multiply by {units[meant]:g}" if meant else fix,
+        _scaled(channel, units[meant]) if meant else None,
+    )
+
+
+def _scaled(channel: str, factor: float) -> Repair:
+    name = {"barometer": "pressure_pa", "magnetometer": "field_t"}[channel]
+
+    def repair(recording: Recording) -> Recording:
+        own = getattr(recording, channel)
+        scaled = dataclasses.replace(own, **{name: getattr(own, name) * factor})
+        return dataclasses.replace(recording, **{channel: scaled})
+
+    return repair
+
+
+def _without_rows(recording: Recording) -> Recording:
+    assert recording.barometer is not None
+    p = recording.barometer.pressure_pa
+    kept = recording.barometer.select((p >= PRESSURE_PA[0]) & (p <= PRESSURE_PA[1]))
+    return dataclasses.replace(recording, barometer=kept)
+
+
+def _hard_iron(field: Array) -> Iterator[Finding]:
+    fitted = circle(field[:, :2])
+    if fitted is None:
+        return
+    centre, radius = fitted
+    offset = float(np.hypot(*centre))
+    if offset <= HARD_IRON * radius:
+        return
+    worst = np.degrees(np.arcsin(min(offset / radius, 1.0)))
+
+    def repair(recording: Recording) -> Recording:
+        assert recording.magnetometer is not None
+        own = recording.magnetometer
+        mended = dataclasses.replace(own, field_t=own.field_t - np.append(centre, 0.0))
+        return dataclasses.replace(recording, magnetometer=mended)
+
+    yield Finding(
+        "hard-iron",
+        "warning",
+        "magnetometer",
+        f"the robot's own iron turns the compass by up to {worst:.0f} deg",
+        f"over the turns of the drive the horizontal field circles ({centre[0] * 1e6:.1f}, "
+        f"{centre[1] * 1e6:.1f}) uT at a radius of {radius * 1e6:.1f} uT",
+        "subtract that offset, taking the drive for level",
+        repair,
+    )
+
+
+def circle(points: Array) -> tuple[Array, float] | None:
+    """Centre (2,) and radius of a circle through points (N, 2), where they lie all around it; else None.
+
+    Least squares of x^2 + y^2 = 2 a x + 2 b y + c (Kasa 1976, IEEE Trans. Instrum. Meas. 25(1)).
+    """
+    if len(points) < LEAST_ROWS:
+        return None
+    scale = float(np.abs(points).max())
+    if scale == 0.0:
+        return None
+    x = points / scale
+    A = np.column_stack([2.0 * x, np.ones(len(x))])
+    solved, _, rank, _ = np.linalg.lstsq(A, (x**2).sum(axis=1), rcond=1e-9)
+    square = float(solved[2] + solved[:2] @ solved[:2])
+    if rank < 3 or square <= 0.0:
+        return None
+    angle = np.arctan2(*(x - solved[:2]).T[::-1])
+    seen = np.unique(np.floor((angle + np.pi) / np.radians(30.0)).astype(int) % 12)
+    if len(seen) < LEAST_COVER * 12:
+        return None
+    return solved[:2] * scale, float(np.sqrt(square)) * scale

@@ -1,0 +1,250 @@
+"""Each clock by itself: spans, coarse stamps, jitter, gaps, repeats, steps taken out on reading."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.sensor_pairs import clocks_of, period_s, retimed
+from terrafusion.datasets.core.recording import Channel, Recording
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+
+CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
+"""Channels that should tick evenly; terrain labels come when they come."""
+GAP_PERIODS, GAP_S = 5.0, 0.2
+MISSING_SHARE = 0.05
+JITTER_SHARE = 0.2
+LEAST_ROWS = 20
+FINEST_TICK_S = 0.002
+SAME_SPAN = 0.1
+"""Channels whose durations differ by less than this share were recorded together."""
+
+
+def check_spans(patient: Patient) -> Iterator[Finding]:
+    """Channels must share a stretch of time."""
+    clocks = {name: t for name, t in clocks_of(patient.recording).items() if name in (*CLOCKED, "truth")}
+    apart = {
+        name: [o for o, t in clocks.items() if t[0] > own[-1] or t[-1] < own[0]]
+        for name, own in clocks.items()
+    }
+    lonely = max(apart, key=lambda name: (len(apart[name]), clocks[name][0]), default="")
+    if not lonely or not apart[lonely]:
+        return
+    own, others = clocks[lonely], [clocks[name] for name in clocks if name != lonely]
+    begins, ends = min(int(t[0]) for t in others), max(int(t[-1]) for t in others)
+    late = own[0] > ends
+    alike = abs(int(own[-1]) - int(own[0]) - (ends - begins)) <= SAME_SPAN * (ends - begins)
+    yield Finding(
+        "no-common-time",
+        "error",
+        lonely,
+        f"begins after {' and '.join(apart[lonely])} ended" if late else "ended before the others begin",
+        f"it runs from {patient.since_start_s(own[0]):.2f} to {patient.since_start_s(own[-1]):.2f} s, "
+        f"the others from {patient.since_start_s(np.int64(begins)):.2f} "
+        f"to {patient.since_start_s(np.int64(ends)):.2f} s",
+        "let it start with the others: they last equally long; correlation finds what is left"
+        if alike
+        else "bring the channels onto one clock; their durations differ, so nobody knows how",
+        _moved(lonely, begins - int(own[0])) if alike else None,
+    )
+
+
+def _moved(name: str, by_ns: int) -> Repair:
+    def repair(recording: Recording) -> Recording:
+        moved = retimed(recording, name, getattr(recording, name).t_ns + by_ns)
+        first_ns = min(int(t[0]) for t in clocks_of(moved).values())
+        return dataclasses.replace(
+            moved, start_ns=max(first_ns, moved.start_ns) if by_ns > 0 else moved.start_ns
+        )
+
+    return repair
+
+
+def check_steps(patient: Patient) -> Iterator[Finding]:
+    """Steps of a clock that the reader had to take out."""
+    jumps = patient.recording.clock_jumps
+    for name in dict.fromkeys(jump.channel for jump in jumps):
+        own = [jump for jump in jumps if jump.channel == name]
+        worst = max(own, key=lambda jump: abs(jump.step_s))
+
+        def repair(recording: Recording, name: str = name) -> Recording:
+            left = tuple(jump for jump in recording.clock_jumps if jump.channel != name)
+            return dataclasses.replace(recording, clock_jumps=left)
+
+        yield Finding(
+            "clock-jump",
+            "error",
+            name,
+            f"its clock was set {len(own)} time{'s' if len(own) > 1 else ''}",
+            f"largest step {worst.step_s:+.3f} s at t = {patient.since_start_s(np.int64(worst.t_ns)):.2f} s",
+            "keep the times as they were mended on reading: good to a sampling period",
+            repair,
+        )
+
+
+def check_coarse(patient: Patient) -> Iterator[Finding]:
+    """Stamps coarser than the rate of the channel."""
+    for name, channel in _clocked(patient.recording):
+        tick_s = coarse_tick_s(channel)
+        if not tick_s:
+            continue
+        cut = tick_s > 0.99
+
+        def repair(
+            recording: Recording, name: str = name, tick_s: float = tick_s, cut: bool = cut
+        ) -> Recording:
+            t_ns = getattr(recording, name).t_ns
+            even = _even(t_ns, 3.0 * tick_s)
+            late_s = 0.5 * (tick_s - float(np.mean(np.diff(even))) * 1e-9) if cut else 0.0
+            return retimed(recording, name, even + round(late_s * 1e9))
+
+        rate_hz = (len(channel) - 1) / max(float(channel.t_ns[-1] - channel.t_ns[0]) * 1e-9, 1e-9)
+        yield Finding(
+            "coarse-times",
+            "error" if tick_s > 0.1 else "warning",
+            name,
+            f"its stamps are {'cut' if cut else 'rounded'} to {tick_s:g} s",
+            f"all times are multiples of {tick_s:g} s apart, at {rate_hz:.3g} rows a second",
+            f"fit an even clock, taking the stamps as {'cut off' if cut else 'rounded'}",
+            repair,
+        )
+
+
+def coarse_tick_s(channel: Channel) -> float:
+    """Unit that the times of a channel are rounded to, where it is coarse beside its rate; else 0."""
+    dt = np.diff(channel.t_ns) * 1e-9
+    if len(dt) < LEAST_ROWS or not (dt > 0).any():
+        return 0.0
+    tick = float(dt[dt > 0].min())
+    steps = dt / tick
+    if tick < FINEST_TICK_S or (np.abs(steps - np.rint(steps)) > 0.01).mean() > 0.01:
+        return 0.0
+    near = steps < 3.5
+    mean = float(dt[near].mean())
+    uneven = (np.abs(dt[near] - np.median(dt[near])) > 0.5 * tick).mean() > 0.1 or np.median(dt) == 0.0
+    if not uneven or tick < 0.6 * mean:
+        return 0.0
+    residual = (channel.t_ns - _even(channel.t_ns, 3.0 * tick)) * 1e-9
+    twice = (dt == 0.0) & _same_rows(channel)
+    if residual.std() > 0.4 * tick or twice.sum() > 0.95 * max((dt == 0.0).sum(), 1):
+        return 0.0
+    return round(tick, 6)
+
+
+def _same_rows(channel: Channel) -> NDArray[np.bool_]:
+    """Whether each row but the first tells what the one before does."""
+    columns = [v for v in channel.columns().values() if v.dtype.kind == "f"]
+    return np.all([(v[1:] == v[:-1]) | (np.isnan(v[1:]) & np.isnan(v[:-1])) for v in columns], axis=0)
+
+
+def _even(t_ns: TimesNs, gap_s: float) -> TimesNs:
+    """Times on straight lines through each stretch without gaps longer than `gap_s` and five mean periods."""
+    dt = np.diff(t_ns) * 1e-9
+    gap_s = max(gap_s, GAP_PERIODS * float(dt.mean()))
+    edges = [0, *(np.flatnonzero(dt > gap_s) + 1).tolist(), len(t_ns)]
+    even = t_ns.copy()
+    for first, last in itertools.pairwise(edges):
+        if last - first >= LEAST_ROWS:
+            index = np.arange(last - first)
+            line = np.polynomial.Polynomial.fit(index, t_ns[first:last] - t_ns[first], 1)
+            even[first:last] = t_ns[first] + np.rint(line(index)).astype(np.int64)
+    return np.maximum.accumulate(even)
+
+
+def check_jitter(patient: Patient) -> Iterator[Finding]:
+    """Intervals that scatter: a clock of arrival rather than of measurement."""
+    for name, channel in _clocked(patient.recording):
+        dt = np.diff(channel.t_ns) * 1e-9
+        if len(dt) < LEAST_ROWS or coarse_tick_s(channel):
+            continue
+        period = float(np.median(dt))
+        off, steps = np.abs(dt - period) > 0.5 * period, dt / period if period > 0.0 else dt
+        lost = (steps > 1.5) & (np.abs(steps - np.rint(steps)) < 0.1)  # samples are missing, no clock is off
+        share = float((off & ~lost).mean())
+        if share <= JITTER_SHARE:
+            continue
+        mean = float(dt.mean())
+        late = (channel.t_ns - _even(channel.t_ns, GAP_S)) * 1e-9
+        regular = len(dt) >= 50 and late.std() < mean and np.abs(late).max() < GAP_PERIODS * mean
+
+        def repair(recording: Recording, name: str = name) -> Recording:
+            return retimed(recording, name, _even(getattr(recording, name).t_ns, GAP_S))
+
+        yield Finding(
+            "uneven-sampling",
+            "warning",
+            name,
+            "uneven sampling",
+            f"{share:.0%} of the intervals are more than half off the median of {period * 1e3:.3g} ms",
+            "fit an even clock: the times scatter about one like times of arrival; their mean delay stays"
+            if regular
+            else "use the sensor's own time stamps; nothing in the log tells them",
+            repair if regular else None,
+        )
+
+
+def gap_findings(patient: Patient, jumps: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
+    """Stretches without samples. `jumps` are rows by channel that a clock jump parts, which are none."""
+    for name, channel in _clocked(patient.recording):
+        dt = np.diff(channel.t_ns) * 1e-9
+        dt[np.array(jumps.get(name, ()), dtype=int) - 1] = 0.0
+        if not (dt > 0).any() or coarse_tick_s(channel):
+            continue
+        period = period_s(channel.t_ns)
+        gaps = np.flatnonzero((dt > GAP_PERIODS * period) & (dt > GAP_S))
+        missing = _missing(dt[dt <= GAP_PERIODS * period] / period) if len(dt) >= LEAST_ROWS else 0
+        if gaps.size:
+            worst = int(gaps[np.argmax(dt[gaps])])
+            what = f"{gaps.size} gap{'s' if gaps.size > 1 else ''}"
+            evidence = (
+                f"longest {dt[worst]:.2f} s from t = {patient.since_start_s(channel.t_ns[worst]):.2f} s, "
+                f"{dt[gaps].sum():.2f} s in all"
+            )
+        elif missing > MISSING_SHARE * (len(channel) + missing):
+            what = f"{missing / (len(channel) + missing):.0%} of the samples are missing, one here and there"
+            evidence = f"intervals of whole multiples of {period * 1e3:.3g} ms, {missing} of which are empty"
+        else:
+            continue
+        fix = "expect larger uncertainty there, and look for dropped messages: nobody knows what is missing"
+        yield Finding("gaps", "warning", name, what, evidence, fix)
+
+
+def _missing(steps: Array) -> int:
+    """Samples missing in intervals told in periods; 0 where the long ones are no whole multiples."""
+    long = steps[steps > 1.5]
+    whole = np.abs(long - np.rint(long)) < 0.25
+    return int((np.rint(long) - 1.0).sum()) if long.size and whole.mean() > 0.8 else 0
+
+
+def check_duplicates(patient: Patient) -> Iterator[Finding]:
+    """Samples that share their time."""
+    for name, channel in patient.recording.channels().items():
+        repeated = np.flatnonzero(np.diff(channel.t_ns) == 0)
+        if not repeated.size or (name in CLOCKED and coarse_tick_s(channel)):
+            continue
+
+        def repair(recording: Recording, name: str = name) -> Recording:
+            channel = getattr(recording, name)
+            first = np.diff(channel.t_ns, prepend=channel.t_ns[0] - 1) > 0
+            return dataclasses.replace(recording, **{name: channel.select(first)})
+
+        yield Finding(
+            "repeated-times",
+            "warning",
+            name,
+            f"{repeated.size} repeated times",
+            f"first at t = {patient.since_start_s(channel.t_ns[repeated[0]]):.3f} s",
+            "keep the first sample of each time",
+            repair,
+        )
+
+
+def _clocked(recording: Recording) -> list[tuple[str, Channel]]:
+    return [(name, channel) for name, channel in recording.channels().items() if name in CLOCKED]

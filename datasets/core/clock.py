@@ -1,0 +1,183 @@
+"""Steps of a clock in recorded times: found, taken out, and told.
+
+A clock that is set while it records makes time run back, or leap ahead. A step is taken out by
+shifting all later times so that the interval at the step is the nominal one, so a repaired clock is
+off by less than a sampling period. Messages that arrived out of order are a different thing: there
+no time is wrong, only the rows are; `in_order` sorts those.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import ClockJump
+
+TimesNs = NDArray[np.int64]
+Step = tuple[int, int]
+"""First row after a step, and the nanoseconds that its time and all later ones lack."""
+
+NEAR_ROWS = 25
+"""Intervals on either side of a step whose median is the nominal one there."""
+DISORDER_ROWS = 50
+"""Rows out of order over a longer stretch are not a matter of arrival."""
+MARGIN_ROWS = 5
+"""Periods before and after a stretch that are counted with it."""
+SHARED_ROWS = 3
+"""Rows about a step of one channel among which another channel of that clock shows it."""
+LEAP_PERIODS, LEAP_S = 10, 0.5
+"""An interval longer than both is a leap ahead, where those are to be taken out."""
+MAX_STEPS = 1000
+
+
+def repair(t_ns: TimesNs, channel: str, *, forwards: bool = False) -> tuple[TimesNs, tuple[ClockJump, ...]]:
+    """Take the steps out of one channel's times.
+
+    Args:
+        t_ns: (N,) int64 in the order of the rows.
+        channel: its name, for the jumps and errors.
+        forwards: take out leaps ahead too. Times alone cannot tell a leap from a gap in the data.
+
+    Returns:
+        The repaired times, and the steps that were taken out; `t_ns` itself where there are none.
+        Rows that merely arrived out of order are still so: sort them by `in_order`.
+
+    Raises:
+        DataError: more than 1000 steps, or steps too large for 64 bits.
+    """
+    t_ns, steps = np.asarray(t_ns), _steps(t_ns, channel, forwards, None)
+    repaired = _shifted(t_ns, steps, channel)
+    return repaired, _jumps(channel, repaired, steps)
+
+
+def repair_together(
+    times: Mapping[str, TimesNs],
+    *,
+    forwards: bool = False,
+    beside: Mapping[str, TimesNs] | None = None,
+) -> tuple[dict[str, TimesNs], tuple[ClockJump, ...]]:
+    """Take the steps out of channels that may share a clock.
+
+    The step is measured on the fastest channel that shows it. Every other one whose interval there
+    fits the step better than it fits its own period shares the clock and gets the same shift, also
+    where its times do not run back; the others keep theirs.
+
+    Args:
+        times: (N,) int64 by channel, in the order of the rows.
+        forwards: as in `repair`.
+        beside: times of the same rows on another clock of the same rate. What leaps ahead on the
+            first and not on this one is a step and no gap in the data, and is taken out too.
+
+    Returns:
+        Repaired times by channel (the same arrays where nothing changed), and all jumps.
+
+    Raises:
+        DataError: as `repair`.
+    """
+    other_clock = beside or {}
+    steps = {name: _steps(t, name, forwards, other_clock.get(name)) for name, t in times.items()}
+    fixed = {name: _shifted(t, steps[name], name) for name, t in times.items()}
+    fastest_first = sorted(times, key=lambda name: _period_ns(np.diff(times[name]), len(times[name]) // 2))
+    for i, name in enumerate(fastest_first):
+        for row, lack in steps[name]:
+            for other in fastest_first[i + 1 :]:
+                shared = _shared_row(times[other], fixed[other], int(fixed[name][row]), lack)
+                if shared is not None:
+                    kept = [step for step in steps[other] if step[0] != shared]
+                    steps[other] = sorted([*kept, (shared, lack)])
+                    fixed[other] = _shifted(times[other], steps[other], other)
+    return fixed, tuple(jump for name in times for jump in _jumps(name, fixed[name], steps[name]))
+
+
+def in_order(t_ns: TimesNs) -> NDArray[np.intp] | None:
+    """The order (N,) that sorts rows by time and keeps ties as they are; None where they are sorted."""
+    return np.argsort(t_ns, kind="stable") if (t_ns[1:] < t_ns[:-1]).any() else None
+
+
+def _jumps(channel: str, repaired: TimesNs, steps: list[Step]) -> tuple[ClockJump, ...]:
+    return tuple(ClockJump(channel, int(repaired[row]), -lack / 1e9) for row, lack in steps)
+
+
+def _shifted(t_ns: TimesNs, steps: list[Step], channel: str) -> TimesNs:
+    if not steps:
+        return t_ns
+    total = sum(abs(lack) for _, lack in steps) + max(abs(int(t_ns.min())), abs(int(t_ns.max())))
+    if total >= 2**63:
+        raise DataError("the clock's steps are larger than a time can be", channel=channel)
+    lacks = np.zeros(len(t_ns), dtype=np.int64)
+    for row, lack in steps:
+        lacks[row] += lack
+    return np.asarray(t_ns + np.cumsum(lacks))
+
+
+def _steps(t_ns: TimesNs, channel: str, forwards: bool, beside: TimesNs | None) -> list[Step]:
+    interval = np.diff(t_ns)
+    suspects = np.flatnonzero(interval < 0)
+    if (forwards or beside is not None) and (interval > 0).any():
+        leap = max(LEAP_PERIODS * float(np.median(interval[interval > 0])), LEAP_S * 1e9)
+        ahead = interval if forwards or beside is None else interval - np.diff(beside)
+        suspects = np.union1d(suspects, np.flatnonzero(ahead > leap))
+    steps: list[Step] = []
+    for row in (suspects + 1).tolist():
+        period = _period_ns(interval, row)
+        first = steps[-1][0] if steps else 0  # rows before an earlier step are of another clock
+        if interval[row - 1] < 0 and _is_disorder(t_ns[first:], row - first, period):
+            continue
+        steps.append((row, round(period) - int(interval[row - 1])))
+        if len(steps) > MAX_STEPS:
+            raise DataError(
+                f"time jumps more than {MAX_STEPS} times: no clock that could be repaired",
+                channel=channel,
+                remedy="use other time stamps (of a bag: --stamps receipt)",
+            )
+    return steps
+
+
+def _period_ns(interval: TimesNs, row: int) -> float:
+    """Median of the intervals about a row."""
+    near = interval[max(row - 1 - NEAR_ROWS, 0) : row + NEAR_ROWS]
+    return max(float(np.median(near)), 0.0) if near.size else 0.0
+
+
+def _is_disorder(t_ns: TimesNs, row: int, period: float) -> bool:
+    """Whether time only seems to run back at `row`, because rows came in another order.
+
+    Then the rows about the time in question span as much of it as their number takes. After a step
+    of the clock the same time is told twice, and they span less by the step.
+    """
+    start, stop = max(row - DISORDER_ROWS, 0), min(row + DISORDER_ROWS, len(t_ns))
+    t, at = t_ns[start:stop] - t_ns[row], row - start
+    steady = np.diff(t)
+    steady = steady[np.abs(steady - period) < 0.5 * period]
+    if steady.size:  # over many rows the mean counts them, where the median adds up its own error
+        period = float(steady.mean())
+    high = int(t[:at].max())
+    has_earlier, has_later = bool((t[:at] < 0).any()), bool((t[at:] > high).any())
+    if (not has_earlier and start > 0) or (not has_later and stop < len(t_ns)):
+        return False  # time does not come back to where it was, not within a few rows
+    if not has_earlier and not has_later:
+        return False  # all rows before are later than all rows after
+    step = high + period
+    if not has_earlier:  # the rows before are all that could tell
+        step = min(step, at * period)
+    if not has_later:
+        step = min(step, (len(t) - at) * period)
+    near = t[(t >= -MARGIN_ROWS * period) & (t <= high + MARGIN_ROWS * period)]
+    missing = (len(near) - 1) * period - float(near.max() - near.min())
+    return missing < step / 2
+
+
+def _shared_row(t_ns: TimesNs, fixed_ns: TimesNs, at_ns: int, lack: int) -> int | None:
+    """The row at which a channel shows a step that another one made at `at_ns` (repaired time)."""
+    middle = int(np.searchsorted(fixed_ns, at_ns))
+    rows = np.arange(max(middle - SHARED_ROWS, 1), min(middle + SHARED_ROWS + 1, len(t_ns)))
+    if not rows.size:
+        return None
+    interval = np.diff(t_ns)
+    period = _period_ns(interval, middle)
+    stepped = np.abs(interval[rows - 1] + lack - period)
+    best = int(np.argmin(stepped))
+    return int(rows[best]) if stepped[best] < abs(interval[rows[best] - 1] - period) else None

@@ -1,0 +1,182 @@
+"""What a log's numbers mean where its format leaves it open: axes, signs, held values, lags.
+
+A reader gives the numbers of its file; `apply` turns them into a `Recording`'s terms. The conventions
+of a public set stand in the catalogue, each with where it was found; nothing is silent: every
+convention that was applied becomes a note.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.config import Position, Quantity
+from terrafusion.datasets.core.recording import Channel, Imu, Recording, Terrain
+from terrafusion.datasets.core.sensors import axes_matrix
+from terrafusion.datasets.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Sign = Annotated[float, Quantity("", -1.0, 1.0)]
+BODY_AXES = ("+x", "+y", "+z")
+
+
+@dataclass(frozen=True)
+class Conventions:
+    """Conventions of a log.
+
+    Attributes:
+        vehicle: name of the vehicle, "" where the log says it.
+        imu_axes: sensor axes that point along body x (forward), y (left), z (up).
+        gyro_z_sign: -1 where the yaw rate is positive to the right (after `imu_axes`).
+        left_wheels_sign, right_wheels_sign: -1 where that side is negative when driving forward.
+        wheel_radius_m, track_m: of the robot; the track is the geometric one.
+        antenna_m, imu_m: positions in the body frame.
+        held: rows for which a channel holds a value, by channel name ("wheels", "imu", "gnss",
+            "truth"); of a run of equal rows the first and then every so many rows are true updates.
+        lag_s: seconds by which a channel's times are late, by channel name.
+        truth_channels: what of the truth can be scored against; () for all it holds.
+        terrain: name of the ground for the whole drive, "" where unknown.
+    """
+
+    vehicle: str = ""
+    imu_axes: tuple[str, ...] = BODY_AXES
+    gyro_z_sign: Sign = 1.0
+    left_wheels_sign: Sign = 1.0
+    right_wheels_sign: Sign = 1.0
+    wheel_radius_m: Annotated[float, Quantity("m", 0.01, 2.0)] | None = None
+    track_m: Annotated[float, Quantity("m", 0.05, 10.0)] | None = None
+    antenna_m: Position | None = None
+    imu_m: Position | None = None
+    held: dict[str, Annotated[float, Quantity("rows", 1.0, 1e4)]] = field(default_factory=dict)
+    lag_s: dict[str, Annotated[float, Quantity("s", -10.0, 10.0)]] = field(default_factory=dict)
+    truth_channels: tuple[str, ...] = ()
+    terrain: str = ""
+
+    def __post_init__(self) -> None:
+        axes_matrix(self.imu_axes)
+
+
+def apply(recording: Recording, conventions: Conventions) -> Recording:
+    """The recording in the terms of `Recording`, with a note for every convention that changed it."""
+    recording = _geometry(recording, conventions)
+    recording = _inertial(recording, conventions)
+    recording = _wheels(recording, conventions)
+    recording = _true_updates(recording, conventions)
+    recording = _lags(recording, conventions)
+    return _truth_and_terrain(recording, conventions)
+
+
+def _geometry(recording: Recording, c: Conventions) -> Recording:
+    own = {name: getattr(c, name) for name in ("wheel_radius_m", "track_m", "antenna_m", "imu_m")}
+    new = {name: value for name, value in own.items() if value is not None}
+    return dataclasses.replace(
+        recording,
+        vehicle=c.vehicle or recording.vehicle,
+        overrides=dataclasses.replace(recording.overrides, **new),
+    )
+
+
+def _inertial(recording: Recording, c: Conventions) -> Recording:
+    imu, field = recording.imu, recording.magnetometer
+    if field is not None and c.imu_axes != BODY_AXES:
+        turned = dataclasses.replace(field, field_t=_turned(axes_matrix(c.imu_axes), field.field_t))
+        recording = dataclasses.replace(recording, magnetometer=turned).with_notes(
+            "magnetometer: taken to have the IMU's axes, and turned with it"
+        )
+    if imu is None:
+        return recording
+    if c.imu_axes != BODY_AXES:
+        R = axes_matrix(c.imu_axes)
+        imu = Imu(imu.t_ns, _turned(R, imu.gyro_radps), _turned(R, imu.accel_mps2))
+        recording = recording.with_notes(
+            f"imu: axes {', '.join(c.imu_axes)} brought to x forward, y left, z up"
+        )
+    if c.gyro_z_sign < 0:
+        imu = dataclasses.replace(imu, gyro_radps=imu.gyro_radps * (1.0, 1.0, -1.0))
+        recording = recording.with_notes("imu: yaw rate was positive to the right; its sign is changed")
+    return dataclasses.replace(recording, imu=imu)
+
+
+def _turned(R: Array, values: Array) -> Array:
+    """R @ v for signed permutations, which keeps NaN axes apart from known ones."""
+    source = np.abs(R).argmax(axis=1)
+    return values[:, source] * R[np.arange(3), source]
+
+
+def _wheels(recording: Recording, c: Conventions) -> Recording:
+    wheels = recording.wheels
+    if wheels is None or c.left_wheels_sign == c.right_wheels_sign == 1.0:
+        return recording
+    signs = np.array(
+        [c.left_wheels_sign if n.endswith("left") else c.right_wheels_sign for n in wheels.names]
+    )
+    angle = None if wheels.angle_rad is None else wheels.angle_rad * signs
+    turned = dataclasses.replace(wheels, speed=wheels.speed * signs, angle_rad=angle)
+    told = (("left", c.left_wheels_sign), ("right", c.right_wheels_sign))
+    sides = " and ".join(side for side, s in told if s < 0)
+    note = f"wheels: the {sides} side was negative when driving forward; its sign is changed"
+    return dataclasses.replace(recording, wheels=turned).with_notes(note)
+
+
+def _true_updates(recording: Recording, c: Conventions) -> Recording:
+    for name, rows in c.held.items():
+        channel = getattr(recording, name)
+        if channel is None or not len(channel):
+            continue
+        keep = true_updates(_values(channel), round(rows))
+        if keep.all():
+            continue
+        note = f"{name}: held values dropped: {int(keep.sum())} true updates of {len(keep)} rows"
+        recording = dataclasses.replace(recording, **{name: channel.select(keep)}).with_notes(note)
+    return recording
+
+
+def true_updates(values: Array, rows: int) -> NDArray[np.bool_]:
+    """Mask (N,) of the rows of `values` (N, k) that are updates: changes, and every `rows` rows of a run."""
+    same = np.zeros(len(values), dtype=bool)
+    same[1:] = ((values[1:] == values[:-1]) | (np.isnan(values[1:]) & np.isnan(values[:-1]))).all(axis=1)
+    index = np.arange(len(values))
+    since_change = index - np.maximum.accumulate(np.where(same, 0, index))
+    return since_change % max(rows, 1) == 0
+
+
+def _values(channel: Channel | Trajectory) -> Array:
+    if isinstance(channel, Trajectory):
+        return (
+            channel.position_m
+            if channel.quaternion is None
+            else np.hstack([channel.position_m, channel.quaternion])
+        )
+    columns = [v for v in channel.columns().values() if v.dtype.kind == "f"]
+    return np.stack(columns, axis=1)
+
+
+def _lags(recording: Recording, c: Conventions) -> Recording:
+    for name, lag_s in c.lag_s.items():
+        channel = getattr(recording, name)
+        if channel is None or lag_s == 0.0:
+            continue
+        shifted = dataclasses.replace(channel, t_ns=channel.t_ns - round(lag_s * 1e9))
+        note = f"{name}: times are {'late' if lag_s > 0 else 'early'} by {abs(lag_s):g} s; corrected"
+        recording = dataclasses.replace(recording, **{name: shifted}).with_notes(note)
+    return recording
+
+
+def _truth_and_terrain(recording: Recording, c: Conventions) -> Recording:
+    if c.truth_channels and recording.truth is not None:
+        kept = tuple(name for name in recording.truth_channels if name in c.truth_channels)
+        lost = [name for name in recording.truth_channels if name not in kept]
+        recording = dataclasses.replace(recording, truth_channels=kept)
+        if lost:
+            recording = recording.with_notes(f"truth: {', '.join(lost)} not good enough to score against")
+    if c.terrain and not recording.terrain_name:
+        label = np.array([c.terrain], dtype=object)
+        terrain = Terrain(np.array([recording.start_ns]), label)
+        recording = dataclasses.replace(
+            recording, terrain_name=c.terrain, terrain=recording.terrain or terrain
+        )
+    return recording

@@ -1,0 +1,51 @@
+"""Files that appear only when they are whole."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+from terrafusion.datasets.core.errors import TerrafusionError
+
+
+def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
+    """Let `write` fill a file beside `path`, then rename it to `path`; missing folders are made.
+
+    Raises:
+        TerrafusionError: the folder cannot be made or written.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write(temporary)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise unwritable(path, error) from None
+    finally:
+        if path.parent.is_dir():
+            temporary.unlink(missing_ok=True)
+    return path
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a folder for results before anything is computed; one that is not there is not made yet.
+
+    Raises:
+        TerrafusionError: it cannot be made or written.
+    """
+    try:
+        there = next(place for place in (path, *path.absolute().parents) if place.exists())
+        tempfile.TemporaryFile(dir=there).close()
+    except OSError as error:
+        raise unwritable(path, error) from None
+
+
+def unwritable(path: Path, error: OSError) -> TerrafusionError:
+    """The error that tells why `path` cannot be written."""
+    return TerrafusionError(
+        f"cannot be written: {error.strerror or error}",
+        file=path,
+        remedy="choose a folder you may write to, with room on the disk",
+    )

@@ -1,0 +1,121 @@
+"""Pieces of a long recording as runs of their own.
+
+Field logs often hold one long drive, while the diagnosis compares runs: `LOG@60-105` is the piece from 60
+to 105 s after the log's start, `LOG@/45` are all pieces of 45 s, one after the other.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import re
+from typing import Any
+
+import numpy as np
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+
+LEAST_S = 5.0
+"""No piece is shorter; what a cut leaves over at the end, if shorter, is left out."""
+_CUT = re.compile(r"^(?P<log>.+)@(?:/(?P<every>[\d.]+)|(?P<begin>[\d.]+)-(?P<end>[\d.]+))$")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cut:
+    """Which part of a log is meant: `begin_s` to `end_s` after its start, or pieces of `every_s` seconds."""
+
+    begin_s: float | None = None
+    end_s: float | None = None
+    every_s: float | None = None
+
+    def of(self, recording: Recording) -> list[Recording]:
+        """The recording's pieces.
+
+        Raises:
+            DataError: there is none.
+        """
+        if self.every_s is not None:
+            return pieces(recording, self.every_s)
+        assert self.begin_s is not None
+        assert self.end_s is not None
+        return [piece(recording, self.begin_s, self.end_s)]
+
+
+def split_name(text: str) -> tuple[str, Cut | None]:
+    """The log and what of it is meant: `LOG`, `LOG@60-105` or `LOG@/45`.
+
+    Raises:
+        DataError: no number, or a piece shorter than `LEAST_S`.
+    """
+    found = _CUT.match(text)
+    if found is None:
+        return text, None
+    try:
+        numbers = {k: float(v) for k, v in found.groupdict().items() if k != "log" and v is not None}
+    except ValueError:
+        raise DataError(f"'{text}' has no number behind @", remedy="write LOG@60-105 or LOG@/45") from None
+    length_s = numbers.get("every", numbers.get("end", 0.0) - numbers.get("begin", 0.0))
+    if length_s < LEAST_S:
+        raise DataError(f"'{text}' is {length_s:g} s long", remedy=f"give at least {LEAST_S:g} s")
+    return found["log"], Cut(numbers.get("begin"), numbers.get("end"), numbers.get("every"))
+
+
+def piece(recording: Recording, begin_s: float, end_s: float) -> Recording:
+    """The recording from `begin_s` to `end_s` after its start; the ground label holds on from before.
+
+    Raises:
+        DataError: nothing was recorded then.
+    """
+    start, end = (recording.start_ns + round(t * 1e9) for t in (begin_s, end_s))
+    parts = {name: channel.between(start, end) for name, channel in recording.channels().items()}
+    terrain = recording.terrain
+    if terrain is not None and len(terrain):
+        first = max(0, int(np.searchsorted(terrain.t_ns, start, side="right")) - 1)
+        last = max(first + 1, int(np.searchsorted(terrain.t_ns, end)))
+        held = terrain.select(slice(first, last))
+        parts["terrain"] = dataclasses.replace(held, t_ns=np.maximum(held.t_ns, start))
+    left: dict[str, Any] = {name: channel if len(channel) else None for name, channel in parts.items()}
+    if not any(channel is not None for name, channel in left.items() if name != "terrain"):
+        raise DataError(
+            f"nothing was recorded from {begin_s:g} to {end_s:g} s",
+            file=recording.name, remedy=f"the log lasts {recording.duration_s():.0f} s",
+        )  # fmt: skip
+    truth = recording.truth
+    if truth is not None:
+        first, last = np.searchsorted(truth.t_ns, [start, end], side="left")
+        truth = truth.select(slice(int(first), int(last))) if last > first else None
+    jumps = tuple(j for j in recording.clock_jumps if start <= j.t_ns < end)
+    name = f"{recording.name}@{begin_s:g}-{end_s:g}"
+    return dataclasses.replace(
+        recording, name=name, start_ns=start, truth=truth, clock_jumps=jumps, **left
+    )  # fmt: skip
+
+
+def pieces(recording: Recording, length_s: float) -> list[Recording]:
+    """All pieces of `length_s` seconds (see `spans`).
+
+    Raises:
+        DataError: the log is shorter than `LEAST_S`.
+    """
+    return [piece(recording, begin, end) for begin, end in spans(recording, length_s)]
+
+
+def spans(recording: Recording, length_s: float) -> list[tuple[float, float]]:
+    """Begin and end of all pieces in seconds from the log's start: from the first input of the twin (wheels
+    or commands) to the log's end; the last may be shorter.
+
+    Raises:
+        DataError: the log is shorter than `LEAST_S`.
+    """
+    inputs = [c for c in (recording.command, recording.wheels) if c is not None and len(c)]
+    first_ns = min((int(c.t_ns[0]) for c in inputs), default=recording.start_ns)
+    begin_s, end_s = max(0.0, (first_ns - recording.start_ns) * 1e-9), recording.duration_s()
+    edges = [*np.arange(begin_s, end_s, length_s).tolist(), end_s]
+    found = [(round(a, 2), round(b, 2)) for a, b in itertools.pairwise(edges) if b - a >= LEAST_S]
+    if not found:
+        raise DataError(
+            f"lasts {end_s - begin_s:.1f} s: too short for a piece", file=recording.name,
+            remedy=f"give a log of at least {LEAST_S:g} s",
+        )  # fmt: skip
+    return found

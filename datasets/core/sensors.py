@@ -1,0 +1,140 @@
+"""What is known of a robot's sensors: where they sit and how good they are.
+
+Positions are in the body frame (`base_link`: x forward, y left, z up), metres.
+Noise densities follow the Allan-variance convention (IEEE Std 952-1997): the
+standard deviation of a rate averaged over tau is density / sqrt(tau).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.config import Position, Quantity
+from terrafusion.datasets.core.recording import Fix
+
+AXES = {
+    "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0),
+    "+y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
+    "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
+}  # fmt: skip
+
+ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
+"""Sigma of each horizontal axis by class of fix, where neither log nor vehicle says it; up takes twice that.
+Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
+
+
+def axes_matrix(axes: tuple[str, ...]) -> NDArray[np.float64]:
+    """Rotation matrix (3, 3) of sensor axes that lie along body x, y, z: v_body = matrix @ v_sensor.
+
+    Raises:
+        ValueError: the axes are not three of `AXES` that make a right-handed frame.
+    """
+    R = (
+        np.array([AXES[axis] for axis in axes])
+        if len(axes) == 3 and set(axes) <= set(AXES)
+        else np.zeros((3, 3))
+    )
+    if np.linalg.det(R) < 0.5:
+        raise ValueError(
+            f"axes {list(axes)} are not a rotation; give three of {', '.join(AXES)} that make a "
+            "right-handed frame"
+        )
+    return R
+
+
+@dataclass(frozen=True)
+class ImuSpec:
+    """Inertial measurement unit: mounting and noise.
+
+    `axes` lists the sensor axes that point along body x, y and z; a husky whose
+    body x is minus the sensor's z reads `["-z", "-x", "+y"]`. It is applied only
+    to messages whose `frame_id` is the one given here.
+    """
+
+    rate_hz: Annotated[float, Quantity("Hz", 1.0, 5000.0)]
+    gyro_noise_radps_sqrthz: Annotated[float, Quantity("rad/s/sqrt(Hz)", 1e-7, 1.0)]
+    gyro_bias_walk_radps2_sqrthz: Annotated[float, Quantity("rad/s2/sqrt(Hz)", 1e-9, 0.1)]
+    gyro_bias_sigma_radps: Annotated[float, Quantity("rad/s", 0.0, 1.0)]
+    accel_noise_mps2_sqrthz: Annotated[float, Quantity("m/s2/sqrt(Hz)", 1e-6, 10.0)]
+    accel_bias_walk_mps3_sqrthz: Annotated[float, Quantity("m/s3/sqrt(Hz)", 1e-8, 1.0)]
+    accel_bias_sigma_mps2: Annotated[float, Quantity("m/s2", 0.0, 5.0)]
+    position_m: Position
+    axes: tuple[str, ...] = ("+x", "+y", "+z")
+    frame_id: str = "imu_link"
+
+    def __post_init__(self) -> None:
+        axes_matrix(self.axes)
+
+    def base_from_sensor(self) -> NDArray[np.float64]:
+        """Rotation matrix (3, 3): vector in the body frame = matrix @ vector in the sensor frame."""
+        return axes_matrix(self.axes)
+
+
+@dataclass(frozen=True)
+class WheelSpec:
+    """Wheel encoders as the log has them: rate and resolution at the wheel."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.5, 5000.0)]
+    quantum_rad: Annotated[float, Quantity("rad", 0.0, 1.0)]
+    speed_sigma_mps: Annotated[float, Quantity("m/s", 0.0, 1.0)]
+
+
+@dataclass(frozen=True)
+class GnssSpec:
+    """GNSS receiver: antenna position and accuracy (1 sigma)."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.05, 100.0)]
+    sigma_horizontal_m: Annotated[float, Quantity("m", 1e-3, 100.0)]
+    sigma_vertical_m: Annotated[float, Quantity("m", 1e-3, 200.0)]
+    sigma_velocity_mps: Annotated[float, Quantity("m/s", 1e-3, 10.0)]
+    correlation_time_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
+    antenna_m: Position
+
+
+@dataclass(frozen=True)
+class BarometerSpec:
+    """Barometer: white noise of a sample (1 sigma), and the random walk of weather and wind on top."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.05, 500.0)]
+    noise_pa: Annotated[float, Quantity("Pa", 0.0, 1000.0)]
+    walk_paps_sqrthz: Annotated[float, Quantity("Pa/s/sqrt(Hz)", 0.0, 100.0)]
+    position_m: Position
+
+
+@dataclass(frozen=True)
+class MagnetometerSpec:
+    """Magnetometer in body axes: white noise of a sample and axis, and the hard iron that its calibration
+    leaves on each axis (1 sigma)."""
+
+    rate_hz: Annotated[float, Quantity("Hz", 0.05, 1000.0)]
+    noise_t: Annotated[float, Quantity("T", 0.0, 1e-4)]
+    hard_iron_sigma_t: Annotated[float, Quantity("T", 0.0, 1e-3)]
+
+
+@dataclass(frozen=True)
+class SensorSuite:
+    """All sensors of a robot; barometer and magnetometer only where it has them."""
+
+    imu: ImuSpec
+    wheels: WheelSpec
+    gnss: GnssSpec
+    barometer: BarometerSpec | None = None
+    magnetometer: MagnetometerSpec | None = None
+
+
+@dataclass(frozen=True)
+class Rig:
+    """The geometry a reader or an estimator needs to interpret a recording.
+
+    `track_m` is the track the log's wheel odometry was made with: a body twist
+    (v, yaw rate) stands for the side speeds v -+ yaw rate * track / 2.
+    """
+
+    wheel_radius_m: float
+    track_m: float
+    sensors: SensorSuite
+    topics: dict[str, str] = field(default_factory=dict)

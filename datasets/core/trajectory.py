@@ -1,0 +1,150 @@
+"""`Trajectory`: poses over time, with body twist and covariance where known."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Poses of the body (or antenna) in the world frame.
+
+    Attributes:
+        t_ns: (N,) int64, strictly increasing.
+        position_m: (N, 3) world; z is NaN where the source is planar.
+        quaternion: (N, 4) x, y, z, w of body to world, or None when unknown.
+        twist_body: (N, 6) body-frame linear (m/s) then angular (rad/s) velocity, NaN where unknown, or None.
+        covariance: (N, 6, 6) of the pose, ROS order (translation then rotation, world axes), or None.
+    """
+
+    t_ns: NDArray[np.int64]
+    position_m: Array
+    quaternion: Array | None = None
+    twist_body: Array | None = None
+    covariance: Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.t_ns)
+        shapes = {"position_m": (n, 3), "quaternion": (n, 4), "twist_body": (n, 6), "covariance": (n, 6, 6)}
+        for name, shape in shapes.items():
+            value = getattr(self, name)
+            if value is not None and value.shape != shape:
+                raise ValueError(f"trajectory: {name} has shape {value.shape}, not {shape}")
+        back = np.flatnonzero(np.diff(self.t_ns) <= 0)
+        if back.size:
+            i = int(back[0])
+            raise DataError(
+                f"time does not increase after row {i}",
+                channel="trajectory",
+                time_s=float(self.t_ns[i] - self.t_ns[0]) * 1e-9,
+                remedy="sort the rows and remove repeated times",
+            )
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, rows: Any) -> Trajectory:
+        """The same trajectory with the rows of a boolean mask, slice or index array."""
+        fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
+        chosen: dict[str, Any] = {k: None if v is None else v[rows] for k, v in fields.items()}
+        return Trajectory(**chosen)
+
+    def yaw_rad(self) -> Array:
+        """Yaw angles (N,), rad, in [-pi, pi]."""
+        if self.quaternion is None:
+            return np.full(len(self), np.nan)
+        return yaw_of(self.quaternion)
+
+    def path_length_m(self) -> float:
+        """Length of the horizontal path, m."""
+        step = np.diff(self.position_m[:, :2], axis=0)
+        return float(np.nansum(np.hypot(step[:, 0], step[:, 1])))
+
+    def positions_at(self, t_ns: NDArray[np.int64]) -> Array:
+        """Positions (M, 3) at the times (M,), linearly interpolated; NaN outside the trajectory's span."""
+        out = np.full((len(t_ns), 3), np.nan)
+        if not len(self):
+            return out
+        origin = self.t_ns[0]
+        query, grid = (t_ns - origin) * 1e-9, (self.t_ns - origin) * 1e-9
+        for axis in range(3):
+            out[:, axis] = np.interp(query, grid, self.position_m[:, axis], left=np.nan, right=np.nan)
+        return out
+
+    def quaternions_at(self, t_ns: NDArray[np.int64]) -> Array:
+        """Orientations (M, 4) at the times (M,), slerped; NaN outside the span or when unknown."""
+        out = np.full((len(t_ns), 4), np.nan)
+        if self.quaternion is None or len(self) < 2:
+            return out
+        from scipy.spatial.transform import Rotation, Slerp
+
+        inside = (t_ns >= self.t_ns[0]) & (t_ns <= self.t_ns[-1])
+        origin = self.t_ns[0]
+        slerp = Slerp((self.t_ns - origin) * 1e-9, Rotation.from_quat(self.quaternion))
+        out[inside] = slerp((t_ns[inside] - origin) * 1e-9).as_quat()
+        return out
+
+    def points_at(self, t_ns: NDArray[np.int64], lever_m: tuple[float, ...] | Array) -> Array:
+        """World positions (M, 3) of the body-fixed point `lever_m` at the times (M,)."""
+        lever = np.asarray(lever_m, dtype=float)
+        positions = self.positions_at(t_ns)
+        if not lever.any():
+            return positions
+        known = np.isfinite(positions[:, 0])
+        out = np.full_like(positions, np.nan)
+        if known.any():
+            R = quaternion_to_matrix(self.quaternions_at(t_ns[known]))
+            out[known] = positions[known] + R @ lever
+        return out
+
+    def to_pandas(self) -> pd.DataFrame:
+        """Columns x_m, y_m, z_m, qx, qy, qz, qw and the body twist where known, indexed by `t_ns`."""
+        import pandas as pd
+
+        table: dict[str, Array] = {f"{axis}_m": self.position_m[:, i] for i, axis in enumerate("xyz")}
+        if self.quaternion is not None:
+            table |= {f"q{axis}": self.quaternion[:, i] for i, axis in enumerate("xyzw")}
+        if self.twist_body is not None:
+            names = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
+            table |= {name: self.twist_body[:, i] for i, name in enumerate(names)}
+        return pd.DataFrame(table, index=pd.Index(self.t_ns, name="t_ns"))
+
+
+def write_tum(trajectory: Trajectory, path: Path) -> None:
+    """Write `t x y z qx qy qz qw` lines, 9 decimals, time in seconds exact to the nanosecond.
+
+    An unknown height is written as 0, an unknown orientation as the identity:
+    the format has no missing values.
+    """
+    q = (
+        trajectory.quaternion
+        if trajectory.quaternion is not None
+        else np.tile([0.0, 0, 0, 1], (len(trajectory), 1))
+    )
+    rows = np.hstack([np.nan_to_num(trajectory.position_m), q])
+    with path.open("w", encoding="utf-8") as out:
+        out.write("# timestamp_s x_m y_m z_m qx qy qz qw\n")
+        for t_ns, row in zip(trajectory.t_ns.tolist(), rows.tolist(), strict=True):
+            numbers = " ".join(f"{value:.9f}" for value in row)
+            out.write(f"{t_ns // 10**9}.{t_ns % 10**9:09d} {numbers}\n")
+
+
+def seconds_to_ns(text: str) -> int:
+    """Decimal seconds as written -> nanoseconds, without passing through a float."""
+    from decimal import ROUND_HALF_EVEN, Decimal
+
+    return int((Decimal(text) * 10**9).to_integral_value(rounding=ROUND_HALF_EVEN))

@@ -1,0 +1,124 @@
+"""What the estimator gives back: states as they come, and whole drives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+STATUS = {
+    "waiting": "no data that allow a start have come yet",
+    "aligning": "heading is unknown until the robot has moved far enough for GNSS to show it",
+    "running": "position, heading and slip are estimated",
+    "outage": "no GNSS fix for more than two seconds; wheels and IMU carry the position",
+    "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
+}
+"""Values of a status and the sentence that explains each."""
+
+
+@dataclass(frozen=True)
+class WeightChange:
+    """Why a sensor's weight changed at a keyframe."""
+
+    t_ns: int
+    sensor: str
+    before: float
+    after: float
+    unit: str
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """The estimate at one time.
+
+    Attributes:
+        t_ns: time of the keyframe.
+        position_m: (3,) body origin in the world (ENU about the datum).
+        quaternion: (4,) x, y, z, w of body to world.
+        velocity_mps: (3,) in the world frame.
+        angular_velocity_radps: (3,) in the body frame, bias removed.
+        gyro_bias_radps, accel_bias_mps2: (3,) in the body frame.
+        slip, slip_sigma: longitudinal slip 1 - v / (omega R) and its 1 sigma.
+        linear, linear_sigma: the states of `key_state.LINEAR` and their 1 sigma.
+        covariance: (6, 6) of the pose, ROS order (translation then rotation, world axes).
+        velocity_covariance: (3, 3), world.
+        twist_covariance: (6, 6) of the body twist, linear then angular.
+        bias_sigma: (6,) 1 sigma of the gyro biases (rad/s), then of the accelerometer's (m/s2).
+        terrain: class name -> probability.
+        status: a key of `STATUS`.
+        slipping: wheels and robot travel different distances (see `monitor`).
+        immobilised: the robot is kept from moving, its wheels spinning or stalled.
+    """
+
+    t_ns: int
+    position_m: Array
+    quaternion: Array
+    velocity_mps: Array
+    angular_velocity_radps: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    slip: float
+    slip_sigma: float
+    linear: Array
+    linear_sigma: Array
+    covariance: Array
+    velocity_covariance: Array
+    twist_covariance: Array
+    bias_sigma: Array
+    terrain: dict[str, float]
+    status: str
+    slipping: bool = False
+    immobilised: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Innovation:
+    """A measurement against its prediction: `value` (m or m/s), normalised square `nis` with `dof`."""
+
+    t_ns: int
+    sensor: str
+    value: Array
+    nis: float
+    dof: int
+    accepted: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """A whole drive as estimated.
+
+    `trajectory` has the twist (body) and the covariance of every keyframe; the
+    other arrays run along it. `classes` names the columns of `terrain`, `key_state.LINEAR` those of `linear`.
+    """
+
+    trajectory: Trajectory
+    velocity_mps: Array
+    velocity_covariance: Array
+    gyro_bias_radps: Array
+    accel_bias_mps2: Array
+    slip: Array
+    slip_sigma: Array
+    terrain: Array
+    classes: tuple[str, ...]
+    weights: dict[str, Array]
+    changes: tuple[WeightChange, ...]
+    innovations: tuple[Innovation, ...]
+    status: NDArray[Any]
+    notes: tuple[str, ...] = ()
+    slipping: NDArray[np.bool_] | None = None
+    immobilised: NDArray[np.bool_] | None = None
+    twist_covariance: Array | None = None
+    bias_sigma: Array | None = None
+    linear: Array | None = None
+    linear_sigma: Array | None = None
+
+    def dominant_terrain(self) -> NDArray[Any]:
+        """The most probable class (N,) at each keyframe."""
+        return np.array(self.classes)[self.terrain.argmax(axis=1)]

@@ -1,0 +1,75 @@
+"""Barometer and magnetometer of one estimator; where no samples of theirs come, nothing is done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.estimator.alignment import LEVEL_SIGMA_STILL_RAD, WINDOW_NS, GivenStart, Start
+from terrafusion.fusion.estimator.barometer import HeightAid
+from terrafusion.fusion.estimator.gnss import GnssUpdater
+from terrafusion.fusion.estimator.magnetometer import HeadingAid
+from terrafusion.fusion.estimator.streams import GnssFix, ImuStream
+from terrafusion.fusion.graph.chain import Chain
+
+Array = NDArray[np.float64]
+
+
+class Aids:
+    """Both sensors.
+
+    Args:
+        rig: the robot; its sensor specifications may lack either.
+        declination_rad: magnetic north, east of true north; None where it is not known.
+        report: called with every tested measurement.
+    """
+
+    def __init__(self, rig: Rig, declination_rad: float | None, report: Callable[[Innovation], None]) -> None:
+        self.height = HeightAid(rig.sensors.barometer, report)
+        self._accel_tilt_rad = rig.sensors.imu.accel_bias_sigma_mps2 / GRAVITY_MPS2
+        tilt = float(np.hypot(LEVEL_SIGMA_STILL_RAD, self._accel_tilt_rad))
+        self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report, tilt)
+        self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
+
+    def update(self, chain: Chain, newest_ns: int, before: Array, after: Array, gnss: GnssUpdater) -> bool:
+        """Use what has come up to the newest keyframe; True where factors were added to it.
+
+        `before` and `after` (n, n) are its covariance without and with its fixes; the IMU has come to
+        `newest_ns`.
+        """
+        t_ns = chain.nodes[-1].t_ns
+        if gnss.local:
+            self.heading.forget_north()
+        placed = gnss.placed is not None
+        height = self.height.active and self.height.update(chain, t_ns, newest_ns, before, after, placed)
+        turned = gnss.turned + placed
+        heading = self.heading.active and self.heading.update(chain, t_ns, newest_ns, before, after, turned)
+        return height or heading
+
+    def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> GivenStart | None:
+        """Where a robot at rest stands and where it heads, once a fix and the field have told it."""
+        self.height.forget(imu.t_ns[0])
+        self.heading.forget(imu.t_ns[0])
+        early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
+        if not early or not self.heading.ready:
+            return None
+        tilt = float(np.hypot(level.level_sigma_rad, self._accel_tilt_rad))
+        told = self.heading.heading_at_rest(level, tilt)
+        if told is None:
+            return None
+        yaw, sigma = told
+        R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, yaw).matrix()
+        best = min(early, key=lambda fix: float(fix.sigma_m[0]))
+        position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
+        return GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
+
+    def notes(self) -> tuple[str, ...]:
+        """What was made of the samples, in sentences."""
+        told = self.height.note()
+        return (*([told] if told else []), *self.heading.notes())

@@ -1,0 +1,213 @@
+"""The start: attitude from gravity, heading and position from GNSS against dead reckoning."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.fusion.estimator.streams import GnssFix, ImuStream, WheelStream
+
+Array = NDArray[np.float64]
+
+STILL_MPS = 0.01
+STILL_RADPS = 0.05
+WINDOW_NS = 1_000_000_000
+LEVEL_SIGMA_STILL_RAD, LEVEL_SIGMA_MOVING_RAD = 0.02, 0.05
+LEAST_RATIO = 0.3
+"""Driven over dead-reckoned distance below which the robot is taken to be stuck: no heading comes of that."""
+SLIP_SIGMA = 0.05
+"""Wheel speed over ground speed, beyond what the fixes show (assumed): the sigma of a GNSS velocity's use."""
+
+
+@dataclass(frozen=True, eq=False)
+class Start:
+    """The robot at `t_ns`: yaw with its 1 sigma, body origin (3,), roll and pitch, speed, gyro bias (3,)."""
+
+    t_ns: int
+    position_m: Array
+    position_sigma_m: float
+    yaw_rad: float
+    yaw_sigma_rad: float
+    roll_rad: float
+    pitch_rad: float
+    level_sigma_rad: float
+    speed_mps: float
+    gyro_bias_radps: Array | None
+
+
+def level_start(imu: ImuStream, wheels: WheelStream, t_ns: int) -> Start:
+    """Attitude and gyro bias at the start; position zero and yaw zero (a local frame).
+
+    Over the first second at rest the mean specific force is gravity and the
+    mean rate is bias. A robot already moving has no known bias; what its wheels
+    and its turn add to gravity, dv/dt forward and v r to the left, is taken
+    off the mean force first.
+    """
+    gyro, accel = imu.levelled(t_ns, t_ns + WINDOW_NS)
+    rolled = wheels.travelled(t_ns, t_ns + WINDOW_NS)
+    still = (
+        rolled is not None
+        and max(abs(rolled[0]), abs(rolled[1])) < STILL_MPS
+        and len(gyro) > 3
+        and float(np.abs(gyro.mean(axis=0)).max()) < STILL_RADPS
+    )
+    force = accel.mean(axis=0) if len(accel) else np.array([0.0, 0.0, 9.8])
+    speed = 0.0
+    if not still:
+        fifth = WINDOW_NS // 5
+        speed = _mean_speed_mps(wheels, t_ns, t_ns + fifth)
+        gained = _mean_speed_mps(wheels, t_ns + 4 * fifth, t_ns + 5 * fifth) - speed
+        yaw_rate = float(gyro[:, 2].mean()) if len(gyro) else 0.0
+        mean_speed = 0.5 * sum(rolled or (0.0, 0.0)) / (WINDOW_NS * 1e-9)
+        force = force - np.array([gained / 0.8, mean_speed * yaw_rate, 0.0])
+        # The mean was felt half a second later, by a robot that had turned on.
+        turned = 0.5e-9 * WINDOW_NS * yaw_rate
+        x, y, _ = force
+        force[0], force[1] = x * np.cos(turned) - y * np.sin(turned), x * np.sin(turned) + y * np.cos(turned)
+    x, y, z = force
+    return Start(
+        t_ns=t_ns,
+        position_m=np.zeros(3),
+        position_sigma_m=1e-3,
+        yaw_rad=0.0,
+        yaw_sigma_rad=1e-3,
+        roll_rad=float(np.arctan2(y, z)),
+        pitch_rad=float(np.arctan2(-x, np.hypot(y, z))),
+        level_sigma_rad=LEVEL_SIGMA_STILL_RAD if still else LEVEL_SIGMA_MOVING_RAD,
+        speed_mps=speed,
+        gyro_bias_radps=gyro.mean(axis=0) if still else None,
+    )
+
+
+def _mean_speed_mps(wheels: WheelStream, start_ns: int, end_ns: int) -> float:
+    rolled = wheels.travelled(start_ns, end_ns)
+    return 0.0 if rolled is None else 0.5 * sum(rolled) / ((end_ns - start_ns) * 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class GivenStart:
+    """A position (3,) and heading, ENU, that are known beforehand, with their 1 sigmas."""
+
+    position_m: Array
+    yaw_rad: float
+    position_sigma_m: float
+    yaw_sigma_rad: float
+
+    def at(self, level: Start) -> Start:
+        """The start there; attitude, speed and bias are those of `level`."""
+        return dataclasses.replace(level, **vars(self))
+
+
+def checked_given(
+    position_m: ArrayLike, yaw_rad: float, position_sigma_m: float, yaw_sigma_rad: float
+) -> GivenStart:
+    """A given start.
+
+    Raises:
+        DataError: not three finite coordinates and a finite heading with positive sigmas.
+    """
+    position = np.asarray(position_m, dtype=float)
+    if position.shape != (3,) or not np.isfinite(position.sum() + yaw_rad):
+        raise DataError(
+            f"start at {position.tolist()} with yaw {yaw_rad} is no pose", remedy="give x, y, z and yaw"
+        )
+    if not (0.0 < position_sigma_m < np.inf and 0.0 < yaw_sigma_rad < np.inf):
+        raise DataError(
+            f"sigmas {position_sigma_m} m, {yaw_sigma_rad} rad of the start are not positive",
+            remedy="give 1 sigma",
+        )
+    return GivenStart(position, float(yaw_rad), position_sigma_m, yaw_sigma_rad)
+
+
+def turn_between(
+    z: NDArray[np.complex128], g: NDArray[np.complex128], weight: Array
+) -> tuple[complex, float]:
+    """The turn that lays points z onto points g, as a complex number, and its information.
+
+    With complex points in the plane the best turn is the argument of
+    sum w_i conj(z_i - z) (g_i - g) (the planar case of Horn 1987, JOSA A 4(4)), the best
+    scale its size over sum w_i |z_i - z|^2, which is given as information.
+    """
+    share = weight / weight.sum()
+    from_mean = z - share @ z
+    weighted = weight * from_mean.conj()
+    return complex(weighted @ (g - share @ g)), float((weighted @ from_mean).real)
+
+
+def heading_from_motion(
+    imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix], level: Start, antenna_m: Array
+) -> Start | None:
+    """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
+
+    Positions and velocities show the same turn, so their sums add up (see `turn_between`). None while
+    fewer than three fixes are inside, or while the fixes hardly move though the wheels do.
+    """
+    times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
+    inside = [f for f in fixes if len(times) and level.t_ns <= f.t_ns <= min(times[-1], imu.t_ns[-1])]
+    if len(inside) < 3 or len(times) < 3:
+        return None
+    yaw_at, path_at = _dead_reckon(imu, wheels, level)
+    t_fix = np.array([f.t_ns - level.t_ns for f in inside], dtype=float) * 1e-9
+    heading = np.exp(1j * yaw_at(t_fix))
+    lever = complex(antenna_m[0], antenna_m[1])
+    z = path_at(t_fix) + lever * heading
+    g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
+    weight = np.array([1.0 / (f.sigma_m[0] * f.sigma_m[1]) for f in inside])
+    turn, information = turn_between(z, g, weight)
+    half = 0.1
+    z_dot = (path_at(t_fix + half) - path_at(t_fix - half)) / (2.0 * half)
+    z_dot = z_dot + lever * (np.exp(1j * yaw_at(t_fix + half)) - np.exp(1j * yaw_at(t_fix - half))) / 0.2
+    for fix, v in zip(inside, z_dot.tolist(), strict=True):
+        if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps[:2].sum() + fix.sigma_v_mps):
+            w = 1.0 / (max(fix.sigma_v_mps, 1e-3) ** 2 + (SLIP_SIGMA * abs(v)) ** 2)
+            turn += w * np.conj(v) * complex(fix.velocity_mps[0], fix.velocity_mps[1])
+            information += w * abs(v) ** 2
+    if information <= 0.0 or abs(turn) < LEAST_RATIO * information:
+        return None
+    yaw = float(np.angle(turn))
+    origin = np.average(g, weights=weight) - np.exp(1j * yaw) * np.average(z, weights=weight)
+    heights = np.array([f.enu_m[2] for f in inside])
+    height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
+    return dataclasses.replace(
+        level,
+        position_m=np.array([origin.real, origin.imag, height]),
+        position_sigma_m=float(5.0 / np.sqrt(weight.max())) + 0.05,
+        yaw_rad=yaw,
+        yaw_sigma_rad=information**0.5 / abs(turn),
+    )
+
+
+def _dead_reckon(imu: ImuStream, wheels: WheelStream, level: Start):  # type: ignore[no-untyped-def]
+    """Yaw (rad) and complex horizontal position (m) over seconds from the start, as functions.
+
+    The ground is taken for a plane: the path in it is laid flat by the attitude of the start.
+    """
+    t, gyro, _ = imu.window(level.t_ns, imu.t_ns[-1] + 1)
+    bias = level.gyro_bias_radps[2] if level.gyro_bias_radps is not None else 0.0
+    yaw = np.concatenate([[0.0], np.cumsum((gyro[1:, 2] - bias) * np.diff(t))])
+    index = [i for i, x in enumerate(wheels.t_ns) if x >= level.t_ns]
+    t_wheel = np.array([wheels.t_ns[i] - level.t_ns for i in index], dtype=float) * 1e-9
+    distance = np.array([0.5 * (wheels.left_m[i] + wheels.right_m[i]) for i in index])
+    middle = np.interp(0.5 * (t_wheel[1:] + t_wheel[:-1]), t, yaw)
+    steps = np.diff(distance)
+    in_plane = np.stack([steps * np.cos(middle), steps * np.sin(middle)])
+    level_x, level_y = _flattened(level) @ in_plane
+    path = np.concatenate([[0.0 + 0.0j], np.cumsum(level_x + 1j * level_y)])
+
+    def yaw_at(s: Array) -> Array:
+        return np.interp(s, t, yaw)
+
+    def path_at(s: Array) -> NDArray[np.complex128]:
+        return np.interp(s, t_wheel, path.real) + 1j * np.interp(s, t_wheel, path.imag)
+
+    return yaw_at, path_at
+
+
+def _flattened(level: Start) -> Array:
+    """Horizontal part (2, 2) of motion in the plane the robot stands on, axes as at the start."""
+    roll, pitch = level.roll_rad, level.pitch_rad
+    return np.array([[np.cos(pitch), np.sin(pitch) * np.sin(roll)], [0.0, np.cos(roll)]])

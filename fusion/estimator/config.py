@@ -1,0 +1,81 @@
+"""Settings of the estimator; every one has a default that suits a ground robot."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.estimator.sensor_config import Inputs
+from terrafusion.fusion.noise.labels import GroundLabels
+from terrafusion.fusion.noise.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
+from terrafusion.fusion.noise.policy import Policy, load_policy
+
+
+@dataclass(frozen=True)
+class EstimatorConfig:
+    """What an `Estimator` is built from.
+
+    Attributes:
+        rig: geometry and sensors of the robot.
+        vehicle: its name, for what the terrain model knows of single robots.
+        mode: "adaptive" (noise follows the detected terrain), "fixed" (one row for all grounds), "robust"
+            (that row, single measurements under a robust loss) or "innovation" (that row, the noise of
+            wheels and GNSS followed by their innovations).
+        policy: noise rows by terrain.
+        tuning: the few numbers of the modes.
+        robust_loss: mode "robust": "cauchy" or "gnc".
+        innovation_method: mode "innovation": "sage_husa" or "variational".
+        keyframe_s: time between keyframes.
+        lag_s: length of the smoothing window.
+        wheel_wait_s: how long a keyframe waits for a late wheel sample.
+        gnss_gate: chi-square probability beyond which a fix is rejected.
+        wheel_gate_sigma: normalised wheel innovation beyond which an increment is rejected.
+        yaw_sigma_start_rad: heading uncertainty at which the graph is started.
+        start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
+        inputs: what the estimator will be given; without all six IMU axes the graph is planar.
+        calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
+        declination_rad: magnetic north at the place, east of true north; with it a magnetometer tells the
+            heading, without it holds the one that GNSS or the start has told.
+        labels: the ground over time, told in place of what the detector finds; None: it detects.
+    """
+
+    rig: Rig
+    vehicle: str | None = None
+    mode: str = "adaptive"
+    policy: Policy = field(default_factory=load_policy)
+    tuning: ModeTuning = field(default_factory=load_modes)
+    robust_loss: str = "cauchy"
+    innovation_method: str = "variational"
+    keyframe_s: float = 0.1
+    lag_s: float = 5.0
+    wheel_wait_s: float = 0.3
+    gnss_gate: float = 0.999
+    wheel_gate_sigma: float = 6.0
+    yaw_sigma_start_rad: float = 0.12
+    start_without_gnss_s: float = 30.0
+    inputs: Inputs = field(default_factory=Inputs)
+    calibrate: bool = False
+    declination_rad: float | None = None
+    labels: GroundLabels | None = None
+
+    @property
+    def longest_wait_s(self) -> float:
+        """How long a start waits for the first fix."""
+        return self.start_without_gnss_s if self.inputs.gnss else 0.0
+
+    def __post_init__(self) -> None:
+        for what, value, known in (
+            ("mode", self.mode, MODES),
+            ("robust_loss", self.robust_loss, ROBUST_LOSSES),
+            ("innovation_method", self.innovation_method, INNOVATION_METHODS),
+        ):
+            if value not in known:
+                raise ConfigError(f"unknown {what} '{value}'", remedy=f"this version has {', '.join(known)}")
+        if not 0.01 <= self.keyframe_s <= 1.0:
+            raise ConfigError(f"keyframe_s is {self.keyframe_s}", remedy="give 0.01 to 1 s")
+        if self.declination_rad is not None and not abs(self.declination_rad) <= math.pi:
+            raise ConfigError(f"declination_rad is {self.declination_rad}", remedy="give -pi to pi rad")
+        if self.lag_s < 5 * self.keyframe_s:
+            raise ConfigError(f"lag_s is {self.lag_s}", remedy="give at least five keyframes")

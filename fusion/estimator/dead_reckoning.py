@@ -1,0 +1,262 @@
+"""Dead reckoning beside the fixes: a second opinion on the heading, and on what a receiver claims.
+
+The filter believes its own past, so it is slow to see that its heading was wrong, or that a receiver
+lies. Wheels and gyro alone, from any start, trace the shape of the path; held against the fixes of
+the last half minute it tells how far the shape is turned, and how much the fixes scatter about it.
+Neither depends on what the filter made of those fixes.
+"""
+
+from __future__ import annotations
+
+import bisect
+import cmath
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.estimator.alignment import turn_between
+from terrafusion.fusion.estimator.streams import GnssFix
+from terrafusion.fusion.graph.chain import Chain
+
+Array = NDArray[np.float64]
+
+KEPT_S = 30.0
+SCATTER_FIXES = 21
+"""Fixes over which a receiver's scatter is judged; the median bears ten wild ones."""
+RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
+"""Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
+LEAST_NEWS, MOST_NEWS = 8.0, 300.0
+"""Second differences from which on the share of a fix that is new is known, and how many are remembered
+(assumed)."""
+WILD = 3.0
+"""A second difference whose square is more than so many times what the claims would make counts as so much
+(assumed)."""
+SLIP_CHANGE = 0.1
+"""How far slip may change from fix to fix and so bend the dead-reckoned path (assumed)."""
+LEAST_RATIO, MOST_RATIO = 0.3, 1.7
+"""Driven over dead-reckoned distance between which a path says something about heading."""
+TURN_SIGMA_RAD = 0.15
+LEAST_TURN_RAD = 0.35
+MOST_JERK_MPS3, SMOOTH_SIGMA = 10.0, 3.0
+"""A wheeled robot changes its acceleration no faster than by 2 m/s2 in a fifth of a second (assumed)."""
+CONFIRMED = 3
+"""Fixes in a row that must show the same wrong heading."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How the dead-reckoned path lies among the fixes.
+
+    Attributes:
+        turn: from the path to the fixes; its size is driven over dead-reckoned distance.
+        sigma_rad: 1 sigma of its angle.
+        middle, fix_middle: the middles of both, which are laid onto each other.
+        rest_m: median distance that is left.
+    """
+
+    turn: complex
+    sigma_rad: float
+    middle: complex
+    fix_middle: complex
+    rest_m: float
+
+    def at(self, z: complex) -> complex:
+        """Where a point of the path lies on the map."""
+        return self.fix_middle + self.turn * (z - self.middle)
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A fix (east + i north, m) with its claimed sigma, and the dead-reckoned antenna `z` (m) at its time."""
+
+    t_ns: int
+    z: complex
+    fix: complex
+    sigma_m: float
+
+
+class MotionTrack:
+    """The dead-reckoned path of the antenna and the fixes along it, for the last `KEPT_S`."""
+
+    def __init__(self, antenna_m: Array) -> None:
+        self._lever = complex(antenna_m[0], antenna_m[1])
+        self._t_ns: list[int] = []
+        self._z: list[complex] = []
+        self._yaw: list[float] = []
+        self.pairs: list[Pair] = []
+        self._yaw_chain = 0.0
+        self._turned = 0
+        self._told = np.zeros(2)
+
+    def step(self, chain: Chain) -> None:
+        """Carry the path to the newest keyframe, by its wheels (or its speed, where they are refused)."""
+        node, state = chain.nodes[-1], chain.state(chain.last)
+        R = state.pose.rotation().matrix()
+        self._yaw_chain = float(np.arctan2(R[1, 0], R[0, 0]))
+        if not self._t_ns or len(chain.nodes) < 2:
+            self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0)
+            return
+        dt = (node.t_ns - self._t_ns[-1]) * 1e-9
+        moved = R.T @ state.velocity * dt
+        if node.wheels is not None and np.isfinite(node.wheels.sigma[0]):
+            moved = node.wheels.displacement_m
+        east, north, _ = R @ moved
+        turn = float((R @ state.rate(node.gyro_radps))[2]) * dt
+        level = complex(east, north) * np.exp(-1j * self._yaw_chain)
+        self._append(node.t_ns, self._z[-1] + level * np.exp(1j * self._yaw[-1]), self._yaw[-1] + turn)
+
+    def _append(self, t_ns: int, z: complex, yaw: float) -> None:
+        self._t_ns.append(t_ns)
+        self._z.append(z)
+        self._yaw.append(yaw)
+        old = bisect.bisect_left(self._t_ns, t_ns - round(KEPT_S * 1e9))
+        if old > 50:
+            del self._t_ns[:old], self._z[:old], self._yaw[:old]
+            kept = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
+            # The differences that go with them, which their two neighbours complete.
+            self._told += self._tell(self.pairs[: len(self.pairs) - len(kept) + 2])
+            self._told *= min(MOST_NEWS / max(self._told[1], 1.0), 1.0)
+            self.pairs = kept
+
+    def add(self, fix: GnssFix) -> None:
+        """Set a fix beside the path, in its place in time."""
+        if len(self._t_ns) < 2 or fix.t_ns < self._t_ns[0]:
+            return
+        i = min(bisect.bisect_left(self._t_ns, fix.t_ns, 1), len(self._t_ns) - 1)
+        begin, end = self._t_ns[i - 1], self._t_ns[i]
+        share = min((fix.t_ns - begin) / (end - begin), 1.0)
+        z = self._z[i - 1] + share * (self._z[i] - self._z[i - 1])
+        yaw = self._yaw[i - 1] + share * (self._yaw[i] - self._yaw[i - 1])
+        at = z + self._lever * complex(np.cos(yaw), np.sin(yaw))
+        pair = Pair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
+        bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
+
+    def scatter(self) -> float:
+        """How many times what they claim the last fixes scatter about the path; NaN if too few tell.
+
+        From second differences of fix minus path: neither an offset, a slow drift, a heading error nor
+        steady slip of the estimate shows in them, white noise of variance s^2 does with 6 s^2.
+        """
+        recent = self.pairs[-SCATTER_FIXES:]
+        if len(recent) < 8:
+            return math.nan
+        seen, bend, claimed = self._second_differences(recent)
+        if len(seen) < 6:
+            return math.nan
+        return math.sqrt(_median(np.maximum(2.0 * seen / RAYLEIGH_MEDIAN - bend, 0.0) / claimed))
+
+    def news(self) -> float:
+        """Variance that is new at every fix, over what the fixes claim; NaN if too few tell.
+
+        The mean of the second differences (`scatter`), of which many more are remembered. Squares of white
+        noise are exponential, and those beyond `WILD` are censored there, so that wild fixes say no more than
+        others (Epstein and Sobel 1953, J. Am. Stat. Assoc. 48). Where slip may have bent the path by more
+        than the fixes claim, they tell nothing of the receiver.
+        """
+        total, counted = self._told + self._tell(self.pairs)
+        return float(total / counted) if counted >= LEAST_NEWS else math.nan
+
+    def _tell(self, pairs: list[Pair]) -> Array:
+        """Sum and number (2,) of second differences over the claims, for `news`."""
+        if len(pairs) < 3:
+            return np.zeros(2)
+        seen, bend, claimed = self._second_differences(pairs)
+        share = (seen / claimed)[bend < claimed]
+        return np.array([np.minimum(share, WILD).sum(), np.count_nonzero(share < WILD)])
+
+    def _second_differences(self, pairs: list[Pair]) -> tuple[Array, Array, Array]:
+        """Squares (m2, each axis) of second differences of fix minus path where fixes come evenly, what slip
+        may add to them, and what the claims would."""
+        z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
+        gap = np.diff(np.array([p.t_ns - pairs[0].t_ns for p in pairs]) * 1e-9)
+        even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
+        rest = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
+        seen = 0.5 * np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2
+        bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
+        claimed = 6.0 * np.array([p.sigma_m for p in pairs])[1:-1] ** 2
+        return seen[even], bend[even], claimed[even]
+
+    def smooth_at(self, t_ns: int) -> bool:
+        """Whether the fix of `t_ns` lies where the three before it lead, as they claim; False with fewer.
+
+        A parabola through the three is carried on; a robot leaves it by no more than `MOST_JERK_MPS3` makes.
+        Fixes of a receiver that scatters beyond its claims do not follow each other so.
+        """
+        last = bisect.bisect_right(self.pairs, t_ns, key=lambda p: p.t_ns)
+        recent = self.pairs[max(last - 4, 0) : last]
+        if len(recent) < 4:
+            return False
+        a, b, c, t = ((p.t_ns - recent[0].t_ns) * 1e-9 for p in recent)
+        if not a < b < c < t:
+            return False
+        weights = (
+            (t - b) * (t - c) / ((a - b) * (a - c)),
+            (t - a) * (t - c) / ((b - a) * (b - c)),
+            (t - a) * (t - b) / ((c - a) * (c - b)),
+        )
+        led = sum(w * p.fix for w, p in zip(weights, recent, strict=False))
+        claimed = [w * p.sigma_m for w, p in zip((*weights, 1.0), recent, strict=True)]
+        jerk = MOST_JERK_MPS3 / 6.0 * (t - a) * (t - b) * (t - c)
+        return abs(recent[3].fix - led) <= SMOOTH_SIGMA * math.hypot(*claimed) + jerk
+
+    def wrong_by(self, yaw_sigma_rad: float, scale: float) -> float | None:
+        """Angle by which the filter's heading must turn to agree with the motion, once that is sure."""
+        turn = self._heading_error(yaw_sigma_rad, scale)
+        self._turned = self._turned + 1 if turn is not None else 0
+        return turn if self._turned >= CONFIRMED else None
+
+    def restart(self) -> None:
+        """Forget the fixes seen so far: the filter has been set right."""
+        self.pairs.clear()
+        self._turned = 0
+
+    def _heading_error(self, yaw_sigma_rad: float, scale: float) -> float | None:
+        fit = self.fit(scale, TURN_SIGMA_RAD)
+        if fit is None:
+            return None
+        error = self.error_of(fit)
+        limit = max(LEAST_TURN_RAD, 4.0 * math.hypot(fit.sigma_rad, min(yaw_sigma_rad, 0.3)))
+        return error if abs(error) > limit else None
+
+    def error_of(self, fit: Fit) -> float:
+        """Angle, rad, by which the chain's heading must turn to agree with the fit."""
+        return cmath.phase(fit.turn * cmath.exp(-1j * (self._yaw_chain - self._yaw[-1])))
+
+    def antenna(self) -> complex:
+        """The dead-reckoned antenna at the newest keyframe, m."""
+        return self._z[-1] + self._lever * cmath.exp(1j * self._yaw[-1])
+
+    def fit(self, scale: float, yaw_sigma_rad: float) -> Fit | None:
+        """The path laid onto the fixes, whose claims count `scale` times; None until its turn is known to
+        `yaw_sigma_rad`."""
+        if len(self.pairs) < 5:
+            return None
+        z, fix = np.array([p.z for p in self.pairs]), np.array([p.fix for p in self.pairs])
+        weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in self.pairs])
+        keep = np.ones(len(z), dtype=bool)
+        for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
+            turn, information = turn_between(z[keep], fix[keep], weight[keep])
+            if information <= 0.0:
+                return None
+            ratio = abs(turn) / information
+            middle, fix_middle = z[keep].mean(), fix[keep].mean()
+            rest = np.abs((fix - fix_middle) - turn / information * (z - middle))
+            left = _median(rest)
+            keep = rest <= 5.0 * left + 1e-6
+            if np.count_nonzero(keep) < 5:
+                return None
+        kept = z[keep]
+        extent = float(np.linalg.norm(kept - kept.mean())) / math.sqrt(len(kept))
+        if extent == 0.0:  # all that is left was seen where the robot stood
+            return None
+        sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * left / extent
+        if sigma > yaw_sigma_rad or not LEAST_RATIO < ratio < MOST_RATIO:
+            return None
+        return Fit(turn / information, sigma, complex(middle), complex(fix_middle), left)
+
+
+def _median(values: Array) -> float:
+    """The median, of an even number the upper of the two in the middle; a tenth of `np.median`'s time."""
+    return float(np.sort(values)[len(values) // 2])

@@ -1,0 +1,450 @@
+"""`Estimator`: sensor messages in, pose, twist, slip and terrain out, live.
+
+est = Estimator.for_vehicle("husky")
+est.add_imu(t_ns, gyro, accel)
+est.add_wheels(t_ns, left_mps, right_mps)
+est.add_gnss(t_ns, enu_m, sigma_m)
+state = est.latest()
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
+from terrafusion.datasets.core.recording import Fix
+from terrafusion.fusion.estimate.estimate import Innovation, State
+from terrafusion.fusion.estimator import snapshot
+from terrafusion.fusion.estimator.aiding import Aids
+from terrafusion.fusion.estimator.alignment import (
+    WINDOW_NS,
+    GivenStart,
+    Start,
+    checked_given,
+    heading_from_motion,
+    level_start,
+)
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.friction import grip_of
+from terrafusion.fusion.estimator.gates import WheelGate
+from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
+from terrafusion.fusion.estimator.odometry import Propagator
+from terrafusion.fusion.estimator.skid import Slide
+from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
+from terrafusion.fusion.estimator.stationarity import RestDetector, forget_waiting, hold
+from terrafusion.fusion.estimator.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.graph import slow_states
+from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.factors import bridge, wheel_increment
+from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
+from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
+from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
+from terrafusion.fusion.weighting.adaptive import TerrainWeights
+
+Array = NDArray[np.float64]
+
+LONGEST_IMU_GAP_S, OUTAGE_S = 0.5, 2.0
+SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
+LAG_MARGIN = 5
+"""Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
+SEEN_LATE_NS, SWITCHED = 1_000_000_000, 0.1
+"""A change of ground is seen a second after it (`docs/terrain.md`); less of a shift is none."""
+UNKNOWN = np.full(3, np.nan)
+
+
+class Estimator:
+    """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
+
+    Samples may come late and out of order (see `streams.Lateness`); keyframes are made as soon as the
+    IMU (and the wheels, or their waiting time) cover them. `on_state` is called with every new `State`,
+    `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
+    """
+
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        on_state: Callable[[State], None] | None = None,
+        on_innovation: Callable[[Innovation], None] | None = None,
+        archive: Chain | None = None,
+    ) -> None:
+        self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
+        self.chain = Chain(archive, config.calibrate)
+        self.imu = ImuStream(six_axis=not config.inputs.planar)
+        self.wheels = WheelStream()
+        self.weights = TerrainWeights(config)
+        self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
+        self._slide = Slide(grip_of(config, self._preintegrator, self.weights.note))
+        self.gnss = GnssUpdater(config, self._report, self.weights.single, self._slide)
+        self.aids = Aids(config.rig, config.declination_rad, self._report)
+        self.wheels_rejected = 0
+        self._on_state, self._on_innovation = on_state, on_innovation
+        self._wheel_gate = WheelGate(config.wheel_gate_sigma)
+        self._step_ns = round(config.keyframe_s * 1e9)
+        self._keep = round(config.lag_s / config.keyframe_s) + LAG_MARGIN
+        self._start: Start | None = None
+        self._given: GivenStart | None = None
+        self._level: Start | None = None
+        self._state: State | None = None
+        self._fresh: State | None = None
+        self._covariance = np.zeros((self.chain.dim, self.chain.dim))
+        self._silent = False
+        self._rest = RestDetector(config.rig)
+        self.monitor = MotionMonitor(config.rig)
+        self._propagator = Propagator(self._preintegrator)
+
+    @classmethod
+    def for_vehicle(cls, name: str, mode: str = "adaptive") -> Estimator:
+        """An estimator for a vehicle of the library (or a vehicle YAML)."""
+        from terrafusion.twin.model.vehicle import load_vehicle
+
+        return cls(EstimatorConfig(load_vehicle(name).rig(), name, mode))
+
+    def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
+        """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.
+
+        Where `config.inputs` declares no more than gyro z, all but the yaw rate may be NaN.
+        """
+        if self.config.inputs.imu == "none":
+            raise DataError("the estimator was told to expect no IMU", channel="imu", remedy="mend `inputs`")
+        self.imu.add(t_ns, gyro_radps, accel_mps2)
+        self._advance()
+
+    def add_wheels(
+        self,
+        t_ns: int,
+        left_mps: float,
+        right_mps: float,
+        left_m: float | None = None,
+        right_m: float | None = None,
+    ) -> None:
+        """Circumferential speed of each side, m/s, and its travelled distance, m, where encoders count it."""
+        self.wheels.add(t_ns, left_mps, right_mps, left_m, right_m)
+        if self.config.inputs.imu == "none":  # the wheels are the clock, and their difference the yaw rate
+            self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m), UNKNOWN)
+            self._advance()
+
+    def add_gnss(
+        self,
+        t_ns: int,
+        enu_m: ArrayLike,
+        sigma_m: ArrayLike | None,
+        velocity_mps: ArrayLike | None = None,
+        sigma_v_mps: float = float("nan"),
+        fix: Fix | int | str | None = None,
+    ) -> None:
+        """Antenna position and 1 sigma (3,), ENU m (a NaN height is unknown); velocity (3,) ENU if known.
+
+        `fix` is the class of fix ("single" to "fixed"); without a sensible sigma that of the class counts.
+        """
+        taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
+        if taken is not None:
+            self.gnss.queue(taken)
+
+    def set_start(
+        self,
+        position_m: ArrayLike,
+        yaw_rad: float,
+        position_sigma_m: float = 0.1,
+        yaw_sigma_rad: float = 0.05,
+    ) -> None:
+        """Start at a known position (3,) and heading, ENU, with 1 sigmas, instead of waiting for motion.
+
+        A heading that proves wrong is set right from the motion. Must come before the start.
+        """
+        self._given = checked_given(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
+
+    def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
+        """Class probabilities of an external source, such as a camera, fused with the own detector's."""
+        self.weights.external(t_ns, probabilities)
+
+    def add_command(self, t_ns: int, v_mps: float) -> None:
+        """Commanded forward speed: it tells a robot that is kept from moving from one that waits."""
+        self.monitor.command(t_ns, v_mps)
+
+    def add_pressure(self, t_ns: int, pressure_pa: float) -> None:
+        """Static pressure of a barometer, Pa: it holds the height that GNSS, or the start, has told."""
+        self.aids.height.add(t_ns, pressure_pa)
+
+    def add_magnetic_field(self, t_ns: int, field_t: ArrayLike) -> None:
+        """Magnetic flux density (3,), body axes, tesla: heading, see `inputs.magnetometer`."""
+        self.aids.heading.add(t_ns, field_t)
+
+    def latest(self) -> State | None:
+        """The newest state, or None before the start."""
+        return self._state
+
+    def odometry(self) -> State | None:
+        """The newest state carried to the newest IMU sample; None before the start."""
+        if self._state is None:
+            return None
+        return self._propagator.carry(self._state, self._covariance, self.imu, self.weights.row)
+
+    def dump(self) -> bytes:
+        """The state of a running estimator, for `restore`; see `snapshot`."""
+        return snapshot.dump(self)
+
+    @classmethod
+    def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Estimator:
+        """An estimator that goes on where `dump` was called, with the same bits; see `snapshot.restore`."""
+        return snapshot.restore(cls(config, **callbacks), data)
+
+    @property
+    def status(self) -> str:
+        """A key of `STATUS`: what the estimator is doing now, also before the first state."""
+        if self._state is not None:
+            return self._state.status
+        return "waiting" if self._level is None else "aligning"
+
+    def finish(self) -> None:
+        """Tell that no more data come: keyframes no longer wait for late samples."""
+        self.imu.late.wait_ns = self.wheels.late.wait_ns = 0
+        self._advance(last=True)
+
+    def _advance(self, last: bool = False) -> None:
+        if self._start is None and not self._try_start(last):
+            return
+        newest = self.chain.last
+        while self._ready(t := self.chain.nodes[-1].t_ns + self._step_ns, last):
+            self._keyframe(t)
+        if self.chain.last == newest or last:
+            self._upkeep()
+
+    def _ready(self, t_ns: int, last: bool) -> bool:
+        """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
+        if not self.imu.covers(t_ns):
+            return False
+        waited = t_ns + round(self.config.wheel_wait_s * 1e9)
+        return last or self.wheels.covers(t_ns) or self.imu.covers(waited)
+
+    def _try_start(self, last: bool) -> bool:
+        """Start the graph once heading is known, or once it is clear that GNSS will not come."""
+        if not self.imu.t_ns or not self.wheels.t_ns:
+            return False
+        begin = max(self.imu.t_ns[0], self.wheels.t_ns[0])
+        level_ns = begin + WINDOW_NS
+        covered = self.wheels.covers(level_ns) or self.imu.covers(level_ns + WINDOW_NS)
+        if not last and not (covered and self.imu.covers(level_ns)):
+            return False
+        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
+        if self._level is None:
+            self._level = level_start(self.imu, self.wheels, begin)
+        if self._given is None:
+            self._given = self.aids.start(self._level, self.imu, self.gnss.waiting)
+        if self._given is not None:
+            self._begin(self._given.at(self._level))
+        elif self.gnss.waiting and self.gnss.news():
+            antenna = np.array(self.config.rig.sensors.gnss.antenna_m)
+            start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
+            if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
+                self._begin(start)
+            elif forget_waiting(self.imu, self.wheels, self.gnss.waiting):
+                self._level = None
+        elif not self.gnss.waiting and (last or elapsed > self.config.longest_wait_s):
+            self.gnss.local = True
+            self._begin(self._level)
+        return self._start is not None
+
+    def _begin(self, start: Start) -> None:
+        self._start = start
+        rotation = gtsam.Rot3.RzRyRx(start.roll_rad, start.pitch_rad, start.yaw_rad)
+        spec = self.config.rig.sensors.imu
+        gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
+        grade = float(rotation.matrix()[2, 0])
+        linear, sigma = slow_states.prior(self.weights.row, grade, self.gnss.drift_sigma_m)
+        point = KeyState(
+            gtsam.Pose3(rotation, start.position_m),
+            rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
+            gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
+            linear,
+        )
+        # The fixes that gave the heading enter the graph again: the prior must not count them twice.
+        from_fixes = not self.gnss.local and self._given is None
+        yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
+        level = float(np.hypot(start.level_sigma_rad, spec.accel_bias_sigma_mps2 / GRAVITY_MPS2))
+        gyro_sigma = spec.gyro_bias_sigma_radps + 1e-6
+        sigmas = [
+            level,
+            level,
+            yaw_sigma,
+            *[start.position_sigma_m] * 3,
+            *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
+        ]
+        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + sigma.tolist()
+        self.chain.append(start.t_ns, point, gyro_radps=gyro_bias)
+        self.chain.set_prior(np.array(sigmas[: self.chain.dim]))
+        if self.chain.archive is not None:
+            self.chain.archive.set_prior(np.array(sigmas[: self.chain.dim]))
+        self.chain.solve(SMOOTH_WINDOW)
+        self._covariance = self.chain.covariance()
+        self.weights.begin(start.t_ns)
+        newest = min(s.t_ns[-1] - s.late.wait_ns for s in (self.imu, self.wheels))
+        # Live, what lies before the start has no estimate; a batch has one from the first keyframe on.
+        self._silent = self.chain.archive is None
+        while self.chain.nodes[-1].t_ns + 2 * self._step_ns <= newest:
+            self._keyframe(self.chain.nodes[-1].t_ns + self._step_ns)
+        self._silent = False
+        self.chain.smooth(len(self.chain.nodes), iterations=5)
+
+    def _keyframe(self, t_ns: int) -> None:
+        self._upkeep()
+        switch = self.weights.take_switch()
+        before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
+        before = self.chain.state(self.chain.last)
+        row, drift = self.weights.row, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
+        if switch > SWITCHED:
+            slow_states.open_slip(self.chain, t_ns - SEEN_LATE_NS, dt, row, *drift, switch)
+        segments = self.imu.segments(before_ns, t_ns)
+        if self.config.inputs.planar:
+            segments = in_a_turn(segments, before)
+        rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
+        segments, wheels = self._slide.dragged(t_ns, dt, segments, wheels, before, self._covariance)
+        k = self.chain.last + 1
+        gyro, accel = mean_rates(segments)
+        link, preintegrated = gtsam.NonlinearFactorGraph(), False
+        if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
+            point = carried(before, wheels, dt)
+            link = bridge(k, before, point, dt)
+        else:
+            measured = self._preintegrator.integrate(segments, before.bias, row)
+            seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
+            nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
+            point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
+            link.add(imu_factor(k, measured))
+            if not self.config.inputs.planar:  # the planar link is no witness against the wheels
+                preintegrated = True
+                wheels = self._gated(t_ns, wheels, before, point, switch)
+        up = before.pose.rotation().matrix()[2]
+        markov = slow_states.step(dt, row, up, *drift, switch, wheels)
+        self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
+        self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
+        if self.config.inputs.planar:
+            self.chain.add(k, held_level(k), "X")
+        self._zero_velocity(k, t_ns, before, link)
+        self._finish_keyframe(t_ns, gyro, rolled.distance_m if rolled else None)
+
+    def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
+        chain = self.chain
+        chain.solve(SMOOTH_WINDOW)
+        before = self._covariance = chain.covariance()
+        if self.gnss.update(chain, self._covariance, self.weights.row):
+            chain.solve(SMOOTH_WINDOW)
+            self._covariance = chain.covariance()
+        if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
+            chain.solve(SMOOTH_WINDOW)
+            self._covariance = chain.covariance()
+        chain.forget(self._keep)
+        self.imu.forget(t_ns - 2_000_000_000)
+        self.wheels.forget(t_ns - 2_000_000_000)
+        self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
+        self._fresh = self._emitted(t_ns, gyro)
+
+    def _upkeep(self) -> None:
+        """What no state waits for: the heading's second opinion, smoothing, the ground.
+
+        Done in the call after a keyframe's, at the latest before the next keyframe: no call takes long.
+        """
+        state, self._fresh = self._fresh, None
+        if state is None:
+            return
+        turned = self.gnss.set_heading_right(self.chain, self.weights.row)
+        if turned or self.chain.last % SMOOTH_EVERY == 0:
+            self.chain.smooth(SMOOTH_WINDOW)
+            self._covariance = self.chain.covariance()
+        self.weights.update(state, self.imu, self.wheels)
+
+    def _wheel_increment(
+        self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState
+    ) -> WheelIncrement | None:
+        travelled = self.wheels.travelled(before_ns, t_ns)
+        if travelled is None:
+            return None
+        rig, inputs = self.config.rig, self.config.inputs
+        quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
+        bias_z = float(before.bias.gyroscope()[2])
+        change = self.wheels.speed_change_mps(before_ns, t_ns)
+        row, surging = self.weights.row, self.config.calibrate
+        increment = wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, row, change, surging)
+        increment = self._slide.loosened(increment, before, (t_ns - before_ns) * 1e-9)
+        return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
+
+    def _gated(
+        self, t_ns: int, wheels: WheelIncrement | None, before: KeyState, point: KeyState, switch: float
+    ) -> WheelIncrement | None:
+        if wheels is None:
+            return None
+        gate, dt = self._wheel_gate, self._step_ns * 1e-9
+        wheels = gate.rejoined(wheels, dt)
+        moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
+        d = wheels.displacement_m
+        innovation = float(moved[0] - before.rolling * d[0])
+        P, row = self._covariance, self.weights.row
+        forward = before.pose.rotation().matrix()[:, 0]
+        variance = (
+            wheels.sigma[0] ** 2
+            + d[0] ** 2 * (P[SLIP, SLIP] + row.slip_sigma**2 * (2.0 * dt / row.slip_time_s + switch))
+            + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
+            + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
+        )
+        robot = float(forward @ before.velocity), float(point.pose.rotation().matrix()[:, 0] @ point.velocity)
+        accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)
+        self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
+        if accepted:
+            return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
+        self.wheels_rejected += not self._silent
+        return wheels.doubted(variance, gate.doubt(nis))
+
+    def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
+        """Zero velocity and rate where the robot has stood for a window."""
+        known = self.gnss.last_used_ns is not None and (t_ns - self.gnss.last_used_ns) * 1e-9 <= OUTAGE_S
+        sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
+        biases = before.bias.gyroscope(), before.bias.accelerometer()
+        if self._rest.stands(
+            t_ns, self.imu, self.wheels, *biases, float(np.linalg.norm(before.velocity)), sigma
+        ):
+            hold(self.chain, k, link)
+
+    def _emitted(self, t_ns: int, gyro: Array) -> State:
+        key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
+        P = self._covariance
+        R = key.pose.rotation().matrix()
+        silent = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
+        status = "no_gnss" if self.gnss.local else ("outage" if silent else "running")
+        state = self._state = State(
+            t_ns=t_ns,
+            position_m=np.asarray(key.pose.translation()),
+            quaternion=quaternion_of(key.pose),
+            velocity_mps=key.velocity,
+            angular_velocity_radps=key.rate(gyro),
+            gyro_bias_radps=np.asarray(key.bias.gyroscope()),
+            accel_bias_mps2=np.asarray(key.bias.accelerometer()),
+            slip=key.slip if wheels is None else slip_of(key.linear, wheels),
+            linear=key.linear,
+            linear_sigma=linear_sigma(P),
+            slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
+            covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
+            velocity_covariance=P[VELOCITY, VELOCITY].copy(),
+            twist_covariance=twist_covariance(
+                P, R, key.velocity, gyro_sigma_radps(self.config, self.weights.row)
+            ),
+            bias_sigma=bias_sigma(P),
+            terrain=self.weights.posterior(),
+            status=status,
+            slipping=self.monitor.slipping,
+            immobilised=self.monitor.immobilised,
+        )
+        if self._on_state is not None and not self._silent:
+            self._on_state(state)
+        return state
+
+    def _report(self, innovation: Innovation) -> None:
+        if self._on_innovation is not None and not self._silent:
+            self._on_innovation(innovation)

@@ -1,0 +1,409 @@
+"""GNSS fixes on their way into the chain: timing, gates, weights."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.recording import Fix
+from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
+from terrafusion.fusion.estimator.gates import GnssGate, Verdict
+from terrafusion.fusion.estimator.map_alignment import Placement, place
+from terrafusion.fusion.estimator.skid import Slide
+from terrafusion.fusion.estimator.streams import GnssFix
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
+from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
+from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
+from terrafusion.fusion.noise.policy import SensorNoise
+from terrafusion.fusion.weighting.weighting import Surprise, Weighting
+from terrafusion.twin.sensors.gnss import best_fix
+
+Array = NDArray[np.float64]
+
+LEAST_SIGMA_M = 0.005
+UNKNOWN_HEIGHT_SIGMA_M = 100.0
+LARGE_TURN_RAD = 0.05
+UNUSED_WEIGHT = 0.01
+"""A fix of which a robust loss leaves less does not end an outage."""
+WHITE_SHARE = 0.2
+"""Share of a fix's variance that is new at every fix; the rest drifts slowly. More is taken to be new
+where the fixes scatter more about the dead-reckoned path."""
+ALL_NEW = 0.75
+"""A share from which on all is taken to be new: the share heard is off by a tenth or two
+(assumed)."""
+LIE = 2.0
+"""Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
+OPTIMISM = 3.0
+"""A stand-alone receiver may claim so many times less than its data sheet and drift all the same; one
+that claims even less has fixes of a better class (RTK), which drift in proportion to what they claim."""
+LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
+"""Claims of a receiver outside this range are no sigma; that of its class of fix takes their place."""
+DOUBTFUL_YAW_SIGMA_RAD = 0.2
+"""What is left of the doubt in a heading after it was turned onto the motion (assumed)."""
+
+
+class GnssUpdater:
+    """Holds fixes until a keyframe has passed them, tests position and height apart (a wrong
+    height must not cost a good position) and adds their factors.
+
+    Attributes:
+        waiting: fixes not yet used, oldest first.
+        local: the graph was started without GNSS, and no fixes have told yet how it lies on the map.
+        placed: how they did, once they have; unplaced: how many came until then.
+        rejected, too_late: how many fixes the gate refused, or came after their keyframe was dropped.
+        turned: how often the heading was set right from the motion.
+        scale: how many times more than it claims the receiver is seen to scatter, 1 for an honest one.
+        white: share of a fix's variance that is taken to be new at every fix.
+        last_used_ns: time of the newest fix in the graph.
+    """
+
+    def __init__(
+        self,
+        config: EstimatorConfig,
+        report: Callable[[Innovation], None],
+        weighting: Weighting | None = None,
+        slide: Slide | None = None,
+    ) -> None:
+        self.weighting = weighting or Weighting()
+        self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
+        self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
+        self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
+        spec = config.rig.sensors.gnss
+        self.track = MotionTrack(self.antenna_m)
+        self.turned = 0
+        self.slide = slide or Slide()
+        self.scale, self.white = 1.0, WHITE_SHARE
+        self.sheet_sigma_m = spec.sigma_horizontal_m
+        self._best = best_fix(spec)
+        self._class: Fix | None = None
+        self._class_scale: dict[Fix | None, float] = {}
+        imu = config.rig.sensors.imu
+        self._bias_sigma = np.repeat([imu.accel_bias_sigma_mps2, imu.gyro_bias_sigma_radps], 3)
+        self.drift_sigma_m = spec.sigma_horizontal_m * float(np.sqrt(1.0 - WHITE_SHARE))
+        self.drift_time_s = max(spec.correlation_time_s, 0.1)
+        # Heights are wrong for minutes at a time and of little use on the ground: no state is spent on them,
+        # they are held to the whole Gauss-Markov spectrum at low frequency (2 sigma^2 tau) instead.
+        self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
+        self.waiting: list[GnssFix] = []
+        self.local = False
+        self.placed: Placement | None = None
+        self.unplaced = 0
+        self.rejected = 0
+        self.too_late = 0
+        self.last_used_ns: int | None = None
+        self._newest_ns = 0
+        self._unchecked: GnssFix | None = None
+        self._report = report
+        self._seen = 0
+
+    def queue(self, fix: GnssFix) -> None:
+        """Take a fix in; order of arrival need not be order of time."""
+        self.waiting.append(fix)
+        if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
+            self.waiting.sort(key=lambda f: f.t_ns)
+
+    def news(self) -> bool:
+        """Whether fixes came since the last call."""
+        changed = len(self.waiting) != self._seen
+        self._seen = len(self.waiting)
+        return changed
+
+    def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
+        """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
+
+        A fix belongs to the first keyframe after it. `covariance` (dim, dim) is
+        that of the newest keyframe.
+        """
+        used = False
+        self.track.step(chain)
+        while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
+            fix = self.waiting.pop(0)
+            k = keyframe_of(fix, chain)
+            if k is None:
+                self.too_late += 1
+            elif self.local:
+                self.unplaced += 1
+                self.track.add(fix)
+                used |= self._place(chain, fix)
+            else:
+                self.track.add(fix)
+                self._hear(self.track.scatter(), self.track.news())
+                if self.slide.grip is not None:
+                    self.slide.grip.seen(fix, self.scale)
+                renewed = self._change_class(chain, k, fix)
+                if renewed or used or k < chain.last:
+                    chain.smooth(max(chain.last - k + 2, 1))
+                    covariance = chain.covariance_at(k)
+                used |= self._add(chain, k, fix, covariance, row)
+                self._unchecked = fix
+        if used:
+            self.weighting.revisit(chain)
+        return used
+
+    def _place(self, chain: Chain, fix: GnssFix) -> bool:
+        """Lay a path that was begun without fixes onto the map; True once they tell how."""
+        self.placed = place(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
+        if self.placed is None:
+            return False
+        self.local, self.last_used_ns = False, fix.t_ns
+        return True
+
+    def _hear(self, scatter: float, news: float) -> None:
+        """Take in how the fixes scatter about the path, and how much of that is new at every fix, over what
+        they claim."""
+        self.scale = scatter if scatter > LIE else 1.0
+        self.white = WHITE_SHARE if math.isnan(news) else max(news, WHITE_SHARE)
+        if self.white > ALL_NEW:
+            self.white = 1.0
+
+    def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
+        """Let the drift start anew where the class of fix changes; True when it does.
+
+        A worse class than the data sheet's drifts in proportion to what its first fix claims.
+        """
+        if fix.t_ns < self._newest_ns or (fix.fix == self._class and self._class_scale):
+            return False
+        self._newest_ns, first, self._class = fix.t_ns, not self._class_scale, fix.fix
+        worse = fix.fix is not None and fix.fix < self._best
+        claimed = float(np.max(fix.sigma_m[:2]))
+        self._class_scale[fix.fix] = max(1.0, claimed / self.sheet_sigma_m) if worse else 1.0
+        step = chain.nodes[k - chain.first].markov
+        if first or step is None:
+            return False
+        chain.revise(k, step.renewed(slice(1, 3)))
+        return True
+
+    def set_heading_right(self, chain: Chain, row: SensorNoise) -> bool:
+        """Turn the whole window where motion and fixes agree on another heading than the filter's.
+
+        Looks only where fixes have been taken since the last call; True when it turned.
+        """
+        fix, self._unchecked = self._unchecked, None
+        if fix is None:
+            return False
+        yaw_sigma = float(np.sqrt(chain.covariance()[2, 2]))
+        turn = self.track.wrong_by(yaw_sigma, self.scale)
+        if turn is None:
+            return False
+        k = chain.at_or_after(fix.t_ns)
+        if k is None:
+            return False
+        chain.smooth(len(chain.nodes))
+        pose = chain.state(k).pose
+        antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
+        off = float(np.hypot(*(fix.enu_m - antenna)[:2]))
+        # All that the wrong heading may have bent is in doubt again.
+        doubt = np.zeros(chain.dim)
+        doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
+        doubt[3:6] = off**2 + float(np.max(fix.sigma_m[:2]) * self.scale) ** 2
+        doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
+        doubt[SLIP], doubt[DRIFT] = row.slip_sigma**2, self.drift_sigma_m**2
+        chain.restart(doubt, chain.first)
+        chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
+        chain.smooth(len(chain.nodes))
+        self.track.restart()
+        if self.slide.grip is not None:
+            self.slide.grip.restart()
+        self.turned += 1
+        return True
+
+    def _add(
+        self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise, again: bool = False
+    ) -> bool:
+        node, state = chain.nodes[k - chain.first], chain.state(k)
+        delay_s = float(state.of(GNSS_DELAY))
+        offset_s = (fix.t_ns - node.t_ns) * 1e-9 - delay_s
+        R = state.pose.rotation().matrix()
+        rate = state.rate(node.gyro_radps)
+        accel_world = R @ state.specific_force(node.accel_mps2) - np.array([0.0, 0.0, GRAVITY_MPS2])
+        antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
+        lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
+        velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
+        inflation = row.gnss_inflation * self.scale
+        share = self._drift_share(fix, inflation)
+        sigma = self._white_sigma(fix, inflation, share)
+        position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
+        innovation = -residual(position, state.pose, state.linear)
+        H_pose, H_linear = jacobians(position, state.pose, state.linear)
+        J = np.hstack([H_pose, np.zeros((3, 9)), H_linear])[:, : chain.dim]
+        P = J @ covariance @ J.T
+        predicted_m2 = P[[0, 1], [0, 1]].copy()
+        # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
+        P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
+        verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
+        if verdict is Verdict.REJECT and nis <= self.weighting.passed_nis:
+            verdict = Verdict.ACCEPT
+        if verdict is Verdict.REJECT and not again and self._slid(chain, k, fix, row):
+            return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
+        scale, weight = 1.0, 1.0
+        if verdict is not Verdict.REACQUIRE:
+            drift_m2 = (share * self.drift_sigma_m) ** 2
+            scale, weight = self.weighting.gnss(
+                Surprise(
+                    fix.t_ns,
+                    innovation[:2],
+                    predicted_m2,
+                    sigma[:2] ** 2,
+                    fix.sigma_m[:2] * self.scale,
+                    drift_m2,
+                    self.white,
+                )
+            )
+        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
+        if verdict is Verdict.REJECT:
+            if again:
+                self.slide.put_back(chain)
+            self.rejected += 1
+            return False
+        self.slide.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
+        P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
+        sigma[:2] *= scale
+        cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
+        known = bool(np.isfinite(innovation[2] + sigma[2]))
+        if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
+            height = (np.asarray(state.pose.translation()) + R @ lever)[2]
+            sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
+            position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
+        chain.add_fix(k, dataclasses.replace(position, weight=weight))
+        if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
+            sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
+            if chain.dim > GNSS_DELAY:
+                doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
+                at_keyframe = fix.velocity_mps - accel_world * offset_s
+                sigma_v, turned = math.hypot(sigma_v, doubt), swing(rate, offset_s)
+                chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
+            else:
+                body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
+                chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
+        if cut:
+            chain.smooth(chain.last - k + 1)
+            chain.restart(np.zeros(chain.dim), k)
+        if weight > UNUSED_WEIGHT:
+            self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
+        return True
+
+    def _slid(self, chain: Chain, k: int, fix: GnssFix, row: SensorNoise) -> bool:
+        """Whether the fixes just refused show that the wheels did not roll where the robot went."""
+        refused = [off for off, _ in self.gate.rejected]
+        sigma_m = float(np.max(fix.sigma_m[:2]))
+        if not self.track.smooth_at(fix.t_ns):
+            return False
+        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m, row):
+            return False
+        self.gate.rejected.pop()  # it is tested again
+        return True
+
+    def _drift_share(self, fix: GnssFix, inflation: float) -> float:
+        """How much of the drift state is in this fix: 0 to 1, above 1 for classes worse than the sheet's."""
+        claimed = float(np.max(fix.sigma_m[:2])) * inflation
+        slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
+        scale = self._class_scale.get(fix.fix, 1.0)
+        return slow * min(scale, OPTIMISM * claimed / self.sheet_sigma_m)
+
+    def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
+        """1 sigma (3,) of what is new in a fix, beyond the drift that is a state."""
+        reported = fix.sigma_m * inflation
+        drift_m = share * self.drift_sigma_m
+        level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, self.white * reported[:2] ** 2))
+        return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
+
+    @staticmethod
+    def _prepare(
+        chain: Chain,
+        k: int,
+        covariance: Array,
+        innovation_m: Array,
+        S: Array,
+        jacobian: Array,
+        verdict: Verdict,
+    ) -> bool:
+        """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
+
+        A fix after a long outage can turn the heading by more than the window's
+        linearisation bears; applied to its keyframe alone it is a Kalman
+        update, which cannot diverge.
+        """
+        gain = covariance @ jacobian.T @ np.linalg.inv(S)
+        doubt = np.zeros(chain.dim)
+        if verdict is Verdict.REACQUIRE:
+            doubt[3:6] = float(innovation_m @ innovation_m)
+        elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
+            return False
+        chain.restart(doubt, k)
+        return True
+
+
+def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
+    """The keyframe at or after a fix, once its stamp is corrected by the delay as far as that is known."""
+    if chain.dim <= GNSS_DELAY:
+        return chain.at_or_after(fix.t_ns)
+    delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
+    return chain.at_or_after(min(fix.t_ns - round(delay_s * 1e9), chain.nodes[-1].t_ns))
+
+
+def checked_fix(
+    t_ns: int,
+    enu_m: ArrayLike,
+    sigma_m: ArrayLike | None,
+    velocity_mps: ArrayLike | None,
+    sigma_v_mps: float,
+    fix: Fix | int | str | None,
+) -> GnssFix | None:
+    """A fix as the graph takes it; None where the receiver itself says that it has none.
+
+    Where the receiver claims no sensible sigma (none, not a number, below 1 mm or above 1 km), that of
+    its class of fix is taken (`ASSUMED_SIGMA_M`; up twice as much). A velocity without a positive sigma
+    is left out, a height without one is free.
+
+    Raises:
+        DataError: no east or north, an unknown class of fix, neither sigma nor class, or a velocity of
+            other than three axes.
+    """
+    position = np.asarray(enu_m, dtype=float)
+    known = _class_of(fix)
+    if known is Fix.NONE:
+        return None
+    if position.shape != (3,) or not np.isfinite(position[:2]).all():
+        raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
+    sigma = np.full(3, np.nan) if sigma_m is None else np.array(sigma_m, dtype=float)
+    sensible = sigma.shape == (3,) and ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
+    if not sensible and known is not None:
+        sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
+    elif sigma.shape != (3,) or not ((sigma[:2] > 0) & (sigma[:2] < np.inf)).all():
+        raise DataError(
+            f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
+        )
+    sigma[2] = sigma[2] if sigma[2] > 0.0 else np.nan
+    velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
+    if velocity is not None and velocity.shape != (3,):
+        raise DataError(
+            f"a velocity of shape {velocity.shape}", channel="gnss", remedy="give east, north, up"
+        )
+    if not 0.0 < sigma_v_mps < np.inf:  # as drivers tell that they do not know it
+        velocity = None
+    return GnssFix(t_ns, position, sigma, velocity, sigma_v_mps, known)
+
+
+def _class_of(fix: Fix | int | str | None) -> Fix | None:
+    if fix is None or isinstance(fix, Fix):
+        return fix
+    try:
+        return Fix[fix.upper()] if isinstance(fix, str) else Fix(fix)
+    except (KeyError, ValueError):
+        raise DataError(
+            f"unknown class of fix {fix!r}",
+            channel="gnss",
+            remedy=f"give one of {', '.join(known.name.lower() for known in Fix)}",
+        ) from None

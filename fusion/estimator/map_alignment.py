@@ -1,0 +1,123 @@
+"""A path that was begun without GNSS, laid onto the map by the fixes that come later.
+
+Until then the path is local: its start and heading are arbitrary. Wheels and gyro trace its shape (see
+`MotionTrack`), and once the fixes of the last half minute tell how that shape lies on the map, the window
+is turned and shifted there as a whole. What was told before stays as it was told.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
+from terrafusion.fusion.estimator.streams import GnssFix
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import DRIFT, quaternion_of
+from terrafusion.fusion.graph.node import Node
+
+Array = NDArray[np.float64]
+
+PLACE = (2, 3, 4, 5)
+"""Tangent of heading and position: what a local frame leaves open."""
+YAW_SIGMA_RAD = 0.25
+"""What the window's linearisation bears; further fixes make the heading surer (assumed)."""
+UPRIGHT = 0.99
+"""Vertical part of a direction that is the same in every frame: a level robot's up."""
+OPEN_YAW_RAD, OPEN_M = np.pi, 1e4
+"""Prior sigmas of heading and place of the first keyframe in a batch, once fixes tell them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """The turn `yaw_rad` about the vertical and the shift that brings `from_m` (3,) to `to_m` (3,), ENU.
+
+    `t_ns` is when it became known.
+    """
+
+    t_ns: int
+    yaw_rad: float
+    from_m: Array
+    to_m: Array
+
+    def moved(self, state: State) -> State:
+        """A local state as it lies on the map."""
+        turn = gtsam.Rot3.Rz(self.yaw_rad)
+        R = turn.matrix()
+        both = np.kron(np.eye(2), R)
+        x, y, z, w = state.quaternion
+        return dataclasses.replace(
+            state,
+            position_m=self.to_m + R @ (state.position_m - self.from_m),
+            quaternion=quaternion_of(gtsam.Pose3(turn * gtsam.Rot3.Quaternion(w, x, y, z), np.zeros(3))),
+            velocity_mps=R @ state.velocity_mps,
+            covariance=both @ state.covariance @ both.T,
+            velocity_covariance=R @ state.velocity_covariance @ R.T,
+        )
+
+
+def place(
+    chain: Chain,
+    track: MotionTrack,
+    fix: GnssFix,
+    antenna_m: Array,
+    drift_sigma_m: float,
+) -> Placement | None:
+    """Lay the window onto the map, once the heading on it is known to `YAW_SIGMA_RAD`; else None."""
+    fit = track.fit(1.0, YAW_SIGMA_RAD)
+    if fit is None:
+        return None
+    chain.smooth(len(chain.nodes))
+    pose = chain.state(chain.last).pose
+    antenna = np.asarray(pose.translation()) + pose.rotation().matrix() @ antenna_m
+    there = fit.at(track.antenna())
+    known = bool(np.isfinite(fix.enu_m[2] + fix.sigma_m[2]))
+    to_m = np.array([there.real, there.imag, fix.enu_m[2] if known else antenna[2]])
+    away_m = abs(track.antenna() - fit.middle)
+    claimed_m = float(np.max(fix.sigma_m[:2]))
+    doubt = np.zeros(chain.dim)
+    doubt[2] = fit.sigma_rad**2
+    doubt[3:5] = claimed_m**2 + fit.rest_m**2 + (fit.sigma_rad * away_m) ** 2
+    doubt[5] = float(fix.sigma_m[2]) ** 2 if known else OPEN_M**2
+    doubt[DRIFT] = drift_sigma_m**2
+    told = Placement(fix.t_ns, track.error_of(fit), antenna, to_m)
+    leave_frame(chain.nodes)
+    chain.restart(doubt, chain.first, PLACE)
+    chain.turn(told.yaw_rad, told.from_m, told.to_m)
+    chain.smooth(len(chain.nodes))
+    if chain.archive is not None:
+        leave_frame(chain.archive.nodes)
+        chain.archive.turn(told.yaw_rad, told.from_m, told.to_m)
+        prior = chain.archive.nodes[0].prior
+        prior[PLACE, :] = 0.0
+        prior[PLACE, PLACE] = 1.0 / np.array([OPEN_YAW_RAD, *[OPEN_M] * 3])
+    track.restart()
+    return told
+
+
+def leave_frame(nodes: list[Node]) -> None:
+    """Drop the headings and heights that barometer and magnetometer have told in a frame that is no more.
+
+    They are as sure as the start was, which was arbitrary: turned along they would make the map's as sure.
+    """
+    for node in nodes:
+        factors = [node.unary.at(i) for i in range(node.unary.size())]
+        stays = [factor for factor in factors if not _of_a_frame(factor)]
+        if len(stays) < len(factors):
+            node.unary = gtsam.NonlinearFactorGraph()
+            for factor in stays:
+                node.unary.add(factor)
+            symbols = [gtsam.Symbol(key) for factor in stays for key in list(factor.keys())]
+            node.unary_keys = {chr(symbol.chr()).upper() for symbol in symbols}
+
+
+def _of_a_frame(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether a factor of one pose tells a height, or a direction other than the vertical."""
+    if isinstance(factor, gtsam.AttitudeFactorPose3):
+        return abs(float(factor.nRef().point3()[2])) < UPRIGHT
+    return isinstance(factor, gtsam.GPSFactorArm)

@@ -1,0 +1,147 @@
+"""What a log holds, and the graph that follows from it.
+
+A log with all six IMU axes gets the full graph. Without them the robot is
+taken to drive on level ground (the planar graph, `graph/planar.py`): yaw from
+the gyro's z axis, else from the difference of the wheels, else from GNSS alone.
+What was chosen is said in notes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Gnss, Imu, Recording
+from terrafusion.datasets.core.sensors import ImuSpec, Rig
+from terrafusion.fusion.graph.planar import PlanarPreintegrator, planar_spec
+from terrafusion.fusion.graph.preintegration import Preintegrator
+
+IMU_KINDS = ("six_axis", "gyro_z", "none")
+YAW_RATIO = 0.6
+"""Yaw rate over what the geometric track says, for skid steer: measured 0.44 to 0.71 (`docs/planar.md`)."""
+COMPLETE_SHARE = 0.5
+"""Least share of the IMU's rows with all six axes for which the log counts as a six-axis one."""
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """What an estimator is given; declared, never guessed from single samples.
+
+    Attributes:
+        imu: "six_axis", "gyro_z" (other axes may be NaN, the accelerometer too) or "none".
+        sides: left and right wheels are told apart; else body speed alone.
+        gnss: fixes will come. Without them the graph starts at once, in a local frame.
+
+    Raises:
+        ConfigError: an unknown kind of IMU.
+        DataError: nothing tells the heading.
+    """
+
+    imu: str = "six_axis"
+    sides: bool = True
+    gnss: bool = True
+
+    def __post_init__(self) -> None:
+        if self.imu not in IMU_KINDS:
+            raise ConfigError(f"unknown kind of IMU '{self.imu}'", remedy=f"give {', '.join(IMU_KINDS)}")
+        if self.yaw == "nobody" and not self.gnss:
+            raise DataError(
+                "nothing tells the heading: no gyro z, body speed instead of two wheels, and no GNSS",
+                channel="imu, wheels and gnss",
+                remedy="add gyro_z_radps, the speeds of both sides, or fixes",
+            )
+
+    @property
+    def planar(self) -> bool:
+        """Whether the planar graph is used."""
+        return self.imu != "six_axis"
+
+    @property
+    def yaw(self) -> str:
+        """Who tells the yaw rate: "gyro", "wheels" or "nobody"."""
+        if self.imu != "none":
+            return "gyro"
+        return "wheels" if self.sides else "nobody"
+
+    def rig(self, rig: Rig) -> Rig:
+        """The robot as the graph sees it: the effective track where the wheels tell yaw."""
+        if not self.planar:
+            return rig
+        imu = planar_spec(rig.sensors.imu, self.yaw)
+        track = rig.track_m / YAW_RATIO if self.yaw == "wheels" else rig.track_m
+        return dataclasses.replace(rig, track_m=track, sensors=dataclasses.replace(rig.sensors, imu=imu))
+
+    def preintegrator(self, spec: ImuSpec) -> Preintegrator:
+        """What makes the link between keyframes."""
+        return PlanarPreintegrator(spec, self.yaw) if self.planar else Preintegrator(spec)
+
+    def notes(self, recording: Recording) -> tuple[str, ...]:
+        """What was assumed, in sentences."""
+        notes = []
+        if self.planar:
+            notes.append(
+                f"{_missing(recording.imu)}: a planar graph is used; roll and pitch are not estimated "
+                "(taken as level), height only from GNSS"
+            )
+        if self.yaw == "wheels":
+            notes.append(
+                f"yaw is taken from the wheels: {YAW_RATIO:g} of what their difference over the track says "
+                "(assumed for skid steer)"
+            )
+        elif self.yaw == "nobody":
+            notes.append("the log has body speed only and no gyro: the heading comes from GNSS alone")
+        if not self.sides and self.yaw == "gyro":
+            notes.append("the log has body speed only: the wheels tell nothing of yaw")
+        return tuple(notes)
+
+
+def inputs_of(recording: Recording, gnss: Gnss | None) -> Inputs:
+    """What `recording` holds, with the fixes `gnss` that the estimator is to be given.
+
+    Raises:
+        DataError: nothing tells the heading.
+    """
+    wheels = recording.wheels
+    fixes = gnss is not None and bool(((gnss.fix > 0) & np.isfinite(gnss.enu_m[:, :2].sum(axis=1))).any())
+    return Inputs(imu_kind(recording.imu), wheels is None or wheels.has_sides(), fixes)
+
+
+def complete_rows(imu: Imu, kind: str) -> np.ndarray:
+    """Which rows (N,) of the IMU hold all that its kind asks for."""
+    z = np.isfinite(imu.gyro_radps[:, 2])
+    if kind == "six_axis":
+        return np.asarray(np.isfinite(imu.gyro_radps.sum(axis=1) + imu.accel_mps2.sum(axis=1)))
+    return np.asarray(z)
+
+
+def imu_kind(imu: Imu | None) -> str:
+    """Which of `IMU_KINDS` the IMU of a log is."""
+    if imu is None or not complete_rows(imu, "gyro_z").any():
+        return "none"
+    six, z = int(complete_rows(imu, "six_axis").sum()), int(complete_rows(imu, "gyro_z").sum())
+    return "six_axis" if six >= COMPLETE_SHARE * z else "gyro_z"
+
+
+def _missing(imu: Imu | None) -> str:
+    if imu is None or not len(imu):
+        return "the log has no IMU"
+    names = [
+        f"gyro {axis}"
+        for axis, absent in zip("xyz", np.all(np.isnan(imu.gyro_radps), axis=0).tolist(), strict=True)
+        if absent
+    ]
+    absent_accel = np.asarray(np.all(np.isnan(imu.accel_mps2), axis=0))
+    if absent_accel.all():
+        names.append("accelerometer")
+    else:
+        names += [
+            f"accelerometer {axis}"
+            for axis, absent in zip("xyz", absent_accel.tolist(), strict=True)
+            if absent
+        ]
+    if names:
+        return f"the log has no {', no '.join(names)}"
+    return "few rows of the IMU hold all six axes"

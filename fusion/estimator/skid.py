@@ -1,0 +1,174 @@
+"""Wheels that fixes refute: a robot that slides goes where its wheels do not roll.
+
+On ice, or in a skid, slip and side-slip leave what the ground's row allows within a second. The wheels
+then keep good fixes out, and after each that is let in lead the estimate astray again. But how far a robot
+can have slid is known: no further than its wheels rolled and its speed carried it since the last fix that
+was used. Fixes that are refused, lie on one side of the estimate and no further off than that, refute
+the wheels, not the receiver: the wheels' way since then is taken to be as wrong as the fixes say, and how
+fast it goes wrong (a random walk, m2 a second of driving) is remembered, as the noise of an adaptive
+filter (Mehra 1972, IEEE T-AC 17(5)), until accepted fixes tell that they are to be
+trusted again.
+"""
+
+from __future__ import annotations
+
+import math
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.estimator.friction import Grip
+from terrafusion.fusion.estimator.streams import ImuSegment
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.noise.policy import SensorNoise
+
+Array = NDArray[np.float64]
+
+SAME_SIDE = 0.5
+"""Cosine between the offsets of two refused fixes from which they lie on one side."""
+REACH_SIGMA = 3.0
+"""Sigmas of a fix by which it may lie beyond the robot's reach."""
+LEAST_M2PS = 1e-4
+"""A centimetre after a second: a slide is over."""
+MEMORY_S = 10.0
+"""How long a slide is remembered while the robot drives and fixes are accepted (assumed: a few turns)."""
+FORGOTTEN_S = 20.0
+"""How long it is remembered without fixes (assumed: the next ground is another one)."""
+DRIVING_MPS = 0.3
+"""At this speed, of the robot or its wheels, half a second counts as driven in a second; at rest none."""
+
+_Passed = tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]
+
+
+class Slide:
+    """How wrong the wheels are beyond their noise.
+
+    Attributes:
+        grip: what friction leaves of the wheels' way, where that is heard.
+        rate_m2ps: variance of the wheels' way, each axis, per second of driving.
+        refutations: how often fixes refuted the wheels.
+    """
+
+    def __init__(self, grip: Grip | None = None) -> None:
+        self.grip = grip
+        self.rate_m2ps = 0.0
+        self.refutations = 0
+        self._before: tuple[float, list[_Passed]] = (0.0, [])
+        self._driven_s = 0.0
+        self._before_m = np.zeros(2)
+        self._last_ns: int | None = None
+
+    def refuted(
+        self,
+        chain: Chain,
+        k: int,
+        since_ns: int | None,
+        refused: list[Array],
+        sigma_m: float,
+        row: SensorNoise,
+    ) -> bool:
+        """Whether refused fixes, the last at keyframe k, refute the wheels; loosens them if so.
+
+        It takes two refused fixes in a row, in a slide one.
+
+        Args:
+            chain: as it is; its wheels from `since_ns` to k are loosened.
+            k: keyframe of the newest refused fix.
+            since_ns: time of the last fix used.
+            refused: offsets (2,), m, of the fixes refused in a row from the estimate.
+            sigma_m: 1 sigma of the newest fix.
+            row: noise of the ground.
+        """
+        if since_ns is None or len(refused) < (1 if self.rate_m2ps else 2) or not _on_one_side(refused[-2:]):
+            return False
+        begin = chain.at_or_after(since_ns)
+        begin = chain.first if begin is None else begin
+        passed = range(begin + 1, k + 1)
+        nodes = [chain.nodes[i - chain.first] for i in passed]
+        rolled_m = [abs(node.wheels.distance_m) for node in nodes if node.wheels is not None]
+        if not rolled_m:
+            return False
+        ends_ns = [chain.nodes[i - 1 - chain.first].t_ns for i in passed] + [nodes[-1].t_ns]
+        steps_s = np.diff(ends_ns) * 1e-9
+        driven_s = [
+            dt * driving(node.point, node.wheels, dt) for dt, node in zip(steps_s, nodes, strict=True)
+        ]
+        fastest_mps = max(float(np.linalg.norm(node.point.velocity)) for node in nodes)
+        off_m = float(np.linalg.norm(refused[-1]))
+        if off_m > sum(rolled_m) + fastest_mps * float(sum(steps_s)) + REACH_SIGMA * sigma_m:
+            return False
+        more_m2ps = 0.5 * off_m**2 / max(sum(driven_s), 1e-9) - self.rate_m2ps
+        if more_m2ps <= 0.0:
+            return False
+        self._before = self.rate_m2ps, [(i, n.wheels, n.link) for i, n in zip(passed, nodes, strict=True)]
+        self.rate_m2ps += more_m2ps
+        self.refutations += 1
+        for i, node, driven in zip(passed, nodes, driven_s, strict=True):
+            if node.wheels is not None:
+                loose = self.grip.loose_link(chain, i, more_m2ps, row) if self.grip else None
+                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * driven), link=loose)
+        chain.smooth(chain.last - begin + 1)
+        return True
+
+    def put_back(self, chain: Chain) -> None:
+        """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
+        self.rate_m2ps, passed = self._before
+        self.refutations -= 1
+        for i, wheels, link in passed:
+            chain.revise(i, wheels=wheels, link=link)
+
+    def loosened(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
+        """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
+        driven_s = dt_s * driving(before, wheels, dt_s)
+        self._driven_s += driven_s
+        if not self.rate_m2ps:
+            return wheels
+        self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
+        return wheels.loosened(self.rate_m2ps * driven_s)
+
+    def dragged(
+        self,
+        t_ns: int,
+        dt_s: float,
+        segments: list[ImuSegment],
+        wheels: WheelIncrement | None,
+        before: KeyState,
+        covariance: Array,
+    ) -> tuple[list[ImuSegment], WheelIncrement | None]:
+        """What links a keyframe, as friction has it where fixes have shown that; see `Grip.step`."""
+        if self.grip is None:
+            return segments, wheels
+        return self.grip.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)
+
+    def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
+        """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.
+
+        Wheels that are still trusted too much leave innovations on one side, fix after fix; what is new at
+        every fix is the receiver's (Mehra: the innovations of the right filter are white).
+        """
+        before_ns = self._last_ns
+        if before_ns is not None and t_ns <= before_ns:
+            return
+        self._last_ns, driven_s, self._driven_s = t_ns, self._driven_s, 0.0
+        before_m, self._before_m = self._before_m, innovation_m
+        if self.rate_m2ps and driven_s > 0.0:
+            more_m2 = 0.5 * min(float(innovation_m @ before_m), float(np.sum(innovation_m**2 - predicted_m2)))
+            beyond = more_m2 / driven_s
+            rate = self.rate_m2ps + (1.0 - math.exp(-driven_s / MEMORY_S)) * beyond
+            self.rate_m2ps = rate if rate > LEAST_M2PS else 0.0
+
+
+def driving(before: KeyState, wheels: WheelIncrement | None, dt_s: float) -> float:
+    """Share in [0, 1) of a time in which a robot drives: 0 where neither it nor its wheels move."""
+    rolled_mps = 0.0 if wheels is None else abs(wheels.distance_m) / dt_s
+    square = max(rolled_mps, float(np.linalg.norm(before.velocity))) ** 2
+    return square / (square + DRIVING_MPS**2)
+
+
+def _on_one_side(refused: list[Array]) -> bool:
+    """Whether offsets (2,), one or two, point the same way."""
+    first, last = refused[0], refused[-1]
+    return float(first @ last) >= SAME_SIDE * float(np.linalg.norm(first) * np.linalg.norm(last))

@@ -1,0 +1,179 @@
+"""Slip and immobilisation told from the wheels' travel against the estimate's.
+
+Both travels are compared over windows of one, two and four seconds: long
+enough for an encoder's quantum to be small in them, where a comparison of
+single samples mistakes each quantum for slip. Slip is told where the travels
+differ by more than `SIGMAS` of what is uncertain about them and by more than
+`SLIP` of the wheels' travel.
+
+A robot is immobilised where its wheels turn and it stays ("traction lost"), or
+where driving is commanded and neither wheels nor robot move ("motors stalled";
+it takes `command`, because at the wheels a stall looks like a stop).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.graph.key_state import KeyState
+
+Array = NDArray[np.float64]
+
+WINDOWS_S = (1.0, 2.0, 4.0)
+SIGMAS = 4.0
+SLIP = 0.08
+"""Slip worth telling: above that of firm ground and of an unknown tyre radius (assumed 3 %) together."""
+RELEASE = 0.5
+"""Slip is over once the travels agree to this share of `SLIP` over `HOLD_S`."""
+HOLD_S = 2.0
+STUCK_S = 0.7
+"""Window of immobilisation."""
+STUCK_MPS = 0.05
+"""A robot slower than this stands (as in the twin's summary)."""
+SPIN_MPS, SPIN_SHARE = 0.1, 0.25
+"""Wheels turn at more than SPIN_MPS and the robot makes less than SPIN_SHARE of it."""
+COMMAND_MPS = 0.1
+"""A command of at least this speed asks for motion."""
+COMMAND_HOLD_NS = 500_000_000
+"""A command holds so long when no other comes."""
+SPINNING, STALLED = "traction lost", "motors stalled"
+
+
+@dataclass(frozen=True)
+class Step:
+    """From keyframe to keyframe: time, wheel travel (None: unknown), mean speed, its sigma, command."""
+
+    dt_s: float
+    rolled_m: float | None
+    speed_mps: float
+    sigma_mps: float
+    command_mps: float
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Sums over a window: time, wheel travel, estimated travel along the body, its 1 sigma, least command."""
+
+    seconds: float
+    rolled_m: float
+    moved_m: float
+    sigma_m: float
+    command_mps: float
+
+
+class MotionMonitor:
+    """Watches wheels against estimate at every keyframe.
+
+    Attributes:
+        slipping: the wheels travel another distance than the robot.
+        cause: why the robot is immobilised, SPINNING or STALLED; None while it is not.
+    """
+
+    def __init__(self, rig: Rig) -> None:
+        # Mean of two counts a side, each up to one quantum off at either end of a window.
+        self.quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
+        # Both ends of a window are read off a line between samples: while the speed changes by 1 m/s2.
+        self._stamp_m = 0.5 * 1.0 / rig.sensors.wheels.rate_hz**2
+        self.slipping = False
+        self.cause: str | None = None
+        self._steps: deque[Step] = deque()
+        self._command: tuple[int, float] | None = None
+        self._t_ns: int | None = None
+        self._agreed_s = 0.0
+        self._speed_mps = 0.0
+
+    @property
+    def immobilised(self) -> bool:
+        """Whether the robot is kept from moving."""
+        return self.cause is not None
+
+    def command(self, t_ns: int, v_mps: float) -> None:
+        """The commanded forward speed, m/s."""
+        if not math.isfinite(v_mps):
+            raise DataError(f"a commanded speed of {v_mps}", channel="command", remedy="leave it out")
+        self._command = (t_ns, v_mps)
+
+    def watch(self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None) -> None:
+        """`update` from a keyframe's state and the covariance (3, 3) of its velocity, world axes."""
+        forward = key.pose.rotation().matrix()[:, 0]
+        sigma = math.sqrt(float(forward @ velocity_covariance @ forward))
+        self.update(t_ns, rolled_m, float(forward @ key.velocity), sigma)
+
+    def update(self, t_ns: int, rolled_m: float | None, speed_mps: float, sigma_mps: float) -> None:
+        """One keyframe: wheel travel since the last, before any gate; forward speed and its sigma."""
+        dt = 0.0 if self._t_ns is None else (t_ns - self._t_ns) * 1e-9
+        self._t_ns = t_ns
+        if dt <= 0.0:
+            self._speed_mps = speed_mps
+            return
+        mean_mps = 0.5 * (self._speed_mps + speed_mps)
+        self._speed_mps = speed_mps
+        self._steps.append(Step(dt, rolled_m, mean_mps, sigma_mps, self._commanded(t_ns)))
+        while len(self._steps) * dt > WINDOWS_S[-1] + 2.0 * dt:
+            self._steps.popleft()
+        self._watch_slip(dt)
+        stuck = self.travel(STUCK_S)
+        self.cause = None if stuck is None else self._cause(stuck)
+
+    def travel(self, seconds: float) -> Travel | None:
+        """The last `seconds`; None before so much is known, or where wheels are missing.
+
+        Errors of the estimated speed last longer than a window: their sigmas add up.
+        """
+        total = rolled = moved = sigma = 0.0
+        least = math.inf
+        for step in reversed(self._steps):
+            if step.rolled_m is None:
+                return None
+            total += step.dt_s
+            rolled += step.rolled_m
+            moved += step.speed_mps * step.dt_s
+            sigma += step.sigma_mps * step.dt_s
+            least = min(least, abs(step.command_mps))
+            if total >= seconds - 1e-6:
+                noise = math.hypot(sigma, self.quantum_m, self._stamp_m)
+                return Travel(total, rolled, moved, noise, least)
+        return None
+
+    def _commanded(self, t_ns: int) -> float:
+        if self._command is None or t_ns - self._command[0] > COMMAND_HOLD_NS:
+            return 0.0
+        return self._command[1]
+
+    def _watch_slip(self, dt_s: float) -> None:
+        windows = [self.travel(seconds) for seconds in WINDOWS_S]
+        if any(window is not None and slips(window) for window in windows):
+            self.slipping, self._agreed_s = True, 0.0
+        elif self.slipping:
+            recent = windows[0]
+            agrees = recent is None or not differs(recent, RELEASE * SLIP)
+            self._agreed_s = self._agreed_s + dt_s if agrees else 0.0
+            self.slipping = self._agreed_s < HOLD_S
+
+    def _cause(self, stuck: Travel) -> str | None:
+        wheels = abs(stuck.rolled_m) / stuck.seconds
+        robot = abs(stuck.moved_m) / stuck.seconds
+        if robot > max(STUCK_MPS, SPIN_SHARE * wheels):
+            return None
+        if wheels > SPIN_MPS and robot < SPIN_SHARE * wheels and slips(stuck):
+            return SPINNING
+        if wheels < STUCK_MPS and stuck.command_mps > COMMAND_MPS:
+            return STALLED
+        return None
+
+
+def slips(travel: Travel) -> bool:
+    """Whether the travels differ by more than chance, the quantum and `SLIP` explain."""
+    return differs(travel, SLIP) and abs(travel.rolled_m - travel.moved_m) > SIGMAS * travel.sigma_m
+
+
+def differs(travel: Travel, share: float) -> bool:
+    """Whether the travels differ by more than a share of the wheels' one."""
+    return abs(travel.rolled_m - travel.moved_m) > share * abs(travel.rolled_m)

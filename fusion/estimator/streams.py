@@ -1,0 +1,294 @@
+"""Sensor samples on their way into the graph: buffered, checked, cut at keyframes."""
+
+from __future__ import annotations
+
+import bisect
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.recording import Fix
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ImuSegment:
+    """A piece of time (s) with constant angular rate (3,) and specific force (3,); either is held where
+    samples before stand for a spike. A force that is reasoned, not measured, brings its density on x, y."""
+
+    dt_s: float
+    gyro_radps: Array
+    accel_mps2: Array
+    gyro_held: bool = False
+    accel_held: bool = False
+    accel_density_mps2: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class GnssFix:
+    """One fix: antenna position (3,) and sigma (3,), ENU m; velocity (3,) m/s and its sigma where known.
+
+    `fix` is the receiver's class of fix, None where it does not say.
+    """
+
+    t_ns: int
+    enu_m: Array
+    sigma_m: Array
+    velocity_mps: Array | None = None
+    sigma_v_mps: float = float("nan")
+    fix: Fix | None = None
+
+
+SPIN_RADPS, SHOCK_MPS2 = 10.0, 50.0
+"""Beyond these, on any axis, a sample tells more of the sensor than of a wheeled robot (assumed): a shock
+lasts for less than a sample, and taken for all of it, at 100 Hz, it is half a metre a second."""
+CALM_NS = 500_000_000
+"""Where half the samples of so long a time are like that, they are believed all the same."""
+RECENT = 10
+"""So many samples before a spike stand for it: fewer would still hold much of the robot's shaking."""
+LATEST_S = 5.0
+"""A sample so much older than its stream's newest is no late message: the clock has jumped."""
+LONGEST_WAIT_S = 0.5
+
+
+class Lateness:
+    """How out of order a stream is, and what of it came too late to be used.
+
+    A keyframe waits for as long as the stream has been seen to be late (a stream in
+    order costs no waiting), and takes what came. A sample before it is then too late.
+
+    Attributes:
+        wait_ns: longest lateness seen so far, at most `LONGEST_WAIT_S`.
+        used_ns: end of what the keyframes have taken.
+        too_late: samples left out because their keyframe had been made.
+    """
+
+    def __init__(self, channel: str) -> None:
+        self.channel = channel
+        self.wait_ns = 0
+        self.used_ns: int | None = None
+        self.too_late = 0
+
+    def place(self, t_ns: int, times: list[int]) -> int | None:
+        """Where in `times` a sample belongs, or None when it is too late.
+
+        Raises:
+            DataError: the sample is so old that the clock must have jumped.
+        """
+        if not times or t_ns >= times[-1]:
+            return len(times)
+        late_ns = times[-1] - t_ns
+        if late_ns > LATEST_S * 1e9:
+            raise DataError(
+                f"sample at {t_ns} ns comes {late_ns * 1e-9:.3f} s after a newer one",
+                channel=self.channel,
+                remedy=f"more than {LATEST_S:g} s is no late message: start anew where a clock jumps",
+            )
+        self.wait_ns = max(self.wait_ns, min(late_ns, round(LONGEST_WAIT_S * 1e9)))
+        if self.used_ns is not None and t_ns <= self.used_ns:
+            self.too_late += 1
+            return None
+        return bisect.bisect_right(times, t_ns)
+
+
+class ImuStream:
+    """IMU samples; the sample at t stands for the time since the one before it.
+
+    With `six_axis` False the stream is declared to tell the yaw rate alone: any
+    other axis may be NaN, and `segments` has in their place, present or not,
+    what a robot reads that drives straight on level ground.
+
+    A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is not believed: the mean of the samples
+    before stands for it. `spikes` counts them.
+    """
+
+    def __init__(self, six_axis: bool = True) -> None:
+        self.six_axis = six_axis
+        self.spikes = 0
+        self._wild_ns: list[int] = []
+        self._gyro_held_ns: list[int] = []
+        self._accel_held_ns: list[int] = []
+        self.late = Lateness("imu")
+        self.t_ns: list[int] = []
+        self.gyro: list[Array] = []
+        self.accel: list[Array] = []
+
+    def add(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
+        gyro, accel = np.asarray(gyro_radps, dtype=float), np.asarray(accel_mps2, dtype=float)
+        known = gyro.shape == accel.shape == (3,) and np.isfinite(
+            gyro.sum() + accel.sum() if self.six_axis else gyro[2]
+        )
+        if not known:
+            wanted = "six finite numbers" if self.six_axis else "six numbers with a finite yaw rate"
+            raise DataError(
+                f"sample is not {wanted}: gyro {gyro.tolist()}, accel {accel.tolist()}",
+                channel="imu",
+                remedy="leave out samples with missing axes",
+            )
+        i = self.late.place(t_ns, self.t_ns)
+        if i is not None:
+            wild = _beyond(gyro, SPIN_RADPS), _beyond(accel, SHOCK_MPS2)
+            if any(wild):
+                if self._alone(i, t_ns):
+                    recent = slice(max(i - RECENT, 0), i)
+                    if wild[0]:
+                        gyro = np.mean(self.gyro[recent], axis=0)
+                        self._gyro_held_ns.append(t_ns)
+                    if wild[1]:
+                        accel = np.mean(self.accel[recent], axis=0)
+                        self._accel_held_ns.append(t_ns)
+                    self.spikes += 1
+                self._wild_ns.append(t_ns)
+            self.t_ns.insert(i, t_ns)
+            self.gyro.insert(i, gyro)
+            self.accel.insert(i, accel)
+
+    def _alone(self, i: int, t_ns: int) -> bool:
+        """Whether most samples before a wild one, which goes to place i, are not like it."""
+        since = bisect.bisect_left(self.t_ns, t_ns - CALM_NS, hi=i)
+        return 2 * sum(t_ns - CALM_NS <= t < t_ns for t in self._wild_ns) < i - since
+
+    def covers(self, t_ns: int) -> bool:
+        return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
+
+    def segments(self, start_ns: int, end_ns: int) -> list[ImuSegment]:
+        """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
+        i = bisect.bisect_right(self.t_ns, start_ns)
+        pieces, t = [], start_ns
+        while t < end_ns:
+            until = min(self.t_ns[i], end_ns)
+            if until > t:
+                held = self.t_ns[i] in self._gyro_held_ns, self.t_ns[i] in self._accel_held_ns
+                readings = self._for_graph(self.gyro[i], self.accel[i])
+                pieces.append(ImuSegment((until - t) * 1e-9, *readings, *held))
+            t = until
+            i += 1
+        return pieces
+
+    def _for_graph(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
+        if self.six_axis:
+            return gyro, accel
+        return np.array([0.0, 0.0, gyro[2]]), np.array([0.0, 0.0, GRAVITY_MPS2])
+
+    def levelled(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
+        """Rates (n, 3) and forces (n, 3) of a window, as `segments` has them."""
+        _, gyro, accel = self.window(start_ns, end_ns)
+        rows = [self._for_graph(g, a) for g, a in zip(gyro, accel, strict=True)]
+        return np.array([g for g, _ in rows]).reshape(-1, 3), np.array([a for _, a in rows]).reshape(-1, 3)
+
+    def largest_gap_s(self, start_ns: int, end_ns: int) -> float:
+        """Longest time between samples that touch the interval, s."""
+        i = max(bisect.bisect_right(self.t_ns, start_ns) - 1, 0)
+        j = bisect.bisect_left(self.t_ns, end_ns)
+        times = self.t_ns[i : j + 1]
+        return max((b - a for a, b in itertools.pairwise(times)), default=0) * 1e-9
+
+    def window(self, start_ns: int, end_ns: int) -> tuple[Array, Array, Array]:
+        """Times (n,) s from `start_ns`, rates (n, 3) and forces (n, 3) with start <= t < end, as measured."""
+        i, j = bisect.bisect_left(self.t_ns, start_ns), bisect.bisect_left(self.t_ns, end_ns)
+        t = np.array([x - start_ns for x in self.t_ns[i:j]], dtype=float) * 1e-9
+        return t, np.array(self.gyro[i:j]).reshape(-1, 3), np.array(self.accel[i:j]).reshape(-1, 3)
+
+    def forget(self, before_ns: int) -> None:
+        """Drop samples older than `before_ns`, in blocks so that it stays cheap."""
+        i = bisect.bisect_left(self.t_ns, before_ns)
+        if i > 256:
+            del self.t_ns[:i], self.gyro[:i], self.accel[:i]
+            for times in (self._wild_ns, self._gyro_held_ns, self._accel_held_ns):
+                times[:] = [t for t in times if t >= before_ns]
+
+
+def _beyond(reading: Array, limit: float) -> bool:
+    return any(abs(x) > limit for x in reading.tolist())
+
+
+class WheelStream:
+    """Travelled distance of the left and right side over time."""
+
+    def __init__(self) -> None:
+        self.late = Lateness("wheels")
+        self.t_ns: list[int] = []
+        self.left_m: list[float] = []
+        self.right_m: list[float] = []
+        self._speeds: list[tuple[float, float]] = []
+
+    def add(
+        self,
+        t_ns: int,
+        left_mps: float,
+        right_mps: float,
+        left_m: float | None = None,
+        right_m: float | None = None,
+    ) -> None:
+        """Side speeds, and, where encoders count angle, the travelled distances, used instead."""
+        if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
+            raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
+        i = self.late.place(t_ns, self.t_ns)
+        if i is None:
+            return
+        counted = left_m is not None and right_m is not None
+        self.t_ns.insert(i, t_ns)
+        self._speeds.insert(i, (left_mps, right_mps))
+        self.left_m.insert(i, left_m if counted else 0.0)  # type: ignore[arg-type]
+        self.right_m.insert(i, right_m if counted else 0.0)  # type: ignore[arg-type]
+        if not counted:
+            self._integrate_from(max(i, 1))
+
+    def _integrate_from(self, first: int) -> None:
+        """Distances by the trapezoid rule, from sample `first` on."""
+        for j in range(first, len(self.t_ns)):
+            half_s = 0.5e-9 * (self.t_ns[j] - self.t_ns[j - 1])
+            (left, right), (left_now, right_now) = self._speeds[j - 1], self._speeds[j]
+            self.left_m[j] = self.left_m[j - 1] + half_s * (left + left_now)
+            self.right_m[j] = self.right_m[j - 1] + half_s * (right + right_now)
+
+    def covers(self, t_ns: int) -> bool:
+        return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
+
+    def travelled(self, start_ns: int, end_ns: int, longest_gap_s: float = 1.0) -> tuple[float, float] | None:
+        """Distance of the left and right side between two times, m; None where samples are missing."""
+        a, b = self._at(start_ns, longest_gap_s), self._at(end_ns, longest_gap_s)
+        if a is None or b is None:
+            return None
+        return b[0] - a[0], b[1] - a[1]
+
+    def _at(self, t_ns: int, longest_gap_s: float) -> tuple[float, float] | None:
+        j = bisect.bisect_left(self.t_ns, t_ns)
+        if j == len(self.t_ns) or (j == 0 and self.t_ns[0] != t_ns):
+            return None
+        if self.t_ns[j] == t_ns:
+            return self.left_m[j], self.right_m[j]
+        span = self.t_ns[j] - self.t_ns[j - 1]
+        if span * 1e-9 > longest_gap_s:
+            return None
+        w = (t_ns - self.t_ns[j - 1]) / span
+        left = self.left_m[j - 1] + w * (self.left_m[j] - self.left_m[j - 1])
+        right = self.right_m[j - 1] + w * (self.right_m[j] - self.right_m[j - 1])
+        return left, right
+
+    def speed_change_mps(self, start_ns: int, end_ns: int, over_ns: int = 100_000_000) -> float:
+        """Speed of both sides at the end less that at the start, m/s; 0 where samples are missing.
+
+        Each speed is a mean about its time; where the newest sample cuts the last one short, its middle
+        is earlier, and the change is that of a steady acceleration between the two middles.
+        """
+        half, newest = over_ns // 2, self.t_ns[-1] if self.t_ns else 0
+        if newest <= end_ns - half:
+            return 0.0
+        windows = [(t - half, min(t + half, newest)) for t in (start_ns, end_ns)]
+        (a, b), (c, d) = windows
+        first, last = self.travelled(a, b), self.travelled(c, d)
+        if first is None or last is None:
+            return 0.0
+        change = 0.5e9 * (sum(last) / (d - c) - sum(first) / (b - a))
+        return change * (end_ns - start_ns) / (0.5 * (c + d - a - b))
+
+    def forget(self, before_ns: int) -> None:
+        i = bisect.bisect_left(self.t_ns, before_ns) - 1
+        if i > 256:
+            del self.t_ns[:i], self.left_m[:i], self.right_m[:i], self._speeds[:i]

@@ -1,0 +1,69 @@
+"""Whether an estimate can be of the drive at all: what can be said without a reference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.recording import Wheels
+from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.metrics.error_series import travelled_m
+
+SPEED_FACTOR, SPEED_SLACK_MPS = 1.5, 1.0
+"""A robot is not faster than so many times its fastest wheel, and this much (rolling down a hill)."""
+LEAST_PATH, MOST_PATH, PATH_SLACK_M = 0.2, 1.2, 5.0
+"""Bounds of the estimated path over the wheels'. Measured slip on ice is 0.64 in the median
+(docs/field.md), which leaves 0.36 of the path; the slack holds for drives of a few metres."""
+
+
+@dataclass(frozen=True)
+class Health:
+    """Top horizontal speed, path, and the path the wheels rolled; `why` it diverged, "" where it did not."""
+
+    top_speed_mps: float
+    path_m: float
+    rolled_m: float
+    why: str
+
+    def path_ratio(self) -> float | None:
+        """Estimated path over rolled path; None where the wheels hardly turned."""
+        return self.path_m / self.rolled_m if self.rolled_m >= 1.0 else None
+
+
+def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Health:
+    """Check numbers, speed and path of an estimate against its wheels."""
+    path = estimate.trajectory
+    P = path.covariance
+    finite = bool(np.isfinite(path.position_m).all() and np.isfinite(estimate.velocity_mps).all())
+    certain = P is not None and bool(np.isfinite(P).all() and (np.einsum("nii->ni", P) > 0.0).all())
+    speed = float(np.hypot(*estimate.velocity_mps[:, :2].T).max()) if finite else float("nan")
+    moved = float(travelled_m(path.position_m)[-1]) if finite else float("nan")
+    wheels = wheels.between(int(path.t_ns[0]), int(path.t_ns[-1]) + 1)
+    sides = wheels.side_speeds_mps(radius_m)
+    sides = sides[np.isfinite(sides).all(axis=1)]
+    fastest = float(np.abs(sides).max()) if len(sides) else 0.0
+    rolled = rolled_m(wheels, radius_m)
+    why = ""
+    if not finite:
+        why = "positions or velocities are not finite"
+    elif not certain:
+        why = "the covariance is not finite and positive"
+    elif speed > SPEED_FACTOR * fastest + SPEED_SLACK_MPS:
+        why = f"{speed:.1f} m/s with wheels of at most {fastest:.1f} m/s"
+    elif not LEAST_PATH * rolled - PATH_SLACK_M <= moved <= MOST_PATH * rolled + PATH_SLACK_M:
+        why = f"a path of {moved:.0f} m where the wheels rolled {rolled:.0f} m"
+    return Health(speed, moved, rolled, why)
+
+
+def rolled_m(wheels: Wheels, radius_m: float) -> float:
+    """Path that the mean of the wheels rolled, m; both ways count."""
+    return float(rolled_until_m(wheels, radius_m)[-1]) if len(wheels) else 0.0
+
+
+def rolled_until_m(wheels: Wheels, radius_m: float) -> NDArray[np.float64]:
+    """Path (N,) that the mean of the wheels rolled up to each sample, m; unknown speeds count as none."""
+    speed = np.abs(np.nan_to_num(wheels.side_speeds_mps(radius_m)).mean(axis=1))
+    steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(wheels.t_ns) * 1e-9
+    return np.concatenate([np.zeros(min(1, len(speed))), np.cumsum(steps)])

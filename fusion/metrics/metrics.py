@@ -1,0 +1,284 @@
+"""Scores of an estimate against truth or against GNSS fixes it never saw.
+
+Definitions, all for the horizontal plane (ground robots; heights are mostly
+unknown or of another quality):
+
+- ATE: root mean square of the position error. Unlike Sturm et al. (2012,
+  "A benchmark for the evaluation of RGB-D SLAM systems", IROS, eq. 5) nothing
+  is aligned first, because estimate and reference share the ENU frame. Only a
+  drive without GNSS is aligned, once, at its start.
+- RPE: Sturm et al. (2012), eq. 2, over pairs a path length of 10, 50 or 100 m
+  apart, as percent of that length and averaged over all pairs as in Geiger et
+  al. (2012, KITTI). Where the reference has no heading, displacements are
+  compared in the world frame instead, so heading errors count in full.
+- NEES: mean of e' P^-1 e / 2 for the 2-D position error e and its covariance
+  P (Bar-Shalom, Li, Kirubarajan 2001, sec. 5.4.2, divided by the dimension):
+  1 is consistent, above 1 overconfident. Against fixes, P holds the fix's own
+  covariance too. By terrain and over time, with bands: `consistency`.
+- Outage: errors inside a stretch without GNSS. Segments are never realigned:
+  an error that was there before the outage counts in full, and so does the
+  heading error with which it began.
+
+Times in seconds count from the start of the recording.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import Gnss, Recording
+from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.metrics.consistency import (
+    Consistency,
+    by_terrain,
+    ground_at,
+    over_time,
+    whitened_series,
+)
+from terrafusion.fusion.metrics.error_series import (
+    Errors,
+    align_both,
+    errors_against_fixes,
+    errors_against_truth,
+    known_keyframes,
+    travelled_m,
+)
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+Rows = NDArray[np.int64]
+
+RPE_LENGTHS_M = (10, 50, 100)
+"""Path lengths over which the relative pose error is taken."""
+
+
+@dataclass(frozen=True)
+class Outage:
+    """A stretch of `seconds` from `start_s` in which the estimator gets no GNSS fix."""
+
+    start_s: float
+    seconds: float
+
+    def covers(self, t_ns: TimesNs, start_ns: int) -> NDArray[np.bool_]:
+        """Which times (N,) lie in start <= t < end; `start_ns` is the start of the recording."""
+        t_s = (t_ns - start_ns) * 1e-9
+        return np.asarray((t_s >= self.start_s) & (t_s < self.start_s + self.seconds))
+
+
+@dataclass(frozen=True)
+class OutageScore:
+    """Drift in one outage; None where there is no reference inside it.
+
+    `max_m` is the largest error, `end_yaw_error_rad` the size of the heading error at the end,
+    `nees_mean` that of the position inside.
+    """
+
+    start_s: float
+    seconds: float
+    distance_m: float
+    end_error_m: float | None
+    median_m: float | None
+    percent: float | None
+    max_m: float | None = None
+    end_yaw_error_rad: float | None = None
+    nees_mean: float | None = None
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Horizontal distance of the estimated antenna from the fixes kept back."""
+
+    fixes: int
+    median_m: float
+    p95_m: float
+
+
+@dataclass(frozen=True, eq=False)
+class Scores:
+    """All scores of one run; None where there is nothing to score against.
+
+    `errors` are the series behind the numbers, `notes` say how they were made. `consistency` holds
+    NEES and NIS of the whole drive and by terrain, `consistency_over_time` the same in windows.
+    """
+
+    against: str | None
+    ate_m: float | None
+    rpe_percent: dict[str, float | None]
+    yaw_rmse_rad: float | None
+    velocity_rmse_mps: float | None
+    nees_mean: float | None
+    held_out: HeldOut | None
+    outages: tuple[OutageScore, ...]
+    notes: tuple[str, ...] = ()
+    errors: Errors | None = field(default=None, repr=False)
+    consistency: tuple[Consistency, ...] = ()
+    consistency_over_time: tuple[Consistency, ...] = field(default=(), repr=False)
+
+
+def parse_outage(text: str) -> Outage:
+    """`START:SECONDS`, both in seconds, as in "120:60".
+
+    Raises:
+        TerrafusionError: not two finite numbers, a negative start, or no duration.
+    """
+    start, colon, seconds = text.partition(":")
+    try:
+        outage = Outage(float(start), float(seconds))
+    except ValueError:
+        outage = Outage(np.nan, np.nan)
+    sane = np.isfinite([outage.start_s, outage.seconds]).all()
+    if not (colon and sane and outage.start_s >= 0.0 and outage.seconds > 0.0):
+        raise TerrafusionError(
+            f"'{text}' is not an outage",
+            channel="--gnss-outage",
+            remedy="write START:SECONDS with START >= 0 and SECONDS > 0, as in 120:60",
+        )
+    return outage
+
+
+def score(
+    estimate: Estimate,
+    recording: Recording,
+    *,
+    held_out: Gnss | None = None,
+    outages: Sequence[Outage] = (),
+    antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0),
+    aligned: bool = False,
+) -> Scores:
+    """Score `estimate` against the truth of `recording`, else against the fixes kept back.
+
+    Args:
+        held_out: fixes the estimator did not see.
+        outages: stretches that are scored on their own.
+        antenna_m: (3,) antenna in the body frame; the point that fixes, and a truth of the antenna, show.
+        aligned: the estimate's start and heading are arbitrary (a drive without GNSS): fit them, once,
+            to the start of the reference.
+    """
+    known, notes = known_keyframes(estimate)
+    truth = errors_against_truth(known, recording, antenna_m)
+    fixes = errors_against_fixes(known, held_out, antenna_m)
+    if aligned:
+        truth, fixes, said = align_both(truth, fixes)
+        notes += said
+    has_position = truth is not None and bool(np.isfinite(truth.reference_m).any())
+    main = truth if has_position or fixes is None else fixes
+    attitude = truth if truth is not None else fixes
+    against = None if main is None else "truth" if main is truth else "gnss_held_out"
+    if against == "gnss_held_out":
+        notes += ("the errors against GNSS fixes hold the noise of the fixes as well",)
+    series = whitened_series(known, main, attitude)
+    start_ns = recording.start_ns
+    return Scores(
+        against=against,
+        ate_m=None if main is None else _rms(main.distance_m()),
+        rpe_percent=dict.fromkeys(map(str, RPE_LENGTHS_M)) if main is None else rpe_percent(main),
+        yaw_rmse_rad=None if attitude is None else _rms(attitude.yaw_error_rad()),
+        velocity_rmse_mps=None if attitude is None else _rms(_norm(attitude.velocity_error_mps)),
+        nees_mean=None if main is None else _mean(main.nees()),
+        held_out=_held_out(fixes),
+        outages=tuple(_outage(o, known, main, start_ns) for o in outages),
+        notes=notes,
+        errors=main,
+        consistency=tuple(
+            row for one in series for row in by_terrain(one, ground_at(recording, known, one.t_ns), start_ns)
+        ),
+        consistency_over_time=tuple(row for one in series for row in over_time(one, start_ns)),
+    )
+
+
+def rpe_percent(errors: Errors, lengths_m: Sequence[float] = RPE_LENGTHS_M) -> dict[str, float | None]:
+    """Mean relative position error over all pairs a length of path apart, percent of that path.
+
+    One number for each length; None where the drive is shorter.
+    """
+    path = errors.path_m()
+    out: dict[str, float | None] = {}
+    for length in lengths_m:
+        first, last = path_pairs(errors, length, path)
+        error = relative_error_m(errors, first, last)
+        out[f"{length:g}"] = _mean(100.0 * error / (path[last] - path[first]))
+    return out
+
+
+def path_pairs(errors: Errors, length_m: float, path_m: Array | None = None) -> tuple[Rows, Rows]:
+    """Rows (n,) of all starts and of the first sample at least `length_m` of the reference's path later."""
+    path = errors.path_m() if path_m is None else path_m
+    known = np.flatnonzero(np.isfinite(errors.distance_m()))
+    last = np.searchsorted(path, path[known] + length_m, side="left")
+    inside = last < len(path)
+    return known[inside], last[inside]
+
+
+def relative_error_m(errors: Errors, first: Rows, last: Rows) -> Array:
+    """RPE of chosen pairs, (n,): the translation of Sturm et al. (2012), eq. 2, in the plane.
+
+    Each displacement is seen from its own heading at the pair's start; where the reference has no
+    heading at one of them, all are compared in the world frame instead.
+    """
+    estimate = errors.estimate_m[last] - errors.estimate_m[first]
+    reference = errors.reference_m[last] - errors.reference_m[first]
+    if len(first) and np.isfinite(errors.reference_yaw_rad[first]).all():
+        estimate = _rotate(estimate, -errors.estimate_yaw_rad[first])
+        reference = _rotate(reference, -errors.reference_yaw_rad[first])
+    return _norm(estimate - reference)
+
+
+def _held_out(errors: Errors | None) -> HeldOut | None:
+    if errors is None:
+        return None
+    distance = errors.distance_m()
+    return HeldOut(len(distance), float(np.median(distance)), float(np.percentile(distance, 95.0)))
+
+
+def _outage(outage: Outage, estimate: Estimate, errors: Errors | None, start_ns: int) -> OutageScore:
+    """Errors at the references inside the outage; the end error is that of the last of them."""
+    path = estimate.trajectory
+    inside = outage.covers(path.t_ns, start_ns)
+    moved = travelled_m(path.position_m[inside])
+    distance = float(moved[-1]) if len(moved) else 0.0
+    if errors is None or not np.isfinite(errors.reference_m).any():
+        return OutageScore(outage.start_s, outage.seconds, distance, None, None, None)
+    rows = outage.covers(errors.t_ns, start_ns)
+    error = errors.distance_m()[rows]
+    if not len(error):
+        return OutageScore(outage.start_s, outage.seconds, distance, None, None, None)
+    if len(error) > 1:
+        distance = float(travelled_m(errors.reference_m[rows], errors.min_step_m)[-1])
+    end = float(error[-1])
+    yaw = float(np.abs(errors.yaw_error_rad()[rows][-1]))
+    return OutageScore(
+        start_s=outage.start_s,
+        seconds=outage.seconds,
+        distance_m=distance,
+        end_error_m=end,
+        median_m=float(np.median(error)),
+        percent=100.0 * end / distance if distance >= 1.0 else None,
+        max_m=float(error.max()),
+        end_yaw_error_rad=yaw if np.isfinite(yaw) else None,
+        nees_mean=_mean(errors.nees()[rows]),
+    )
+
+
+def _rotate(vectors: Array, angle_rad: Array) -> Array:
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = vectors[:, 0], vectors[:, 1]
+    return np.stack([c * x - s * y, s * x + c * y], axis=1)
+
+
+def _norm(vectors: Array) -> Array:
+    return np.asarray(np.hypot(vectors[:, 0], vectors[:, 1]))
+
+
+def _rms(values: Array) -> float | None:
+    mean = _mean(values**2)
+    return None if mean is None else mean**0.5
+
+
+def _mean(values: Array) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None

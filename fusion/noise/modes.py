@@ -1,0 +1,146 @@
+"""The few numbers of each estimator mode, as `python -m tests.studies.mode_tuning` finds them."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.fusion.noise.policy import Policy, SensorNoise
+
+SCHEMA = "terrafusion.modes/1"
+MODES = ("adaptive", "fixed", "robust", "innovation")
+ROBUST_LOSSES = ("cauchy", "gnc")
+INNOVATION_METHODS = ("sage_husa", "variational")
+
+
+@dataclass(frozen=True)
+class RowTuning:
+    """Factors on three standard deviations of a policy's row; 1 leaves it as it was fitted."""
+
+    wheel_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
+    slip_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
+    gnss_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
+
+    def of(self, row: SensorNoise) -> SensorNoise:
+        """`row` with the factors on it."""
+        return dataclasses.replace(
+            row,
+            wheel_sigma_mps=row.wheel_sigma_mps * self.wheel_factor,
+            slip_sigma=row.slip_sigma * self.slip_factor,
+            gnss_inflation=row.gnss_inflation * self.gnss_factor,
+        )
+
+    def of_all(self, policy: Policy) -> Policy:
+        """`policy` with the factors on every row."""
+        classes = {name: self.of(row) for name, row in policy.classes.items()}
+        return dataclasses.replace(policy, classes=classes, fixed=self.of(policy.fixed))
+
+
+@dataclass(frozen=True)
+class RobustTuning:
+    """Scales c of the losses, in sigmas, and how many sigmas off a fix is left out whatever the loss says."""
+
+    wheel_c: Annotated[float, Quantity("", 0.1, 1e6)] = 3.0
+    gnss_c: Annotated[float, Quantity("", 0.1, 1e6)] = 4.0
+    gate_sigma: Annotated[float, Quantity("", 1.0, 1e6)] = 30.0
+
+
+@dataclass(frozen=True)
+class InnovationTuning:
+    """Memory, in measurements, and by what factor the wheels' sigma may leave the row's, up and down."""
+
+    wheel_memory: Annotated[float, Quantity("", 2.0, 1e6)] = 100.0
+    gnss_memory: Annotated[float, Quantity("", 2.0, 1e6)] = 50.0
+    wheel_span: Annotated[float, Quantity("", 1.0, 100.0)] = 3.0
+
+
+@dataclass(frozen=True)
+class ModeTuning:
+    """What was tuned, mode by mode.
+
+    `fixed` is also the row from which "robust" and "innovation" start, and that of "adaptive" on a robot
+    that the terrain model does not know, until its slip tells the ground.
+    """
+
+    fixed: RowTuning = RowTuning()
+    adaptive: RowTuning = RowTuning()
+    cauchy: RobustTuning = RobustTuning()
+    gnc: RobustTuning = RobustTuning()
+    sage_husa: InnovationTuning = InnovationTuning()
+    variational: InnovationTuning = InnovationTuning()
+    inputs_sha256: str = ""
+
+
+SECTIONS: dict[str, type] = {
+    "fixed": RowTuning,
+    "adaptive": RowTuning,
+    "cauchy": RobustTuning,
+    "gnc": RobustTuning,
+    "sage_husa": InnovationTuning,
+    "variational": InnovationTuning,
+}
+
+
+def bounds(section: type, name: str) -> tuple[float, float]:
+    """Least and largest allowed value of a number of a section."""
+    quantity: Quantity = get_type_hints(section, include_extras=True)[name].__metadata__[0]
+    return quantity.low, quantity.high
+
+
+def load_modes(path: Path | None = None) -> ModeTuning:
+    """The tuning file `path`, or the one shipped with the library.
+
+    Raises:
+        ConfigError: unknown or missing key, wrong type, out of range.
+    """
+    if path is None:
+        with resources.as_file(resources.files("terrafusion.fusion.noise") / "modes.yaml") as shipped:
+            return _parse(read_yaml(shipped), shipped)
+    return _parse(read_yaml(path), path)
+
+
+def _parse(content: dict, file: Path) -> ModeTuning:
+    allowed = {"schema", "made_by", "inputs_sha256", *SECTIONS}
+    wrong = sorted(allowed.symmetric_difference(content))
+    if wrong:
+        what = "missing" if wrong[0] in allowed else "unknown"
+        raise ConfigError(
+            f"{what} key '{wrong[0]}'", file=file, remedy=f"needed: {', '.join(sorted(allowed))}"
+        )
+    if content["schema"] != SCHEMA:
+        raise ConfigError(
+            f"schema is '{content['schema']}'", file=file, remedy=f"this version reads {SCHEMA}"
+        )
+    sections: dict[str, Any] = {
+        name: _section(cls, content[name], file, name) for name, cls in SECTIONS.items()
+    }
+    return ModeTuning(**sections, inputs_sha256=str(content["inputs_sha256"]))
+
+
+def _section(cls: type, raw: object, file: Path, key: str) -> object:
+    hints = get_type_hints(cls, include_extras=True)
+    if not isinstance(raw, dict) or set(raw) != set(hints):
+        raise ConfigError(f"'{key}' must have exactly the keys {', '.join(hints)}", file=file)
+    return cls(
+        **{
+            name: checked_number(raw[name], hint.__metadata__[0], file=file, key=f"{key}.{name}")
+            for name, hint in hints.items()
+        }
+    )
+
+
+def write_modes(tuning: ModeTuning, path: Path, made_by: str) -> None:
+    """Write a tuning file: same tuning, same bytes."""
+    from ruamel.yaml import YAML
+
+    content: dict[str, Any] = {"schema": SCHEMA, "made_by": made_by, "inputs_sha256": tuning.inputs_sha256}
+    content |= {name: dataclasses.asdict(getattr(tuning, name)) for name in SECTIONS}
+    yaml = YAML()
+    yaml.default_flow_style = False
+    with path.open("w", encoding="utf-8") as out:
+        yaml.dump(content, out)

@@ -1,0 +1,159 @@
+"""The weighting policy: terrain class -> noise of each sensor.
+
+A policy is one YAML file made by `terrafusion policy fit` from twin drives,
+with the hash of its inputs. Where the class is uncertain, the noise is the
+moment match of the mixture: its variance includes the spread of the class
+means (law of total variance), so doubt about the ground widens the weights.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, get_type_hints
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml
+from terrafusion.datasets.core.errors import ConfigError
+
+SCHEMA = "terrafusion.policy/2"
+
+
+@dataclass(frozen=True)
+class SensorNoise:
+    """Noise of the sensors on one ground (1 sigma).
+
+    Slip is i = 1 - v / (omega R), positive when driving wheels outrun the
+    robot. It is modelled as an Ornstein-Uhlenbeck process about
+    `slip_mean + slip_per_grade * grade`, grade being the sine of the pitch
+    (uphill positive), with the standard deviation and the correlation time
+    given here. Yaw scale is true over wheel yaw rate, less one. Side-slip is the lateral over
+    the forward displacement. The inflations multiply the standard deviations
+    of the data sheet (IMU) or of the receiver's own report (GNSS); the gyro has one about
+    roll and pitch and one about yaw, for rough ground shakes those more.
+    """
+
+    slip_mean: Annotated[float, Quantity("", -1.0, 1.0)]
+    slip_per_grade: Annotated[float, Quantity("", -20.0, 20.0)]
+    slip_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
+    slip_time_s: Annotated[float, Quantity("s", 0.05, 600.0)]
+    wheel_sigma_mps: Annotated[float, Quantity("m/s", 1e-4, 2.0)]
+    yaw_scale_mean: Annotated[float, Quantity("", -0.95, 0.95)]
+    yaw_scale_sigma: Annotated[float, Quantity("", 1e-4, 1.0)]
+    side_slip_sigma: Annotated[float, Quantity("", 1e-4, 2.0)]
+    gyro_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
+    gyro_yaw_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
+    accel_inflation: Annotated[float, Quantity("", 1.0, 1e4)]
+    gnss_inflation: Annotated[float, Quantity("", 1.0, 100.0)]
+
+    def gyro_axes(self) -> tuple[float, float, float]:
+        """Inflation of the gyro about roll, pitch and yaw."""
+        return self.gyro_inflation, self.gyro_inflation, self.gyro_yaw_inflation
+
+    def slip_at(self, grade: float) -> float:
+        """Expected slip at a grade (sine of the pitch, uphill positive)."""
+        return min(max(self.slip_mean + self.slip_per_grade * grade, -0.9), 0.9)
+
+
+_FIELDS = tuple(f.name for f in dataclasses.fields(SensorNoise))
+_SLIP_MEAN, _SLIP_SIGMA = _FIELDS.index("slip_mean"), _FIELDS.index("slip_sigma")
+_YAW_MEAN, _YAW_SIGMA = _FIELDS.index("yaw_scale_mean"), _FIELDS.index("yaw_scale_sigma")
+_SLIP_PER_GRADE = _FIELDS.index("slip_per_grade")
+_AVERAGED = np.array(
+    [name in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean") for name in _FIELDS]
+)
+"""Columns that blend as means; the others are standard deviations (or factors on them)."""
+_HINTS = get_type_hints(SensorNoise, include_extras=True)
+_RANGES: dict[str, Quantity] = {name: _HINTS[name].__metadata__[0] for name in _FIELDS}
+
+
+def within_ranges(row: SensorNoise) -> SensorNoise:
+    """The row with every number inside the range that a policy file may hold."""
+    return SensorNoise(**{n: min(max(getattr(row, n), q.low), q.high) for n, q in _RANGES.items()})
+
+
+@dataclass(frozen=True)
+class Policy:
+    """Noise rows of the terrain classes, and the one row that fixed weighting uses.
+
+    Attributes:
+        classes: class name -> row; "unknown" is one of them.
+        fixed: the row fitted to all grounds together, on the same training drives.
+        inputs_sha256: hash of what the rows were fitted to.
+        name: file name, for messages and reports.
+    """
+
+    classes: dict[str, SensorNoise]
+    fixed: SensorNoise
+    inputs_sha256: str
+    name: str = "policy"
+
+    def names(self) -> tuple[str, ...]:
+        """Class names in the file's order; probabilities are given in this order."""
+        return tuple(self.classes)
+
+    @functools.cached_property
+    def _table(self) -> NDArray[np.float64]:
+        return np.array([dataclasses.astuple(row) for row in self.classes.values()])
+
+    def blend(self, probabilities: ArrayLike, grade: float = 0.0) -> SensorNoise:
+        """The moment-matched row for class probabilities (k,) that sum to one, at a grade.
+
+        Slip and yaw scale have the mean and the variance of the mixture (law of total
+        variance: mean of the variances plus variance of the means); the other
+        errors have zero mean in every class, so their variances average.
+        """
+        p = np.asarray(probabilities, dtype=float)
+        mean = p @ self._table
+        variance = p @ self._table**2
+        slips = self._table[:, _SLIP_MEAN] + grade * self._table[:, _SLIP_PER_GRADE]
+        variance[_SLIP_SIGMA] += p @ (slips - p @ slips) ** 2
+        scales = self._table[:, _YAW_MEAN]
+        variance[_YAW_SIGMA] += p @ (scales - p @ scales) ** 2
+        return SensorNoise(*np.where(_AVERAGED, mean, np.sqrt(variance)).tolist())
+
+
+def load_policy(path: Path | None = None) -> Policy:
+    """The policy file `path`, or the one shipped with the library.
+
+    Raises:
+        ConfigError: unknown or missing key, wrong type, out of range, no `unknown` class.
+    """
+    if path is None:
+        with resources.as_file(resources.files("terrafusion.fusion.noise") / "policy.yaml") as shipped:
+            return _parse(read_yaml(shipped), shipped)
+    return _parse(read_yaml(path), path)
+
+
+def _parse(content: dict, file: Path) -> Policy:
+    allowed = {"schema", "inputs_sha256", "made_by", "classes", "fixed"}
+    for key in content:
+        if key not in allowed:
+            raise ConfigError(
+                f"unknown key '{key}'", file=file, remedy=f"known: {', '.join(sorted(allowed))}"
+            )
+    if content.get("schema") != SCHEMA:
+        raise ConfigError(
+            f"schema is '{content.get('schema')}'", file=file, remedy=f"this version reads {SCHEMA}"
+        )
+    classes = content.get("classes")
+    if not isinstance(classes, dict) or "unknown" not in classes:
+        raise ConfigError("'classes' must map class names to rows and hold 'unknown'", file=file)
+    rows = {name: _row(row, file, f"classes.{name}") for name, row in classes.items()}
+    fixed = _row(content.get("fixed"), file, "fixed")
+    return Policy(rows, fixed, str(content.get("inputs_sha256", "")), name=file.name)
+
+
+def _row(raw: object, file: Path, key: str) -> SensorNoise:
+    if not isinstance(raw, dict) or set(raw) != set(_FIELDS):
+        raise ConfigError(f"'{key}' must have exactly the keys {', '.join(_FIELDS)}", file=file)
+    values = {
+        name: checked_number(raw[name], quantity, file=file, key=f"{key}.{name}")
+        for name, quantity in _RANGES.items()
+    }
+    return SensorNoise(**values)  # type: ignore[arg-type]

@@ -1,0 +1,172 @@
+"""The files of a benchmark.
+
+benchmark.json   every row, every comparison and target, where it comes from
+benchmark.md     the tables; with `--docs` also the document made of them
+ratios.png       the figure
+report.html      tables and figure in one page
+parts/           the rows of single jobs, from which a stopped run goes on
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import subprocess
+from collections.abc import Mapping, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import write_atomically
+from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
+from terrafusion.fusion.benchmark.drives import FIELD
+from terrafusion.fusion.benchmark.parts import LIBRARIES, hash_sources, sources_sha256
+from terrafusion.fusion.benchmark.plan import Plan
+from terrafusion.fusion.benchmark.reasons import reasons
+from terrafusion.fusion.benchmark.run import Found
+from terrafusion.fusion.benchmark.targets import nees_cells, targets
+from terrafusion.fusion.noise.modes import load_modes
+from terrafusion.fusion.noise.policy import load_policy
+from terrafusion.fusion.reports import page
+from terrafusion.fusion.reports.benchmark.plots import plot_ratios
+from terrafusion.fusion.reports.benchmark.text import Table, markdown, tables
+from terrafusion.fusion.reports.replay.outputs import to_json
+from tests.studies.twin_consistency import Cell
+
+SCHEMA = "terrafusion.benchmark/1"
+MARK = "<!-- what follows is written by terrafusion benchmark --docs -->"
+CAPTION = (
+    "Position error in the outage over that of the fixed row tuned on the training drives. "
+    "The diamond is the adaptive weighting with the detected ground."
+)
+
+
+def write_benchmark(out: Path, found: Found, origin: Mapping[str, str]) -> list[Table]:
+    """All files but the parts; returns the tables.
+
+    Raises:
+        TerrafusionError: a file cannot be written.
+    """
+    made = tables(found.rows)
+    _text(out / "benchmark.json", to_json(_content(found, origin), indent=1) + "\n")
+    _text(out / "benchmark.md", "\n".join(document_lines(made, found, origin)) + "\n")
+    figure = plot_ratios(contrasts(found.rows))
+    write_atomically(out / "ratios.png", lambda part: figure.savefig(part, format="png", dpi=110))
+    _page(out / "report.html", made, found, origin)
+    return made
+
+
+def write_document(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> None:
+    """Put the tables into a document: what follows its line `MARK` is replaced, the rest is kept.
+
+    Raises:
+        ConfigError: the file is not there, or has no such line.
+        TerrafusionError: it cannot be written.
+    """
+    _text(path, document_head(path) + MARK + "\n\n" + "\n".join(document_lines(made, found, origin)) + "\n")
+
+
+def document_head(path: Path) -> str:
+    """What stands before the line `MARK` of a document.
+
+    Raises:
+        ConfigError: the file is not there, or has no such line.
+    """
+    try:
+        head, mark, _ = path.read_text(encoding="utf-8").partition(MARK)
+    except (OSError, ValueError):
+        head, mark = "", ""
+    if not mark:
+        raise ConfigError(
+            "is no document with a place for the tables", file=path, remedy=f"add a line {MARK}"
+        )
+    return head
+
+
+def origin_of(plan: Plan, command: str) -> dict[str, str]:
+    """What the numbers are made by and of: to be asked before they are made."""
+    seeds = [f"{family} {plan.seed_count(family)}" for family in plan.families if family != FIELD]
+    return {
+        "command": command,
+        "commit": commit() or "not from a checkout",
+        "sources": sources_sha256()[:16],
+        "policy": load_policy().inputs_sha256[:16],
+        "modes": load_modes().inputs_sha256[:16],
+        "seeds": ", ".join(seeds) or "none",
+    }
+
+
+def at_the_end(origin: Mapping[str, str]) -> dict[str, str]:
+    """The origin, which says so where the sources are no longer those of the beginning."""
+    note = "" if hash_sources()[:16] == origin["sources"] else ", changed while it ran"
+    return {**origin, "sources": origin["sources"] + note}
+
+
+def commit() -> str:
+    """Commit of the checkout that this library runs from, "-dirty" where files differ; "" without one.
+
+    An installed library lies in nobody's checkout, even where the folder above it is one.
+    """
+    file = Path(__file__)
+    try:
+        _git(file.parent, "ls-files", "--error-unmatch", file.name)
+        return _git(file.parent, "describe", "--always", "--dirty", "--abbrev=12")
+    except (OSError, subprocess.SubprocessError):
+        return ""
+
+
+def _git(folder: Path, *words: str) -> str:
+    command = ["git", "-C", str(folder), *words]
+    return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
+
+
+def document_lines(made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> list[str]:
+    """The tables as Markdown, and where they come from."""
+    lines: list[str] = []
+    for table in made:
+        lines += [*markdown(table), ""]
+    if found.refused:
+        lines += ["## Logs not run", "", *(f"- {one.line}" for one in found.refused), ""]
+    return [*lines, "## Made by", "", *(f"- {name}: `{text}`" for name, text in origin.items())]
+
+
+def _content(found: Found, origin: Mapping[str, str]) -> dict[str, Any]:
+    rows = found.rows
+    return {
+        "schema": SCHEMA,
+        "origin": dict(origin),
+        "contrasts": [
+            dataclasses.asdict(c) for base in ("fixed", "innovation") for c in contrasts(rows, base)
+        ],
+        "shares": [dataclasses.asdict(s) for s in shares(rows)],
+        "targets": [dataclasses.asdict(t) | {"verdict": t.verdict()} for t in targets(rows)],
+        "reasons": [dataclasses.asdict(r) | {"blame": r.blame()} for r in reasons(rows)],
+        "consistency": [_cell(c) for c in nees_cells(rows)],
+        "refused": [dataclasses.asdict(one) for one in found.refused],
+        "rows": [dataclasses.asdict(row) for row in rows],
+    }
+
+
+def _cell(cell: Cell) -> dict[str, Any]:
+    """A cell with its verdict, or without verdict and interval where its drives are too few."""
+    few = cell.drives < LEAST_UNITS
+    known = {"interval": None, "verdict": None} if few else {"verdict": cell.verdict()}
+    return dataclasses.asdict(cell) | known
+
+
+def _page(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> None:
+    body = ["<h1>Fixed against adaptive weighting</h1>"]
+    for k, table in enumerate(made):
+        cells = [[escape(cell) for cell in row] for row in table.rows]
+        body += [f"<h2>{escape(table.title)}</h2>", f"<p>{escape(table.about)}</p>"]
+        body.append(page.table(table.heads, cells, range(1, len(table.heads))))
+        if k == 0:
+            body.append(page.figure(plot_ratios(contrasts(found.rows)), CAPTION))
+    if found.refused:
+        body += ["<h2>Logs not run</h2>", page.bullets(escape(one.line) for one in found.refused)]
+    body.append(page.where_from(origin, LIBRARIES))
+    page.write_page(path, "Fixed against adaptive weighting", body)
+
+
+def _text(path: Path, text: str) -> None:
+    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

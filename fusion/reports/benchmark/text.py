@@ -1,0 +1,211 @@
+"""The tables of a benchmark as plain cells, for the terminal, the document and the page alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
+from terrafusion.fusion.benchmark.compare import LEAST_UNITS, Contrast, Interval, contrasts, groups_of, shares
+from terrafusion.fusion.benchmark.drives import FAMILIES, FIELD, PLANTS
+from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
+from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, nees_cells, targets
+from terrafusion.fusion.reports.replay.text import number
+from tests.studies.twin_consistency import MARKS, Cell
+
+Cells = list[str]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table with what it says in words; the first column is text, the others numbers or words."""
+
+    title: str
+    about: str
+    heads: tuple[str, ...]
+    rows: tuple[Cells, ...]
+
+
+def tables(rows: Sequence[Row]) -> list[Table]:
+    """All tables, the main one first; those without rows are left out."""
+    made = (
+        _main(rows), _targets(targets(rows)), _reasons(reasons(rows)), _wins(contrasts(rows)), _shares(rows),
+        _nees(nees_cells(rows)), _field(rows), _failures(rows), _arms(),
+    )  # fmt: skip
+    return [table for table in made if table.rows]
+
+
+def markdown(table: Table) -> list[str]:
+    """Lines of a section."""
+    lines = [f"## {table.title}", table.about, "", f"| {' | '.join(table.heads)} |"]
+    lines.append("| --- |" + " --- |" * (len(table.heads) - 1))
+    return [*lines, *(f"| {' | '.join(cells)} |" for cells in table.rows)]
+
+
+def group_name(family: str, plant: str) -> str:
+    """ "mixed, twin"."""
+    return f"{family}, {plant}"
+
+
+def _main(rows: Sequence[Row]) -> Table:
+    """Median error of the fixed row, and the ratios to it."""
+    found = contrasts(rows)
+    arms = [arm.name for arm in ARMS if arm.name != BASE]
+    lines = []
+    for family, plant in groups_of(rows):
+        of = {c.arm: c for c in found if (c.family, c.plant) == (family, plant)}
+        if BASE in of:
+            units = of[BASE].units
+            head = [group_name(family, plant), str(units), number(of[BASE].error_m)]
+            lines.append([*head, *(_ratio(of.get(arm), units) for arm in arms)])
+    about = (
+        f"Root mean square position error inside the outage: its median for {BASE} (tuned), and for the "
+        f"others the median of the paired ratios to it, with its 95 % interval from {LEAST_UNITS} pairs on. "
+        "Below 1 is better. A replay that failed counts as infinitely wrong; in brackets the pairs where not "
+        "every drive has labels."
+    )
+    return Table("Errors", about, ("drives", "pairs", f"{BASE}, m", *arms), tuple(lines))
+
+
+def _targets(found: Iterable[Target]) -> Table:
+    lines = [
+        [
+            t.name, t.what, f"{'<=' if t.most else '>='} {t.limit:g}{f' {t.unit}' if t.unit else ''}",
+            f"{number(t.found)}{_ends(t.interval)}{f'; {t.broken} failed or diverged' if t.broken else ''}",
+            t.verdict(),
+        ]
+        for t in found
+    ]  # fmt: skip
+    about = (
+        "Reached or missed: by the whole interval. Open: the interval holds the limit, or there is none "
+        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {OWN} that fails or diverges, "
+        "and the estimator was made with its logs in view."
+    )
+    return Table("Targets", about, ("target", "what", "limit", "found", "verdict"), tuple(lines))
+
+
+def _reasons(found: Iterable[Reason]) -> Table:
+    lines = [
+        [
+            group_name(r.family, r.plant), f"{r.winner}, {r.ratio:.2f}{'' if r.sure else ' (not sure)'}",
+            number(r.oracle), r.blame(), f"{r.ground}: {r.kind}" if r.ground else "the truth does not tell",
+            _percent(r.recognised[0]), _percent(r.recognised[1]),
+        ]
+        for r in found
+    ]  # fmt: skip
+    about = (
+        "Groups in which some baseline beats the detected ground by more than 3 %: adaptive over that "
+        "baseline, the oracle over it, and the ground and kind of velocity error in which most is lost to it."
+    )
+    heads = ("drives", "beaten by", "oracle", "blame", "most lost", "recognised", "recognised there")
+    return Table("Where adaptive loses", about, heads, tuple(lines))
+
+
+def _wins(found: Iterable[Contrast]) -> Table:
+    arms = [arm.name for arm in ARMS if arm.name != BASE]
+    groups: dict[tuple[str, str], dict[str, Contrast]] = {}
+    for c in found:
+        groups.setdefault((c.family, c.plant), {})[c.arm] = c
+    lines = [
+        [group_name(*key), *(f"{of[a].wins} : {of[a].losses}" if a in of else "-" for a in arms)]
+        for key, of in groups.items()
+    ]
+    about = f"Drives (logs in the field) won and lost against {BASE} by more than 3 %."
+    return Table("Wins and losses", about, ("drives", *arms), tuple(lines))
+
+
+def _shares(rows: Sequence[Row]) -> Table:
+    groups = groups_of(rows)
+    lines = []
+    for s in shares(rows):
+        known = recognised(groups[s.family, s.plant])
+        delays = [r.switch_s for r in groups[s.family, s.plant] if r.arm == OWN and r.switch_s is not None]
+        if s.share is not None or known is not None:
+            share = "no gain" if s.share is None else f"{number(s.share)}{_ends(s.interval)}"
+            after = f"{np.median(delays):.1f} s" if delays else "-"
+            lines.append([group_name(s.family, s.plant), share, _percent(known), after])
+    about = (
+        f"Gain of the detected ground over {BASE} as a share of the gain with true labels, and how much of "
+        "the outages the detector names the ground, and how long after a change (median over drives). "
+        "No gain: the oracle is no better than 3 %."
+    )
+    return Table(
+        "Share of the oracle's gain", about, ("drives", "share", "recognised", "after"), tuple(lines)
+    )
+
+
+def _nees(cells: Iterable[Cell]) -> Table:
+    groups: dict[tuple[str, str], dict[str, Cell]] = {}
+    for cell in cells:
+        groups.setdefault((cell.terrain, cell.mode), {})[cell.quantity] = cell
+    lines = []
+    for (ground, mode), of in groups.items():
+        texts = [_cell(of[q]) if q in of else "-" for q in (INSIDE, IN_OUTAGE)]
+        lines.append([ground, mode, str(max(c.drives for c in of.values())), *texts])
+    about = (
+        "Mean NEES of the position per dimension on each true ground [95 % interval over drives], inside "
+        "(=), above (+, overconfident) or below (-, cautious) the band of a consistent estimator; with fewer "
+        f"than {LEAST_UNITS} drives the mean alone."
+    )
+    heads = ("ground", "plant, arm", "drives", INSIDE, IN_OUTAGE)
+    return Table("Consistency", about, heads, tuple(lines))
+
+
+def _field(rows: Sequence[Row]) -> Table:
+    """Log by log: medians over its outages."""
+    own = [row for row in rows if row.family == FIELD and row.error_m is not None]
+    lines = []
+    for log in dict.fromkeys(row.unit for row in own):
+        of = {
+            arm.name: [row.error_m for row in own if (row.unit, row.arm) == (log, arm.name)] for arm in ARMS
+        }
+        lines.append([log, str(len(of[BASE])), *(_median(of[arm.name]) for arm in ARMS)])
+    about = "Median over the outages of a log, m; against truth, or fixes kept back with their noise."
+    return Table("Field logs", about, ("log", "drives", *(arm.name for arm in ARMS)), tuple(lines))
+
+
+def _failures(rows: Sequence[Row]) -> Table:
+    found = [(row, row.failed or f"diverged: {row.diverged}") for row in rows if row.failed or row.diverged]
+    lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.arm, why] for row, why in found)
+    return Table("Replays that failed or diverged", "All of them.", ("drive", "arm", "why"), lines)
+
+
+def _arms() -> Table:
+    lines = [[arm.name, arm.about] for arm in ARMS]
+    lines += [[name, family.about] for name, family in FAMILIES.items()]
+    lines += [[FIELD, "field logs at hand, 30, 60 and 120 s without GNSS; by ground"]]
+    lines += [[name, about] for name, about in PLANTS.items()]
+    return Table("Names", "Arms, families of drives, and plants.", ("name", "is"), tuple(lines))
+
+
+def _ratio(c: Contrast | None, units: int) -> str:
+    if c is None:
+        return "-"
+    return f"{c.ratio:.2f}{_ends(c.interval, 2)}{f' ({c.units})' if c.units != units else ''}"
+
+
+def _ends(interval: Interval | None, decimals: int | None = None) -> str:
+    if interval is None:
+        return ""
+    low, high = (f"{x:.{decimals}f}" if decimals else number(x) for x in interval)
+    return f" [{low}, {high}]"
+
+
+def _cell(cell: Cell) -> str:
+    if cell.drives < LEAST_UNITS:
+        return f"{cell.mean:.2f}"
+    (low, high), band = cell.interval, cell.band
+    return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {MARKS[cell.verdict()]} {band[0]:.2f}..{band[1]:.2f}"
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:.0f} %"
+
+
+def _median(values: Sequence[float | None]) -> str:
+    from tests.studies.field_table.summary import median
+
+    return "-" if not values else number(median(values))

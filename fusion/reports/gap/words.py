@@ -1,0 +1,112 @@
+"""A diagnosis in plain words that say only what its numbers carry."""
+
+from __future__ import annotations
+
+import math
+
+from terrafusion.twin.gap.answer.next_run import BY_HAND
+from terrafusion.twin.gap.answer.verdict import Cause
+from terrafusion.twin.gap.answer.where import LEAST_REFERENCES
+from terrafusion.twin.gap.diagnose import Diagnosis
+
+MOST_LISTED = 4
+
+
+def sentences(d: Diagnosis) -> list[str]:
+    """The answer in sentences."""
+    said = [_detection(d)]
+    if d.detected:
+        said += [_cause(d), _place(d), _shrink(d)]
+    if d.next_run is not None:
+        what = d.next_run.scenario
+        said.append(f"Next, {what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}.")
+    if d.uncalibrated:
+        said.append(
+            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in "
+            "for them."
+        )
+    return [s for s in said if s]
+
+
+def _detection(d: Diagnosis) -> str:
+    p, runs = d.detection.p_value, f"{len(d.runs)} run(s), {d.seconds:.0f} s"
+    against = f"{len(d.references)} reference run(s)" if d.references else "the twin's own replicates"
+    if not d.detected:
+        return (
+            f"No gap was found: {runs} differ from {against} no more than these among themselves "
+            f"(p = {p:.3g}, threshold {d.significance:g}). A small gap may still be there."
+        )
+    return f"There is a gap: {runs} differ from {against} (p = {p:.3g}, threshold {d.significance:g})."
+
+
+def _cause(d: Diagnosis) -> str:
+    verdict, first = d.verdict, d.verdict.causes[0]
+    share = "" if first.share is None else f", which explains {100.0 * first.share:.0f} % of it"
+    if verdict.kind == "unknown":
+        return (
+            f"No candidate explains it: the best, {first.effect}, leaves too much. "
+            "Something is at work that the catalogue does not have."
+        )
+    if verdict.kind == "parameters":
+        return f"The ground has changed its strength; nothing structural is missing ({numbers(d)})."
+    if len(verdict.named) > 1:
+        several = [cause for name in verdict.named for cause in verdict.causes if cause.effect == name]
+        listed = "; and ".join(f"{_class_of(cause)} ({numbers(d, cause)})" for cause in several)
+        sure = 100.0 * sum(cause.probability for cause in several)
+        return f"The most probable causes act together (probability {sure:.0f} %): {listed}."
+    if verdict.kind == "ambiguous":
+        listed = ", ".join(first.members)
+        return f"Its cause is one of {listed}: these runs cannot tell them apart{share} ({numbers(d)})."
+    return (
+        f"The most probable cause is {first.effect} "
+        f"(probability {100.0 * first.probability:.0f} %){share} ({numbers(d)})."
+    )
+
+
+def _class_of(cause: Cause) -> str:
+    if len(cause.members) == 1:
+        return cause.effect
+    return f"one of {', '.join(cause.members)}, which these runs cannot tell apart"
+
+
+def numbers(d: Diagnosis, cause: Cause | None = None) -> str:
+    """A cause's parameters with one sigma; None: the first one's."""
+    cause, c = cause or d.verdict.causes[0], d.bench.candidates
+    parts = []
+    for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
+        unit = f" {c.units[i]}" if c.units[i] else ""
+        within = (
+            f"+- {sigma * c.scale[i]:.2g}{unit}" if math.isfinite(sigma) else f"{unit} (fit failed)".strip()
+        )
+        parts.append(f"{c.keys[i]} = {value * c.scale[i]:.3g} {within}")
+    return ", ".join(parts)
+
+
+def _place(d: Diagnosis) -> str:
+    if len(d.references) < LEAST_REFERENCES:
+        return f"In which channel and regime it shows is not told: that takes {LEAST_REFERENCES} references."
+    sure = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
+    if not sure:
+        return "It shows in no single channel and regime clearly enough to name one."
+    listed = "; ".join(f"{c.channel} while {c.regime}, {c.band} ({100.0 * c.share:.0f} %)" for c in sure)
+    return f"It shows in: {listed}. A channel in which a gap shows is not its cause."
+
+
+def _shrink(d: Diagnosis) -> str:
+    s = d.shrinking
+    if s is None or not d.verdict.named:
+        return ""
+    if s.share is None:
+        return (
+            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap stands "
+            "too little above its floor to call that a share."
+        )
+    interval = (
+        "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
+    )
+    held = "on runs left out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
+    return (
+        f"With the effect in the twin {100.0 * s.share:.0f} % of the gap above its floor goes away "
+        f"{held}{interval}: {s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the "
+        f"references; soil and sensor offsets set anew alone leave {s.recalibrated:.3g}."
+    )

@@ -1,0 +1,80 @@
+"""The linear states of an `Estimate` as people read them: series by name, and what a calibration told."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR
+from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
+
+Array = NDArray[np.float64]
+
+OBSERVED_SHARE = 0.5
+"""A state counts as observed once its sigma is below this share of the prior's."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """How a state of a calibration is shown: `value * scale` in `unit`."""
+
+    label: str
+    unit: str
+    scale: float
+
+
+_DEGREES = math.degrees(1.0)
+QUANTITIES = {
+    "radius_scale": Quantity("wheel radius, beyond the vehicle file's", "%", 100.0),
+    "antenna_x_m": Quantity("GNSS antenna, further forward", "m", 1.0),
+    "antenna_y_m": Quantity("GNSS antenna, further left", "m", 1.0),
+    "imu_roll_rad": Quantity("IMU turned about x", "deg", _DEGREES),
+    "imu_pitch_rad": Quantity("IMU turned about y", "deg", _DEGREES),
+    "imu_yaw_rad": Quantity("IMU turned about z", "deg", _DEGREES),
+    "wheel_delay_s": Quantity("wheel stamps later than the IMU's", "s", 1.0),
+    "gnss_delay_s": Quantity("GNSS stamps later than the IMU's", "s", 1.0),
+}
+"""Of each state of `key_state.CALIBRATION`."""
+
+
+def series(estimate: Estimate, name: str) -> tuple[Array, Array] | None:
+    """A linear state (N,) over the drive and its 1 sigma (N,); None where it was not estimated."""
+    if estimate.linear is None or estimate.linear_sigma is None:
+        return None
+    i = LINEAR.index(name)
+    sigma = estimate.linear_sigma[:, i]
+    return (estimate.linear[:, i], sigma) if np.isfinite(sigma).any() else None
+
+
+def calibration(estimate: Estimate) -> list[dict[str, Any]]:
+    """What the last keyframe knows of each state of a calibration; empty where none was estimated.
+
+    Rows of `state`, `value`, `sigma`, `prior_sigma` (SI, as the name says) and `observed`: sigma is less
+    than `OBSERVED_SHARE` of the prior's.
+    """
+    found = {name: series(estimate, name) for name in CALIBRATION}
+    return [
+        {
+            "state": name,
+            "value": float(values[0][-1]),
+            "sigma": float(values[1][-1]),
+            "prior_sigma": CALIBRATION_SIGMA[name],
+            "observed": bool(values[1][-1] < OBSERVED_SHARE * CALIBRATION_SIGMA[name]),
+        }
+        for name, values in found.items()
+        if values is not None
+    ]
+
+
+def cells(row: Mapping[str, Any]) -> list[str]:
+    """A row of `calibration` as text: quantity, value, sigma, prior's sigma, verdict."""
+    told = QUANTITIES[row["state"]]
+    numbers = [f"{row[key] * told.scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
+    verdict = "observed" if row["observed"] else "not observable on this drive"
+    return [f"{told.label}, {told.unit}", *numbers, verdict]

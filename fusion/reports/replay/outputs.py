@@ -1,0 +1,266 @@
+"""The machine-readable results of a replay, in one folder.
+
+    metrics.json     the scores; keeps to docs/schemas/metrics.schema.json
+    estimate.csv     one row a keyframe (`estimate_columns` names the columns)
+    trajectory.tum   `t x y z qx qy qz qw`, for evo and the like
+    weights.jsonl    one change of a sensor's weight a line, with its reason
+
+Each file is written whole under another name and then renamed, so a reader
+never sees half of one. Numbers that are unknown or not finite are null in JSON
+and empty cells in CSV. The same estimate gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import write_tum
+from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
+from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.metrics.metrics import Scores
+from terrafusion.fusion.reports.replay.linear_states import series
+
+SCHEMA = "terrafusion.replay/1"
+MODES = ("adaptive", "fixed", "robust", "innovation")
+
+
+def build_metrics(
+    *,
+    log: str,
+    vehicle: str,
+    mode: str,
+    duration_s: float,
+    distance_m: float,
+    realtime_factor: float,
+    updates: int,
+    latencies_ms: ArrayLike,
+    terrain: Mapping[str, float],
+    changes: int,
+    rejected: Mapping[str, int],
+    scores: Scores,
+    status: Mapping[str, str],
+    notes: Sequence[str] = (),
+    calibration: Sequence[Mapping[str, Any]] = (),
+) -> dict[str, Any]:
+    """The content of `metrics.json`.
+
+    Args:
+        log: name of the recording.
+        mode: one of `MODES`.
+        realtime_factor: seconds of drive processed in a second.
+        latencies_ms: (K,) time that each update took.
+        terrain: share of the time spent on each class (see `terrain_shares`).
+        changes: how many times a weight changed.
+        rejected: measurements turned away by a gate, by sensor (see `rejected_counts`).
+        status: `value` and `message` (see `final_status`).
+        notes: what was assumed; notes on the scoring are added.
+        calibration: rows of `linear_states.calibration`; empty where none was asked for.
+    """
+    if mode not in MODES:
+        raise ValueError(f"mode is '{mode}', not one of {', '.join(MODES)}")
+    latencies = np.asarray(latencies_ms, dtype=float).ravel()
+    latencies = latencies[np.isfinite(latencies)]
+    p50, p99 = np.percentile(latencies, [50.0, 99.0]) if len(latencies) else (0.0, 0.0)
+    return {
+        "schema": SCHEMA,
+        "log": log,
+        "vehicle": vehicle,
+        "mode": mode,
+        "duration_s": _at_least_zero(duration_s),
+        "distance_m": _at_least_zero(distance_m),
+        "realtime_factor": _at_least_zero(realtime_factor),
+        "updates": int(updates),
+        "update_latency_ms": {"p50": float(p50), "p99": float(p99)},
+        "terrain": {name: min(1.0, _at_least_zero(share)) for name, share in terrain.items()},
+        "weights": {"changes": int(changes)},
+        "rejected": {"gnss": 0, "wheels": 0} | {name: int(count) for name, count in rejected.items()},
+        "against": scores.against,
+        "ate_m": finite(scores.ate_m),
+        "rpe_percent": finite(scores.rpe_percent),
+        "yaw_rmse_rad": finite(scores.yaw_rmse_rad),
+        "velocity_rmse_mps": finite(scores.velocity_rmse_mps),
+        "nees_mean": finite(scores.nees_mean),
+        "held_out": None if scores.held_out is None else finite(dataclasses.asdict(scores.held_out)),
+        "outages": [finite(dataclasses.asdict(outage)) for outage in scores.outages],
+        "consistency": [
+            finite(dataclasses.asdict(row)) | {"verdict": row.verdict()} for row in scores.consistency
+        ],
+        "calibration": [finite(row) for row in calibration],
+        "status": {"value": status["value"], "message": status["message"]},
+        "notes": [*notes, *(note for note in scores.notes if note not in notes)],
+    }
+
+
+def terrain_shares(estimate: Estimate) -> dict[str, float]:
+    """Share of the drive's time in which each class was the most probable; they sum to 1.
+
+    A keyframe's class holds until the next keyframe; classes that never lead are left out.
+    """
+    t_ns = estimate.trajectory.t_ns
+    if not len(t_ns) or not estimate.classes:
+        return {}
+    seconds = np.diff(t_ns, append=t_ns[-1]) * 1e-9
+    if not seconds.sum() > 0.0:
+        seconds = np.ones(len(t_ns))
+    label = np.nan_to_num(estimate.terrain).argmax(axis=1)
+    total = np.bincount(label, weights=seconds, minlength=len(estimate.classes)) / seconds.sum()
+    return {name: float(share) for name, share in zip(estimate.classes, total, strict=True) if share > 0.0}
+
+
+def rejected_counts(estimate: Estimate) -> dict[str, int]:
+    """Measurements turned away by a gate; `gnss` counts its velocities too, `wheels` their side-slip too."""
+    counts = {"gnss": 0, "wheels": 0}
+    for innovation in estimate.innovations:
+        if not innovation.accepted:
+            sensor = next((name for name in counts if innovation.sensor.startswith(name)), innovation.sensor)
+            counts[sensor] = counts.get(sensor, 0) + 1
+    return counts
+
+
+def final_status(estimate: Estimate) -> dict[str, str]:
+    """Status of the last keyframe and its sentence; `waiting` when there is no keyframe."""
+    value = str(estimate.status[-1]) if len(estimate.status) else "waiting"
+    return {"value": value, "message": STATUS.get(value, value)}
+
+
+def write_outputs(
+    directory: Path, estimate: Estimate, metrics: Mapping[str, Any], recording: Recording
+) -> dict[str, Path]:
+    """Write all files into `directory` (made when absent) and return their paths by file name.
+
+    Raises:
+        TerrafusionError: the folder cannot be made or written.
+    """
+    writers: dict[str, Callable[[Path], object]] = {
+        "metrics.json": lambda path: path.write_text(to_json(metrics, indent=2) + "\n", encoding="utf-8"),
+        "estimate.csv": lambda path: _write_csv(path, estimate_columns(estimate, recording.start_ns)),
+        "trajectory.tum": lambda path: write_tum(estimate.trajectory, path),
+        "weights.jsonl": lambda path: _write_lines(path, _change_lines(estimate, recording.start_ns)),
+    }
+    return {name: write_atomically(directory / name, write) for name, write in writers.items()}
+
+
+def finite(value: Any) -> Any:
+    """The same JSON value with plain Python numbers, and None for every number that is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): finite(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return finite(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    if isinstance(value, np.generic):
+        return finite(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def to_json(value: Any, *, indent: int | None = None) -> str:
+    """`value` as strict JSON: never NaN or Infinity."""
+    return json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
+
+
+def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
+    """The cells of `estimate.csv`, by column.
+
+    t_s                          seconds from the start of the recording
+    t_ns                         nanoseconds, Unix epoch for real logs
+    x_m, y_m, z_m                body origin, ENU about the datum
+    qx, qy, qz, qw               orientation, body to world
+    v_e_mps, v_n_mps, v_u_mps    velocity of the body origin, world
+    yaw_rate_radps               body z, bias removed
+    slip, slip_sigma             1 - v / (omega R), and its 1 sigma
+    terrain, p_<class>           most probable class, and the probability of each
+    sigma_x_m, sigma_y_m         1 sigma of the position, world axes
+    sigma_yaw_rad                1 sigma of the heading
+    gyro_bias_*, accel_bias_*    body axes
+    w_<name>                     the weights in force, named and measured as in the policy file
+    status                       waiting, aligning, running, outage or no_gnss
+    slipping, immobilised        1 or 0, see docs/monitor.md
+    sigma_gyro_bias_*, sigma_accel_bias_*   1 sigma of the biases
+    <state>, sigma_<state>       the linear states but slip, as far as they are estimated; see
+                                 docs/calibration-states.md
+    """
+    path = estimate.trajectory
+    n = len(path)
+    q = path.quaternion if path.quaternion is not None else np.full((n, 4), np.nan)
+    twist = path.twist_body if path.twist_body is not None else np.full((n, 6), np.nan)
+    P = path.covariance if path.covariance is not None else np.full((n, 6, 6), np.nan)
+    sigma = np.sqrt(np.maximum(np.diagonal(P, axis1=1, axis2=2), 0.0))
+    offset = path.t_ns - start_ns
+    table = {"t_s": [_seconds(t) for t in offset.tolist()], "t_ns": [str(t) for t in path.t_ns.tolist()]}
+    table |= _numbers(("x_m", "y_m", "z_m"), path.position_m, ".6f")
+    table |= _numbers(("qx", "qy", "qz", "qw"), q, ".9f")
+    table |= _numbers(("v_e_mps", "v_n_mps", "v_u_mps"), estimate.velocity_mps, ".6f")
+    table |= _numbers(("yaw_rate_radps",), twist[:, 5:], ".6f")
+    table |= _numbers(("slip", "slip_sigma"), np.stack([estimate.slip, estimate.slip_sigma], axis=1), ".6f")
+    table["terrain"] = [_cell(name) for name in estimate.dominant_terrain()] if estimate.classes else [""] * n
+    table |= _numbers([f"p_{name}" for name in estimate.classes], estimate.terrain, ".6f")
+    table |= _numbers(("sigma_x_m", "sigma_y_m", "sigma_yaw_rad"), sigma[:, [0, 1, 5]], ".6g")
+    table |= _numbers([f"gyro_bias_{a}_radps" for a in "xyz"], estimate.gyro_bias_radps, ".6g")
+    table |= _numbers([f"accel_bias_{a}_mps2" for a in "xyz"], estimate.accel_bias_mps2, ".6g")
+    for name, values in estimate.weights.items():
+        table |= _numbers((f"w_{name}",), np.reshape(values, (n, 1)), ".6g")
+    table["status"] = [_cell(value) for value in estimate.status]
+    for name, flags in (("slipping", estimate.slipping), ("immobilised", estimate.immobilised)):
+        table[name] = [""] * n if flags is None else [str(int(flag)) for flag in flags]
+    biases = [f"sigma_gyro_bias_{a}_radps" for a in "xyz"] + [f"sigma_accel_bias_{a}_mps2" for a in "xyz"]
+    unknown = np.full((n, 6), np.nan)
+    table |= _numbers(biases, unknown if estimate.bias_sigma is None else estimate.bias_sigma, ".6g")
+    for state in LINEAR[1:]:
+        found = series(estimate, state)
+        if found is not None:
+            table |= _numbers((state, f"sigma_{state}"), np.stack(found, axis=1), ".6g")
+    return table
+
+
+def change_record(change: WeightChange, start_ns: int) -> dict[str, Any]:
+    """One line of `weights.jsonl`: t_s, t_ns, sensor, before, after, unit, reason."""
+    return {"t_s": (change.t_ns - start_ns) * 1e-9} | dataclasses.asdict(change)
+
+
+def _change_lines(estimate: Estimate, start_ns: int) -> Iterable[str]:
+    return (to_json(change_record(change, start_ns)) for change in estimate.changes)
+
+
+def _numbers(names: Sequence[str], values: NDArray[Any], spec: str) -> dict[str, list[str]]:
+    columns = np.asarray(values, dtype=float).T.tolist()
+    return {
+        name: [format(x, spec) if math.isfinite(x) else "" for x in column]
+        for name, column in zip(names, columns, strict=True)
+    }
+
+
+def _seconds(t_ns: int) -> str:
+    whole, rest = divmod(abs(t_ns), 10**9)
+    return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
+
+
+def _cell(value: object) -> str:
+    text = " ".join(str(value).split())
+    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"') else text
+
+
+def _write_csv(path: Path, table: Mapping[str, list[str]]) -> None:
+    header = ",".join(_cell(name) for name in table)
+    _write_lines(path, [header, *(",".join(row) for row in zip(*table.values(), strict=True))])
+
+
+def _write_lines(path: Path, lines: Iterable[str]) -> None:
+    with path.open("w", encoding="utf-8", newline="\n") as out:
+        out.writelines(line + "\n" for line in lines)
+
+
+def _at_least_zero(value: float) -> float:
+    """`value`, or 0 where it is negative or not finite: the schema has no null for it."""
+    return float(value) if math.isfinite(value) and value > 0.0 else 0.0

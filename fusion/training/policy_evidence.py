@@ -1,0 +1,263 @@
+"""What a drive says of its ground: the samples that the policy's rows are fitted to.
+
+What counts, ground by ground, and how it is measured against the truth:
+
+- slip: 1 - v / (omega R) of half-second means while the wheels turn faster than
+  0.15 m/s. A robot that spins on the spot has slip 1 for as long as it likes, so
+  of every immobilised spell only the first second counts: its onset is what a
+  policy must cover, its length is chance. A line over the grade (sine of the
+  pitch) is fitted by least absolute deviations, the standard deviation is the rms
+  about it; the correlation time is that of an Ornstein-Uhlenbeck process with this variance
+  that moves as much in 2 s as slip did: tau = -2 s / ln(rho), rho the
+  autocorrelation about the ground's line at a lag of 2 s.
+  A rolling radius is known to about 1 %, which the twin's odometry is not subject
+  to: that constant error is added to variance and autocorrelation alike.
+- wheel sigma: speed over 0.1 s that slip, averaged over 1 s, leaves unexplained,
+  in quadrature with the vehicle file's `speed_sigma_mps` (position error, backlash,
+  uneven ground: the twin's encoders are only quantised).
+- yaw scale: true over wheel yaw rate less one, half-second means, while the wheels turn the robot by more
+  than 0.1 rad/s: the median, and the rms about it.
+- side-slip: lateral over forward speed of the body origin, above 0.2 m/s, without the part that follows the
+  yaw rate (a centre of rotation ahead of the origin is a state of its own).
+- IMU: the mean error over tau less its 60 s running mean (the bias), rms over the
+  axes (gyro: roll and pitch, and yaw by itself), as a multiple of the data sheet's
+  density / sqrt(tau). Vibration has a band: its mean falls faster than that of white
+  noise, so the multiple falls with tau, and
+  tau must be the time over which the estimator integrates the sensor before another
+  corrects it: 2 s for the specific force (wheels and GNSS hold the speed), 5 s for
+  the rate (heading is corrected slowly).
+- GNSS: horizontal error over the reported sigma, rms, at least 1.
+
+Recorded drives tell less, see `policy_logs`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
+from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.sensors import ImuSpec
+from terrafusion.fusion.training.drives import seconds, wheel_samples
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+
+Array = NDArray[np.float64]
+
+SHORT_S, SLIP_S, LAG_S = 0.1, 0.5, 2.0
+GYRO_S, ACCEL_S = 5.0, 2.0
+TURNING_MPS, SIDE_SLIP_FROM_MPS, STUCK_MPS = 0.15, 0.2, 0.05
+STUCK_COUNTS_S = 1.0
+YAWING_RADPS = 0.1
+BIAS_S = 60.0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What one drive, or many, say of a ground: (n,) samples of each quantity.
+
+    `slip_pairs` and `grade_pairs` (n, 2) are slips and grades `LAG_S` apart; `gyro` (roll and pitch),
+    `gyro_yaw` and `accel` are errors over what the data sheet allows, `gnss` over the reported sigma.
+    """
+
+    slip: Array
+    grade: Array
+    slip_pairs: Array
+    grade_pairs: Array
+    wheel_mps: Array
+    yaw_scale: Array
+    side_slip: Array
+    gyro: Array
+    gyro_yaw: Array
+    accel: Array
+    gnss: Array
+
+    @staticmethod
+    def joined(parts: Iterable[Evidence]) -> Evidence:
+        """All of them together."""
+        listed = list(parts)
+        names = [f.name for f in dataclasses.fields(Evidence)]
+        return Evidence(**{n: np.concatenate([getattr(p, n) for p in listed]) for n in names})
+
+
+def evidence_of(recording: Recording) -> Evidence:
+    """Everything one simulated drive says of its ground."""
+    truth = recording.truth
+    assert truth is not None
+    assert truth.twist_body is not None
+    slip, grade, pairs, grade_pairs, wheel = _slip_evidence(recording)
+    gyro, gyro_yaw, accel = _imu_evidence(recording)
+    return Evidence(
+        slip,
+        grade,
+        pairs,
+        grade_pairs,
+        wheel,
+        _yaw_scales(recording),
+        side_slips_of(truth.twist_body[:, 0], truth.twist_body[:, 1], truth.twist_body[:, 5]),
+        gyro,
+        gyro_yaw,
+        accel,
+        _gnss_evidence(recording),
+    )
+
+
+def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array, Array, Array]:
+    """Slips and grades (n,), pairs of both (m, 2), and speed errors (k,) m/s that slip leaves."""
+    samples = wheel_samples(recording)
+    wheel, forward = samples.sides_mps.mean(axis=1), samples.forward_mps
+    step = float(np.median(np.diff(samples.t_s)))
+    short = max(round(SHORT_S / step), 1)
+    wheel, forward = _block_means(wheel, short), _block_means(forward, short)
+    grade = _block_means(_grades(recording, samples.t_s), short)
+    width = round(1.0 / SHORT_S)
+    kernel = np.full(width, 1.0 / width)
+    smooth_wheel, smooth = np.convolve(wheel, kernel, "same"), np.convolve(forward, kernel, "same")
+    turning = np.abs(smooth_wheel) > TURNING_MPS
+    share = np.divide(smooth, smooth_wheel, out=np.ones_like(smooth), where=turning)
+    residual = (forward - share * wheel)[turning]
+
+    blocks = round(SLIP_S / SHORT_S)
+    slips = slips_of(*(_block_means(x, blocks) for x in (wheel, forward, grade)))
+    encoder = _vehicle(recording).sensors.wheels.speed_sigma_mps
+    return *slips, np.hypot(residual, encoder)
+
+
+def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> tuple[Array, Array, Array, Array]:
+    """Slips and grades (n,), and pairs of both (m, 2), of speeds (k,) every `SLIP_S`.
+
+    Where a speed is NaN nothing is known.
+    """
+    wheel, forward = wheel_mps, forward_mps
+    counted = (np.abs(wheel) > TURNING_MPS) & np.isfinite(forward)
+    counted &= _spell_age_s(counted & (np.abs(forward) < STUCK_MPS)) <= STUCK_COUNTS_S
+    slip = np.full(len(wheel), np.nan)
+    slip[counted] = np.clip(1.0 - forward[counted] / wheel[counted], -1.0, 1.0)
+    lag = round(LAG_S / SLIP_S)
+    pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
+    grade_pairs = np.stack([grade[:-lag], grade[lag:]], axis=1)
+    both = np.isfinite(pairs).all(axis=1)
+    return slip[counted], grade[counted], pairs[both], grade_pairs[both]
+
+
+def _grades(recording: Recording, t_s: Array) -> Array:
+    """Sine of the true pitch (n,), uphill positive."""
+    truth = recording.truth
+    assert truth is not None
+    assert truth.quaternion is not None
+    up = quaternion_to_matrix(truth.quaternion)[:, 2, 0]
+    return np.interp(t_s, seconds(truth.t_ns, recording), up)
+
+
+def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
+    """How long (n,), s, the robot has spun on the spot at each half second; 0 where it does not."""
+    age, out = 0.0, np.zeros(len(stuck))
+    for i, now in enumerate(stuck.tolist()):
+        age = age + SLIP_S if now else 0.0
+        out[i] = age
+    return out
+
+
+def _yaw_scales(recording: Recording) -> Array:
+    samples = wheel_samples(recording)
+    count = max(round(SLIP_S / float(np.median(np.diff(samples.t_s)))), 1)
+    left, right = _block_means(samples.sides_mps, count).T
+    wheel = (right - left) / _vehicle(recording).rig().track_m
+    return yaw_scales_of(wheel, _block_means(samples.yaw_rate_radps, count))
+
+
+def yaw_scales_of(wheel_radps: Array, true_radps: Array) -> Array:
+    """True over wheel yaw rate (n,), less one, while the wheels turn the robot."""
+    turning = (np.abs(wheel_radps) > YAWING_RADPS) & np.isfinite(true_radps)
+    return np.asarray(np.clip(true_radps[turning] / wheel_radps[turning] - 1.0, -1.0, 1.0))
+
+
+def side_slips_of(forward_mps: Array, lateral_mps: Array, rate_radps: Array) -> Array:
+    """Lateral over forward speed (n,), without what turning about another point than the body origin does."""
+    moving = np.abs(forward_mps) > SIDE_SLIP_FROM_MPS  # never so where it is NaN
+    known = np.isfinite(forward_mps)
+    lateral, rate = lateral_mps[known], rate_radps[known]
+    icr = -float(lateral @ rate) / max(float(rate @ rate), 1e-9)
+    return np.asarray((lateral_mps + icr * rate_radps)[moving] / forward_mps[moving])
+
+
+def _imu_evidence(recording: Recording) -> tuple[Array, Array, Array]:
+    """Errors of means over the data sheet's: gyro about roll and pitch (2 n,), yaw (n,), accelerometer (m,).
+
+    Each sample is compared with the rotation and the change of velocity over
+    the interval before it. Only while the wheels turn.
+    """
+    imu, truth = recording.imu, recording.truth
+    assert imu is not None
+    assert truth is not None
+    assert truth.twist_body is not None
+    assert truth.quaternion is not None
+    spec = _vehicle(recording).sensors.imu
+    imu_t, truth_t = seconds(imu.t_ns, recording), seconds(truth.t_ns, recording)
+    step = float(np.median(np.diff(imu_t)))
+    rows = np.searchsorted(truth_t, np.append(imu_t[0] - step, imu_t) - 0.5 * step)
+    rows = np.minimum(rows, len(truth_t) - 1)
+    R = quaternion_to_matrix(truth.quaternion[rows])
+    velocity = _imu_velocity(truth.twist_body[rows], R, spec)
+    change = np.diff(velocity, axis=0) / step + np.array([0.0, 0.0, GRAVITY_MPS2])
+    gyro = imu.gyro_radps - _rotation_vectors(np.swapaxes(R[:-1], 1, 2) @ R[1:]) / step
+    accel = imu.accel_mps2 - np.einsum("nji,nj->ni", R[:-1], change)
+    samples = wheel_samples(recording)
+    speed = np.interp(imu_t, samples.t_s, np.abs(samples.sides_mps).mean(axis=1))
+    return (
+        _relative(gyro[:, :2], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
+        _relative(gyro[:, 2:], speed, step, GYRO_S, spec.gyro_noise_radps_sqrthz),
+        _relative(accel, speed, step, ACCEL_S, spec.accel_noise_mps2_sqrthz),
+    )
+
+
+def _relative(error: Array, speed_mps: Array, step_s: float, tau_s: float, density: float) -> Array:
+    """Means over `tau_s` of errors (n, axes) less bias, over density / sqrt(tau): (m,), while wheels turn."""
+    count = max(round(tau_s / step_s), 1)
+    means = _unbiased(_block_means(error, count), count * step_s)
+    rolling = _block_means(speed_mps, count) > TURNING_MPS
+    return np.asarray((means[rolling] * np.sqrt(count * step_s) / density).ravel())
+
+
+def _imu_velocity(twist: Array, R: Array, spec: ImuSpec) -> Array:
+    """World velocity (n, 3) of the IMU's place."""
+    return np.asarray(np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m)))
+
+
+def _rotation_vectors(R: Array) -> Array:
+    """Rotation vectors (n, 3), rad, of rotations (n, 3, 3) by less than a quarter turn."""
+    twice = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.maximum(0.5 * np.linalg.norm(twice, axis=1, keepdims=True), 1e-12)
+    return np.asarray(0.5 * twice * np.arcsin(np.minimum(sine, 1.0)) / sine)
+
+
+def _unbiased(error: Array, tau_s: float) -> Array:
+    """Errors (n, axes) less their running mean over `BIAS_S`."""
+    width = min(max(round(BIAS_S / tau_s), 1), len(error))
+    count = np.convolve(np.ones(len(error)), np.ones(width), "same")
+    slow = np.stack([np.convolve(e, np.ones(width), "same") / count for e in error.T], axis=1)
+    return np.asarray(error - slow)
+
+
+def _gnss_evidence(recording: Recording) -> Array:
+    """Horizontal errors of the fixes over their reported sigma, east and north together (n,)."""
+    gnss, truth = recording.gnss, recording.truth
+    if gnss is None or truth is None:
+        return np.empty(0)
+    antenna = _vehicle(recording).sensors.gnss.antenna_m
+    error = (gnss.enu_m - truth.points_at(gnss.t_ns, antenna))[:, :2] / gnss.sigma_enu_m[:, :2]
+    return np.asarray(error[(gnss.fix > Fix.NONE) & np.isfinite(error).all(axis=1)].ravel())
+
+
+def _vehicle(recording: Recording) -> VehicleParams:
+    return load_vehicle(recording.vehicle or "elevate")
+
+
+def _block_means(x: Array, count: int) -> Array:
+    """Means of `count` rows each, the rest left out."""
+    blocks = len(x) // count
+    return np.asarray(x[: blocks * count].reshape(blocks, count, *x.shape[1:]).mean(axis=1))

@@ -1,0 +1,202 @@
+"""What labelled logs of a real robot say of its grounds, for the weighting policy.
+
+A log needs the wheels of both sides, a truth with position and orientation, and its
+ground, for the whole drive or over time. It tells slip, yaw scale and side-slip.
+Everything else of a row stays the twin's: a lidar or motion capture pose, which is what
+logs have for a truth, tells neither a tenth of a second of wheel speed nor the noise of
+an IMU, and a receiver's errors need a truth in the receiver's own frame.
+
+Speeds are means over `MEAN_S` of what the poses moved along the axes of the body, taken
+every half second. Six seconds, as a pose that is stamped to 50 ms tells the slip only to
+0.07 s over the mean's length at any speed, which would count as slip: of one Warthog on
+asphalt it makes a sigma of 0.071 in two seconds, 0.041 in six, 0.026 in ten. What changes
+within six seconds is not seen, so logs tell no correlation time, and narrow no scatter.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import quaternion_to_matrix, yaw_of
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.terrain.classifier import UNKNOWN
+from terrafusion.fusion.terrain.external import TRUE_SOURCES
+from terrafusion.fusion.training.policy_evidence import (
+    SLIP_S,
+    Evidence,
+    side_slips_of,
+    slips_of,
+    yaw_scales_of,
+)
+from terrafusion.fusion.training.policy_fit import Logged
+
+Array = NDArray[np.float64]
+
+MEAN_S = 6.0
+GAP_S = 1.0
+"""Where wheels or truth are silent for longer, nothing is known."""
+LEAST_SLIPS = 60
+"""Half a minute of driving on a ground."""
+NEEDED = ("position", "yaw")
+_HALF_NS = round(0.5e9 * MEAN_S)
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Means over `MEAN_S` every `SLIP_S`, NaN where not known, (n,) each.
+
+    `t_ns` is the middle; speeds in m/s: of the wheels' mean, forward and to the left; yaw rates in rad/s by
+    wheels and truth; `grade` is the sine of the pitch.
+    """
+
+    t_ns: NDArray[np.int64]
+    wheel_mps: Array
+    forward_mps: Array
+    lateral_mps: Array
+    wheel_radps: Array
+    true_radps: Array
+    grade: Array
+
+
+def read_logs(logs: Sequence[str], vehicle: str | None = None) -> Logged:
+    """The evidence of logs: files, folders, or names of the catalogue; `vehicle` for those that name none.
+
+    Raises:
+        DataError: a log lacks wheels, truth or labels, or moves too little on a ground.
+        TerrafusionError: a log cannot be read.
+    """
+    from terrafusion.datasets.readers import open_recordings
+    from terrafusion.fusion.training.labelled import hashes_of
+
+    parts: dict[str, list[Evidence]] = {}
+    for log in logs:
+        for recording in open_recordings(log):
+            for ground, evidence in logged_evidence(recording, vehicle).items():
+                parts.setdefault(ground, []).append(evidence)
+    grounds = {name: Evidence.joined(found) for name, found in parts.items()}
+    for name, evidence in grounds.items():
+        if len(evidence.slip) < LEAST_SLIPS:
+            raise DataError(
+                f"the logs hold {len(evidence.slip)} slips on '{name}', {LEAST_SLIPS} are needed",
+                channel="terrain",
+                remedy="give longer drives on that ground, or leave its logs out",
+            )
+    return Logged(grounds, hashes_of(logs), MEAN_S)
+
+
+def logged_evidence(recording: Recording, vehicle: str | None = None) -> dict[str, Evidence]:
+    """What a recorded drive says of each of its grounds."""
+    motion, grounds = motion_of(recording, vehicle), grounds_of(recording)
+    names = np.array([_ground_around(t, grounds) for t in motion.t_ns.tolist()])
+    found = {}
+    for ground in sorted(set(names.tolist()) - {"", UNKNOWN}):
+        here = names == ground
+        forward = np.where(here, motion.forward_mps, np.nan)
+        slip = slips_of(motion.wheel_mps, forward, motion.grade)
+        yaw = yaw_scales_of(motion.wheel_radps, np.where(here, motion.true_radps, np.nan))
+        side = side_slips_of(forward, motion.lateral_mps, motion.true_radps)
+        none = np.empty(0)
+        found[ground] = Evidence(*slip, none, yaw, side, none, none, none, none)
+    return found
+
+
+def grounds_of(recording: Recording) -> list[tuple[int, str]]:
+    """Begin (ns) and name of each stretch of ground of a labelled drive; "" is no label.
+
+    Raises:
+        DataError: the recording has no label that was there before the estimator.
+    """
+    terrain = recording.terrain
+    if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
+        label = terrain.label.astype(str)
+        first = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
+        return list(zip(terrain.t_ns[first].tolist(), label[first].tolist(), strict=True))
+    if recording.terrain_name:
+        return [(recording.start_ns, recording.terrain_name)]
+    raise DataError(
+        f"{recording.name}: no ground label",
+        channel="terrain",
+        remedy="name it in meta.yaml ('terrain'), or add terrain.csv",
+    )
+
+
+def _ground_around(t_ns: int, grounds: list[tuple[int, str]]) -> str:
+    """The ground over the whole mean about a time, or ""."""
+    last = [name for begin, name in grounds if begin <= t_ns - _HALF_NS][-1:]
+    seen = {name for begin, name in grounds if t_ns - _HALF_NS < begin <= t_ns + _HALF_NS} | set(last)
+    return seen.pop() if last and len(seen) == 1 else ""
+
+
+def motion_of(recording: Recording, vehicle: str | None = None) -> Motion:
+    """Wheels and truth of a recorded drive.
+
+    Raises:
+        DataError: no wheels of both sides, or no truth of the body with position and yaw.
+    """
+    from terrafusion.fusion.replay import choose_vehicle
+
+    wheels, truth = recording.wheels, recording.truth
+    if wheels is None or not wheels.has_sides():
+        raise DataError(f"{recording.name}: the wheels of both sides are needed", channel="wheels")
+    listed = recording.truth_channels or NEEDED
+    told = truth is not None and truth.quaternion is not None and set(NEEDED) <= set(listed)
+    if not told or recording.truth_frame != "base":
+        raise DataError(
+            f"{recording.name}: a truth with position and yaw of the body is needed", channel="truth"
+        )
+    assert truth is not None
+    assert truth.quaternion is not None
+    wheels = wheels.select(np.isfinite(wheels.speed).all(axis=1))
+    truth = truth.select(
+        np.isfinite(np.column_stack([truth.position_m[:, :2], truth.quaternion])).all(axis=1)
+    )
+    if len(wheels) < 2 or len(truth) < 2:
+        raise DataError(f"{recording.name}: wheels or truth hold no two samples", channel="truth")
+    rig = choose_vehicle(recording, recording.vehicle or vehicle)[0].rig()
+    first, last = max(wheels.t_ns[0], truth.t_ns[0]), min(wheels.t_ns[-1], truth.t_ns[-1])
+    middle = np.arange(first + _HALF_NS, last - _HALF_NS, round(SLIP_S * 1e9), dtype=np.int64)
+    left, right = _means(
+        wheels.t_ns, _rolled(wheels.t_ns, wheels.side_speeds_mps(rig.wheel_radius_m)), middle
+    )
+    forward, lateral, rate = _means(truth.t_ns, _moved(truth), middle)
+    grade = np.interp(middle, truth.t_ns, _rotations(truth)[:, 2, 0])
+    return Motion(middle, 0.5 * (left + right), forward, lateral, (right - left) / rig.track_m, rate, grade)
+
+
+def _means(t_ns: NDArray[np.int64], path: Array, middle_ns: NDArray[np.int64]) -> Array:
+    """Rates (k, n) of what a path (m, k) at times (m,) gained over `MEAN_S` about `middle_ns` (n,)."""
+    begin, end = middle_ns - _HALF_NS, middle_ns + _HALF_NS
+    rates = np.stack([(np.interp(end, t_ns, x) - np.interp(begin, t_ns, x)) / MEAN_S for x in path.T])
+    silent = (begin < t_ns[0]) | (end > t_ns[-1])
+    for i in np.flatnonzero(np.diff(t_ns) > GAP_S * 1e9):
+        silent |= (end > t_ns[i]) & (begin < t_ns[i + 1])
+    rates[:, silent] = np.nan
+    return rates
+
+
+def _rolled(t_ns: NDArray[np.int64], sides_mps: Array) -> Array:
+    """Metres (n, 2) that the sides have rolled since the first sample."""
+    steps = 0.5 * (sides_mps[1:] + sides_mps[:-1]) * (np.diff(t_ns) * 1e-9)[:, None]
+    return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
+
+
+def _moved(truth: Trajectory) -> Array:
+    """Metres forward and to the left in body axes, and radians turned, (n, 3), since the first pose."""
+    R = _rotations(truth)
+    step = np.diff(np.nan_to_num(truth.position_m), axis=0)
+    along = 0.5 * np.einsum("nij,ni->nj", R[:-1] + R[1:], step)[:, :2]
+    assert truth.quaternion is not None
+    yaw = np.unwrap(yaw_of(truth.quaternion))
+    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(along, axis=0)]), yaw - yaw[0]])
+
+
+def _rotations(truth: Trajectory) -> Array:
+    """Body to world (n, 3, 3)."""
+    assert truth.quaternion is not None
+    return quaternion_to_matrix(truth.quaternion)

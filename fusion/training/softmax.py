@@ -1,0 +1,221 @@
+"""A learner of labelled drives: softmax regression over `surface` features, calibrated, in a small file.
+
+Softmax regression (multinomial logistic regression) and not a forest: grouped
+by run it is the better one on BorealTC (docs/detector.md), it is 300 numbers
+in a YAML file, and it answers in microseconds. Features not observed count as
+the mean of the training drives; so that this does not make it too sure of
+itself, it is trained on copies of the windows with whole inputs taken out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.config import read_yaml
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.fusion.terrain.sequence import PatchFilter
+from terrafusion.fusion.training.surface_features import GROUPS, HOP_S, SURFACE_FEATURES, WINDOW_S, Windows
+
+Array = NDArray[np.float64]
+
+SCHEMA = "terrafusion.surface/1"
+UNKNOWN = "unknown"
+PATCH_LENGTH_M = 10.0
+BREAK_MEMORY = 6
+BREAK_FROM = 0.75
+"""A last second that answers otherwise than the six before (total variation above this) ends the patch:
+windows of one patch err alike, so the filter is slow to give up a ground for evidence of the usual kind."""
+STRADDLES = round(WINDOW_S / HOP_S)
+"""Windows from a change on that still show some of the ground before: there the last second is believed."""
+STRENGTH = 0.1
+"""Inverse of the L2 penalty on the weights of standardised features."""
+ERROR_SHARE = 1e-3
+"""Share of windows that look like nothing they are: no window rules a ground out."""
+UNKNOWN_SHARE = 0.05
+"""Share of windows of known ground that may be called unknown (split conformal, Vovk et al. 2005)."""
+_NUMBERS = ("mean", "scale", "weights", "offsets", "centres", "precision")
+_PLAIN = ("schema", "made_by", "inputs", "features", "classes", "temperature", "odd_distance")
+
+
+@dataclass(frozen=True, eq=False)
+class SoftmaxModel:
+    """Weights of standardised features, and what makes probabilities of them.
+
+    Attributes:
+        classes: k names.
+        mean, scale: (d,) of the features in training.
+        weights, offsets: (k, d), (k,).
+        centres, precision: (k, d) class means and (d, d) inverse scatter within classes, standardised.
+        odd_distance: squared Mahalanobis distance per observed feature from the nearest class beyond
+            which a window is called unknown.
+        temperature: what log-probabilities are divided by before the patch filter, as windows overlap.
+        inputs: file name -> SHA-256 of what it was trained on.
+    """
+
+    classes: tuple[str, ...]
+    mean: Array
+    scale: Array
+    weights: Array
+    offsets: Array
+    centres: Array
+    precision: Array
+    odd_distance: float = np.inf
+    temperature: float = 1.0
+    inputs: dict[str, str] = dataclasses.field(default_factory=dict)
+    made_by: str = ""
+
+    def standardised(self, x: Array) -> Array:
+        """Features (n, d) in units of the training's scatter, 0 where not observed."""
+        return np.nan_to_num((np.atleast_2d(x) - self.mean) / self.scale)
+
+    def log_probabilities(self, x: Array) -> Array:
+        """log P(class | window) (n, k), equal priors, each at least about log `ERROR_SHARE`."""
+        logits = self.standardised(x) @ self.weights.T + self.offsets
+        p = np.exp(logits - logits.max(axis=1, keepdims=True))
+        p /= p.sum(axis=1, keepdims=True)
+        k = len(self.classes)
+        return np.asarray(np.log(ERROR_SHARE + (1.0 - k * ERROR_SHARE) * p))
+
+    def oddness(self, x: Array) -> Array:
+        """Squared Mahalanobis distance (n,) from the nearest class, per observed feature."""
+        z = self.standardised(x)
+        away = z[:, None, :] - self.centres
+        away[np.broadcast_to(~np.isfinite(np.atleast_2d(x))[:, None, :], away.shape)] = 0.0
+        distance = np.einsum("nki,ij,nkj->nk", away, self.precision, away)
+        seen = np.maximum(np.isfinite(np.atleast_2d(x)).sum(axis=1), 1)
+        return np.asarray(distance.min(axis=1) / seen)
+
+    def filtered(self, windows: Windows) -> Array:
+        """Class probabilities (n, k) along the n windows of a drive."""
+        log_p, recent = self.log_probabilities(windows.x), self.log_probabilities(windows.recent)
+        patches = PatchFilter(len(self.classes), PATCH_LENGTH_M)
+        p = np.empty_like(log_p)
+        age = STRADDLES
+        for i, rolled in enumerate(windows.rolled_m):
+            patches.predict(float(rolled))
+            broken = _broken(np.exp(recent[max(i - BREAK_MEMORY, 0) : i + 1]))
+            patches.forget(broken)
+            age = 0 if broken > 0.5 else age + 1
+            p[i] = patches.update((recent if age < STRADDLES else log_p)[i] / self.temperature)
+        return p
+
+    def write(self, path: Path) -> None:
+        """Write as YAML, six significant digits."""
+        from ruamel.yaml import YAML
+
+        content: dict[str, Any] = {
+            "schema": SCHEMA, "made_by": self.made_by, "inputs": self.inputs,
+            "features": list(SURFACE_FEATURES), "classes": list(self.classes),
+            "temperature": _digits(self.temperature), "odd_distance": _digits(self.odd_distance),
+        }  # fmt: skip
+        content |= {name: _digits(getattr(self, name).tolist()) for name in _NUMBERS}
+        yaml = YAML()
+        yaml.default_flow_style = None
+        yaml.width = 110
+        with path.open("w", encoding="utf-8") as out:
+            yaml.dump(content, out)
+
+
+def _broken(answers: Array) -> float:
+    """How surely the last of the answers (m, k) ends what the others were about, 0 to 1."""
+    if len(answers) < 4:
+        return 0.0
+    away = 0.5 * float(np.abs(answers[-1] - answers[:-1].mean(axis=0)).sum())
+    return min(max(0.0, (away - BREAK_FROM) / (1.0 - BREAK_FROM)), 1.0)
+
+
+def read_softmax(path: Path) -> SoftmaxModel:
+    """A model file.
+
+    Raises:
+        ConfigError: not such a file, or its numbers do not fit together.
+    """
+    content = read_yaml(path)
+    again = "make it again with 'terrafusion terrain train'"
+    if content.get("schema") != SCHEMA or set(content) != {*_PLAIN, *_NUMBERS}:
+        raise ConfigError(f"no model of schema {SCHEMA}", file=path, remedy=again)
+    if content["features"] != list(SURFACE_FEATURES):
+        raise ConfigError("'features' differ from what this version computes", file=path, remedy=again)
+    try:
+        numbers = {name: np.array(content[name], dtype=float) for name in _NUMBERS}
+        odd, temperature = float(content["odd_distance"]), float(content["temperature"])
+    except (TypeError, ValueError):
+        raise ConfigError("holds something that is no number", file=path, remedy=again) from None
+    d, k = len(SURFACE_FEATURES), len(content["classes"])
+    shapes = {
+        "mean": (d,),
+        "scale": (d,),
+        "weights": (k, d),
+        "offsets": (k,),
+        "centres": (k, d),
+        "precision": (d, d),
+    }
+    for name, shape in shapes.items():
+        if numbers[name].shape != shape or not np.isfinite(numbers[name]).all():
+            raise ConfigError(f"'{name}' needs {shape} finite numbers", file=path, remedy=again)
+    if not (numbers["scale"] > 0.0).all() or not temperature > 0.0 or not odd > 0.0:
+        raise ConfigError(
+            "'scale', 'temperature' and 'odd_distance' must be positive", file=path, remedy=again
+        )
+    return SoftmaxModel(
+        tuple(str(c) for c in content["classes"]), **numbers, odd_distance=odd, temperature=temperature,
+        inputs=dict(content["inputs"]), made_by=str(content["made_by"]),
+    )  # fmt: skip
+
+
+def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFACE_FEATURES) -> SoftmaxModel:
+    """Fit to windows (n, d) with a label each, by `features` alone; not yet calibrated.
+
+    Every class counts the same, however many windows it has.
+
+    Raises:
+        ConfigError: scikit-learn is not installed, or there are fewer than two classes.
+    """
+    try:
+        from sklearn.linear_model import LogisticRegression
+    except ImportError:
+        raise ConfigError(
+            "training on logs needs scikit-learn", remedy='pip install "terrafusion[learn]"'
+        ) from None
+    used = np.isin(SURFACE_FEATURES, list(features))
+    x = np.where(used & np.isfinite(x), x, np.nan)
+    classes, y = np.unique(np.asarray(labels, dtype=str), return_inverse=True)
+    if len(classes) < 2:
+        raise ConfigError("a learner needs at least two grounds", remedy="give logs of more grounds")
+    seen = np.isfinite(x).any(axis=0)
+    mean, scale = np.zeros(x.shape[1]), np.ones(x.shape[1])
+    mean[seen] = np.nanmean(x[:, seen], axis=0)
+    scale[seen] = np.maximum(np.nanstd(x[:, seen], axis=0), 1e-6)
+    z = np.nan_to_num((x - mean) / scale)
+    machine = LogisticRegression(C=STRENGTH, max_iter=2000, class_weight="balanced")
+    machine.fit(*_with_gaps(z, y))
+    two = len(classes) == 2  # scikit-learn then keeps one row, of the second class
+    weights = np.vstack([-machine.coef_, machine.coef_]) / 2.0 if two else machine.coef_
+    offsets = np.append(-machine.intercept_, machine.intercept_) / 2.0 if two else machine.intercept_
+    weights = np.where(seen, weights, 0.0)
+    centres = np.stack([z[y == c].mean(axis=0) for c in range(len(classes))])
+    scatter = np.cov((z - centres[y]).T) + 0.1 * np.eye(z.shape[1])
+    precision: Array = np.asarray(np.linalg.inv(scatter), dtype=np.float64)
+    return SoftmaxModel(tuple(classes.tolist()), mean, scale, weights, offsets, centres, precision)
+
+
+def _with_gaps(z: Array, y: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
+    """The windows (n, d), and every fourth of them again for each input without that input."""
+    copies, answers = [z], [y]
+    for i, group in enumerate(("motor current", "spectrum above 10 Hz", "gyro spectrum")):
+        part = z[i::4].copy()
+        part[:, np.isin(SURFACE_FEATURES, GROUPS[group])] = 0.0
+        copies.append(part)
+        answers.append(y[i::4])
+    return np.vstack(copies), np.concatenate(answers)
+
+
+def _digits(x: Any) -> Any:
+    return [_digits(v) for v in x] if isinstance(x, list) else float(f"{x:.6g}")

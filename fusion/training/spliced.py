@@ -1,0 +1,122 @@
+"""Routes over several grounds, cut together from the signals of held-out runs: how soon a change is seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.training.softmax import SoftmaxModel
+from terrafusion.fusion.training.surface_features import Signals, surface_windows
+
+Array = NDArray[np.float64]
+
+PATCHES = 30
+PATCH_S = (10.0, 30.0)
+"""Shortest and longest time on one ground."""
+LEAST_RUN_S = PATCH_S[0] + 1.0
+"""Shorter runs give no patch."""
+SEEN_WITHIN_S = 2.0
+
+
+@dataclass(frozen=True)
+class Changes:
+    """Delays of the changes of ground: quantiles of those seen, s, and shares of all changes.
+
+    A change counts as seen when its new ground first has the largest
+    probability; never, if that does not happen before the next.
+    """
+
+    median_s: float
+    p95_s: float
+    within_2_s: float
+    never: float
+    right: float
+    changes: int
+
+
+def spliced(runs: Sequence[tuple[Signals, str]], seed: int) -> tuple[Signals, list[tuple[float, str]]]:
+    """One route cut from runs of two grounds or more, and when each ground begins.
+
+    The cut is in the raw samples, so windows across a change see both grounds. No run may be shorter than
+    `LEAST_RUN_S`.
+    """
+    rng = np.random.default_rng([seed, 23])
+    grounds = sorted({label for _, label in runs})
+    parts: list[tuple[float, Signals]] = []
+    begins: list[tuple[float, str]] = []
+    at, last = 0.0, ""
+    for _ in range(PATCHES):
+        label = str(rng.choice([g for g in grounds if g != last]))
+        choices = [s for s, g in runs if g == label]
+        source = choices[int(rng.integers(len(choices)))]
+        length = min(float(rng.uniform(*PATCH_S)), source.end_s() - 0.5)
+        begin = float(rng.uniform(0.0, source.end_s() - length))
+        parts.append((at - begin, source.between(begin, begin + length)))
+        begins.append((at, label))
+        at, last = at + length, label
+    return _joined(parts), begins
+
+
+def _joined(parts: Sequence[tuple[float, Signals]]) -> Signals:
+    def times(name: str) -> Array:
+        return np.concatenate([getattr(s, name) + shift for shift, s in parts])
+
+    def rows(name: str) -> Array:
+        return np.concatenate([getattr(s, name) for _, s in parts])
+
+    return Signals(
+        times("imu_s"), rows("gyro_radps"), rows("accel_mps2"), times("wheels_s"), rows("sides_mps"),
+        parts[0][1].track_m, times("current_s"), rows("current_a"),
+    )  # fmt: skip
+
+
+def delays(
+    model: SoftmaxModel, route: Signals, begins: Sequence[tuple[float, str]]
+) -> tuple[list[float], float]:
+    """Time from each change to its detection, s (inf: never), and the share of windows named right."""
+    windows = surface_windows(route)
+    ends = windows.end_s
+    winner = np.array(model.classes)[model.filtered(windows).argmax(axis=1)]
+    found: list[float] = []
+    right = 0
+    for k, (begin, label) in enumerate(begins):
+        until = begins[k + 1][0] if k + 1 < len(begins) else np.inf
+        rows = np.flatnonzero((ends > begin) & (ends <= until))
+        hits = rows[winner[rows] == label]
+        right += len(hits)
+        if k:
+            found.append(float(ends[hits[0]] - begin) if len(hits) else np.inf)
+    return found, right / max(len(ends), 1)
+
+
+def changes_seen(
+    models: Sequence[SoftmaxModel], held_out: Sequence[Sequence[tuple[Signals, str]]]
+) -> Changes | None:
+    """Each model on two routes over the runs (signals, label) it has not seen.
+
+    None where no model has runs of two grounds that are long enough.
+    """
+    found: list[float] = []
+    right: list[float] = []
+    for fold, (model, given) in enumerate(zip(models, held_out, strict=True)):
+        runs = [(signals, label) for signals, label in given if signals.end_s() > LEAST_RUN_S]
+        if len({label for _, label in runs}) < 2:
+            continue
+        for seed in (2 * fold, 2 * fold + 1):
+            here, share = delays(model, *spliced(runs, seed))
+            found += here
+            right.append(share)
+    if not found:
+        return None
+    seen = np.array([d for d in found if np.isfinite(d)])
+    return Changes(
+        median_s=float(np.median(seen)) if len(seen) else np.inf,
+        p95_s=float(np.quantile(seen, 0.95)) if len(seen) else np.inf,
+        within_2_s=float(np.mean(np.array(found) <= SEEN_WITHIN_S)),
+        never=float(np.mean(~np.isfinite(found))),
+        right=float(np.mean(right)),
+        changes=len(found),
+    )

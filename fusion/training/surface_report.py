@@ -1,0 +1,260 @@
+"""The evaluation of labelled logs: everything `terrafusion terrain eval LOGS` measures, as one mapping."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import Counter
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.fusion.training.labelled import (
+    FOLDS,
+    LEAST_RUNS,
+    Folded,
+    Run,
+    check_runs,
+    cross_validate,
+    deal,
+    figures_of,
+    labels_of,
+    train_on,
+    window_ms,
+)
+from terrafusion.fusion.training.softmax import SoftmaxModel, fit_softmax
+from terrafusion.fusion.training.spliced import LEAST_RUN_S, changes_seen
+from terrafusion.fusion.training.surface_features import GROUPS, SURFACE_FEATURES
+
+Array = NDArray[np.float64]
+
+STEPS = 5 + len(GROUPS)
+"""How often `report_on` ticks."""
+ABLATION_TEMPERATURE = 8.0
+"""Calibrated once on all inputs; not again for each input taken away."""
+
+
+def report_on(
+    runs: Sequence[Run], others: Sequence[Run] = (), tick: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
+    """All figures of one set of labelled runs, and of a model of it on `others`; JSON-able.
+
+    Raises:
+        ConfigError: fewer than two grounds, or no scikit-learn.
+        DataError: a ground of a single run.
+    """
+    check_runs(runs)
+    folded = cross_validate(runs)
+    tick()
+    held_out = [
+        [(r.signals, r.label) for r, f in zip(runs, folded.fold_of, strict=True) if f == fold]
+        for fold in range(FOLDS)
+    ]
+    changes = changes_seen(folded.models, held_out)
+    report: dict[str, Any] = {
+        "runs": {
+            f"fold {k}": [r.name for r, f in zip(runs, folded.fold_of, strict=True) if f == k]
+            for k in range(FOLDS)
+        },
+        "temperatures": [m.temperature for m in folded.models],
+        "window by window": dataclasses.asdict(folded.figures(filtered=False)),
+        "filtered": dataclasses.asdict(folded.figures()),
+        "changes of ground": None if changes is None else dataclasses.asdict(changes),
+        "window_ms": window_ms(folded.models[0], max(runs, key=lambda r: len(r.x))),
+    }
+    tick()
+    report["ablation"] = ablation(runs, tick)
+    report["reference"] = {"extra trees, by run": trees(runs, deal(runs)), "split that leaks": leaking(runs)}
+    tick()
+    report["ground never seen"] = never_seen(runs)
+    tick()
+    if others:
+        report["other set"] = transfer(runs, others)
+    return report
+
+
+def ablation(runs: Sequence[Run], tick: Callable[[], None]) -> dict[str, dict[str, float]]:
+    """Macro-F1 by run without each input, and with it alone."""
+    table: dict[str, dict[str, float]] = {}
+    for name, features in {"nothing": (), **GROUPS}.items():
+        rest = [f for f in SURFACE_FEATURES if f not in features]
+        table[name] = {"without": _f1(cross_validate(runs, rest, ABLATION_TEMPERATURE))}
+        if features:
+            table[name]["alone"] = _f1(cross_validate(runs, features, ABLATION_TEMPERATURE))
+        tick()
+    return table
+
+
+def trees(runs: Sequence[Run], fold_of: NDArray[np.intp]) -> float:
+    """Macro-F1, window by window, of extremely randomised trees (Geurts et al. 2006) on the same folds."""
+    x, y, fold = _stacked(runs, fold_of)
+    return _tree_f1(x, y, fold)
+
+
+def leaking(runs: Sequence[Run]) -> dict[str, float]:
+    """Macro-F1 where windows, not runs, are dealt to the folds: overlapping windows in training and test."""
+    x, y, _ = _stacked(runs, deal(runs))
+    fold = np.random.default_rng(0).permutation(len(x)) % FOLDS
+    p = np.zeros((len(x), len(set(y.tolist()))))
+    for k in range(FOLDS):
+        model = fit_softmax(x[fold != k], y[fold != k].tolist())
+        p[fold == k] = np.exp(model.log_probabilities(x[fold == k]))
+    return {
+        "softmax": figures_of(model.classes, runs, [p]).macro_f1,
+        "extra trees": _tree_f1(x, y, fold),
+    }
+
+
+def never_seen(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
+    """Shares of windows called odd: of a ground left out of the training, and of runs of known ground."""
+    shares: dict[str, dict[str, float]] = {}
+    fold_of = deal(runs)
+    for ground in sorted({r.label for r in runs}):
+        known = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f != 0]
+        test = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f == 0]
+        counts = Counter(r.label for r in known)
+        if len(counts) < 2 or max(counts.values()) < LEAST_RUNS or not test:
+            continue
+        model = train_on(known)
+        odd = {
+            name: float(np.mean(model.oddness(np.vstack([r.x for r in part])) > model.odd_distance))
+            for name, part in (("left out", [r for r in runs if r.label == ground]), ("known", test))
+        }
+        shares[ground] = odd
+    return shares
+
+
+def transfer(runs: Sequence[Run], others: Sequence[Run]) -> dict[str, Any]:
+    """A model of `runs` on another set, by the inputs that set has, on the grounds both have."""
+    common = sorted({r.label for r in runs} & {r.label for r in others})
+    test = [r for r in others if r.label in common]
+    if len(common) < 2:
+        return {"common grounds": common}
+    x = np.vstack([r.x for r in test])
+    features = [name for i, name in enumerate(SURFACE_FEATURES) if np.isfinite(x[:, i]).any()]
+    result: dict[str, Any] = {"common grounds": common, "inputs": features}
+    for name, train, on in (("there", runs, test), ("back", test, runs)):
+        here = [r for r in train if r.label in common]
+        back = [r for r in on if r.label in common]
+        model = train_on(here, features, ABLATION_TEMPERATURE)
+        x = np.vstack([r.x for r in back])
+        single = figures_of(model.classes, back, [np.exp(model.log_probabilities(x))])
+        result[name] = dataclasses.asdict(single)
+    result["odd"] = float(np.mean(_odd(runs, test, features)))
+    return result
+
+
+def score(model: SoftmaxModel, runs: Sequence[Run]) -> dict[str, Any]:
+    """Figures of a finished model on runs that it was not trained on; JSON-able.
+
+    Raises:
+        DataError: a ground that the model does not know.
+    """
+    strange = sorted({r.label for r in runs} - set(model.classes))
+    if strange:
+        raise DataError(
+            f"the model does not know {', '.join(strange)}",
+            channel="terrain",
+            remedy=f"give runs on {', '.join(model.classes)}",
+        )
+    answers = {
+        "window by window": [np.exp(model.log_probabilities(r.x)) for r in runs],
+        "filtered": [model.filtered(r.windows) for r in runs],
+    }
+    return {name: dataclasses.asdict(figures_of(model.classes, runs, p)) for name, p in answers.items()}
+
+
+def figures_lines(report: dict[str, Any]) -> list[str]:
+    """The figures of single and of filtered answers in words and tables, line by line."""
+    lines: list[str] = []
+    for name in ("window by window", "filtered"):
+        figures = report[name]
+        lines += [
+            "",
+            f"{name}: macro-F1 {figures['macro_f1']:.3f}, accuracy {figures['accuracy']:.3f}, "
+            f"ECE {figures['ece']:.3f}, {figures['windows']} windows",
+            *_table(figures),
+        ]
+    return lines
+
+
+def lines_of(report: dict[str, Any]) -> list[str]:
+    """The report in words and tables, line by line."""
+    lines = [f"{fold}: {', '.join(names)}" for fold, names in report["runs"].items()]
+    lines += figures_lines(report)
+    lines += [
+        "",
+        _change(report["changes of ground"]),
+        f"one window {report['window_ms']:.2f} ms",
+        "",
+        "macro-F1 without an input, and with it alone:",
+    ]
+    for name, row in report["ablation"].items():
+        alone = f"{row['alone']:.3f}" if "alone" in row else ""
+        lines.append(f"{name:26s} {row['without']:.3f} {alone}")
+    reference = report["reference"]
+    leak = reference["split that leaks"]
+    lines += [
+        "",
+        f"extra trees, window by window, by run {reference['extra trees, by run']:.3f}; "
+        "windows of one run in training and test: "
+        f"softmax {leak['softmax']:.3f}, extra trees {leak['extra trees']:.3f}",
+        "",
+        "called odd, of a ground left out of the training and of known ground:",
+        *(
+            f"{ground:14s} {s['left out']:.3f} {s['known']:.3f}"
+            for ground, s in report["ground never seen"].items()
+        ),
+    ]
+    other = report.get("other set", {})
+    if "there" in other:
+        lines += [
+            "",
+            f"trained here, tested on the other set ({', '.join(other['common grounds'])}): "
+            f"macro-F1 {other['there']['macro_f1']:.3f}; the other way {other['back']['macro_f1']:.3f}; "
+            f"called odd there {other['odd']:.3f}",
+        ]
+    return lines
+
+
+def _change(change: dict[str, Any] | None) -> str:
+    if change is None:
+        return f"change of ground: not measured, no fold has two grounds with runs above {LEAST_RUN_S:g} s"
+    return (
+        f"change of ground seen after {change['median_s']:.1f} s (median), {change['p95_s']:.1f} s (95 %); "
+        f"within 2 s {change['within_2_s']:.0%}, never {change['never']:.0%} of {change['changes']}"
+    )
+
+
+def _table(figures: dict[str, Any]) -> list[str]:
+    head = " " * 14 + " ".join(f"{c:>12s}" for c in figures["classes"])
+    rows = zip(figures["classes"], figures["confusion"], strict=True)
+    return [head, *(f"{c:14s}" + " ".join(f"{share:12.3f}" for share in row) for c, row in rows)]
+
+
+def _odd(runs: Sequence[Run], others: Sequence[Run], features: Sequence[str]) -> NDArray[np.bool_]:
+    model = train_on(runs, features)
+    return np.asarray(model.oddness(np.vstack([r.x for r in others])) > model.odd_distance)
+
+
+def _f1(folded: Folded) -> float:
+    return folded.figures().macro_f1
+
+
+def _stacked(runs: Sequence[Run], fold_of: NDArray[np.intp]) -> tuple[Array, NDArray[Any], NDArray[np.intp]]:
+    x = np.vstack([r.x for r in runs])
+    return x, np.array(labels_of(runs)), np.repeat(fold_of, [len(r.x) for r in runs])
+
+
+def _tree_f1(x: Array, y: NDArray[Any], fold: NDArray[np.intp]) -> float:
+    from sklearn.ensemble import ExtraTreesClassifier
+    from sklearn.metrics import f1_score
+
+    filled = np.where(np.isfinite(x), x, 0.0)
+    named = np.empty(len(y), dtype=object)
+    for k in np.unique(fold):
+        machine = ExtraTreesClassifier(200, min_samples_leaf=2, class_weight="balanced", random_state=0)
+        named[fold == k] = machine.fit(filled[fold != k], y[fold != k]).predict(filled[fold == k])
+    return float(f1_score(y, named.astype(str), average="macro"))

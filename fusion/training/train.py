@@ -1,0 +1,236 @@
+"""Training of the terrain model on drives of the twin.
+
+Three sets of seeds: one for the densities, one to calibrate temperature and
+the weight of `unknown`, one for the scores. No set sees another's drives.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
+from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, Window, extract
+from terrafusion.fusion.terrain.sequence import PatchFilter
+from terrafusion.fusion.training.drives import GROUNDS, Grid, run_all, windows_of
+from terrafusion.fusion.training.evaluate import Route, Scores, evaluate, splice
+from terrafusion.fusion.training.mixture import fit_best
+
+Array = NDArray[np.float64]
+Drive = tuple[list[Window], str]
+
+SCENARIOS = ("staircase", "figure_eight")
+SLOPES_DEG = (0.0, 3.0, 6.0)
+PAYLOADS_KG = (0.0, 30.0)
+CALIBRATION_SEED, SCORING_SEED, FRESH_SEED = 1000, 2000, 3000
+PATCH_LENGTH_M = 25.0
+SIGMA_FLOOR = np.array([0.03] * SLIP + [0.02, 0.05])
+UNKNOWN_SPREAD = 3.0
+"""`unknown` is as wide as all grounds together, times this."""
+UNKNOWN_SHARE = 0.03
+TEMPERATURES = np.round(np.geomspace(2.0, 20.0, 11), 3)
+"""From 2 up: windows overlap by half, so each moment is seen twice."""
+PATCHES = 60
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a training runs: `seeds` seeds for the densities, one each to calibrate and to score."""
+
+    seeds: int = 3
+    scenarios: tuple[str, ...] = SCENARIOS
+    slopes_deg: tuple[float, ...] = SLOPES_DEG
+    payloads_kg: tuple[float, ...] = PAYLOADS_KG
+
+    def grid(self, *seeds: int) -> Grid:
+        """The drives of given seeds."""
+        return Grid(self.scenarios, self.slopes_deg, self.payloads_kg, seeds, GROUNDS)
+
+    def training(self) -> Grid:
+        """The drives the densities are fitted to."""
+        return self.grid(*range(self.seeds))
+
+    def drives(self) -> int:
+        """Number of drives in all."""
+        return (self.seeds + 2) * len(self.grid(0).conditions())
+
+
+def train(plan: Plan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainModel, Scores]:
+    """Simulate, fit, calibrate and score; `tick` is called after each drive.
+
+    Raises:
+        TerrafusionError: a ground gave too few windows.
+    """
+    rows: dict[str, list[Array]] = {ground: [] for ground in GROUNDS}
+    for windows, ground in drives_of(plan.training(), tick):
+        rows[ground].append(features_of(windows))
+    mixtures = {}
+    for ground, parts in rows.items():
+        x = np.vstack(parts)
+        try:
+            fitted = fit_best(x, SIGMA_FLOOR, SLIP)
+        except ValueError as error:
+            raise TerrafusionError(
+                str(error), channel=ground, remedy="train with more seeds, scenarios or slopes"
+            ) from None
+        mixtures[ground] = fitted
+    draft = TerrainModel(
+        classes=mixtures,
+        unknown=_broad(mixtures),
+        temperature=1.0,
+        patch_length_m=PATCH_LENGTH_M,
+        vehicles=(plan.training().vehicle,),
+        inputs_sha256=fingerprint_of(plan),
+        made_by=f"terrafusion terrain train --seeds {plan.seeds}",
+    )
+    held_out = list(drives_of(plan.grid(CALIBRATION_SEED), tick))
+    model = calibrate(draft, splice(held_out, PATCHES, CALIBRATION_SEED))
+    scores = evaluate(model, routes_of(plan, SCORING_SEED, tick))
+    return dataclasses.replace(model, scores=_plain(scores)), scores
+
+
+def routes_of(plan: Plan, first_seed: int, tick: Callable[[], None], seeds: int = 1) -> list[Route]:
+    """Spliced routes over drives of `seeds` seeds from `first_seed`, one a seed."""
+    return [
+        splice(list(drives_of(plan.grid(seed), tick)), PATCHES, seed)
+        for seed in range(first_seed, first_seed + seeds)
+    ]
+
+
+def drives_of(grid: Grid, tick: Callable[[], None]) -> list[Drive]:
+    """The windows of every drive of a grid, with its ground."""
+    drives: list[Drive] = []
+    for condition, recording in run_all(grid.conditions(), tick):
+        windows, _ = windows_of(recording, condition.stream("estimator"))
+        drives.append((windows, condition.terrain))
+    return drives
+
+
+def features_of(windows: list[Window]) -> Array:
+    """Features (n, 7) of the windows in which anything was observed."""
+    x = np.array([extract(w)[0] for w in windows if w.ground_speed_mps() > MIN_SPEED_MPS])
+    if not len(x):
+        return np.empty((0, len(FEATURES)))
+    return np.asarray(x[np.isfinite(x).any(axis=1)])
+
+
+def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
+    """Temperature by the filtered log-score of the true ground, then the weight of `unknown`.
+
+    The weight is the largest of a falling series for which at most
+    `UNKNOWN_SHARE` of the windows are called unknown.
+    """
+    evidence = _evidence(model, route)
+    temperature = min((float(t) for t in TEMPERATURES), key=lambda t: _log_loss(model, evidence, t, 0.0)[0])
+    for exponent in range(0, -13, -1):
+        log_weight = np.log(10.0) * exponent
+        if _log_loss(model, evidence, temperature, log_weight)[1] <= UNKNOWN_SHARE:
+            break
+    weighted = dataclasses.replace(model.unknown, log_weight=np.array([log_weight]))
+    return dataclasses.replace(model, unknown=weighted, temperature=temperature)
+
+
+def _evidence(model: TerrainModel, route: Route) -> list[tuple[float, Array, int]]:
+    """Distance driven, untempered log-likelihoods (k,) and true class of every moving window."""
+    classes = (*model.classes, UNKNOWN)
+    table = LikelihoodTable(dataclasses.replace(model, temperature=1.0), classes)
+    return [
+        (w.ground_speed_mps() * w.dt_s, table.evaluate(*extract(w)), classes.index(str(label)))
+        for w, label in zip(route.windows, route.labels, strict=True)
+        if w.ground_speed_mps() > MIN_SPEED_MPS
+    ]
+
+
+def _log_loss(
+    model: TerrainModel,
+    evidence: list[tuple[float, Array, int]],
+    temperature: float,
+    unknown_log_weight: float,
+) -> tuple[float, float]:
+    """Mean -log posterior of the true ground along a route, and the share of windows called unknown."""
+    patch = PatchFilter(len(model.classes) + 1, model.patch_length_m)
+    weight = np.append(np.zeros(len(model.classes)), unknown_log_weight)
+    loss, unknown = 0.0, 0
+    for distance, log_likelihood, true in evidence:
+        patch.predict(distance)
+        p = patch.update((log_likelihood + weight) / temperature)
+        loss -= float(np.log(p[true]))
+        unknown += int(p.argmax() == len(p) - 1)
+    return loss / len(evidence), unknown / len(evidence)
+
+
+def _broad(mixtures: dict[str, Mixture]) -> Mixture:
+    """One Gaussian around all grounds alike: the moment match, `UNKNOWN_SPREAD` times wider."""
+    weight = np.concatenate([np.exp(m.log_weight) for m in mixtures.values()]) / len(mixtures)
+    means = np.concatenate([m.mean for m in mixtures.values()])
+    covariances = np.concatenate([m.covariance for m in mixtures.values()])
+    mean = weight @ means
+    centred = means - mean
+    covariance = np.tensordot(weight, covariances, 1) + (weight[:, None] * centred).T @ centred
+    return Mixture(np.zeros(1), mean[None], UNKNOWN_SPREAD**2 * covariance[None])
+
+
+def fingerprint_of(plan: Plan) -> str:
+    """SHA-256 of what a model made by `plan` depends on: parameter files and settings."""
+    settings = {
+        "plan": dataclasses.asdict(plan),
+        "features": list(FEATURES),
+        "sigma_floor": SIGMA_FLOOR.tolist(),
+        "unknown": [UNKNOWN_SPREAD, UNKNOWN_SHARE],
+        "patch_length_m": PATCH_LENGTH_M,
+    }
+    return plan.training().fingerprint(settings=settings)
+
+
+def _plain(scores: Scores) -> dict[str, Any]:
+    """The figures that come out the same on every machine, rounded."""
+    median, p95, largest = scores.switch_delay_s
+    return {
+        "held_out_windows": scores.windows,
+        "macro_f1": round(scores.macro_f1, 4),
+        "ece": round(scores.ece, 4),
+        "unknown_share": round(scores.unknown_share, 4),
+        "switch_delay_s": {"median": median, "p95": round(p95, 3), "max": largest},
+        "switches_missed": round(scores.switches_missed, 4),
+        "false_switches_per_min": round(scores.false_switches_per_min, 3),
+    }
+
+
+def write_model(model: TerrainModel, path: Path) -> None:
+    """Write the model as YAML, numbers with six significant digits: same model, same bytes."""
+    from ruamel.yaml import YAML
+
+    content = {
+        "schema": SCHEMA,
+        "made_by": model.made_by,
+        "inputs_sha256": model.inputs_sha256,
+        "vehicles": list(model.vehicles),
+        "features": list(FEATURES),
+        "temperature": model.temperature,
+        "patch_length_m": model.patch_length_m,
+        "classes": {name: _listed(mixture) for name, mixture in model.classes.items()},
+        "unknown": _listed(model.unknown),
+        "scores": model.scores,
+    }
+    yaml = YAML()
+    yaml.default_flow_style = None
+    yaml.width = 110
+    with path.open("w", encoding="utf-8") as out:
+        yaml.dump(content, out)
+
+
+def _listed(mixture: Mixture) -> list[dict[str, Any]]:
+    def digits(x: Any) -> Any:
+        return [digits(v) for v in x] if isinstance(x, list) else float(f"{x:.6g}")
+
+    return [
+        {"weight": digits(float(np.exp(w))), "mean": digits(m.tolist()), "covariance": digits(c.tolist())}
+        for w, m, c in zip(mixture.log_weight, mixture.mean, mixture.covariance, strict=True)
+    ]

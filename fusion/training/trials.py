@@ -1,0 +1,97 @@
+"""The trials of `terrafusion terrain eval`: fresh drives, missing sensors, slow IMUs, a ground never seen."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import numpy as np
+
+from terrafusion.fusion.terrain.classifier import TerrainModel
+from terrafusion.fusion.terrain.features import Window
+from terrafusion.fusion.training.drives import GROUNDS, Condition, windows_of
+from terrafusion.fusion.training.evaluate import Route, Scores, changes_in, evaluate, splice
+from terrafusion.fusion.training.train import FRESH_SEED, PATCHES, Plan, drives_of
+from terrafusion.twin.simulate import simulate
+
+MIXED_RUNS = 4
+SLOW_HZ = 30.0
+"""Rate of the slowest IMU among the field logs."""
+
+
+def count(seeds: int) -> int:
+    """Number of drives `run` simulates."""
+    return seeds * len(Plan().grid(0).conditions()) + seeds * MIXED_RUNS
+
+
+def run(model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None) -> dict[str, Scores]:
+    """Scores by trial; `tick` is called after each drive.
+
+    - spliced: patches of fresh drives on single grounds, cut together;
+    - no slip: the same in a GNSS outage, where the estimator supplies no slip;
+    - slow IMU: the same at 30 Hz, means of the samples between;
+    - foreign: the same as a robot the model does not know, shaking twice as much; firm ground is unknown;
+    - mixed route: the twin's own drive over several grounds;
+    - without X: X left out of the model, so that `unknown` is the right answer there.
+    """
+    fresh = range(FRESH_SEED, FRESH_SEED + seeds)
+    routes = [splice(list(drives_of(Plan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
+    mixed = [_mixed(MIXED_RUNS * FRESH_SEED + number, tick) for number in range(MIXED_RUNS * seeds)]
+    foreign = model.for_vehicle(None)
+    firm = sorted(set(model.classes) - set(foreign.classes))
+    scores = {
+        "spliced": evaluate(model, routes),
+        "no slip": evaluate(model, [_changed(r, _without_slip) for r in routes]),
+        "slow IMU": evaluate(model, [_changed(r, _slow) for r in routes]),
+        "foreign": evaluate(foreign, [_relabelled(_changed(r, _louder), *firm) for r in routes]),
+        "mixed route": evaluate(model, mixed),
+    }
+    for ground in GROUNDS:
+        fewer = {name: mixture for name, mixture in model.classes.items() if name != ground}
+        scores[f"without {ground}"] = evaluate(
+            dataclasses.replace(model, classes=fewer), [_relabelled(r, ground) for r in routes]
+        )
+    return scores
+
+
+def _mixed(seed: int, tick: Callable[[], None]) -> Route:
+    recording = simulate("mixed_terrain", seed=seed)
+    tick()
+    stream = Condition("mixed_terrain", "mixed", 0.0, 0.0, seed).stream("estimator")
+    return changes_in(*windows_of(recording, stream))
+
+
+def _changed(route: Route, change: Callable[[Window], Window]) -> Route:
+    return dataclasses.replace(route, windows=[change(w) for w in route.windows])
+
+
+def _relabelled(route: Route, *grounds: str) -> Route:
+    labels = np.where(np.isin(route.labels, grounds), "unknown", route.labels)
+    return dataclasses.replace(route, labels=labels)
+
+
+def _without_slip(window: Window) -> Window:
+    return dataclasses.replace(window, slip=None, slip_sigma=None)
+
+
+def _louder(window: Window) -> Window:
+    """Twice the vibration, the yaw rate as it was."""
+    accel = 2.0 * window.accel_mps2
+    gyro = window.gyro_radps * np.array([2.0, 2.0, 1.0])
+    return dataclasses.replace(window, accel_mps2=accel, gyro_radps=gyro)
+
+
+def _slow(window: Window) -> Window:
+    """The IMU at `SLOW_HZ`: each sample the mean over its interval, as an integrating sensor gives it."""
+    t = window.imu_t_s
+    if len(t) < 2:
+        return window
+    ticks = np.arange(t[0], t[-1], 1.0 / SLOW_HZ)
+    cuts = np.searchsorted(t, ticks)
+    sizes = np.diff(np.append(cuts, len(t)))[:, None]
+    return dataclasses.replace(
+        window,
+        imu_t_s=ticks,
+        gyro_radps=np.add.reduceat(window.gyro_radps, cuts) / sizes,
+        accel_mps2=np.add.reduceat(window.accel_mps2, cuts) / sizes,
+    )

@@ -1,0 +1,209 @@
+"""From the detected terrain to the noise row in force, with a reason for every change."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections import deque
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.fusion.estimate.estimate import State, WeightChange
+from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.estimator.streams import ImuStream, WheelStream
+from terrafusion.fusion.noise.policy import SensorNoise
+from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
+from terrafusion.fusion.terrain.detector import TerrainDetector, Window
+from terrafusion.fusion.terrain.features import slip_without_prior
+from terrafusion.fusion.weighting.weighting import weighting_for
+
+Array = NDArray[np.float64]
+
+UPDATE_NS = 500_000_000
+WINDOW_NS = 1_000_000_000
+NOTEWORTHY = 0.1
+"""Relative change of a weight that is worth a record."""
+
+KEPT_CHANGES = 1000
+"""Records kept where nobody takes them: a robot that runs for days must not grow."""
+
+_RECORDED = {
+    "slip_mean": ("wheels", ""),
+    "slip_sigma": ("wheels", ""),
+    "wheel_sigma_mps": ("wheels", "m/s"),
+    "side_slip_sigma": ("wheels", ""),
+    "gyro_inflation": ("imu", ""),
+    "gyro_yaw_inflation": ("imu", ""),
+    "accel_inflation": ("imu", ""),
+    "gnss_inflation": ("gnss", ""),
+}
+
+
+class TerrainWeights:
+    """Runs the detector along the drive and blends the policy by its posterior.
+
+    In the other modes the terrain is still detected and reported, but the row
+    stays the policy's fixed one, as tuned ("innovation" moves it from there).
+
+    Attributes:
+        row: the noise in force.
+        single: what the mode makes of single measurements.
+        changes: what changed since `take_changes` was last called, the newest `KEPT_CHANGES` of it.
+    """
+
+    def __init__(self, config: EstimatorConfig) -> None:
+        self.policy = config.tuning.adaptive.of_all(config.policy)
+        self.adaptive = config.mode == "adaptive"
+        model = load_terrain_model().for_vehicle(config.vehicle)
+        self.detector = TerrainDetector(model, config.policy.names())
+        self._labels = config.labels
+        self._told: Array | None = None
+        fixed = config.tuning.fixed.of(config.policy.fixed)
+        self._pooled = model.slip_only
+        if self._pooled:
+            # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
+            classes = {**self.policy.classes, UNKNOWN: fixed}
+            self.policy = dataclasses.replace(self.policy, classes=classes)
+        self.row = self.policy.blend(self._shares) if self.adaptive else fixed
+        self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
+        self._noted: SensorNoise | None = None
+        self._rig = config.rig
+        # Only where gyro and wheels both tell yaw does their difference say something of the ground.
+        self._two_yaws = config.inputs.sides and config.inputs.yaw == "gyro"
+        self.single = weighting_for(config, self)
+        self._before = self._shares
+        self._next_ns = 0
+        self._grade = 0.0
+        self._last_speed = 0.0
+        self._source = "detector"
+
+    def note(self, change: WeightChange) -> None:
+        """Record a change that another part made."""
+        self.changes.append(change)
+
+    def take_changes(self) -> list[WeightChange]:
+        """The changes since the last call."""
+        taken = list(self.changes)
+        self.changes.clear()
+        return taken
+
+    def take_switch(self) -> float:
+        """Share that changed class since the last call (total variation); 0 with fixed weights."""
+        if not self.adaptive:
+            return 0.0
+        p = self._shares
+        moved = 0.5 * float(np.abs(p - self._before).sum())
+        self._before = p
+        return moved
+
+    def begin(self, t_ns: int) -> None:
+        """Start the clock; the first row is a change from the policy's fixed one."""
+        self._next_ns = t_ns + WINDOW_NS
+        self._noted = self.policy.fixed
+        self._listen(t_ns)
+        self._reweight(t_ns)
+
+    def posterior(self) -> dict[str, float]:
+        """Class name -> probability now."""
+        return dict(zip(self.detector.classes, self._probabilities.tolist(), strict=True))
+
+    @property
+    def _probabilities(self) -> Array:
+        return self.detector.probabilities if self._told is None else self._told
+
+    def external(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
+        """Fuse the class probabilities of another source.
+
+        Raises:
+            DataError: a class the policy does not know, or numbers that are no probabilities.
+        """
+        unknown = sorted(set(probabilities) - set(self.detector.classes))
+        if unknown:
+            raise DataError(
+                f"unknown class '{unknown[0]}'",
+                channel="terrain",
+                remedy=f"the policy knows {', '.join(self.detector.classes)}",
+            )
+        self.detector.fuse(np.array([probabilities.get(name, 0.0) for name in self.detector.classes]))
+        self._source = "external source"
+        self._reweight(t_ns)
+
+    def update(self, state: State, imu: ImuStream, wheels: WheelStream) -> None:
+        """Look at the last second, twice a second."""
+        if state.t_ns < self._next_ns:
+            return
+        self._next_ns = state.t_ns + UPDATE_NS
+        self.detector.update(self._window(state, imu, wheels))
+        self._source = "detector"
+        self._listen(state.t_ns)
+        self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
+        self._reweight(state.t_ns)
+
+    def _listen(self, t_ns: int) -> None:
+        """Take the ground from the labels, where some are told; the detector runs on, unheard."""
+        if self._labels is not None:
+            self._told = self._labels.probabilities(t_ns, self.detector.classes)
+            self._source = "label"
+
+    def _window(self, state: State, imu: ImuStream, wheels: WheelStream) -> Window:
+        start_ns, rig = state.t_ns - WINDOW_NS, self._rig
+        t, gyro, accel = imu.window(start_ns, state.t_ns + 1)
+        rolled = wheels.travelled(start_ns, state.t_ns)
+        left, right = rolled if rolled is not None else (np.nan, np.nan)
+        speed = 0.5 * (left + right) / (WINDOW_NS * 1e-9)
+        rate = (speed - self._last_speed) / (UPDATE_NS * 1e-9)
+        self._last_speed = 0.0 if np.isnan(speed) else speed
+        prior = self.row.slip_at(self._grade), self.row.slip_sigma
+        observed = state.status == "running"  # without fixes the slip is what its prior says
+        measured = slip_without_prior(state.slip, state.slip_sigma, *prior) if observed else None
+        slip, slip_sigma = measured if measured is not None else (None, None)
+        return Window(
+            dt_s=UPDATE_NS * 1e-9,
+            imu_t_s=t,
+            gyro_radps=gyro,
+            accel_mps2=accel,
+            wheel_speed_mps=speed,
+            wheel_speed_rate_mps2=0.0 if np.isnan(rate) else rate,
+            speed_mps=float(np.hypot(*state.velocity_mps[:2])),
+            yaw_rate_wheels_radps=None
+            if rolled is None or not self._two_yaws
+            else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
+            yaw_rate_gyro_radps=float(gyro[:, 2].mean() - state.gyro_bias_radps[2]) if len(gyro) else np.nan,
+            slip=slip,
+            slip_sigma=slip_sigma,
+        )
+
+    @property
+    def _shares(self) -> Array:
+        """What each ground counts, (k,): its probability.
+
+        For a robot that the model does not know, a ground counts as far as it is more likely than not: the
+        pooled row, which holds until then, was fitted to all grounds, and has the doubt between them in it.
+        """
+        p = self._probabilities
+        if self._pooled and self._told is None:
+            p = np.maximum(2.0 * p - 1.0, 0.0)
+            unknown = self.detector.classes.index(UNKNOWN)
+            p[unknown] = 0.0
+            p[unknown] = 1.0 - p.sum()
+        return p
+
+    def _reweight(self, t_ns: int) -> None:
+        if not self.adaptive:
+            return
+        p = self._probabilities
+        self.row = self.policy.blend(self._shares, self._grade)
+        if self._noted is None:  # not started yet: nothing to change from
+            return
+        before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)
+        best = int(p.argmax())
+        why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
+        for name, (sensor, unit) in _RECORDED.items():
+            scale = max(abs(before[name]), 0.02)
+            if abs(now[name] - before[name]) > NOTEWORTHY * scale:
+                reason = f"{name}: {why}"
+                self.changes.append(WeightChange(t_ns, sensor, before[name], now[name], unit, reason))
+                self._noted = dataclasses.replace(self._noted, **{name: now[name]})

@@ -1,0 +1,91 @@
+"""What a mode makes of single measurements: the seam between the estimator and its baselines."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from terrafusion.fusion.estimator.config import EstimatorConfig
+    from terrafusion.fusion.graph.chain import Chain
+    from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+    from terrafusion.fusion.weighting.adaptive import TerrainWeights
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Surprise:
+    """A measurement against its prediction, its `dof` components d taken to be independent.
+
+    Attributes:
+        t_ns: its time.
+        innovation_m: (d,) measurement minus prediction.
+        predicted_m2: (d,) variance of the prediction, and of all errors that are not weighted.
+        noise_m2: (d,) variance that the factor gives to the measurement itself.
+        drift_m2: GNSS: variance of the part of its error that is a state.
+        unit_m: (d,) what the noise is a multiple of: the receiver's sigma, or the time step (s).
+        white_share: GNSS: share of the reported variance that is at least new at every fix.
+    """
+
+    t_ns: int
+    innovation_m: Array
+    predicted_m2: Array
+    noise_m2: Array
+    unit_m: Array
+    drift_m2: float = 0.0
+    white_share: float = 1.0
+
+
+class Weighting:
+    """The trivial answers, of modes "fixed" and "adaptive": a measurement keeps the sigma of the row.
+
+    Attributes:
+        passed_nis: a fix that its gate rejects is used all the same up to this normalised square.
+    """
+
+    passed_nis = 0.0
+
+    def wheels(
+        self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
+    ) -> WheelIncrement:
+        """The increment with the sigma it is to have; `variance_m2` is that of the innovation."""
+        return wheels
+
+    def gnss(self, tested: Surprise) -> tuple[float, float]:
+        """Factor on the horizontal sigma of a fix, and its weight by a robust loss (0 to 1)."""
+        return 1.0, 1.0
+
+    def revisit(self, chain: Chain) -> None:
+        """Weigh the fixes still held in the window again, after new ones came."""
+
+
+def tested_wheels(
+    t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
+) -> Surprise:
+    """A wheel increment against its prediction, along body x."""
+    own = wheels.sigma[0] ** 2
+    rest = max(variance_m2 - own, 0.0)
+    return Surprise(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
+
+
+def widened(wheels: WheelIncrement, scale: float) -> WheelIncrement:
+    """The increment with `scale` times the sigma along body x."""
+    return dataclasses.replace(wheels, sigma=wheels.sigma * np.array([scale, 1.0, 1.0, 1.0]))
+
+
+def weighting_for(config: EstimatorConfig, weights: TerrainWeights) -> Weighting:
+    """The weighting of the mode asked for; what it changes is told in `weights.changes`."""
+    if config.mode == "robust":
+        from terrafusion.fusion.weighting.robust import RobustWeighting
+
+        return RobustWeighting(config, weights)
+    if config.mode == "innovation":
+        from terrafusion.fusion.weighting.innovation import InnovationWeighting
+
+        return InnovationWeighting(config, weights)
+    return Weighting()

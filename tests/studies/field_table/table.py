@@ -1,0 +1,440 @@
+"""`python -m tests.studies.field_table.table --out DIR`: every field log in every mode.
+
+Each log with wheels and IMU is replayed whole, and once for each simulated
+outage (`outage_plan`), scored on its truth or on fixes kept back and never
+realigned after the start. A log with truth but no receiver is dead reckoning
+when replayed whole; for outages it gets fixes made from its truth. A log
+without any reference is only checked for divergence (`health`).
+
+What one log gives in one mode is kept in `DIR/parts` as soon as it is known: a
+table that was stopped goes on with the same command, and `--collect` writes
+the tables of what is there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import sys
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import quote
+
+import numpy as np
+
+from terrafusion.datasets.catalog.catalog import CatalogFile, at_hand, data_folders, load_catalog
+from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors_of
+from terrafusion.datasets.core.files import check_folder
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.readers import open_recordings
+from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, plan_outages, until
+from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, write_part
+from terrafusion.fusion.estimator.config import MODES
+from terrafusion.fusion.metrics.health import examine_estimate, rolled_until_m
+from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.replay import Replay, choose_vehicle, replay
+from terrafusion.twin.executors import open_pool
+from tests.studies.twin_field.joined import joined_drives
+from tests.studies.twin_field.sources import CUT, WHOLE
+
+OUTAGES_S = (30.0, 60.0, 120.0)
+LEAST_DRIVE_S = 10.0
+"""Shorter recordings are windows cut from a drive: those that go on from each other are joined."""
+LEAST_JOINED_S = 25.0
+"""Shorter drives joined from windows hold no outage, and little driving after a start."""
+LEAD_ROLLED_M = 5.0
+"""The wheels must have rolled so far before an outage: fixes show no heading of a robot that stands."""
+LEAST_ROLLED_M = 3.0
+"""Outages in which the wheels roll less test nothing and are left out."""
+FIRST_MODES = ("adaptive", "fixed")
+"""Run on every log before the other modes: a table that was stopped compares these two everywhere."""
+SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
+UNFORESEEN = (ArithmeticError, RuntimeError, ValueError)
+"""Errors of readers and solver that stop one replay, counted and not hidden, but not the whole table."""
+Found = TypeVar("Found")
+SET_GROUND = {"husky_parkinglot": "firm"}
+"""Ground of sets whose logs carry no label but whose title names it."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """One replay: of the whole log (`test` "whole"; "aided" with fixes made from its truth), or with one
+    outage ("outage 60 s" from `start_s`); on the `drive`th drive of the log, made fixes with noise of `seed`.
+
+    `error_m` is, whole and aided: the root mean square against truth, or the median
+    distance from fixes kept back; in an outage: the error at its end.
+    """
+
+    log: str
+    ground: str
+    vehicle: str
+    reference: str
+    mode: str
+    test: str
+    start_s: float | None
+    distance_m: float
+    error_m: float | None
+    within_m: float | None
+    percent: float | None
+    nees: float | None
+    top_speed_mps: float
+    path_ratio: float | None
+    diverged: str
+    wheels_rejected: int
+    gnss_rejected: int
+    seconds: float
+    realtime: float
+    latency_p99_ms: float
+    drive: int = 0
+    seed: int = 0
+
+    @classmethod
+    def read(cls, raw: dict[str, Any]) -> Run:
+        """A run from its JSON object, which has null for numbers that are not finite."""
+        floats = [f.name for f in dataclasses.fields(cls) if f.type == "float"]
+        return cls(**{**raw, **{name: float("nan") for name in floats if raw[name] is None}})
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A log that was not run, and why."""
+
+    log: str
+    why: str
+
+    @property
+    def line(self) -> str:
+        """Both, as tables tell it."""
+        return f"{self.log}: {self.why}"
+
+
+@dataclass(frozen=True)
+class Task:
+    """One log in one mode, so that tasks can run beside each other.
+
+    `again` runs what other noise changes: fixes made from the truth, no whole drives, no fixes of a receiver.
+    """
+
+    log: str
+    mode: str
+    most_starts: int
+    seed: int
+    again: bool = False
+
+    @property
+    def key(self) -> str:
+        """Its name as that of a file."""
+        name = f"{quote(self.log, safe='')}-{self.mode}-{self.most_starts}-{self.seed}"
+        return f"{name}-again" if self.again else name
+
+
+def tasks_of(
+    logs: Sequence[str], modes: Sequence[str], most_starts: int, seed: int, seeds: int = 1
+) -> list[Task]:
+    """The tasks in the order in which they are run: `FIRST_MODES` on all logs, the others, further seeds."""
+    late = [mode not in FIRST_MODES for mode in modes]
+    return [
+        Task(log, mode, most_starts, seed + more, more > 0)
+        for more in range(seeds)
+        for turn in (False, True)
+        for log in logs
+        for mode, is_late in zip(modes, late, strict=True)
+        if is_late == turn
+    ]
+
+
+def run_tasks(
+    tasks: Sequence[Task], out: Path, *, jobs: int = 1, progress: Callable[[str], None] = lambda _: None
+) -> None:
+    """Run the tasks of which `out` does not hold the results yet, and keep them there.
+
+    Args:
+        jobs: processes beside each other; the times measured are those of loaded processors then.
+
+    Raises:
+        TerrafusionError: workers died, or the folder cannot be written.
+    """
+    check_folder(out / FOLDER)
+    missing = [task for task in tasks if read_part(out, task.key, log_state(task.log)) is None]
+    with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
+        for task, found in pool.results(run_task, [(task,) for task in missing]):
+            runs = [dataclasses.asdict(r) for r in found if isinstance(r, Run)]
+            refused = [dataclasses.asdict(r) for r in found if isinstance(r, Refusal)]
+            write_part(out, task.key, {"runs": runs, "refused": refused}, log_state(task.log))
+            progress(f"{task.log}, {task.mode}")
+
+
+def collect(tasks: Sequence[Task], out: Path) -> tuple[list[Run], list[Refusal], list[Task]]:
+    """The runs that `out` holds, log by log, the logs that were refused, and the tasks still missing."""
+    runs: list[Run] = []
+    refusals: dict[Refusal, None] = {}
+    missing: list[Task] = []
+    logs, modes = list(dict.fromkeys(t.log for t in tasks)), list(dict.fromkeys(t.mode for t in tasks))
+    for task in sorted(tasks, key=lambda t: (logs.index(t.log), modes.index(t.mode), t.seed)):
+        part = read_part(out, task.key, log_state(task.log))
+        if part is None:
+            missing.append(task)
+            continue
+        runs += [Run.read(raw) for raw in part["runs"]]
+        refusals |= {Refusal(**raw): None for raw in part["refused"]}
+    return runs, list(refusals), missing
+
+
+def catalogued() -> list[str]:
+    """Names of the catalogue's recordings whose files are all at hand, but windows cut from one of them."""
+    folders = data_folders()
+
+    def complete(files: list[CatalogFile]) -> bool:
+        return all(at_hand(entry, folders) is not None for entry in files)
+
+    names = [name for name, files in load_catalog().recordings().items() if complete(files)]
+    cut = {f"{name.removesuffix(WHOLE)}{CUT}" for name in names if name.endswith(f"/{WHOLE}")}
+    return [name for name in names if name not in cut]
+
+
+def run_task(task: Task) -> tuple[Task, list[Run | Refusal]]:
+    """The task, and all runs of its log in its mode; what stops one becomes a line that says so."""
+    return task, each_drive(
+        task.log, lambda log, n, drive: _runs(dataclasses.replace(task, log=log), n, drive)
+    )
+
+
+def each_drive(
+    log: str, run: Callable[[str, int, Recording], Iterable[Found | Refusal]]
+) -> list[Found | Refusal]:
+    """What `run` gives for name, number and recording of every drive of a log; what stops it is a refusal."""
+    out: list[Found | Refusal] = []
+    try:
+        recordings, joined = _drives(log)
+    except (TerrafusionError, *UNFORESEEN) as error:
+        return [_refusal(log, error)]
+    for i, recording in enumerate(recordings):
+        name = log if joined or len(recordings) == 1 else f"{log}#{i}"
+        try:
+            with errors_of(name):
+                out += run(name, i, recording)
+        except (TerrafusionError, *UNFORESEEN) as error:
+            out.append(_refusal(name, error))
+    return out
+
+
+def _refusal(name: str, error: Exception) -> Refusal:
+    """Told of the log and its file, not of the folder where they lie: tables go into documents."""
+    if not isinstance(error, TerrafusionError):
+        return Refusal(name, f"FAILED, {type(error).__name__}: {error}")
+    file = None if error.file is None else Path(error.file).name
+    told = TerrafusionError(
+        error.what,
+        file=None if file == Path(name).name else file,
+        channel=error.channel,
+        time_s=error.time_s,
+        remedy=error.remedy,
+    )
+    return Refusal(name, str(told))
+
+
+@functools.lru_cache(maxsize=1)
+def _drives(log: str) -> tuple[list[Recording], bool]:
+    """The drives of a log, read once for modes that follow each other, and whether they had to be joined."""
+    recordings = open_recordings(log)
+    if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= LEAST_DRIVE_S:
+        return recordings, False
+    drives = [d for d in joined_drives(log, recordings) if d.duration_s() >= LEAST_JOINED_S]
+    drives = [d for d in drives if d.truth is not None]
+    if not drives:
+        told = f"holds {len(recordings)} pieces that make no drive of {LEAST_JOINED_S:g} s with a truth"
+        raise DataError(told, remedy="give a log that is one drive")
+    return drives, True
+
+
+def _runs(task: Task, drive: int, recording: Recording) -> Iterator[Run | Refusal]:
+    check_log(recording)
+    reference = reference_of(recording)
+    made = reference == "truth" and recording.gnss is None
+    if task.again and not made:
+        return
+    if not task.again:
+        yield _tried(task, drive, recording, reference, "whole", None)
+    if reference == "none":
+        return
+    if made:
+        recording, reference = aided_by_truth(recording, task.seed), "truth, fixes made from it"
+        yield _tried(task, drive, recording, reference, "aided", None)
+    for outage in outages_of(recording, task.most_starts):
+        part, test = until(recording, outage.start_s + outage.seconds + 0.5), f"outage {outage.seconds:g} s"
+        yield _tried(task, drive, part, reference, test, outage)
+
+
+def _tried(
+    task: Task, drive: int, recording: Recording, reference: str, test: str, outage: Outage | None
+) -> Run | Refusal:
+    """One replay; what stops it becomes a line of the table, so that one log does not cost all others."""
+    where = f"{task.log}, {test}" + ("" if outage is None else f" from {outage.start_s:.1f} s")
+    try:
+        result = replay(recording, mode=task.mode, outages=[] if outage is None else [outage])
+    except TerrafusionError as error:
+        return _refusal(where, error)
+    except UNFORESEEN as error:
+        return _refusal(f"{where}, {task.mode}", error)
+    return dataclasses.replace(_run(task, result, reference, test, outage), drive=drive, seed=task.seed)
+
+
+def check_log(recording: Recording) -> None:
+    """Refuse what `terrafusion replay` refuses."""
+    if recording.wheels is None or recording.imu is None:
+        raise DataError("has no wheels or no IMU", remedy="nothing to estimate from: the table leaves it out")
+    params, _ = choose_vehicle(recording, None)
+    errors = [found for found in examine(recording, params.rig()) if found.severity == "error"]
+    if errors:
+        raise DataError(
+            f"{errors[0].what} ({errors[0].evidence})", channel=errors[0].channel, remedy=errors[0].fix
+        )
+
+
+def reference_of(recording: Recording) -> str:
+    """ "truth", "fixes kept back", or "none"."""
+    listed = recording.truth_channels
+    if recording.truth is not None and len(recording.truth) and (not listed or "position" in listed):
+        return "truth"
+    return "fixes kept back" if recording.gnss is not None and len(recording.gnss) else "none"
+
+
+def ground_of(log: str, recording: Recording) -> str:
+    """ "firm" or "slipping" by the log's label, else by its set; "" where neither tells."""
+    labels = {recording.terrain_name} - {""}
+    if recording.terrain is not None:
+        labels |= set(recording.terrain.label.astype(str).tolist())
+    if labels - {"unknown", "mixed"}:
+        return "slipping" if labels & set(SLIPPING) else "firm"
+    return SET_GROUND.get(log.partition("/")[0], "")
+
+
+def outages_of(recording: Recording, most_starts: int) -> list[Outage]:
+    """Outages of all lengths where wheels, IMU and fixes are there and the wheels roll."""
+    wheels, imu, gnss = recording.wheels, recording.imu, recording.gnss
+    assert wheels is not None
+    assert imu is not None
+    assert gnss is not None
+    start_ns = recording.start_ns
+    first_s = (max(int(c.t_ns[0]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
+    last_s = (min(int(c.t_ns[-1]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
+    radius_m = choose_vehicle(recording, None)[0].rig().wheel_radius_m
+    rolled = rolled_until_m(wheels, radius_m)
+    if rolled[-1] < LEAD_ROLLED_M:
+        return []
+    moved_s = (int(wheels.t_ns[np.searchsorted(rolled, LEAD_ROLLED_M)]) - start_ns) * 1e-9
+    earliest = max(first_s + lead_s(first_s, last_s), moved_s)
+    planned = [o for s in OUTAGES_S for o in plan_outages(earliest, last_s, s, most_starts)]
+    return [o for o in planned if np.ptp(rolled[o.covers(wheels.t_ns, start_ns)]) >= LEAST_ROLLED_M]
+
+
+def _run(task: Task, result: Replay, reference: str, test: str, outage: Outage | None) -> Run:
+    recording, scores = result.recording, result.scores
+    assert recording.wheels is not None
+    health = examine_estimate(result.estimate, recording.wheels, result.vehicle.rig().wheel_radius_m)
+    percent: float | None = None
+    distance, nees, within = health.path_m, scores.nees_mean, None
+    if outage is not None:
+        part = scores.outages[0]
+        distance, error, within, percent = part.distance_m, part.end_error_m, part.median_m, part.percent
+        nees = _nees_in(result, outage)
+    elif scores.against == "truth":
+        error = scores.ate_m
+    else:
+        error = None if scores.held_out is None else scores.held_out.median_m
+    latencies = result.latencies_ms
+    return Run(
+        log=task.log,
+        ground=ground_of(task.log, recording),
+        vehicle=result.vehicle.name,
+        reference="truth, no fixes"
+        if test == "whole" and recording.gnss is None and error is not None
+        else reference,
+        mode=task.mode,
+        test=test,
+        start_s=None if outage is None else outage.start_s,
+        distance_m=distance,
+        error_m=error,
+        within_m=within,
+        percent=percent,
+        nees=nees,
+        top_speed_mps=health.top_speed_mps,
+        path_ratio=health.path_ratio(),
+        diverged=health.why,
+        wheels_rejected=result.rejected_wheels,
+        gnss_rejected=result.rejected_gnss,
+        seconds=result.seconds,
+        realtime=result.realtime_factor(),
+        latency_p99_ms=float(np.percentile(latencies, 99.0)) if len(latencies) else float("nan"),
+    )
+
+
+def _nees_in(result: Replay, outage: Outage) -> float | None:
+    errors = result.scores.errors
+    if errors is None:
+        return None
+    nees = errors.nees()[outage.covers(errors.t_ns, result.recording.start_ns)]
+    nees = nees[np.isfinite(nees)]
+    return float(nees.mean()) if len(nees) else None
+
+
+def main() -> int:
+    """Run, write the tables and the figure; 0, or 1 after a known error."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.field_table.table", description=__doc__.partition("\n")[0]
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for tables and figure")
+    parser.add_argument("--modes", nargs="+", choices=MODES, default=MODES, help="by default all")
+    parser.add_argument(
+        "--logs", nargs="+", metavar="LOG", help="by default all of the catalogue that are at hand"
+    )
+    parser.add_argument("--starts", type=int, default=4, help="outages of each length in a log, at most")
+    parser.add_argument("--seed", type=int, default=1, help="of the noise on fixes made from truth")
+    parser.add_argument("--seeds", type=int, default=1, help="how many draws of that noise, from --seed on")
+    parser.add_argument("--jobs", type=int, default=1, help="processes beside each other")
+    parser.add_argument("--collect", action="store_true", help="run nothing, write what has been run")
+    words = parser.parse_args()
+    if words.seeds < 1:
+        parser.error("--seeds must be 1 or more")
+    logs = list(words.logs) if words.logs else catalogued()
+    tasks = tasks_of(logs, words.modes, words.starts, words.seed, words.seeds)
+    try:
+        _table(words.out, tasks, None if words.collect else words.jobs)
+    except TerrafusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def _table(out: Path, tasks: Sequence[Task], jobs: int | None) -> None:
+    """Run what is missing, unless `jobs` is None, and write the tables of what is there."""
+    from tests.studies.field_table.page import write
+
+    if not tasks:
+        raise DataError(
+            "no field log is at hand", remedy="set TERRAFUSION_DATA, or run `terrafusion fetch SET`"
+        )
+    begun = time.monotonic()
+
+    def progress(text: str) -> None:
+        if sys.stderr.isatty():
+            print(f"\r\x1b[K{time.monotonic() - begun:5.0f} s  {text}", end="", file=sys.stderr, flush=True)
+
+    if jobs is not None:
+        run_tasks(tasks, out, jobs=jobs, progress=progress)
+    progress("")
+    runs, refusals, missing = collect(tasks, out)
+    print(write(out, runs, refusals))
+    rest = f"; {len(missing)} of {len(tasks)} logs and modes not run yet" if missing else ""
+    print(f"{time.monotonic() - begun:.0f} s; written to {out}{rest}")
+
+
+if __name__ == "__main__":
+    from tests.studies.field_table import table as field_table
+
+    sys.exit(field_table.main())  # workers know the tasks by the module's own name

@@ -1,0 +1,241 @@
+"""NEES and NIS on twin drives, ground by ground, in the adaptive and the fixed mode.
+
+    python -m terrafusion.fusion.metrics.consistency --seeds 10
+
+Each seed is a drive of its own: heading, soil (scattered as for the policy) and all sensor noise are drawn
+from it. The seeds and the scenario are not those of the policy's training. Every drive has one outage; rows
+inside it are told apart, because there P is the model's word and not the receiver's.
+
+Two bounds stand beside each mean. The band is where the mean of a consistent estimator would fall, with the
+effective samples of all drives added up. The interval is the bootstrap's over drives, which are independent
+(Efron 1979, Ann. Statist. 7(1)): how far the mean itself is known.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.metrics.consistency import (
+    CONFIDENCE,
+    Consistency,
+    band,
+    summarise,
+    verdict,
+    whitened_series,
+)
+
+Array = NDArray[np.float64]
+
+MODES = ("adaptive", "fixed")
+SCENARIO = "waypoints"
+FIRST_SEED = 1000
+"""The policy is fitted to seeds from 0 on."""
+OUTAGE_S = (20.0, 30.0)
+"""Start and length of the outage of each drive."""
+RESAMPLES = 4000
+IN_OUTAGE = ", outage"
+TWO_DIMENSIONAL = ("position", f"position{IN_OUTAGE}", "nis gnss")
+TABLES = (
+    ("position", f"position{IN_OUTAGE}"),
+    ("heading", f"heading{IN_OUTAGE}"),
+    ("nis gnss", "nis wheels"),
+)
+MARKS = {"consistent": "=", "overconfident": "+", "cautious": "-"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One quantity on one ground in one mode, over all drives.
+
+    Attributes:
+        drives, effective: number of drives, and of independent samples in all of them together.
+        mean: of the drives' mean NEES or NIS per dimension.
+        interval: of that mean, by bootstrap over drives.
+        band: in which it lies for a consistent estimator.
+    """
+
+    terrain: str
+    mode: str
+    quantity: str
+    drives: int
+    effective: float
+    mean: float
+    interval: tuple[float, float]
+    band: tuple[float, float]
+
+    def verdict(self) -> str:
+        """ "consistent", "overconfident" or "cautious", by the band."""
+        return verdict(self.mean, *self.band)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Which drives are made: `seeds` of each ground, in each mode."""
+
+    seeds: int
+    terrains: tuple[str, ...] = ("mud", "loose_sand", "medium_sand", "asphalt")
+    modes: tuple[str, ...] = MODES
+    scenario: str = SCENARIO
+    slope_deg: float = 0.0
+
+    def runs(self) -> int:
+        """Number of replays."""
+        return self.seeds * len(self.terrains) * len(self.modes)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the drives of a plan gave; `refused` says which of them could not be estimated, and why."""
+
+    cells: tuple[Cell, ...]
+    refused: tuple[str, ...] = ()
+
+
+def run(plan: Plan, progress: Callable[[float], None] | None = None) -> Found:
+    """Drive, replay and test; the same plan finds the same.
+
+    Raises:
+        ConfigError: no seeds, or an unknown ground or scenario.
+    """
+    from terrafusion.fusion.training.drives import Condition
+
+    if plan.seeds < 1:
+        raise ConfigError(f"{plan.seeds} seeds are none", remedy="give --seeds 1 or more")
+    cells: list[Cell] = []
+    refused: list[str] = []
+    done = 0
+    for terrain in plan.terrains:
+        drives: dict[str, list[tuple[Consistency, ...]]] = {mode: [] for mode in plan.modes}
+        for seed in range(FIRST_SEED, FIRST_SEED + plan.seeds):
+            recording = Condition(plan.scenario, terrain, plan.slope_deg, 0.0, seed).run()
+            for mode in plan.modes:
+                try:
+                    drives[mode].append(checked_drive(recording, mode))
+                except DataError as error:
+                    refused.append(f"{terrain}, {mode}, seed {seed}: {error}")
+                done += 1
+                if progress is not None:
+                    progress(done / plan.runs())
+        for mode in plan.modes:
+            cells += pool(terrain, mode, drives[mode])
+    return Found(tuple(cells), tuple(refused))
+
+
+def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
+    """Replay one drive; its quantities, those against the truth apart inside and outside the outage."""
+    from terrafusion.fusion.metrics.metrics import Outage
+    from terrafusion.fusion.replay import replay
+
+    outage = Outage(*OUTAGE_S)
+    result = replay(recording, mode=mode, outages=[outage])
+    errors = result.scores.errors
+    rows: list[Consistency | None] = []
+    for series in whitened_series(result.estimate, errors, errors):
+        lost = outage.covers(series.t_ns, recording.start_ns)
+        if series.quantity.startswith("nis"):
+            rows.append(summarise(series, np.ones_like(lost), recording.start_ns))
+            continue
+        rows.append(summarise(series, ~lost, recording.start_ns))
+        inside = dataclasses.replace(series, quantity=f"{series.quantity}{IN_OUTAGE}")
+        rows.append(summarise(inside, lost, recording.start_ns))
+    return tuple(row for row in rows if row is not None)
+
+
+def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> list[Cell]:
+    """The drives of one ground and mode together, every drive counting the same."""
+    cells = []
+    for quantity in dict.fromkeys(row.quantity for drive in drives for row in drive):
+        rows = [row for drive in drives for row in drive if row.quantity == quantity]
+        means = np.array([row.mean for row in rows])
+        # The mean of M means of which each is worth n_i samples: its variance is sum(1 / n_i) / M^2.
+        effective = len(rows) ** 2 / sum(1.0 / row.effective for row in rows)
+        degrees = effective * (2 if quantity in TWO_DIMENSIONAL else 1)
+        cells.append(
+            Cell(
+                terrain,
+                mode,
+                quantity,
+                len(rows),
+                effective,
+                float(means.mean()),
+                bootstrap(means),
+                band(degrees),
+            )
+        )
+    return cells
+
+
+def bootstrap(values: Array, seed: int = 0) -> tuple[float, float]:
+    """Percentile interval of the mean of independent `values` (M,); a point where there is one value."""
+    rng = np.random.default_rng(seed)
+    means = rng.choice(values, size=(RESAMPLES, len(values))).mean(axis=1)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(means, [tail, 100.0 - tail])
+    return float(low), float(high)
+
+
+def table(cells: Sequence[Cell], quantities: Sequence[str]) -> list[str]:
+    """Markdown: a row for each ground and mode, a column for each quantity that was found."""
+    shown = [q for q in quantities if any(cell.quantity == q for cell in cells)]
+    lines = ["| ground | mode | " + " | ".join(shown) + " |", "| --- | --- |" + " --- |" * len(shown)]
+    for terrain, mode in dict.fromkeys((cell.terrain, cell.mode) for cell in cells):
+        of = {cell.quantity: cell for cell in cells if (cell.terrain, cell.mode) == (terrain, mode)}
+        texts = [_text(of[q]) if q in of else "-" for q in shown]
+        lines.append(f"| {terrain} | {mode} | " + " | ".join(texts) + " |")
+    return lines
+
+
+def _text(cell: Cell) -> str:
+    (a, b), (low, high) = cell.interval, cell.band
+    return f"{cell.mean:.2f} [{a:.2f}, {b:.2f}] {MARKS[cell.verdict()]} {low:.2f}..{high:.2f}"
+
+
+def command(arguments: list[str] | None = None) -> int:
+    """`python -m terrafusion.fusion.metrics.consistency`: 0 when done, 1 with one line for a known error."""
+    import argparse
+    import sys
+
+    from terrafusion.fusion.cli.common import progress_bar
+
+    parser = argparse.ArgumentParser(
+        prog="python -m terrafusion.fusion.metrics.consistency",
+        description="NEES and NIS of the estimator on twin drives of each ground.",
+        epilog="example: python -m terrafusion.fusion.metrics.consistency --seeds 10",
+    )
+    plan = Plan(seeds=0)
+    parser.add_argument("--seeds", type=int, default=5, help="drives of each ground (default 5)")
+    parser.add_argument("--terrain", nargs="+", default=plan.terrains, help="grounds")
+    parser.add_argument("--mode", nargs="+", default=plan.modes, help="modes of the estimator")
+    parser.add_argument("--scenario", default=plan.scenario, help=f"default {plan.scenario}")
+    parser.add_argument("--slope-deg", type=float, default=plan.slope_deg, help="default 0")
+    given = parser.parse_args(arguments)
+    asked = Plan(given.seeds, tuple(given.terrain), tuple(given.mode), given.scenario, given.slope_deg)
+    try:
+        with progress_bar("consistency") as progress:
+            found = run(asked, progress)
+    except TerrafusionError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(report(asked, found)))
+    return 0
+
+
+def report(plan: Plan, found: Found) -> list[str]:
+    """Everything the command prints."""
+    start, seconds = OUTAGE_S
+    lines = [
+        f"Mean per dimension over {plan.seeds} drives of {plan.scenario} a ground, "
+        f"slope {plan.slope_deg:g} deg, no GNSS from {start:g} to {start + seconds:g} s.",
+        f"[{CONFIDENCE:.0%} of the bootstrap over drives], then = inside, + above (overconfident), - below "
+        f"(cautious) the {CONFIDENCE:.0%} band of a consistent estimator.",
+    ]
+    for quantities in TABLES:
+        lines += ["", *table(found.cells, quantities)]
+    return [*lines, *(f"not estimated: {line}" for line in found.refused)]

@@ -1,0 +1,113 @@
+"""Windows that go on from each other as one drive: for what must drive on longer than a window.
+
+Public sets hold drives cut into windows of two seconds, whose truth starts at an origin of its own in each
+of them. Joined, wheels and IMU are the windows' own samples; the truth is a path whose heading is that of
+the gyro and whose speeds along and across are those that best explain the poses of every window
+(`truth.body_velocity`). It tells how far and which way the body moved under that heading; an error of the
+gyro is in it as in everything that uses the gyro.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.trajectory import Trajectory
+from tests.studies.twin_field.runs import DT_S, FieldRun, chain_starts, chains_of, field_run
+from tests.studies.twin_field.truth import heading
+
+Array = NDArray[np.float64]
+
+LONGEST_HOLE_S = 1.0
+"""Over longer holes in the truth of a drive nothing is joined."""
+
+
+def joined_drives(name: str, recordings: Sequence[Recording]) -> list[Recording]:
+    """The drives of two windows and more that `recordings`, in their order, make.
+
+    Each starts at time 0, heading along x from the origin, and has wheels, IMU and truth; other channels are
+    left out. A drive whose truth has a hole of more than `LONGEST_HOLE_S` comes without truth.
+
+    Raises:
+        DataError: the windows have no wheels or no gyro, or do not say which vehicle it is.
+    """
+    chains = [chain for chain in chains_of(recordings) if len(chain) > 1]
+    return [_joined(f"{name}#{k}", name, chain) for k, chain in enumerate(chains)]
+
+
+def _joined(name: str, recording: str, chain: Sequence[Recording]) -> Recording:
+    starts, _ = chain_starts(chain)
+    run = field_run(name, recording, chain)
+    first = chain[0]
+    imu = _channel(chain, starts, lambda r: r.imu, ("gyro_radps", "accel_mps2"))
+    # The first wheel speed of a window is an old one that is held, as its first pose is.
+    wheels = _channel(chain, starts, lambda r: r.wheels, ("speed",), held=True)
+    assert first.wheels is not None
+    truth = _path(run)
+    note = f"{len(chain)} windows joined, {run.t_s[-1]:.1f} s; the truth's heading is the gyro's"
+    return dataclasses.replace(
+        first,
+        name=name,
+        start_ns=0,
+        wheels=Wheels(wheels["t_ns"], wheels["speed"], first.wheels.names, first.wheels.unit),
+        imu=Imu(imu["t_ns"], imu["gyro_radps"], imu["accel_mps2"]),
+        command=None,
+        gnss=None,
+        motor=None,
+        terrain=None,
+        barometer=None,
+        magnetometer=None,
+        truth=truth,
+        truth_channels=("position", "yaw"),
+        description="",
+    ).with_notes(note)
+
+
+def _channel(
+    chain: Sequence[Recording],
+    starts: Sequence[float],
+    of: Callable[[Recording], Any],
+    names: tuple[str, ...],
+    *,
+    held: bool = False,
+) -> dict[str, NDArray[Any]]:
+    """Times and columns of a channel over a chain; times count from the first IMU sample and increase."""
+    parts: dict[str, list[NDArray[Any]]] = {key: [] for key in ("t_ns", *names)}
+    last = -(2**62)
+    for k, (recording, start) in enumerate(zip(chain, starts, strict=True)):
+        assert recording.imu is not None
+        channel = of(recording)
+        t = channel.t_ns - recording.imu.t_ns[0] + round(start * 1e9)
+        rows = np.flatnonzero(t > last)[1 if held and k else 0 :]
+        if not len(rows):
+            continue
+        last = int(t[rows[-1]])
+        parts["t_ns"].append(t[rows])
+        for key in names:
+            parts[key].append(getattr(channel, key)[rows])
+    return {key: np.concatenate(found) for key, found in parts.items()}
+
+
+def _path(run: FieldRun) -> Trajectory | None:
+    """The path of the run's speeds under the gyro's heading, from its first to its last known speed."""
+    known = np.flatnonzero(np.isfinite(run.velocity_mps).all(axis=1))
+    if len(known) < 2 or float(np.diff(run.t_s[known]).max()) > LONGEST_HOLE_S:
+        return None
+    rows = slice(known[0], known[-1] + 1)
+    t = run.t_s[rows]
+    along, across = (np.interp(t, run.t_s[known], run.velocity_mps[known, i]) for i in (0, 1))
+    psi = heading(run.t_s, run.yaw_rate_radps)[rows]
+    psi = psi - psi[0]
+    world = np.stack(
+        [np.cos(psi) * along - np.sin(psi) * across, np.sin(psi) * along + np.cos(psi) * across], 1
+    )
+    steps = 0.5 * DT_S * (world[1:] + world[:-1])
+    position = np.zeros((len(t), 3))
+    position[1:, :2] = np.cumsum(steps, axis=0)
+    quaternion = np.stack([0 * psi, 0 * psi, np.sin(0.5 * psi), np.cos(0.5 * psi)], axis=1)
+    return Trajectory(np.rint(t * 1e9).astype(np.int64), position, quaternion)

@@ -1,0 +1,188 @@
+"""Overlapping Allan deviation, and the noise parameters read from it (IEEE Std 952-1997, annex C).
+
+`python -m terrafusion.twin.analysis.allan [VEHICLE]` prints the Allan deviation of a vehicle's simulated
+IMU at rest beside the parameters it was made from.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import ConfigError
+
+Array = NDArray[np.float64]
+
+CONFIDENCE = 0.95
+REWEIGHTINGS = 5
+SHORT_S, LONG_S = 1.0, 3.0
+"""Clusters up to the first show white noise alone, those from the second on the others."""
+
+
+@dataclass(frozen=True, eq=False)
+class Allan:
+    """Allan deviation of one series.
+
+    Attributes:
+        tau_s: (K,) cluster times, s.
+        deviation: (K,) in the unit of the series.
+        low, high: (K,) bounds of its confidence interval (95 %).
+    """
+
+    tau_s: Array
+    deviation: Array
+    low: Array
+    high: Array
+
+
+@dataclass(frozen=True)
+class InertialNoise:
+    """Coefficients of an inertial sensor's noise and their standard errors.
+
+    `density` is the white noise (unit/sqrt(Hz)), `walk` the random walk of the bias (unit sqrt(Hz)),
+    `floor` the flat part of the Allan deviation that bias instability makes (unit).
+    """
+
+    density: float
+    walk: float
+    floor: float
+    density_error: float
+    walk_error: float
+    floor_error: float
+
+
+def allan_deviation(values: Array, rate_hz: float, per_octave: int = 2) -> Allan:
+    """Overlapping Allan deviation of rates (N,) sampled at `rate_hz`, to clusters of a fifth of the series.
+
+    sigma^2(tau) = <(theta(t + 2 tau) - 2 theta(t + tau) + theta(t))^2> / (2 tau^2), theta the integral of the
+    rates (IEEE Std 952-1997, annex C). The interval takes the smaller of the degrees of freedom that
+    white noise and a random walk leave (Riley, NIST SP 1065, 2008, table 5).
+
+    Raises:
+        ValueError: fewer than 10 values.
+    """
+    from scipy.stats import chi2
+
+    n = len(values)
+    if n < 10:
+        raise ValueError(f"{n} values are too few for an Allan deviation")
+    octaves = math.log2(n / 5.0)
+    sizes = np.unique(np.round(2.0 ** np.linspace(0.0, octaves, round(per_octave * octaves) + 1)).astype(int))
+    theta = np.concatenate([[0.0], np.cumsum(values - values.mean())]) / rate_hz
+    deviation = np.empty(len(sizes))
+    for k, m in enumerate(sizes.tolist()):
+        second = theta[2 * m :] - 2.0 * theta[m:-m] + theta[: -2 * m]
+        deviation[k] = math.sqrt(float(np.mean(second**2)) / 2.0) * rate_hz / m
+    free = np.minimum(*_degrees_of_freedom(n + 1, sizes))
+    tail = 0.5 * (1.0 - CONFIDENCE)
+    low, high = (deviation * np.sqrt(free / chi2.ppf(p, free)) for p in (1.0 - tail, tail))
+    return Allan(sizes / rate_hz, deviation, low, high)
+
+
+def _degrees_of_freedom(points: int, sizes: NDArray[np.int64]) -> tuple[Array, Array]:
+    """Of the overlapping Allan variance of so many angles, for rates that are white or a random walk."""
+    n, m = float(points), sizes.astype(float)
+    white = (1.5 * (n - 1.0) / m - 2.0 * (n - 2.0) / n) * 4.0 * m**2 / (4.0 * m**2 + 5.0)
+    walk = (n - 2.0) / m * ((n - 1.0) ** 2 - 3.0 * m * (n - 1.0) + 4.0 * m**2) / (n - 3.0) ** 2
+    return white, walk
+
+
+def inertial_noise(curves: list[Allan]) -> InertialNoise:
+    """White noise, bias walk and floor that explain the Allan variances of like sensors.
+
+    sigma^2 = density^2 / tau + floor^2 + walk^2 tau / 3: the density from clusters up to 1 s, the others by
+    non-negative least squares from clusters above 3 s, with the weights of the degrees of freedom. The
+    standard errors are the scatter of the fits over the curves.
+    """
+    fits = np.array([_fit(curve) for curve in curves])
+    spread = fits.std(axis=0, ddof=1) / math.sqrt(len(curves)) if len(curves) > 1 else np.full(3, math.nan)
+    return InertialNoise(*fits.mean(axis=0).tolist(), *spread.tolist())
+
+
+def _fit(curve: Allan) -> Array:
+    """density, walk, floor of one curve."""
+    from scipy.optimize import nnls
+
+    tau, square = curve.tau_s, curve.deviation**2
+    short, long = tau <= SHORT_S, tau >= LONG_S
+    white = float(np.average((square * tau)[short], weights=1.0 / tau[short]))
+    model = np.stack([tau / 3.0, np.ones_like(tau)], axis=1)[long]
+    rest, expected = np.maximum(square - white / tau, 0.0)[long], square[long]
+    for _ in range(REWEIGHTINGS):
+        # The relative error of an Allan variance of clusters of m in N values grows with sqrt(m / N); of the
+        # fitted variance, because a weight of the measured one would favour what came out small.
+        weight = 1.0 / (expected * np.sqrt(tau[long]))
+        squares, _ = nnls(model * weight[:, None], rest * weight)
+        expected = model @ squares + white / tau[long]
+    return np.sqrt([white, *squares])
+
+
+def expected_deviation(tau_s: Array, density: float, walk: float, floor: float) -> Array:
+    """Allan deviation (K,) of white noise, bias walk and a flat floor together."""
+    return np.sqrt(density**2 / tau_s + walk**2 * tau_s / 3.0 + floor**2)
+
+
+def main(vehicle: str = "elevate", hours: float = 2.0, seeds: int = 4) -> list[str]:
+    """Lines of a table: the Allan deviation of the simulated IMU at rest, and the parameters read from it."""
+    from terrafusion.twin.model.vehicle import load_vehicle
+    from terrafusion.twin.sensors.imu import at_rest
+
+    params = load_vehicle(vehicle)
+    spec, real = params.sensors.imu, params.realism.imu
+    told = {
+        "gyro": (
+            spec.gyro_noise_radps_sqrthz, spec.gyro_bias_walk_radps2_sqrthz, real.gyro_bias_instability_radps
+        ),
+        "accel": (
+            spec.accel_noise_mps2_sqrthz, spec.accel_bias_walk_mps3_sqrthz, real.accel_bias_instability_mps2
+        ),
+    }  # fmt: skip
+    count = round(3600.0 * hours * spec.rate_hz)
+    series: dict[str, list[Allan]] = {"gyro": [], "accel": []}
+    for seed in range(seeds):
+        for name, values in zip(series, at_rest(params, count, seed), strict=True):
+            series[name] += [allan_deviation(column, spec.rate_hz, 1) for column in values.T]
+    lines = [f"{vehicle}: IMU at rest, {hours:g} h, {seeds} seeds x 3 axes, mean of the curves"]
+    for name, curves in series.items():
+        mean = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=0))
+        theory = expected_deviation(curves[0].tau_s, *told[name])
+        lines.append(f"{name}: tau s, Allan deviation, expected")
+        rows = zip(curves[0].tau_s, mean, theory, strict=True)
+        lines += [f"  {tau:9.2f}  {value:.3e}  {wanted:.3e}" for tau, value, wanted in rows]
+        found = inertial_noise(curves)
+        for word, made, value, error in zip(
+            ("density", "walk", "floor"),
+            told[name],
+            (found.density, found.walk, found.floor),
+            (found.density_error, found.walk_error, found.floor_error),
+            strict=True,
+        ):
+            lines.append(f"  {word}: made with {made:.3e}, found {value:.3e} +- {error:.1e}")
+    return lines
+
+
+def command(arguments: list[str] | None = None) -> int:
+    """`python -m terrafusion.twin.analysis.allan [VEHICLE]`: 0 when done, 1 with one line for an unknown vehicle."""
+    import argparse
+    import sys
+
+    parser = argparse.ArgumentParser(
+        prog="python -m terrafusion.twin.analysis.allan",
+        description="Allan deviation of a vehicle's simulated IMU: 2 h at rest, some seconds of work.",
+        epilog="example: python -m terrafusion.twin.analysis.allan elevate",
+    )
+    parser.add_argument("vehicle", nargs="?", default="elevate", help="name, or YAML file")
+    try:
+        lines = main(parser.parse_args(arguments).vehicle)
+    except ConfigError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    print("\n".join(lines))
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(command())

@@ -1,0 +1,98 @@
+"""The numbers as the solver sees them: scaled by what was known of them before the log."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from terrafusion.datasets.core.config import Quantity
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.effects.catalogue import lookup
+
+PRIOR_FACTOR = 0.5
+"""Sigma of the logarithm of a positive number by default (assumed): known to a factor of 1.65."""
+PRIOR_SHARE = 0.05
+"""Sigma of any other number by default (assumed), as a share of its range."""
+
+
+@dataclass(frozen=True)
+class Prior:
+    """What was known of a number before the log: value and 1 sigma, in its unit."""
+
+    value: float
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Coordinate:
+    """A number as the solver sees it: w = 0 at the prior, 1 at one prior sigma.
+
+    A positive number moves by its logarithm, any other one linearly; so neither its unit nor the
+    order of the parameters matters to the solver.
+
+    Attributes:
+        name: dotted name.
+        unit: of the number.
+        low, high: its range.
+        prior: value at w = 0.
+        scale: prior sigma, of the logarithm where `logarithmic`.
+        logarithmic: how the number moves.
+        start: value the search starts from.
+    """
+
+    name: str
+    unit: str
+    low: float
+    high: float
+    prior: float
+    scale: float
+    logarithmic: bool
+    start: float
+
+    @classmethod
+    def of(cls, name: str, quantity: Quantity, start: float, prior: Prior | None) -> Coordinate:
+        """The coordinate of a number that stands at `start` in the model; without a prior that is the prior.
+
+        Raises:
+            ConfigError: a prior outside the number's range or without a width.
+        """
+        value = start if prior is None else prior.value
+        if prior is not None and not (
+            quantity.low <= value <= quantity.high and 0.0 < prior.sigma < math.inf
+        ):
+            raise ConfigError(
+                f"the prior {prior.value:g} +- {prior.sigma:g} of '{name}' is out of range",
+                remedy=f"give {quantity.allowed()} and a positive sigma",
+            )
+        logarithmic = quantity.low >= 0.0 and value > 0.0 and start > 0.0
+        if prior is not None:
+            scale = prior.sigma / value if logarithmic else prior.sigma
+        elif name.startswith("effects."):
+            scale = lookup(name.removeprefix("effects."))[1].scale
+        else:
+            scale = PRIOR_FACTOR if logarithmic else PRIOR_SHARE * (quantity.high - quantity.low)
+        return cls(name, quantity.unit, quantity.low, quantity.high, value, scale, logarithmic, start)
+
+    def value(self, w: float) -> float:
+        """The number at w, kept in its range."""
+        moved = (
+            self.prior * math.exp(min(self.scale * w, 700.0))
+            if self.logarithmic
+            else self.prior + self.scale * w
+        )
+        return min(max(moved, self.low), self.high)
+
+    def at(self, value: float) -> float:
+        """w of a number."""
+        if self.logarithmic:
+            return math.log(value / self.prior) / self.scale
+        return (value - self.prior) / self.scale
+
+    def rate(self, w: float) -> float:
+        """Derivative of the number by w."""
+        return self.scale * (self.value(w) if self.logarithmic else 1.0)
+
+    def bounds(self) -> tuple[float, float]:
+        """Range of w."""
+        low = -math.inf if self.logarithmic and self.low <= 0.0 else self.at(self.low)
+        return low, self.at(self.high)

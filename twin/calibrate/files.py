@@ -1,0 +1,111 @@
+"""Vehicle and soil files with the calibrated numbers in place, each with where it comes from."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.files import write_atomically
+from terrafusion.twin.calibrate.result import Calibration, Fitted
+from terrafusion.twin.model.library import read_named
+from terrafusion.twin.model.soil_table import is_published, published_soil
+
+
+def write_files(
+    calibration: Calibration,
+    out: Path,
+    vehicle: str | Path,
+    soils: Mapping[str, str | Path] | None = None,
+) -> list[Path]:
+    """Write `vehicle.yaml`, and `soil.yaml` (or `soil_NAME.yaml` for several), which load as they are.
+
+    Args:
+        out: the folder; it is made where it is missing.
+        vehicle, soils: names or files that the calibration started from; a soil is taken by its own name
+            where it is not given.
+
+    Raises:
+        ConfigError: one of those cannot be read.
+        TerrafusionError: the folder cannot be written.
+    """
+    model, logs = calibration.model, ", ".join(calibration.sensor_errors)
+    if not calibration.converged():
+        logs += " by a search that did not converge"
+    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    own = ("vehicle.", "effects.")
+    mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith(own)}
+    updated = _updated(raw, model.vehicle, mine, logs)
+    mark_measured(updated, *model.vehicle.measured)
+    written = [write_yaml(out / "vehicle.yaml", updated)]
+    for name, soil in model.soils.items():
+        given = str((soils or {}).get(name, name))
+        raw = published_soil(given) if is_published(given) else read_named("soils", given, kind="terrain")[0]
+        mine = {
+            f.name.removeprefix(f"{name}."): f for f in calibration.fitted if f.name.startswith(f"{name}.")
+        }
+        target = out / ("soil.yaml" if len(model.soils) == 1 else f"soil_{name}.yaml")
+        written.append(write_yaml(target, _updated(raw, soil, mine, logs)))
+    return written
+
+
+def _updated(raw: dict[str, Any], values: Any, fitted: Mapping[str, Fitted], logs: str) -> dict[str, Any]:
+    out = copy.deepcopy(raw)
+    for name, f in fitted.items():
+        section, parts = out, name.split(".")
+        for part in parts[:-1]:
+            section = section.setdefault(part, {})
+        section[parts[-1]] = _entry(section.get(parts[-1]), f.value, _source(f, logs))
+    _overridden(out, values)
+    return out
+
+
+def _entry(before: Any, value: Any, source: str) -> dict[str, Any]:
+    """A number in the place of an entry; a range `valid` that it lies outside of is left to its source."""
+    valid = before.get("valid") if isinstance(before, dict) else None
+    if valid is None:
+        return {"value": value, "source": source}
+    if isinstance(value, float) and valid[0] <= value <= valid[1]:
+        return {"value": value, "valid": valid, "source": source}
+    return {"value": value, "source": f"{source}; outside the validity range {valid} of the file before"}
+
+
+def _source(f: Fitted, logs: str) -> str:
+    if f.status == "told":
+        return f"calibrated from {logs}: 1 sigma {f.sigma:.3g}"
+    return f"{f.status} by the calibration from {logs} (1 sigma {f.sigma:.3g}); before: {f.start:.6g}"
+
+
+def _overridden(raw: dict[str, Any], values: Any) -> None:
+    """Numbers that the log itself gave go before those of the file."""
+    for name, entry in list(raw.items()):
+        value = getattr(values, name, None)
+        if not isinstance(entry, dict) or value is None:
+            continue
+        if "value" not in entry:
+            _overridden(entry, value)
+        elif entry["value"] != (list(value) if isinstance(value, tuple) else value):
+            plain = list(value) if isinstance(value, tuple) else value
+            raw[name] = _entry(entry, plain, "as the log says")
+
+
+def mark_measured(vehicle: dict[str, Any], *names: str) -> None:
+    """Note in a vehicle's file that numbers of it were found for this robot (`VehicleParams.measured`)."""
+    if names:
+        vehicle["measured"] = sorted({*vehicle.get("measured", ()), *names})
+
+
+def write_yaml(path: Path, content: dict[str, Any]) -> Path:
+    """Write a mapping as YAML, in the order of its keys."""
+    from ruamel.yaml import YAML
+
+    yaml: Any = YAML(typ="safe", pure=True)
+    yaml.default_flow_style = False
+    yaml.sort_base_mapping_type_on_output = False
+
+    def dump(part: Path) -> None:
+        with part.open("w", encoding="utf-8") as file:
+            yaml.dump(content, file)
+
+    return write_atomically(path, dump)

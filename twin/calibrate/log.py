@@ -1,0 +1,157 @@
+"""A recording made ready: what the twin is told, the ground over time, windows and where each starts."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS, told_by
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.observations import Observed, observe
+from terrafusion.twin.calibrate.window_starts import window_starts
+
+Array = NDArray[np.float64]
+
+START_S = 1.0
+"""The first second of a log that starts on the move, or of the motion on a slope, is not compared: how soil,
+brakes and motors shared the load is not known."""
+LEAST_ROWS = 4
+"""A channel with fewer rows is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Log:
+    """One drive as the fit sees it; times in seconds from the first input, on a grid of `inputs.DT_S`.
+
+    Attributes:
+        name: of the recording.
+        sides: (N + 1, 2) wheel speeds told to left and right, rad/s, before any dead time.
+        follows: whether the twin's wheels follow measured ones.
+        labels, borders: grounds in the order driven, and the times (K - 1,) between them.
+        windows: (W, 2) first and last grid sample of each window; each starts where the one before ends.
+        start: (W, 3) x, y, yaw in the plane at each window's start, a guess from the data.
+        observed: the channels.
+        posed: whether anything in the log says where the robot heads.
+        notes: what was assumed, in sentences.
+    """
+
+    name: str
+    sides: Array
+    follows: bool
+    labels: tuple[str, ...]
+    borders: Array
+    windows: NDArray[np.int64]
+    start: Array
+    observed: tuple[Observed, ...]
+    posed: bool
+    notes: tuple[str, ...]
+
+    def seconds(self) -> float:
+        """Length of what is compared, s."""
+        return float(self.windows[-1, 1] - self.windows[0, 0]) * DT_S
+
+
+def prepare(
+    recording: Recording,
+    model: Model,
+    *,
+    source: str = "auto",
+    truth: bool = False,
+    window_s: float = 10.0,
+    ground: str | None = None,
+    channels: tuple[str, ...] | None = None,
+) -> Log:
+    """The log as the fit needs it.
+
+    Args:
+        source: one of `inputs.SOURCES`.
+        truth: use the reference pose as a measurement.
+        window_s: length of the windows.
+        ground: name of the ground all along; None: the log's own labels.
+        channels: use only these, by name or beginning of a name.
+
+    Raises:
+        DataError: no input, or nothing to compare the twin with.
+    """
+    told = told_by(recording, model.vehicle, source)
+    notes = list(told.notes)
+    observed = observe(recording, model.vehicle, told.start_ns, wheels=not told.follows, truth=truth)
+    if channels is not None:
+        observed = tuple(o for o in observed if o.channel.startswith(channels))
+    ends = [float(o.end_s[-1]) for o in observed]
+    end_s = min(told.end_s(), max(ends, default=0.0))
+    windows = _windows(_begin_s(told.sides, model.slope_rad), end_s, window_s)
+    named = [o.channel for o in observed]
+    observed = tuple(filter(_enough, (_within(o, windows, told.gaps) for o in observed)))
+    if lost := [name for name in named if name not in {o.channel for o in observed}]:
+        notes.append(f"left out, with less than {LEAST_ROWS} rows while the twin drives: {', '.join(lost)}")
+    if not observed:
+        raise DataError(
+            "nothing in the log can be compared with the twin",
+            file=recording.name,
+            remedy="it needs wheels, an IMU, GNSS or motor currents beside what drives the twin",
+        )
+    labels, borders = grounds(recording, told.start_ns) if ground is None else ((ground,), np.zeros(0))
+    at_s: Array = windows[:, 0].astype(float) * DT_S
+    start, posed = window_starts(recording, model, told.start_ns, at_s, window_s, truth=truth)
+    if model.slope_rad > 0.0 and not posed:
+        notes.append("on a slope, and nothing in the log says its heading: taken as 0 at the start")
+    return Log(
+        recording.name, told.sides, told.follows, labels, borders, windows, start, observed, posed,
+        tuple(notes),
+    )  # fmt: skip
+
+
+def _begin_s(sides: Array, slope_rad: float) -> float:
+    """Time from which the log is compared; a robot at rest on the flat is loaded by nothing."""
+    moving = np.abs(sides).max(axis=1) > MOVING_RADPS
+    if moving[0]:
+        return START_S
+    return START_S + float(np.argmax(moving)) * DT_S if slope_rad > 0.0 and moving.any() else 0.0
+
+
+def grounds(recording: Recording, start_ns: int) -> tuple[tuple[str, ...], Array]:
+    """Grounds in the order driven, and the times between them in seconds from `start_ns`."""
+    terrain = recording.terrain
+    if terrain is None or not len(terrain):
+        return (recording.terrain_name,), np.zeros(0)
+    label = np.asarray(terrain.label, dtype=str)
+    change = np.flatnonzero(label[1:] != label[:-1]) + 1
+    middle = (
+        terrain.t_ns[change - 1] - start_ns + (terrain.t_ns[change] - terrain.t_ns[change - 1]) // 2
+    ) * 1e-9
+    return (str(label[0]), *(str(x) for x in label[change])), np.asarray(middle)
+
+
+def _windows(begin_s: float, end_s: float, window_s: float) -> NDArray[np.int64]:
+    """First and last grid sample (W, 2) of the windows; what is left over, if half as long, is one too."""
+    first, last, size = round(begin_s / DT_S), int(end_s / DT_S + 1e-6), max(2, round(window_s / DT_S))
+    edges = np.arange(first, max(last, first) + 1, size)
+    if len(edges) == 1 or last - edges[-1] >= size // 2:
+        edges = np.append(edges, last)
+    return np.stack([edges[:-1], np.maximum(edges[1:], edges[:-1])], axis=1)
+
+
+def _within(observed: Observed, windows: NDArray[np.int64], gaps: Array) -> Observed:
+    """The rows that lie in one window each and touch no gap of the input."""
+    starts, stops = windows[:, 0] * DT_S - 1e-6, windows[:, 1] * DT_S + 1e-6
+    k = np.clip(window_of(observed, windows), 0, len(windows) - 1)
+    inside = (observed.begin_s >= starts[k]) & (observed.end_s <= stops[k])
+    for begin, end in gaps:
+        inside &= (observed.end_s < begin) | (observed.begin_s > end)
+    return observed.select(inside)
+
+
+def window_of(observed: Observed, windows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Number (n,) of the window in which each row begins; an instant on a border belongs to the later one,
+    a mean over an interval to the one the interval lies in."""
+    middle = 0.5 * (observed.begin_s + observed.end_s)
+    return np.searchsorted(windows[:, 0] * DT_S, middle + 1e-9, side="right") - 1
+
+
+def _enough(observed: Observed) -> bool:
+    return len(observed.value) >= LEAST_ROWS

@@ -1,0 +1,241 @@
+"""What the twin says the log's channels should read, and how that changes with every parameter.
+
+The twin runs from window to window: its inner states (wheels, motors, soil under the wheels) and their
+derivatives are carried on from one window into the next, while the pose starts anew in each, from a guess
+that the fit corrects. So no error of the pose builds up, and no unknown inner state is needed
+(multiple shooting, Bock 1983, with the pose as the only state that is set free).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS
+from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.observations import Observed
+from terrafusion.twin.calibrate.readings import readings
+from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
+from terrafusion.twin.model.plant import Plant, RouteTable
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, soil_vector, state_slice
+from terrafusion.twin.scenario.commands import told
+
+Array = NDArray[np.float64]
+
+LEAD_S = 5.0
+"""Before a log the twin stands, or drives on, for this long as it is first told: so it starts loaded."""
+TRANSITION_S = 0.3
+"""Two grounds join within this time."""
+POSE = ("x", "y", "yaw")
+FOLLOWING = ("torque_limit_nm", "stall_torque_nm", "loop_p_nms", "loop_i_nm", "lag_s", "dead_time_s")
+"""Vehicle parameters that a stiff speed loop replaces where the twin follows measured wheels."""
+_FOLLOWING_LAG_S, _FOLLOWING_RATE = 0.001, 80.0
+"""Motor lag, s, and integral over proportional gain, 1/s, of that loop: it is late by milliseconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One channel as the twin has it.
+
+    Attributes:
+        value: (n,) at the rows of the channel.
+        change: (n, P) derivative by the parameters, by pose (n, 3) that by the window's start.
+    """
+
+    value: Array
+    change: Array
+    by_pose: Array
+
+
+def predict(log: Log, model: Model, names: Sequence[str], start: Array) -> list[Prediction]:
+    """The channels of `log.observed` for the windows' starts (W, 3), with derivatives by the named numbers.
+
+    Raises:
+        TerrafusionError: the run diverged.
+    """
+    plant, directions = plant_of(log, model, names)
+    inputs = told(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
+    states, changes = _run(log, plant, directions, inputs, start)
+    samples = np.concatenate([np.arange(first, last + 1) for first, last in log.windows])
+    channels = tuple(o.channel for o in log.observed)
+    values, by_direction = readings(
+        channels, model, plant, directions, samples * DT_S, states, changes, inputs[samples]
+    )
+    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
+    count, out = len(names), []
+    for i, observed in enumerate(log.observed):
+        at, weight = averaging(observed, log, shift)
+        change = np.einsum("nk,nkm->nm", weight, by_direction[at, i])
+        value = np.einsum("nk,nk->n", weight, values[at, i])
+        out.append(Prediction(value, change[:, :count], change[:, count:]))
+    return out
+
+
+def plant_of(log: Log, model: Model, names: Sequence[str]) -> tuple[Plant, Directions]:
+    """The plant, and as directions the named numbers, then x, y and yaw of a start."""
+    route = route_of(log, model)
+    vehicle, count = model.vehicle_vector(), len(names)
+    plant = Plant(vehicle, route, {k: v for k, v in model.effects.items() if v != 0.0})
+    effects = [name.removeprefix("effects.") for name in names if name.startswith("effects.")]
+    d = Directions.zeros(plant, count + len(POSE), effects)
+    knots = _knot_labels(log)
+    for m, name in enumerate(names):
+        if name.startswith("effects."):
+            d.effects[name.removeprefix("effects.")][m] = 1.0
+        elif name.startswith("vehicle."):
+            d.vehicle[:, m] = model.vehicle_change(name)
+        else:
+            for k, label in enumerate(knots):
+                d.soil[k, :, m] = model.soil_change(name, label)
+    if log.follows:
+        _follow(vehicle, d)
+    return plant, d
+
+
+def _follow(vehicle: Array, d: Directions) -> None:
+    """Make the speed loop stiff: critically damped with a short motor lag, and no limit of torque."""
+    at = {name: VEHICLE_PARAMETERS.index(name) for name in FOLLOWING}
+    lag = min(float(vehicle[at["lag_s"]]), _FOLLOWING_LAG_S)
+    gain = float(vehicle[VEHICLE_PARAMETERS.index("wheel_inertia_kgm2")]) / (4.0 * lag)
+    vehicle[at["lag_s"]], vehicle[at["loop_p_nms"]] = lag, gain
+    vehicle[at["loop_i_nm"]], vehicle[at["dead_time_s"]] = _FOLLOWING_RATE * gain, 0.0
+    vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] = 0.0
+    for name in ("torque_limit_nm", "stall_torque_nm"):
+        vehicle[at[name]] *= 1000.0
+    d.vehicle[list(at.values())] = 0.0
+
+
+def route_of(log: Log, model: Model) -> RouteTable:
+    """The ground over the log's time."""
+    vectors = np.array([soil_vector(model.soils[label]) for label in log.labels])
+    if len(log.labels) == 1:
+        return RouteTable("time", np.zeros(1), vectors)
+    half = 0.5 * min(TRANSITION_S, 0.8 * float(np.min(np.diff(log.borders), initial=TRANSITION_S)))
+    at = np.repeat(log.borders, 2) + np.tile([-half, half], len(log.borders))
+    return RouteTable("time", at, np.repeat(vectors, 2, axis=0)[1:-1])
+
+
+def _knot_labels(log: Log) -> list[str]:
+    """Ground at each knot of `route_of`."""
+    if len(log.labels) == 1:
+        return list(log.labels)
+    return [label for label in log.labels for _ in range(2)][1:-1]
+
+
+def _run(log: Log, plant: Plant, d: Directions, inputs: Array, start: Array) -> tuple[Array, Array]:
+    """States (N, X) at all samples of all windows, one after the other, and derivatives (N, X, M).
+
+    The last window's pose enters the next one's inner states on a slope only, by its heading; that is left
+    out. A shift of the start shifts the run; where no slope and no effect looks at the heading, a turn of
+    the start turns it: these directions need not be integrated.
+    """
+    turns = not plant.effect_names(d.effects) and not plant.vehicle[_GRAVITY].any()
+    kept = np.arange(d.count - (len(POSE) if turns else len(POSE) - 1))
+    kept = kept if turns else np.append(kept, d.count - 1)
+    run = part_of(d, kept)
+    x, S = led_in(log, plant, run, inputs)
+    pose = [INDEX[name] for name in POSE]
+    states, changes = [], []
+    for (begin, end), guess in zip(log.windows, start, strict=True):
+        x[pose], S[pose] = guess, 0.0
+        if not turns:
+            S[:, -1] = 0.0
+            S[pose[-1], -1] = 1.0
+        xs, Ss = integrate_with_sensitivity(
+            x, inputs[begin : end + 1], DT_S, plant, Directions(S, run.vehicle, run.soil, run.effects),
+            t0_s=begin * DT_S,
+        )  # fmt: skip
+        x, S = xs[-1].copy(), Ss[-1].copy()
+        states.append(xs)
+        changes.append(_with_pose(xs, Ss, d.count, kept, turns))
+    return np.concatenate(states), np.concatenate(changes)
+
+
+_GRAVITY = [VEHICLE_PARAMETERS.index(name) for name in ("gravity_x_mps2", "gravity_y_mps2")]
+
+
+def part_of(d: Directions, kept: NDArray[np.int64]) -> Directions:
+    """Some of the directions."""
+    effects = {name: values[kept] for name, values in d.effects.items()}
+    return Directions(d.start[:, kept], d.vehicle[:, kept], d.soil[:, :, kept], effects)
+
+
+def _with_pose(xs: Array, Ss: Array, count: int, kept: NDArray[np.int64], turns: bool) -> Array:
+    """Derivatives (n, X, M) with those by the pose at the start put in, which were not integrated."""
+    out = np.zeros((len(xs), xs.shape[1], count))
+    out[:, :, kept] = Ss
+    x, y, yaw = (INDEX[name] for name in POSE)
+    out[:, x, count - 3] = out[:, y, count - 2] = 1.0
+    if turns:
+        out[:, x, -1], out[:, y, -1], out[:, yaw, -1] = xs[0, y] - xs[:, y], xs[:, x] - xs[0, x], 1.0
+    return out
+
+
+def _carried(
+    plant: Plant, d: Directions, inputs: Array, x: Array, S: Array, t0_s: float
+) -> tuple[Array, Array]:
+    xs, Ss = integrate_with_sensitivity(
+        x, inputs, DT_S, plant, Directions(S, d.vehicle, d.soil, d.effects), t0_s=t0_s
+    )
+    return xs[-1].copy(), Ss[-1].copy()
+
+
+def led_in(log: Log, plant: Plant, d: Directions, inputs: Array) -> tuple[Array, Array]:
+    """State (X,) and derivatives (X, M) at the first window, after driving as first told for `LEAD_S`."""
+    x, before = run_up(log, plant, inputs)
+    return _carried(plant, d, before, x, np.zeros((len(STATES), d.count)), -LEAD_S)
+
+
+def run_up(log: Log, plant: Plant, inputs: Array) -> tuple[Array, Array]:
+    """State (X,) `LEAD_S` before the log, and the inputs from there up to the first window."""
+    x = np.zeros(len(STATES))
+    x[INDEX["yaw"]] = log.start[0, 2]
+    first = inputs[0].copy()
+    first[2:] = 0.0
+    if np.abs(log.sides[0]).max() > MOVING_RADPS:
+        x[state_slice("wheel_speed")] = first[[0, 1, 0, 1]]
+        x[INDEX["u"]] = first[:2].mean() * plant.vehicle[VEHICLE_PARAMETERS.index("radius_m")]
+    before = np.tile(first, (round(LEAD_S / DT_S), 1))
+    return x, np.vstack([before, inputs[: log.windows[0, 0] + 1]])
+
+
+def averaging(
+    observed: Observed, log: Log, shift: NDArray[np.int64], window: NDArray[np.int64] | None = None
+) -> tuple[NDArray[np.int64], Array]:
+    """Stacked samples (n, k) that a row depends on, and their weights (n, k): its mean over its interval.
+
+    Between samples the twin's channel is a cubic (Keys 1981, a = -1/2), at a window's ends it goes on
+    straight: the mean is right to the fourth order of `DT_S`.
+    `window` (n,) is that of each row; None: the one it lies in.
+    """
+    window = window_of(observed, log.windows) if window is None else window
+    first, last = log.windows[window, :1], log.windows[window, 1:]
+    a, b = observed.begin_s[:, None] / DT_S, observed.end_s[:, None] / DT_S
+    at = np.floor(a + 1e-9).astype(np.int64) - 1 + np.arange(int(np.ceil(np.max(b - a, initial=0.0))) + 4)
+    mean = (_kernel_integral(b - at) - _kernel_integral(a - at)) / np.maximum(b - a, 1e-12)
+    weight = np.where(b - a > 1e-6, mean, _kernel(a - at))
+    before, after = np.clip(first - at, 0, None) * weight, np.clip(at - last, 0, None) * weight
+    inside = np.clip(at, first, last)
+    # Straight on beyond an end: f(end + d) = (1 + d) f(end) - d f(end - 1), likewise before the start.
+    columns = [inside, inside, np.broadcast_to(first + 1, at.shape), np.broadcast_to(last - 1, at.shape)]
+    weights = [weight, before + after, -before, -after]
+    return np.hstack(columns) - first + shift[window][:, None], np.hstack(weights)
+
+
+def _kernel(s: Array) -> Array:
+    """Cubic convolution kernel (Keys 1981, eq. 4, a = -1/2)."""
+    x = np.minimum(np.abs(s), 2.0)
+    near = (1.5 * x - 2.5) * x * x + 1.0
+    return np.where(x < 1.0, near, ((-0.5 * x + 2.5) * x - 4.0) * x + 2.0)
+
+
+def _kernel_integral(s: Array) -> Array:
+    """Its integral from minus infinity to s."""
+    x = np.minimum(np.abs(s), 2.0)
+    near = ((0.375 * x - 5.0 / 6.0) * x * x + 1.0) * x
+    far = (((-0.125 * x + 5.0 / 6.0) * x - 2.0) * x + 2.0) * x - 1.0 / 6.0
+    return 0.5 + np.sign(s) * np.where(x < 1.0, near, far)

@@ -1,0 +1,229 @@
+"""The least-squares problem: residuals of all logs and windows, and its normal equations.
+
+Unknown are the parameters (as `coordinates.Coordinate`), constant errors of the sensors a log,
+and the pose at the start of each window. All have Gaussian priors and are counted in units of their prior
+sigma, so that the normal matrix is never singular. The poses are eliminated window by window (Schur
+complement), which marginalises them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.calibrate.coordinates import Coordinate
+from terrafusion.twin.calibrate.inputs import DT_S
+from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.noise import Noise
+from terrafusion.twin.calibrate.predict import POSE, Prediction, predict
+from terrafusion.twin.calibrate.sensor_offsets import sensor_errors
+
+Array = NDArray[np.float64]
+
+POSE_SIGMA = np.array([10.0, 10.0, 1.0])
+"""1 sigma of a window's start about its guess (assumed, m and rad): wide, as the log says where it is."""
+UNPOSED_YAW_SIGMA = 0.2
+"""1 sigma of the heading (assumed, rad) where nothing in the log says it."""
+HUBER = 2.5
+"""Whitened residuals beyond this weigh linearly, not as squares, where robust (Huber 1964)."""
+
+Key = tuple[int, int]
+"""Log and channel, by number."""
+
+
+@dataclass(frozen=True, eq=False)
+class Point:
+    """Where the solver stands: w (P,), sensor errors (L, B), poses (W, 3) a log; all in prior sigmas."""
+
+    w: Array
+    errors: Array
+    pose: tuple[Array, ...]
+
+    def moved(self, dw: Array, derrors: Array, dpose: Sequence[Array]) -> Point:
+        pose = tuple(p + d for p, d in zip(self.pose, dpose, strict=True))
+        return Point(self.w + dw, self.errors + derrors, pose)
+
+    def prior_cost(self) -> float:
+        parts = (self.w, self.errors, *self.pose)
+        return 0.5 * sum(float((part**2).sum()) for part in parts)
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Residuals (twin less log) of one channel in one window, and their derivatives by what is local to it.
+
+    Attributes:
+        log, channel, window: where it belongs.
+        rows: (n,) its rows in the channel.
+        residual: (n,).
+        change: (n, P + B + 3) by parameters, sensor errors of the log and pose of the window.
+    """
+
+    log: int
+    channel: int
+    window: int
+    rows: NDArray[np.int64]
+    residual: Array
+    change: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Eliminated:
+    """The pose (3,) of one window: its step is -own - by @ d[at] for a step d (G,) of the others.
+
+    `information` (3, 3) and `gradient` (3,) are its own, with the others fixed.
+    """
+
+    at: NDArray[np.int64]
+    by: Array
+    own: Array
+    information: Array
+    gradient: Array
+
+
+@dataclass(frozen=True, eq=False)
+class Normal:
+    """Normal equations of parameters and offsets (G,), the poses eliminated.
+
+    Attributes:
+        H, g: (G, G) and (G,).
+        cost: half the sum of squares, in nats.
+        poses: how to get those of a log's window back.
+    """
+
+    H: Array
+    g: Array
+    cost: float
+    poses: dict[Key, Eliminated]
+
+    def pose_gain(self) -> float:
+        """By how much the poses' own steps lower the cost, to first order."""
+        return 0.5 * sum(float(e.gradient @ e.own) for e in self.poses.values())
+
+
+class Problem:
+    """Logs, a model and the coordinates of what is unknown."""
+
+    def __init__(
+        self, logs: Sequence[Log], model: Model, coordinates: Sequence[Coordinate], *, robust: bool
+    ) -> None:
+        self.logs, self.model, self.coordinates, self.robust = tuple(logs), model, tuple(coordinates), robust
+        self.names = tuple(c.name for c in coordinates)
+        self.errors = sensor_errors(model.vehicle)
+        self.windows = [[window_of(o, log.windows) for o in log.observed] for log in self.logs]
+
+    def start(self) -> Point:
+        """At the model's own numbers, without offsets, at the guessed poses."""
+        w = np.array([c.at(c.start) for c in self.coordinates])
+        return Point(
+            w,
+            np.zeros((len(self.logs), len(self.errors))),
+            tuple(np.zeros_like(log.start) for log in self.logs),
+        )
+
+    def values(self, w: Array) -> dict[str, float]:
+        """The numbers by name."""
+        return {c.name: c.value(float(x)) for c, x in zip(self.coordinates, w, strict=True)}
+
+    def model_at(self, w: Array) -> Model:
+        """The model with the numbers at w."""
+        return self.model.replaced(self.values(w))
+
+    def predictions(self, point: Point) -> list[list[Prediction]]:
+        """Every log's channels, without offsets; raises TerrafusionError where the twin diverges."""
+        model = self.model_at(point.w)
+        return [
+            predict(log, model, self.names, log.start + pose * self.pose_sigma(log))
+            for log, pose in zip(self.logs, point.pose, strict=True)
+        ]
+
+    def blocks(self, point: Point) -> list[Block]:
+        """Residuals and derivatives, in a fixed order."""
+        rate = np.array([c.rate(float(x)) for c, x in zip(self.coordinates, point.w, strict=True)])
+        out = []
+        for i, (log, predicted) in enumerate(zip(self.logs, self.predictions(point), strict=True)):
+            for j, (observed, p) in enumerate(zip(log.observed, predicted, strict=True)):
+                gain, by = self._sensor(observed.channel, p.value, point.errors[i])
+                residual = p.value + by @ point.errors[i] - observed.value
+                change = np.hstack([gain * p.change * rate, by, gain * p.by_pose * self.pose_sigma(log)])
+                for window in np.unique(self.windows[i][j]):
+                    rows = np.flatnonzero(self.windows[i][j] == window)
+                    out.append(Block(i, j, int(window), rows, residual[rows], change[rows]))
+        return out
+
+    def _sensor(self, channel: str, value: Array, errors: Array) -> tuple[float, Array]:
+        """A channel's gain, and derivatives (n, B) of its reading by its errors, in which it is linear."""
+        by, gain = np.zeros((len(value), len(self.errors))), 1.0
+        for k, error in enumerate(self.errors):
+            if error.channel == channel:
+                by[:, k] = error.sigma * (value if error.kind == "gain" else 1.0)
+                gain += error.sigma * float(errors[k]) if error.kind == "gain" else 0.0
+        return gain, by
+
+    @staticmethod
+    def pose_sigma(log: Log) -> Array:
+        """Prior sigma (3,) of a window's start, m and rad."""
+        return POSE_SIGMA if log.posed else np.array([*POSE_SIGMA[:2], UNPOSED_YAW_SIGMA])
+
+    def whitened(self, block: Block, noise: dict[Key, Noise]) -> tuple[Array, Array]:
+        """Residual (n,) and derivatives with white noise of variance one, outliers weighed down."""
+        observed = self.logs[block.log].observed[block.channel]
+        columns = np.column_stack([block.residual, block.change])
+        white = noise[block.log, block.channel].whiten(
+            observed.slot[block.rows], observed.sigma[block.rows], columns
+        )
+        r, J = white[:, 0], white[:, 1:]
+        if self.robust:
+            root = np.sqrt(np.minimum(1.0, HUBER / np.maximum(np.abs(r), 1e-12)))
+            r, J = r * root, J * root[:, None]
+        return r, J
+
+    def cost_of(self, r: Array) -> float:
+        """What weighted residuals add to the cost; those weighed down count by Huber's function."""
+        if not self.robust:
+            return 0.5 * float(r @ r)
+        # sqrt(HUBER |r|) is what an outlier was weighed down to.
+        outlier = np.abs(r) > HUBER
+        return 0.5 * float(np.sum(np.where(outlier, 2.0 * r * r - HUBER**2, r * r)))
+
+    def normal(self, point: Point, blocks: Sequence[Block], noise: dict[Key, Noise]) -> Normal:
+        """Normal equations of parameters and offsets, priors included."""
+        P, B, Q = len(self.coordinates), len(self.errors), len(POSE)
+        size = P + B * len(self.logs)
+        H, g = np.eye(size), np.concatenate([point.w, point.errors.ravel()])
+        cost = point.prior_cost()
+        poses: dict[Key, Eliminated] = {}
+        by_window: dict[Key, list[Block]] = {}
+        for block in blocks:
+            by_window.setdefault((block.log, block.window), []).append(block)
+        for (i, k), mine in by_window.items():
+            local, gradient = np.zeros((P + B + Q, P + B + Q)), np.zeros(P + B + Q)
+            for block in mine:
+                r, J = self.whitened(block, noise)
+                cost += self.cost_of(r)
+                local += J.T @ J
+                gradient += J.T @ r
+            at = np.concatenate([np.arange(P), P + B * i + np.arange(B)])
+            A = local[P + B :, P + B :] + np.eye(Q)
+            a = gradient[P + B :] + point.pose[i][k]
+            solved = np.linalg.solve(A, np.column_stack([local[P + B :, : P + B], a]))
+            H[np.ix_(at, at)] += local[: P + B, : P + B] - local[: P + B, P + B :] @ solved[:, :-1]
+            g[at] += gradient[: P + B] - local[: P + B, P + B :] @ solved[:, -1]
+            poses[i, k] = Eliminated(at, solved[:, :-1], solved[:, -1], A, a)
+        return Normal(0.5 * (H + H.T), g, cost, poses)
+
+    def step(self, normal: Normal, d: Array) -> tuple[Array, Array, list[Array]]:
+        """Steps of w, offsets and poses that go with a step d (G,) of parameters and offsets."""
+        P = len(self.coordinates)
+        pose = [np.zeros_like(log.start) for log in self.logs]
+        for (i, k), e in normal.poses.items():
+            pose[i][k] = -e.own - e.by @ d[e.at]
+        return d[:P], d[P:].reshape(len(self.logs), -1), pose
+
+    def seconds(self) -> float:
+        """Length of all logs, s."""
+        return sum(float(np.diff(log.windows, axis=1).sum()) * DT_S for log in self.logs)

@@ -1,0 +1,116 @@
+"""The twin's channels at many samples at once, and their derivatives: the measurement graph, contracted."""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.pointwise import Pointwise, pointwise
+from terrafusion.twin.engine.sensitivity import Directions
+from terrafusion.twin.model.measurement import (
+    Jacobians,
+    measured,
+    measured_jacobians,
+    measurement,
+    measurement_jacobian,
+)
+from terrafusion.twin.model.motion import plane_rotation
+from terrafusion.twin.model.plant import Plant, RouteTable
+from terrafusion.twin.physics.layout import INDEX, OUTPUTS, WHEELS, mounting_vector
+
+Array = NDArray[np.float64]
+
+
+def readings(
+    channels: tuple[str, ...],
+    model: Model,
+    plant: Plant,
+    directions: Directions,
+    t_s: Array,
+    states: Array,
+    changes: Array,
+    inputs: Array,
+) -> tuple[Array, Array]:
+    """Values (N, C) of the channels and their derivatives (N, C, M) along the directions.
+
+    Args:
+        t_s: (N,) times, for the ground under the wheels.
+        states, changes: (N, X) and (N, X, M), as the run gives them.
+        inputs: (N, U).
+    """
+    effects = {name: plant.effects.get(name, 0.0) for name in plant.effect_names(directions.effects)}
+    soil = np.tile(along(plant.route, plant.route.soil, t_s), (1, len(WHEELS)))
+    y, by = _measured(states, inputs, plant.vehicle, soil, mounting_vector(model.vehicle), effects)
+    d_soil = np.tile(along(plant.route, directions.soil, t_s), (1, len(WHEELS), 1))
+    d_effects = [directions.effects.get(name, np.zeros(directions.count)) for name in sorted(effects)]
+    dy = by.states @ changes + by.vehicle @ directions.vehicle + by.soil @ d_soil
+    if effects:
+        dy = dy + by.effects @ np.array(d_effects)
+    return _channels(channels, model, y, dy, states, changes)
+
+
+def _measured(
+    states: Array, inputs: Array, vehicle: Array, soil: Array, mounting: Array, effects: dict[str, float]
+) -> tuple[Array, Jacobians]:
+    """`measured` and `measured_jacobians`, in compiled code where there is a compiler."""
+    names = tuple(sorted(effects))
+    value, derivative = _compiled(names)
+    if value is None or derivative is None:
+        arguments = (states, inputs, vehicle, soil, mounting, effects)
+        return measured(*arguments), measured_jacobians(*arguments)
+    values = np.array([effects[name] for name in names])
+    given = (states, inputs, vehicle, soil, values, mounting)
+    return value(len(states), *given)[0][:, :, 0], Jacobians(*derivative(len(states), *given))
+
+
+@functools.cache
+def _compiled(effects: tuple[str, ...]) -> tuple[Pointwise | None, Pointwise | None]:
+    return pointwise(measurement(effects)), pointwise(measurement_jacobian(effects))
+
+
+def along(route: RouteTable, table: Array, t_s: Array) -> Array:
+    """Rows of a route's `table` (K, ...) at times (N,), joined as the engine joins them."""
+    out = np.repeat(table[:1], len(t_s), axis=0)
+    for k in range(len(route.at) - 1):
+        s = np.clip((t_s - route.at[k]) / (route.at[k + 1] - route.at[k]), 0.0, 1.0)
+        share = s * s * (3.0 - 2.0 * s)
+        out += share.reshape(-1, *(1,) * (table.ndim - 1)) * (table[k + 1] - table[k])
+    return out
+
+
+def _channels(
+    channels: tuple[str, ...], model: Model, y: Array, dy: Array, states: Array, changes: Array
+) -> tuple[Array, Array]:
+    """The channels by name: those of the measurement graph, the mean of both sides' wheels, and the pose."""
+    values, derivatives = [], []
+    turn = plane_rotation(model.slope_rad, model.aspect_rad)
+    for name in channels:
+        if name in OUTPUTS:
+            i = OUTPUTS.index(name)
+            value, change = y[:, i], dy[:, i]
+        elif name == "wheel_mean_radps":
+            pair = [OUTPUTS.index(f"wheel_{side}_radps") for side in ("left", "right")]
+            value, change = y[:, pair].mean(axis=1), dy[:, pair].mean(axis=1)
+        elif name == "truth_yaw_rad":
+            value, change = _heading(turn, states[:, INDEX["yaw"]], changes[:, INDEX["yaw"]])
+        else:
+            row = turn[("truth_east_m", "truth_north_m").index(name), :2]
+            xy = [INDEX["x"], INDEX["y"]]
+            value, change = states[:, xy] @ row, np.einsum("i,nim->nm", row, changes[:, xy])
+        values.append(value)
+        derivatives.append(change)
+    return np.stack(values, axis=1), np.stack(derivatives, axis=1)
+
+
+def _heading(turn: Array, yaw: Array, change: Array) -> tuple[Array, Array]:
+    """Heading (N,) in the world of a yaw (N,) in the plane, unwrapped like it, and its derivatives (N, M)."""
+    forward = np.stack([np.cos(yaw), np.sin(yaw)], axis=1) @ turn[:2, :2].T
+    left = np.stack([-np.sin(yaw), np.cos(yaw)], axis=1) @ turn[:2, :2].T
+    heading = np.arctan2(forward[:, 1], forward[:, 0])
+    heading = yaw + np.angle(np.exp(1j * (heading - yaw)))
+    size = (forward**2).sum(axis=1)
+    rate = (forward[:, 0] * left[:, 1] - forward[:, 1] * left[:, 0]) / size
+    return heading, rate[:, None] * change

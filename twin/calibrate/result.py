@@ -1,0 +1,170 @@
+"""What a calibration says: numbers with sigma, what could not be told, how well the twin fits now."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.calibrate.identifiability import TOLD, Identifiability
+from terrafusion.twin.calibrate.model import Model
+
+Array = NDArray[np.float64]
+
+SCHEMA = "terrafusion.calibration/1"
+CONVERGED = ("converged", "at_bound")
+"""Outcomes of a search that came to its end."""
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """One number.
+
+    Attributes:
+        name, unit: dotted name and unit.
+        value, sigma: the fit and its 1 sigma, in the unit. One that is not told keeps its prior value.
+        low, high: two sigma about it, by the logarithm where the number moves so.
+        start: where the search began; prior, prior_sigma: what was known before.
+        status: one of `identifiability`'s: told, only in combination, not told.
+        ratio: posterior over prior sigma.
+        at_bound: whether it ended at the end of its range.
+    """
+
+    name: str
+    unit: str
+    value: float
+    sigma: float
+    low: float
+    high: float
+    start: float
+    prior: float
+    prior_sigma: float
+    status: str
+    ratio: float
+    at_bound: bool
+
+
+@dataclass(frozen=True, eq=False)
+class ChannelFit:
+    """One channel of one log, before and after.
+
+    Attributes:
+        log, channel: names.
+        t_s: (n,) times from the log's first input; measured, before, after: (n,) values there, those of the
+            twin with its offsets added and each window's pose fitted. "Before" is with the start values.
+        sigma: noise of one row, estimated.
+        correlation: autocorrelation of neighbouring rows.
+        left: that of whitened rows, which should be about zero.
+        outliers: share of whitened rows beyond 4.
+    """
+
+    log: str
+    channel: str
+    t_s: Array
+    measured: Array
+    before: Array
+    after: Array
+    sigma: float
+    correlation: float
+    left: float
+    outliers: float
+
+    def rms(self, series: Array) -> float:
+        """Root mean square of a series (n,) less what was measured."""
+        return float(np.sqrt(np.mean((series - self.measured) ** 2)))
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """The answer.
+
+    Attributes:
+        fitted: the numbers, in the order asked for.
+        correlation: (P, P) of their errors; covariance: (P, P) in their units.
+        identifiability: what could be told.
+        model: vehicle, soils and effects with the numbers in place.
+        before: the model at the start.
+        channels: how each channel fits.
+        sensor_errors: by log name, channel and kind: the offset or gain that was found, and its sigma.
+        outcome, sentence: how the search ended, as a key and in words.
+        runs, seconds_of_data: evaluations of the twin, and what they ran over.
+        notes: what was assumed.
+    """
+
+    fitted: tuple[Fitted, ...]
+    correlation: Array
+    covariance: Array
+    identifiability: Identifiability
+    model: Model
+    before: Model
+    channels: tuple[ChannelFit, ...]
+    sensor_errors: dict[str, dict[str, tuple[float, float]]]
+    outcome: str
+    sentence: str
+    runs: int
+    seconds_of_data: float
+    notes: tuple[str, ...]
+
+    def __getitem__(self, name: str) -> Fitted:
+        """A number by its name; `soil.` stands for the ground where there is one only."""
+        return next(f for f in self.fitted if f.name == name or self._is_soil(name, f.name))
+
+    def _is_soil(self, name: str, spelt: str) -> bool:
+        return len(self.model.soils) == 1 and f"soil.{spelt.partition('.')[2]}" == name
+
+    def converged(self) -> bool:
+        """Whether the search came to its end; if not, values and sigma are not to be trusted."""
+        return self.outcome in CONVERGED
+
+    def untold(self) -> tuple[Fitted, ...]:
+        """Numbers that the data do not tell by themselves."""
+        return tuple(f for f in self.fitted if f.status != TOLD)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The content of `calibration.json`."""
+        return {
+            "schema": SCHEMA,
+            "vehicle": self.model.vehicle.name,
+            "soils": list(self.model.soils),
+            "logs": list(self.sensor_errors),
+            "seconds": round(self.seconds_of_data, 3),
+            "outcome": self.outcome,
+            "sentence": self.sentence,
+            "converged": self.converged(),
+            "runs": self.runs,
+            "parameters": {f.name: _entry(f, self.converged()) for f in self.fitted},
+            "order": [f.name for f in self.fitted],
+            "correlation": self.correlation.tolist(),
+            "covariance": self.covariance.tolist(),
+            "identifiability": {
+                "eigenvalues": self.identifiability.eigenvalues.tolist(),
+                "eigenvectors": self.identifiability.eigenvectors.T.tolist(),
+                "weak": [
+                    {"weights": d.weights, "ratio": d.ratio, "sentence": d.sentence}
+                    for d in self.identifiability.weak
+                ],
+            },
+            "sensor_errors": {
+                log: {name: {"value": value, "sigma": sigma} for name, (value, sigma) in found.items()}
+                for log, found in self.sensor_errors.items()
+            },
+            "channels": [
+                {
+                    "log": c.log, "channel": c.channel, "rows": len(c.measured),
+                    "rms_before": c.rms(c.before), "rms_after": c.rms(c.after), "sigma": c.sigma,
+                    "correlation": c.correlation, "whitened_correlation": c.left, "outliers": c.outliers,
+                }
+                for c in self.channels
+            ],
+            "notes": list(self.notes),
+        }  # fmt: skip
+
+
+def _entry(f: Fitted, converged: bool) -> dict[str, Any]:
+    return {
+        "value": f.value, "sigma": f.sigma, "unit": f.unit, "interval_2_sigma": [f.low, f.high],
+        "start": f.start, "prior": f.prior, "prior_sigma": f.prior_sigma, "status": f.status,
+        "posterior_over_prior": f.ratio, "at_bound": f.at_bound, "sigma_valid": converged,
+    }  # fmt: skip

@@ -1,0 +1,96 @@
+"""Which drive would tell what the logs left open: the twin drives each, and the information is added up."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
+from terrafusion.twin.calibrate.log import prepare
+from terrafusion.twin.calibrate.model import resolve
+from terrafusion.twin.calibrate.problem import Problem
+from terrafusion.twin.calibrate.result import Calibration
+from terrafusion.twin.calibrate.solver import first_noise
+from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.simulate import simulate_run
+
+Array = NDArray[np.float64]
+
+SECONDS = 60.0
+CANDIDATES = (
+    ("straight", 0.0), ("straight", 10.0), ("circle", 0.0), ("figure_eight", 10.0), ("spin", 0.0),
+    ("staircase", 0.0), ("chirp", 0.0),
+)  # fmt: skip
+"""Scenarios and slopes (deg) that are tried."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Suggestion:
+    """A drive and what it would do: posterior over prior sigma of a number, now and with that drive added."""
+
+    name: str
+    scenario: str
+    slope_deg: float
+    ratio_now: float
+    ratio_then: float
+
+    def sentence(self) -> str:
+        """In words."""
+        slope = f" on a slope of {self.slope_deg:g} deg" if self.slope_deg else ""
+        return (
+            f"{self.name}: of the drives tried, '{self.scenario}'{slope} tells most; its sigma would be "
+            f"{100.0 * self.ratio_then:.0f} % of the prior's (now {100.0 * self.ratio_now:.0f} %)"
+        )
+
+
+def suggest(
+    calibration: Calibration, candidates: Sequence[tuple[str, float]] = CANDIDATES
+) -> list[Suggestion]:
+    """For each number that is not told by itself, the drive of `SECONDS` that would tell it best.
+
+    Uses the first ground, the fitted numbers, and noise as in the data sheets (white): a forecast, not a
+    promise. A drive the twin cannot do is left out.
+    """
+    open_ones = calibration.untold()
+    if not open_ones:
+        return []
+    names = [f.name for f in calibration.fitted]
+    ratios = np.array([f.ratio for f in calibration.fitted])
+    now = np.linalg.inv(calibration.correlation * np.outer(ratios, ratios))
+    then = {}
+    for scenario, slope_deg in candidates:
+        information = _information(calibration, scenario, slope_deg)
+        if information is not None:
+            then[scenario, slope_deg] = np.sqrt(np.diag(np.linalg.inv(now + information)))
+    out = []
+    for f in open_ones:
+        i = names.index(f.name)
+        if then:
+            best = min(then, key=lambda key: float(then[key][i]))
+            out.append(Suggestion(f.name, *best, f.ratio, float(then[best][i])))
+    return out
+
+
+def _information(calibration: Calibration, scenario: str, slope_deg: float) -> Array | None:
+    """What a drive would tell (P, P), in units of the priors; None where the twin cannot do it."""
+    model, ground = calibration.model, next(iter(calibration.model.soils))
+    planned = dataclasses.replace(load_scenario(scenario), duration_s=SECONDS).with_ground(ground, slope_deg)
+    try:
+        run = simulate_run(planned, vehicle=model.vehicle, soils=model.soils, noiseless=True)
+        sloped = dataclasses.replace(model, slope_rad=math.radians(slope_deg), aspect_rad=0.0)
+        priors = {f.name: Prior(f.prior, f.prior_sigma) for f in calibration.fitted}
+        coordinates = [
+            Coordinate.of(name, quantity, sloped.value(name), priors[name])
+            for name, quantity in resolve(tuple(priors), sloped).items()
+        ]
+        problem = Problem([prepare(run.recording, sloped, ground=ground)], sloped, coordinates, robust=False)
+        point, P = problem.start(), len(coordinates)
+        normal = problem.normal(point, problem.blocks(point), first_noise(problem))
+    except TerrafusionError:
+        return None
+    return np.asarray(np.linalg.inv(np.linalg.inv(normal.H)[:P, :P]) - np.eye(P))

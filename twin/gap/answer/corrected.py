@@ -1,0 +1,94 @@
+"""The vehicle's file with the effects found in it: as numbers that it has, or in its section `effects`."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from terrafusion.twin.calibrate.files import mark_measured, write_yaml
+from terrafusion.twin.effects.catalogue import lookup
+from terrafusion.twin.model.library import read_named
+from terrafusion.twin.model.vehicle import VehicleParams
+
+if TYPE_CHECKING:
+    from terrafusion.twin.gap.diagnose import Diagnosis
+
+FIELDS = {
+    "mass/at_cg": (("body.mass_kg", "times"), ("body.yaw_inertia_kgm2", "times")),
+    "cg_lateral/shift": (("body.cg_left_m", "plus"),),
+    "cg_longitudinal/shift": (("body.cg_forward_m", "plus"),),
+    "wheel_radius/scale": (("wheel.radius_m", "times"),),
+    "track_width/scale": (("body.track_m", "times"),),
+    "torque_limit/scale": (("drive.torque_limit_nm", "less"),),
+    "drivetrain_friction/efficiency": (("drive.gear_efficiency", "less"),),
+    "dead_time/transport": (("drive.dead_time_s", "plus"),),
+    "actuator_lag/torque": (("drive.lag_s", "plus"),),
+}
+"""Numbers of the vehicle's file that an effect changes: by a factor 1 + e, 1 - e, or by e."""
+_CHANGES = {
+    "times": lambda x, e: x * (1.0 + e),
+    "less": lambda x, e: x * (1.0 - e),
+    "plus": lambda x, e: x + e,
+}
+
+
+def values_of(diagnosis: Diagnosis) -> dict[str, float]:
+    """Parameters of the effects named, by key."""
+    answer = diagnosis.to_json()
+    named = set(answer["named"])
+    return {
+        key: number["value"]
+        for cause in answer["causes"]
+        if cause["effect"] in named
+        for key, number in cause["parameters"].items()
+    }
+
+
+def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> list[str]:
+    """Write the vehicle's file with the effects named; what was done, in sentences.
+
+    The twin of that file has them: `terrafusion gap` and `simulate` with `--vehicle` as with `--effect`.
+
+    Raises:
+        ConfigError: the vehicle's file cannot be read.
+        TerrafusionError: the file cannot be written.
+    """
+    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    out, said = copy.deepcopy(raw), []
+    for key, value in values_of(diagnosis).items():
+        for path, how in FIELDS.get(key, ()):
+            said.append(_change(out, diagnosis.bench.model.vehicle, path, how, value))
+        if key not in FIELDS:
+            said.append(_added(out, diagnosis.bench.model.vehicle, key, value))
+    if not said:
+        return ["no effect was named: the vehicle's file stays as it is"]
+    write_yaml(target, out)
+    return [*said, f"written to {target}"]
+
+
+def _added(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) -> str:
+    """An effect that is no number of the vehicle, on top of what it has of it."""
+    before, number = vehicle.effects.get(key, 0.0), lookup(key)[1]
+    after = min(max(before + value, number.low), number.high)
+    source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
+    raw.setdefault("effects", {})[key] = {"value": after, "source": source}
+    return f"effects.{key}: {before:.6g} -> {after:.6g}"
+
+
+def _change(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, value: float) -> str:
+    before: Any = vehicle
+    for part in path.split("."):
+        before = getattr(before, part)
+    after = float(_CHANGES[how](before, value))
+    *sections, last = path.split(".")
+    section: Any = raw
+    for part in sections:
+        section = section.setdefault(part, {})
+    old = section.get(last)
+    source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
+    kept: Mapping[str, Any] = {k: v for k, v in old.items() if k == "valid"} if isinstance(old, dict) else {}
+    section[last] = {"value": after, **kept, "source": source}
+    mark_measured(raw, path)
+    return f"{path}: {before:.6g} -> {after:.6g}"

@@ -1,0 +1,167 @@
+"""Which drive would tell two look-alikes apart: the twin drives each of a small catalogue, and counts by how
+many standard deviations the two effects would differ there at the sizes they have been found with."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.twin.calibrate.inputs import DT_S
+from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.observations import Observed
+from terrafusion.twin.gap.answer.classes import TELLING, likeness
+from terrafusion.twin.gap.data.residuals import SOIL_STATE, Evidence, raw_of, whitened
+from terrafusion.twin.gap.infer.evidence import WINDOW_S, Bench
+from terrafusion.twin.gap.infer.posterior import Pool
+from terrafusion.twin.gap.null.null import JITTER, Null
+from terrafusion.twin.gap.null.score import score
+from terrafusion.twin.gap.rollout.sensitivities import drive, signatures
+from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.scenario.commands import open_loop
+from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
+
+if TYPE_CHECKING:
+    from terrafusion.twin.gap.answer.verdict import Cause
+
+Array = NDArray[np.float64]
+
+BY_HAND = "measurement by hand"
+MOST_REPEATS = 10
+"""Where so many repeats of the best drive do not tell two effects apart, none is proposed."""
+LIFTED = "wheels lifted"
+HALF_TURN_S, QUARTER_TURN_S = math.pi / 0.6, 0.5 * math.pi / 0.6
+
+
+def _sequence(*segments: tuple[float, float, float]) -> tuple[DriveSegment, ...]:
+    return tuple(DriveSegment(*s) for s in ((1.0, 0.0, 0.0), *segments, (1.0, 0.0, 0.0)))
+
+
+DRIVES: dict[str, tuple[DriveSegment, ...]] = {
+    "same lane both ways": _sequence(
+        (9.0, 1.0, 0.0), (1.0, 0.0, 0.0), (HALF_TURN_S, 0.0, 0.6), (1.0, 0.0, 0.0), (9.0, 1.0, 0.0)
+    ),
+    "spins, then straight": _sequence(
+        (7.0, 0.0, 0.8), (7.0, 0.0, -0.8), (1.0, 0.0, 0.0), (7.0, 1.2, 0.0), (6.0, 0.6, 0.0)
+    ),
+    "four headings": _sequence(*(((4.5, 0.8, 0.0), (QUARTER_TURN_S, 0.0, 0.6)) * 4)),
+    LIFTED: _sequence((6.0, 0.4, 0.0), (6.0, 0.8, 0.0), (6.0, 1.4, 0.0), (5.0, -0.6, 0.0), (5.0, 0.0, 0.8)),
+    "chirp, 0.2 to 3 Hz": (
+        DriveSegment(2.0),
+        DriveSegment(13.0, v_mps=0.8, v_amplitude_mps=0.3, period_s=5.0, end_period_s=1.0 / 3.0),
+        DriveSegment(2.0),
+        DriveSegment(13.0, v_mps=0.8, yaw_rate_amplitude_radps=0.5, period_s=5.0, end_period_s=1.0 / 3.0),
+    ),
+    "speed staircase": _sequence(*((5.0, v, 0.0) for v in (0.3, 0.6, 0.9, 1.2, 1.5))),
+    "figure of eight": _sequence((14.0, 0.8, 0.45), (14.0, 0.8, -0.45)),
+}
+"""What is tried, by name: about 30 s each, level ground of the kind that the runs were on."""
+
+
+@dataclass(frozen=True)
+class NextRun:
+    """A drive, the two effects that it separates, by how many sigmas one such drive does, and in words."""
+
+    scenario: str
+    separates: tuple[str, str]
+    sigmas: float
+    why: str
+
+
+def propose(bench: Bench, sigma: Array, one: Cause, other: Cause) -> NextRun:
+    """The drive on which two causes differ most; a measurement by hand where none tells them apart."""
+    found = {name: separation(bench, sigma, name, one, other) for name in DRIVES}
+    best = max(found, key=lambda name: found[name])
+    sigmas, pair = found[best], (one.effect, other.effect)
+    repeats = math.inf if sigmas <= 0.0 else math.ceil((TELLING / sigmas) ** 2)
+    if repeats > MOST_REPEATS:
+        why = (
+            f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by {sigmas:.1f} "
+            "sigma in the twin): measure one of the two directly"
+        )
+        return NextRun(BY_HAND, pair, sigmas, why)
+    often = "once" if repeats == 1 else f"{repeats} times"
+    why = (
+        f"of {len(DRIVES)} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by {sigmas:.1f} "
+        f"sigma a drive at the size found; {often} should do"
+    )
+    return NextRun(best, pair, sigmas, why)
+
+
+def separation(bench: Bench, sigma: Array, name: str, one: Cause, other: Cause) -> float:
+    """Sigmas by which a drive tells two causes apart, whichever is true; 0 where the twin diverges on it."""
+    try:
+        run = _forecast(bench, name, {one.effect, other.effect})
+    except TerrafusionError:
+        return 0.0
+    own = score(run, sigma)
+    zero = np.zeros(len(own.b))
+    covariance = own.fisher + JITTER * np.eye(len(zero))
+    pool = Pool.of([dataclasses.replace(own, b=zero)], Null(zero, zero, covariance, 1))
+    return min(_told(pool, bench, one, other.effect), _told(pool, bench, other, one.effect))
+
+
+def _told(pool: Pool, bench: Bench, true: Cause, other: str) -> float:
+    """Sigmas that are left of the true cause once any form of the other is fitted to it."""
+    at = np.asarray(true.columns)
+    does = pool.information[:, at] @ true.value
+    signal = float(true.value @ does[at])
+    forms = [h.columns for h in bench.candidates.hypotheses if h.effect == other]
+    alike = max(likeness(pool, does, signal, columns) for columns in forms)
+    return math.sqrt(max(signal * (1.0 - alike**2), 0.0))
+
+
+def _forecast(bench: Bench, name: str, effects: set[str]) -> Evidence:
+    """Evidence of a drive that has not been driven: its errors are zero."""
+    template, model, segments = bench.runs[0].log, bench.model, DRIVES[name]
+    label = template.labels[0]
+    if name == LIFTED:
+        model = dataclasses.replace(model, soils={**model.soils, label: _no_ground()})
+    scenario = Scenario(name, sum(s.duration_s for s in segments), drive=segments)
+    t_s = DT_S * np.arange(round(scenario.duration_s / DT_S) + 1.0)
+    prompt = dataclasses.replace(model.vehicle.drive, dead_time_s=0.0)  # the log's commands have none either
+    _, inputs = open_loop(scenario, t_s, dataclasses.replace(model.vehicle, drive=prompt))
+    windows = _windows(len(t_s))
+    end = float(windows[-1, 1]) * DT_S
+    log = Log(
+        name, inputs[:, :2], template.follows, (label,), np.zeros(0), windows,
+        np.zeros((len(windows), 3)), tuple(_rows(o, end) for o in template.observed), True, (),
+    )  # fmt: skip
+    keys = {k for k in bench.candidates.keys if k.split("/")[0] in effects or k in SOIL_STATE}
+    found = drive(log, model, bench.candidates, log.start, keys)
+    seen = signatures(log, found)
+    return whitened(raw_of(log, seen, model, bench.candidates, bench.channels), bench.noise)
+
+
+def _no_ground() -> SoilParams:
+    """What lifted wheels turn on: next to no friction."""
+    firm = load_soil("asphalt")
+    return dataclasses.replace(
+        firm,
+        shear=dataclasses.replace(firm.shear, friction_angle_rad=0.01, friction_cap=0.01),
+        resistance=dataclasses.replace(firm.resistance, rolling=0.0),
+    )
+
+
+def _windows(count: int) -> NDArray[np.int64]:
+    """Windows (W, 2) of so many grid samples; a last one of less than half the length is left out."""
+    size = round(WINDOW_S / DT_S)
+    edges = np.append(np.arange(0, count - 1, size), count - 1)
+    windows = np.stack([edges[:-1], edges[1:]], axis=1)
+    return windows[windows[:, 1] - windows[:, 0] >= size // 2]
+
+
+def _rows(observed: Observed, end_s: float) -> Observed:
+    """Regular rows of a channel up to a time, as noisy as those of a log."""
+    slot = np.arange(1, max(2, int(end_s / observed.slot_s)))
+    end: Array = slot.astype(float) * observed.slot_s
+    length = float(np.median(observed.end_s - observed.begin_s))
+    return Observed(
+        observed.channel, end - length, end, np.zeros(len(slot)), np.full(len(slot),
+        np.median(observed.sigma)), slot, observed.slot_s, observed.least, observed.correlation,
+    )  # fmt: skip

@@ -1,0 +1,79 @@
+"""The learned null: how scores scatter from run to run where nothing has changed.
+
+Commissioning errors and whatever the twin lacks anyway shift and correlate the scores of every run. Their
+mean and covariance come from reference runs; the covariance is shrunk to the Fisher form, which is what it
+would be were the twin right (Ledoit and Wolf 2004: shrinkage to a structured target).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.gap.null.score import Score
+
+Array = NDArray[np.float64]
+
+SHRINK_RUNS = 8.0
+"""The Fisher form counts as much as so many reference runs (tuned on twin trials)."""
+JITTER = 0.02
+"""Added variance of a standardised score: no combination of scores is taken as exact."""
+
+
+@dataclass(frozen=True, eq=False)
+class Null:
+    """Standardised scores x = D^-1/2 (b - A phi0) are N(mean, covariance) in a reference run.
+
+    Attributes:
+        offset: (P,) phi0, what all references have in common, in the columns' units.
+        mean: (P,) what is left of it.
+        covariance: (P, P), that of the mean's own error included.
+        runs: how many references it was learnt from.
+    """
+
+    offset: Array
+    mean: Array
+    covariance: Array
+    runs: int
+
+    @functools.cached_property
+    def inverse(self) -> Array:
+        """(P, P) inverse of the covariance."""
+        return np.asarray(np.linalg.inv(self.covariance), dtype=np.float64)
+
+    def standardised(self, run: Score) -> tuple[Array, Array]:
+        """x - mean (P,) of a run, and the change of x by the columns (P, P)."""
+        return run.root * (run.b - run.A @ self.offset) - self.mean, run.root[:, None] * run.A
+
+
+def common_offset(references: Sequence[Score]) -> Array:
+    """Offset (P,) that all references have in common, in the columns' units (ridge, one unit)."""
+    P = len(references[0].b)
+    total = sum((r.A for r in references), np.zeros((P, P)))
+    shared = sum((r.b for r in references), np.zeros(P))
+    return np.asarray(np.linalg.solve(total + np.eye(P), shared), dtype=np.float64)
+
+
+def learn(references: Sequence[Score], judged: int) -> Null:
+    """The null of the references, for a judgement of so many runs together."""
+    count, P = len(references), len(references[0].b)
+    offset = common_offset(references)
+    x = np.array([r.root * (r.b - r.A @ offset) for r in references])
+    fisher = sum((r.fisher for r in references), np.zeros((P, P))) / count
+    mean: Array = np.asarray(x.mean(axis=0))
+    centred = x - mean
+    shown = centred.T @ centred
+    # Inflation of each score's variance over the Fisher form, itself shrunk to their median.
+    ratio = (np.diag(shown) + SHRINK_RUNS * np.diag(fisher)) / (
+        (count - 1 + SHRINK_RUNS) * np.maximum(np.diag(fisher), 1e-9)
+    )
+    stretch = np.sqrt(np.maximum(ratio, 0.25))
+    target = stretch[:, None] * fisher * stretch
+    covariance = (shown + SHRINK_RUNS * target) / (count - 1 + SHRINK_RUNS)
+    covariance = covariance + JITTER * np.eye(P)
+    covariance *= 1.0 + judged / count
+    return Null(offset, mean, covariance, count)

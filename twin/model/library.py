@@ -1,0 +1,71 @@
+"""The parameter files that come with the library, found by name."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.config import read_yaml
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.twin.model.soil_table import is_published, published_soil
+
+
+def known_names(folder: str) -> tuple[str, ...]:
+    """Names (file stems) of the YAML files in `twin/params/<folder>`, sorted."""
+    root = resources.files("terrafusion.twin.params") / folder
+    return tuple(
+        sorted(entry.name.removesuffix(".yaml") for entry in root.iterdir() if entry.name.endswith(".yaml"))
+    )
+
+
+def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dict[str, Any], str]:
+    """Content of a library file by name, or of the file at a path, and what to call it in messages.
+
+    Raises:
+        ConfigError: neither a known name (they are listed) nor an existing file.
+    """
+    text = str(name_or_path)
+    if text in known_names(folder):
+        return _own_file(folder, text), f"{folder}/{text}.yaml"
+    path = Path(text).expanduser()
+    try:
+        is_file = path.is_file()
+    except OSError:  # a name that no file can have
+        is_file = False
+    if path.suffix in (".yaml", ".yml") or is_file:
+        return read_yaml(path), text
+    raise ConfigError(
+        f"unknown {kind} '{text}'",
+        remedy=f"known are {', '.join(known_names(folder))}; or give the path of a .yaml file",
+    )
+
+
+@functools.cache
+def _own_file(folder: str, name: str) -> dict[str, Any]:
+    """Content of a file of the library, read once; callers do not change it."""
+    with resources.as_file(resources.files("terrafusion.twin.params") / folder / f"{name}.yaml") as path:
+        return read_yaml(path)
+
+
+def assumed(folder: str, name_or_path: str | Path) -> tuple[int, int]:
+    """How many numbers of a file are assumed by their sources, and how many it has; (0, 0) for no file."""
+    try:
+        if folder == "soils" and is_published(str(name_or_path)):
+            raw = published_soil(str(name_or_path))
+        else:
+            raw, _ = read_named(folder, name_or_path, kind="file")
+    except ConfigError:
+        return 0, 0
+    sources = list(_sources(raw))
+    return sum(source.startswith("assumed") for source in sources), len(sources)
+
+
+def _sources(section: dict[str, Any]) -> Iterator[str]:
+    for value in section.values():
+        if isinstance(value, dict) and "source" in value:
+            yield str(value["source"])
+        elif isinstance(value, dict):
+            yield from _sources(value)

@@ -1,0 +1,253 @@
+"""Vehicle parameters: what the twin drives and what the estimator knows of a robot.
+
+A vehicle is a YAML file in `twin/params/vehicles` (or the user's own): every
+number stands as `{value, source}` under a key that carries its unit.
+Body frame: x forward, y left, z up; its origin lies in the ground plane,
+midway between the four contact points.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from terrafusion.datasets.core.config import Quantity, structure
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.core.sensors import Rig, SensorSuite
+from terrafusion.twin.model.library import known_names, read_named
+from terrafusion.twin.model.sensor_realism import SensorRealism
+
+GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
+"""What a log tells of its odometry, and the number of the body that it stands for, too, unless `measured`."""
+
+
+@dataclass(frozen=True)
+class Body:
+    """Rigid body on four wheels; the centre of gravity is given from the body origin."""
+
+    mass_kg: Annotated[float, Quantity("kg", 1.0, 5000.0)]
+    payload_max_kg: Annotated[float, Quantity("kg", 0.0, 5000.0)]
+    yaw_inertia_kgm2: Annotated[float, Quantity("kg m2", 0.01, 20000.0)]
+    wheelbase_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+    track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+    cg_forward_m: Annotated[float, Quantity("m", -1.0, 1.0)]
+    cg_left_m: Annotated[float, Quantity("m", -1.0, 1.0)]
+    cg_height_m: Annotated[float, Quantity("m", 0.0, 2.0)]
+
+
+@dataclass(frozen=True)
+class Wheel:
+    """One of the four equal wheels; `inertia_kgm2` includes the reflected rotor.
+
+    Grousers stand out by `grouser_height_m`, `grouser_count` around the rim; 0 is a smooth wheel.
+    """
+
+    radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
+    width_m: Annotated[float, Quantity("m", 0.005, 1.0)]
+    inertia_kgm2: Annotated[float, Quantity("kg m2", 1e-5, 100.0)]
+    grouser_height_m: Annotated[float, Quantity("m", 0.0, 0.3)] = 0.0
+    grouser_count: Annotated[float, Quantity("", 0.0, 200.0)] = 0.0
+
+
+@dataclass(frozen=True)
+class Drive:
+    """One motor and gearbox a wheel, its speed loop, and the command limits.
+
+    Torque-speed line: stall torque at rest falling to zero at the no-load
+    speed; the current limit caps it at `torque_limit_nm` (motor shaft). The
+    no-load current is what friction in motor, gears and belts takes at any load.
+    """
+
+    gear_ratio: Annotated[float, Quantity("", 1.0, 1000.0)]
+    gear_efficiency: Annotated[float, Quantity("", 0.1, 1.0)]
+    no_load_speed_radps: Annotated[float, Quantity("rad/s", 10.0, 5000.0)]
+    stall_torque_nm: Annotated[float, Quantity("N m", 0.001, 500.0)]
+    torque_limit_nm: Annotated[float, Quantity("N m", 0.001, 500.0)]
+    supply_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
+    speed_loop_p_nms: Annotated[float, Quantity("N m s/rad at the wheel", 0.01, 10000.0)]
+    speed_loop_i_nm: Annotated[float, Quantity("N m/rad at the wheel", 0.0, 10000.0)]
+    lag_s: Annotated[float, Quantity("s", 0.001, 1.0)]
+    dead_time_s: Annotated[float, Quantity("s", 0.0, 2.0)]
+    max_speed_mps: Annotated[float, Quantity("m/s", 0.05, 50.0)]
+    max_accel_mps2: Annotated[float, Quantity("m/s2", 0.05, 50.0)]
+    max_yaw_accel_radps2: Annotated[float, Quantity("rad/s2", 0.05, 50.0)]
+    no_load_current_a: Annotated[float, Quantity("A", 0.0, 100.0)] = 0.0
+
+
+@dataclass(frozen=True)
+class Battery:
+    """What feeds all motors: open-circuit voltage, linear from full to empty, behind a resistance.
+
+    `charge` is the share of `capacity_wh` it holds at the start of a run.
+    """
+
+    full_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
+    empty_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
+    resistance_ohm: Annotated[float, Quantity("ohm", 0.0, 10.0)]
+    capacity_wh: Annotated[float, Quantity("W h", 1.0, 1e6)]
+    charge: Annotated[float, Quantity("", 0.0, 1.0)]
+
+    def __post_init__(self) -> None:
+        if self.empty_v > self.full_v:
+            raise ValueError(f"empty_v {self.empty_v:g} is above full_v {self.full_v:g}")
+
+
+@dataclass(frozen=True)
+class Odometry:
+    """Geometry the robot's own wheel odometry assumes (it need not be the true one)."""
+
+    wheel_radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
+    track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+
+
+@dataclass(frozen=True)
+class VehicleParams:
+    """A four-wheel differential-drive robot: body, drive, odometry and sensors.
+
+    Without a battery the motors are fed with `drive.supply_v`, whatever they draw. `effects` are optional
+    effects by key (docs/effects.md) that this robot, or what it drives on, is known to have, as `terrafusion
+    gap` finds them: the twin has them in every run. `measured` are numbers, by dotted name, that were found
+    for the body of this very robot: the geometry that a log assumes does not replace them.
+    """
+
+    name: str
+    description: str
+    body: Body
+    wheel: Wheel
+    drive: Drive
+    odometry: Odometry
+    sensors: SensorSuite
+    realism: SensorRealism
+    battery: Battery | None = None
+    topics: dict[str, str] = field(default_factory=dict)
+    effects: dict[str, Annotated[float, Quantity("")]] = field(default_factory=dict)
+    measured: tuple[str, ...] = ()
+
+    def rig(self) -> Rig:
+        """What a reader or an estimator needs: odometry geometry, sensors and topic names."""
+        return Rig(
+            wheel_radius_m=self.odometry.wheel_radius_m,
+            track_m=self.odometry.track_m,
+            sensors=self.sensors,
+            topics=dict(self.topics),
+        )
+
+
+def vehicle_names() -> tuple[str, ...]:
+    """Names of the vehicles that come with the library."""
+    return known_names("vehicles")
+
+
+def load_vehicle(name_or_path: str | Path) -> VehicleParams:
+    """A vehicle by its name in the library, or from a YAML file.
+
+    Raises:
+        ConfigError: unknown name (the known ones are listed), or a file that
+            does not keep to the parameters' names, units and ranges.
+    """
+    raw, file = read_named("vehicles", name_or_path, kind="vehicle")
+    found = structure(VehicleParams, raw, file=file)
+    for name in found.measured:
+        section, _, last = name.partition(".")
+        if not last or not isinstance(getattr(getattr(found, section, None), last, None), float):
+            raise ConfigError(
+                f"there is no number '{name}'", file=file, channel="measured",
+                remedy="give dotted names such as body.track_m",
+            )  # fmt: skip
+    if found.effects:
+        from terrafusion.twin.effects.catalogue import checked
+
+        try:
+            checked(found.effects)
+        except ConfigError as error:
+            raise ConfigError(error.what, file=file, channel="effects", remedy=error.remedy) from None
+    return found
+
+
+def with_payload(
+    vehicle: VehicleParams, payload_kg: float, at_m: tuple[float, float, float] | None = None
+) -> VehicleParams:
+    """The vehicle with a payload whose centre of gravity is at `at_m` (body frame), or at the vehicle's own.
+
+    The payload is taken to spread as the vehicle does: it has the vehicle's radius of gyration about
+    its own centre of gravity (assumed), and both turn about the common one by the parallel axis theorem.
+    """
+    body = vehicle.body
+    own = (body.cg_forward_m, body.cg_left_m, body.cg_height_m)
+    share = payload_kg / (body.mass_kg + payload_kg)
+    way = tuple(a - b for a, b in zip(at_m or own, own, strict=True))
+    forward, left, height = (b + share * w for b, w in zip(own, way, strict=True))
+    spread = body.yaw_inertia_kgm2 * (1.0 + payload_kg / body.mass_kg)
+    loaded = dataclasses.replace(
+        body,
+        mass_kg=body.mass_kg + payload_kg,
+        yaw_inertia_kgm2=spread + body.mass_kg * share * (way[0] ** 2 + way[1] ** 2),
+        cg_forward_m=forward,
+        cg_left_m=left,
+        cg_height_m=height,
+    )
+    return dataclasses.replace(vehicle, body=loaded)
+
+
+def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParams:
+    """The vehicle with what a log says of it: wheel radius, track, antenna and IMU position.
+
+    Radius and track replace the odometry's numbers and, unless `measured`, the body's: the log
+    knows one geometry only.
+    """
+    body, wheel, odometry, sensors = vehicle.body, vehicle.wheel, vehicle.odometry, vehicle.sensors
+    if overrides.wheel_radius_m is not None:
+        if GEOMETRY["wheel_radius_m"] not in vehicle.measured:
+            wheel = dataclasses.replace(wheel, radius_m=overrides.wheel_radius_m)
+        odometry = dataclasses.replace(odometry, wheel_radius_m=overrides.wheel_radius_m)
+    if overrides.track_m is not None:
+        if GEOMETRY["track_m"] not in vehicle.measured:
+            body = dataclasses.replace(body, track_m=overrides.track_m)
+        odometry = dataclasses.replace(odometry, track_m=overrides.track_m)
+    if overrides.antenna_m is not None:
+        gnss = dataclasses.replace(sensors.gnss, antenna_m=overrides.antenna_m)
+        sensors = dataclasses.replace(sensors, gnss=gnss)
+    if overrides.imu_m is not None:
+        imu = dataclasses.replace(sensors.imu, position_m=overrides.imu_m)
+        sensors = dataclasses.replace(sensors, imu=imu)
+    return dataclasses.replace(vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors)
+
+
+def told_geometry(recordings: Sequence[Recording]) -> Overrides:
+    """What logs of one vehicle tell of its geometry.
+
+    Raises:
+        DataError: two of them tell another.
+    """
+    first = recordings[0]
+    for recording in recordings[1:]:
+        if recording.overrides != first.overrides:
+            raise DataError(
+                f"it tells another geometry of the vehicle ({_listed(recording.overrides)}) than "
+                f"{first.name} ({_listed(first.overrides)})",
+                file=recording.name,
+                remedy="give logs of one vehicle, or the same wheel_radius_m, track_m, antenna_m and imu_m",
+            )  # fmt: skip
+    return first.overrides
+
+
+def _listed(overrides: Overrides) -> str:
+    """What a log tells of the geometry, in words."""
+    told = dataclasses.asdict(overrides).items()
+    return ", ".join(f"{name} = {value}" for name, value in told if value is not None) or "none"
+
+
+def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:
+    """What `with_overrides` takes from a log, and what it leaves, in a sentence; none if it tells nothing."""
+    if overrides == Overrides():
+        return ()
+    note = f"the log's own geometry is used: {_listed(overrides)}"
+    told = [number for name, number in GEOMETRY.items() if getattr(overrides, name) is not None]
+    kept = [number for number in told if number in vehicle.measured]
+    if kept:
+        note += f"; measured on this robot before, and kept for its body: {', '.join(kept)}"
+    return (note,)

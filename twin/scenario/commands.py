@@ -1,0 +1,168 @@
+"""From a scenario to driven states: command limits, side speeds, steering by waypoints."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.physics.layout import ENERGIES, INDEX, INPUTS, STATES, state_slice
+from terrafusion.twin.scenario.scenario import Scenario
+
+Array = NDArray[np.float64]
+Integrator = Callable[[Array, Array, float], Array]
+"""(state (X,), inputs (N + 1, U), start time s) -> states (N + 1, X)."""
+
+SETTLE_S = 10.0
+"""The robot stands this long before the run starts, so that it starts from rest in equilibrium."""
+STEERING_PERIOD_S = 0.1
+WAYPOINT_REACHED_M = 0.5
+LOOK_AHEAD_M = 1.5
+STEERING_GAIN_PER_S = 1.5
+MAX_STEERING_RADPS = 0.8
+
+
+@dataclass(frozen=True, eq=False)
+class Driven:
+    """What was wanted, told and driven: twist (N, 2) before limits, inputs (N, U), states (N, X)."""
+
+    wanted: Array
+    inputs: Array
+    states: Array
+
+
+def limit_slew(wanted: Array, dt_s: float, vehicle: VehicleParams, scenario: Scenario, start: Array) -> Array:
+    """Twist (N, 2) that follows `wanted` within the limits of speed and acceleration, from `start` (2,)."""
+    drive = vehicle.drive
+    accel = min(drive.max_accel_mps2, scenario.max_accel_mps2)
+    steps = (accel * dt_s, drive.max_yaw_accel_radps2 * dt_s)
+    goal_v = np.clip(wanted[:, 0], -drive.max_speed_mps, drive.max_speed_mps)
+    goals = zip((goal_v, wanted[:, 1]), steps, start.tolist(), strict=True)
+    return np.stack([follow(goal, step, first) for goal, step, first in goals], axis=1)
+
+
+def follow(goal: Array, step: float, start: float) -> Array:
+    """The goal (N,), approached from `start` by at most `step` a sample."""
+    out = np.array(goal, dtype=float)
+    behind = np.flatnonzero(np.abs(np.diff(goal, prepend=start)) > step).tolist()
+    targets, done = out.tolist(), 0
+    for first in behind:  # elsewhere the goal is met as it stands
+        if first < done:
+            continue
+        now = start if first == 0 else targets[first - 1]
+        for i in range(first, len(targets)):
+            missing = targets[i] - now
+            done = i + 1
+            if -step <= missing <= step:
+                break
+            now += step if missing > 0.0 else -step
+            out[i] = now
+    return out
+
+
+def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
+    """Wheel speeds (N, 2) of left and right, rad/s, by the robot's own odometry geometry."""
+    half = 0.5 * vehicle.odometry.track_m * twist[:, 1]
+    return np.stack([twist[:, 0] - half, twist[:, 0] + half], axis=1) / vehicle.odometry.wheel_radius_m
+
+
+def told(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
+    """Inputs (N, 4), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, that arrive late.
+
+    Linear between samples; before the first sample the first one held. The
+    rates are those of the interval that ends at the delayed time: the late
+    command's derivative by the dead time is minus the rate.
+    """
+    steps = np.diff(sides, axis=0, prepend=sides[:1]) / dt_s
+    if dead_time_s == 0.0:
+        return np.hstack([sides, steps])
+    count = len(sides)
+    at = np.arange(count) - dead_time_s / dt_s
+    whole = np.clip(np.ceil(at).astype(int), 0, count - 1)
+    late = np.stack([np.interp(at, np.arange(count), side) for side in sides.T], axis=1)
+    return np.hstack([late, np.where(at[:, None] > 0.0, steps[whole], 0.0)])
+
+
+def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
+    """Initial state (X,): standing at the origin with the scenario's heading, settled on the slope."""
+    start, inputs = settling(scenario, dt_s)
+    return settled(scenario, integrate(start, inputs, -SETTLE_S)[-1])
+
+
+def settling(scenario: Scenario, dt_s: float) -> tuple[Array, Array]:
+    """State (X,) and inputs (N + 1, U) from which the robot settles for `SETTLE_S`."""
+    x0 = np.zeros(len(STATES))
+    x0[INDEX["yaw"]] = math.radians(scenario.heading_deg)
+    return x0, np.zeros((max(1, round(SETTLE_S / dt_s)) + 1, len(INPUTS)))
+
+
+def settled(scenario: Scenario, state: Array) -> Array:
+    """The state (X,) after settling, moved back to the origin with nothing driven yet."""
+    x = state.copy()
+    for name in ("x", "y", "travel", "clog", "elapsed", *ENERGIES):
+        x[INDEX[name]] = 0.0
+    x[state_slice("wheel_angle")] = 0.0
+    x[INDEX["yaw"]] = math.radians(scenario.heading_deg)
+    return x
+
+
+def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[Array, Array]:
+    """Wanted twist (N, 2) and inputs (N, U) of a scenario that steers by no waypoints."""
+    dt = float(t_s[-1]) / (len(t_s) - 1)
+    wanted = scenario.commanded(t_s)
+    twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
+    return wanted, told(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
+
+
+def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator) -> Driven:
+    """Drive the scenario at the samples t_s (N,), uniformly spaced from 0."""
+    start = at_rest(scenario, float(t_s[-1]) / (len(t_s) - 1), integrate)
+    if scenario.waypoints:
+        return _steer(scenario, t_s, vehicle, integrate, start)
+    wanted, inputs = open_loop(scenario, t_s, vehicle)
+    return Driven(wanted, inputs, integrate(start, inputs, 0.0))
+
+
+def _steer(
+    scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator, start: Array
+) -> Driven:
+    """Steer along the waypoints by the true pose, renewed every `STEERING_PERIOD_S`."""
+    dt = float(t_s[-1]) / (len(t_s) - 1)
+    period, reach = max(1, round(STEERING_PERIOD_S / dt)), math.ceil(vehicle.drive.dead_time_s / dt) + 2
+    points = np.array([(0.0, 0.0), *scenario.waypoints])
+    states, wanted = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
+    states[0], wanted[0] = start, 0.0
+    twists = np.zeros((len(t_s), 2))
+    goal, first = 1, 0
+    while first < len(t_s) - 1:
+        last = min(first + period, len(t_s) - 1)
+        pose = states[first, :3]
+        while goal < len(points) and np.hypot(*(points[goal] - pose[:2])) < WAYPOINT_REACHED_M:
+            goal += 1
+        wish = _towards(points, goal, pose, scenario.waypoint_speed_mps)
+        block = np.tile(wish, (last - first, 1))
+        twists[first + 1 : last + 1] = limit_slew(block, dt, vehicle, scenario, twists[first])
+        known = max(0, first - reach)
+        inputs = told(side_speeds(twists[known : last + 1], vehicle), dt, vehicle.drive.dead_time_s)
+        states[first : last + 1] = integrate(states[first], inputs[first - known :], float(t_s[first]))
+        wanted[first + 1 : last + 1] = wish
+        first = last
+    return Driven(wanted, told(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s), states)
+
+
+def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:
+    """Twist (2,) towards a point ahead on the leg that ends at `points[goal]`; rest after the last one."""
+    if goal >= len(points):
+        return np.zeros(2)
+    leg = points[goal] - points[goal - 1]
+    length = max(float(np.hypot(*leg)), 1e-9)
+    along = float((pose[:2] - points[goal - 1]) @ leg) / length
+    ahead = points[goal - 1] + leg / length * min(along + LOOK_AHEAD_M, length)
+    bearing = math.atan2(*(ahead - pose[:2])[::-1]) - float(pose[2])
+    error = math.remainder(bearing, 2.0 * math.pi)
+    rate = min(max(STEERING_GAIN_PER_S * error, -MAX_STEERING_RADPS), MAX_STEERING_RADPS)
+    return np.array([speed_mps * max(math.cos(error), 0.0), rate])

@@ -1,0 +1,143 @@
+"""A simulated drive with optional effects: what they make of the plant, of its motion and of each channel.
+
+Effects of the motion are in the plant. What effects add to the readings of a motion
+(`measurement.correction`) is added to the channels of `sensors.py`, whose noise stays as it was. A delay of a
+whole sensor is exact: it shifts the stamps.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.twin.effects.catalogue import moves
+from terrafusion.twin.model.ground import under_wheels
+from terrafusion.twin.model.measurement import corrections, measured
+from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.plant import Plant
+from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.physics.layout import INPUTS, OUTPUTS, VEHICLE_PARAMETERS, mounting_vector
+from terrafusion.twin.sensors.noise import rows_at_rate, sample_rate_hz
+
+Array = NDArray[np.float64]
+C = TypeVar("C", Imu, Gnss)
+
+DEAD_TIME = "dead_time/transport"
+STAMPED_LATE = {"imu": "imu_time_offset/shift", "gnss": "gnss_latency/both"}
+"""Delays of a whole channel."""
+
+
+def with_effects(plant: Plant, effects: Mapping[str, float]) -> Plant:
+    """The plant with the effects that change its motion; its dead time counts as applied by the driver."""
+    vehicle = plant.vehicle.copy()
+    vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] += effects.get(DEAD_TIME, 0.0)
+    moving = {key: value for key, value in effects.items() if moves(key)}
+    return dataclasses.replace(plant, vehicle=vehicle, effects=moving)
+
+
+def as_driven(vehicle: VehicleParams, effects: Mapping[str, float]) -> VehicleParams:
+    """The vehicle as its driver has it: commands arrive later by the dead time among the effects."""
+    late = vehicle.drive.dead_time_s + effects.get(DEAD_TIME, 0.0)
+    return dataclasses.replace(vehicle, drive=dataclasses.replace(vehicle.drive, dead_time_s=late))
+
+
+def true_motion(
+    motion: Motion, states: Array, inputs: Array | None, plant: Plant, vehicle: VehicleParams
+) -> Motion:
+    """The motion with the body origin's velocity as effects have it that move the centre of gravity."""
+    told = np.zeros((len(states), len(INPUTS))) if inputs is None else inputs
+    ground = np.tile(plant.route.soil[0], 4)  # the origin's velocity does not depend on it
+    y = measured(states, told, plant.vehicle, ground, mounting_vector(vehicle), plant.effects)
+    velocity = motion.velocity_body_mps.copy()
+    velocity[:, :2] = y[:, [OUTPUTS.index("speed_mps"), OUTPUTS.index("side_speed_mps")]]
+    return dataclasses.replace(motion, velocity_body_mps=velocity)
+
+
+def sensed(
+    recording: Recording,
+    motion: Motion,
+    states: Array,
+    inputs: Array,
+    plant: Plant,
+    vehicle: VehicleParams,
+    effects: Mapping[str, float],
+    gnss_latency_s: float = 0.0,
+) -> Recording:
+    """A simulated recording with what the effects add to its channels, as late as they make them.
+
+    Args:
+        recording: as the sensors without effects report the motion.
+        motion: of the body (see `true_motion`), at the samples (N,).
+        states, inputs: (N, X) and (N, U) at the samples.
+        plant: that was driven.
+        vehicle: with the nominal sensors.
+        effects: all of them, by name.
+        gnss_latency_s: how late the recording's fixes are stamped.
+    """
+    wheels, imu, gnss, motor = recording.wheels, recording.imu, recording.gnss, recording.motor
+    if wheels is None or imu is None or gnss is None or motor is None:
+        raise ValueError("a simulated recording has all channels")
+    late = {name: effects.get(key, 0.0) for name, key in STAMPED_LATE.items()}
+    rest = {key: value for key, value in effects.items() if key not in STAMPED_LATE.values()}
+    ground = under_wheels(plant.route, plant.vehicle, motion.t_s, states)
+    added = corrections(states, inputs, plant.vehicle, ground, mounting_vector(vehicle), rest)
+    columns = dict(zip(OUTPUTS, added.T, strict=True))
+    rows = rows_at_rate(len(states), sample_rate_hz(motion.t_s), vehicle.sensors.wheels.rate_hz)
+    epochs_s = (gnss.t_ns - recording.start_ns) * 1e-9 - gnss_latency_s
+    seen = {name: np.interp(epochs_s, motion.t_s, column) for name, column in columns.items()}
+    return dataclasses.replace(
+        recording,
+        wheels=_wheels(wheels, columns, motion.t_s, rows),
+        imu=_stamped(_imu(imu, columns), late["imu"]),
+        gnss=_stamped(_gnss(gnss, seen), late["gnss"]),
+        motor=dataclasses.replace(motor, current_a=motor.current_a + _sides(columns, "current", "a")[rows]),
+    )
+
+
+def _stamped(channel: C, late_s: float) -> C:
+    return dataclasses.replace(channel, t_ns=channel.t_ns + round(late_s * 1e9))
+
+
+def _sides(columns: Mapping[str, Array], name: str, unit: str) -> Array:
+    return np.stack([columns[f"{name}_{side}_{unit}"] for side in ("left", "right")], axis=1)
+
+
+def _means(values: Array) -> Array:
+    """Means over the intervals between samples."""
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def _imu(imu: Imu, added: Mapping[str, Array]) -> Imu:
+    gyro, accel = imu.gyro_radps.copy(), imu.accel_mps2.copy()
+    gyro[:, 2] += _means(added["yaw_rate_radps"])
+    accel[:, 0] += _means(added["accel_x_mps2"])
+    accel[:, 1] += _means(added["accel_y_mps2"])
+    return dataclasses.replace(imu, gyro_radps=gyro, accel_mps2=accel)
+
+
+def _wheels(wheels: Wheels, added: Mapping[str, Array], t_s: Array, rows: NDArray[np.int64]) -> Wheels:
+    """Angles gain the integral of what is added, after counting; speeds stay their differences."""
+    rates = np.tile(_sides(added, "wheel", "radps"), 2)
+    turned = np.zeros_like(rates)
+    turned[1:] = np.cumsum(_means(rates) * np.diff(t_s)[:, None], axis=0)
+    turned = turned[rows]
+    speed = wheels.speed.copy()
+    speed[1:] += np.diff(turned, axis=0) / np.diff(t_s[rows])[:, None]
+    angle = None if wheels.angle_rad is None else wheels.angle_rad + turned
+    return dataclasses.replace(wheels, speed=speed, angle_rad=angle)
+
+
+def _gnss(gnss: Gnss, added: Mapping[str, Array]) -> Gnss:
+    position, velocity = gnss.enu_m.copy(), gnss.velocity_enu_mps
+    for column, axis in enumerate(("east", "north")):
+        position[:, column] += added[f"gnss_{axis}_m"]
+    if velocity is not None:
+        velocity = velocity.copy()
+        for column, axis in enumerate(("e", "n")):
+            velocity[:, column] += added[f"gnss_v_{axis}_mps"]
+    return dataclasses.replace(gnss, enu_m=position, velocity_enu_mps=velocity)

@@ -1,0 +1,88 @@
+"""Barometer and magnetometer; a vehicle whose file says nothing of them has none.
+
+Pressure: the standard atmosphere at the sensor's height, plus what the weather makes of it (an offset and
+a trend that are drawn once a run, and a random walk), plus white noise.
+
+Field: M (R^T b + disturbance of the place) + hard iron + white noise, in body axes. b is Earth's field at
+the datum of simulated drives. M = I + E (soft iron), E symmetric, and the hard iron are drawn once a run.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.atmosphere import pressure_at
+from terrafusion.datasets.core.recording import Barometer, Magnetometer
+from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.sensors.noise import Noise, rows_at_rate, sample_rate_hz
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+
+FIELD_SIZE_T, INCLINATION_RAD, DECLINATION_RAD = 49.54e-6, math.radians(67.35), math.radians(3.35)
+"""World Magnetic Model 2020 at 52 deg N, 8 deg E, 100 m, for 2024-01-01. The declination is positive to the
+east, the inclination downwards."""
+DISTURBANCE_WAVES = 24
+
+
+def earth_field_t() -> Array:
+    """Earth's field (3,) at the datum of simulated drives: east, north, up, tesla."""
+    flat = FIELD_SIZE_T * math.cos(INCLINATION_RAD)
+    up = -FIELD_SIZE_T * math.sin(INCLINATION_RAD)
+    return np.array([flat * math.sin(DECLINATION_RAD), flat * math.cos(DECLINATION_RAD), up])
+
+
+def barometer_channel(
+    t_ns: TimesNs, motion: Motion, datum_height_m: float, vehicle: VehicleParams, noise: Noise
+) -> Barometer | None:
+    """Static pressure at the sensor, `datum_height_m` + its ENU height above sea level."""
+    spec, real = vehicle.sensors.barometer, vehicle.realism.barometer
+    if spec is None:
+        return None
+    rows = rows_at_rate(len(t_ns), sample_rate_hz(motion.t_s), spec.rate_hz)
+    pressure = pressure_at(datum_height_m + motion.point_position_m(spec.position_m)[rows, 2])
+    if not noise.noiseless:
+        t_s = motion.t_s[rows]
+        offset, trend = noise.stream("weather").normal(size=2)
+        pressure = pressure + real.offset_sigma_pa * offset + real.trend_sigma_paps * trend * t_s
+        rng = noise.stream("barometer")
+        steps = np.sqrt(np.diff(t_s, prepend=t_s[0])) * rng.normal(size=len(rows))
+        pressure = pressure + spec.walk_paps_sqrthz * np.cumsum(steps)
+        pressure = pressure + spec.noise_pa * rng.normal(size=len(rows))
+    return Barometer(t_ns[rows], pressure)
+
+
+def magnetometer_channel(
+    t_ns: TimesNs, motion: Motion, vehicle: VehicleParams, noise: Noise
+) -> Magnetometer | None:
+    """Magnetic flux density in body axes."""
+    spec, real = vehicle.sensors.magnetometer, vehicle.realism.magnetometer
+    if spec is None:
+        return None
+    rows = rows_at_rate(len(t_ns), sample_rate_hz(motion.t_s), spec.rate_hz)
+    world = np.tile(earth_field_t(), (len(rows), 1))
+    if not noise.noiseless:
+        world = world + real.disturbance_t * _of_the_place(
+            motion.position_m[rows], real.disturbance_length_m, noise.stream("magnetic place")
+        )
+    field = np.einsum("nji,nj->ni", motion.rotation[rows], world)
+    if not noise.noiseless:
+        rng = noise.stream("iron")
+        hard, soft = rng.normal(size=3), rng.normal(size=(3, 3))
+        mixing = np.eye(3) + real.soft_iron_sigma * 0.5 * (soft + soft.T)
+        field = field @ mixing.T + spec.hard_iron_sigma_t * hard
+        field = field + spec.noise_t * noise.stream("magnetometer").normal(size=field.shape)
+    return Magnetometer(t_ns[rows], field)
+
+
+def _of_the_place(position_m: Array, length_m: float, rng: np.random.Generator) -> Array:
+    """A fixed random vector field (N, 3) of unit variance an axis over the ground, squared-exponential over
+    `length_m`: a sum of plane waves with Gaussian wave vectors (Rahimi and Recht 2007)."""
+    waves = rng.normal(0.0, 1.0 / length_m, (3, 2, DISTURBANCE_WAVES))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (3, DISTURBANCE_WAVES))
+    parts = [np.cos(position_m[:, :2] @ w + p).sum(axis=1) for w, p in zip(waves, phase, strict=True)]
+    return np.asarray(math.sqrt(2.0 / DISTURBANCE_WAVES) * np.stack(parts, axis=1))

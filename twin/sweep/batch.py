@@ -1,0 +1,68 @@
+"""Driving many runs without sensors, several side by side where the engine can."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.engine.integrate import raise_if_diverged
+from terrafusion.twin.engine.lanes import integrate_many
+from terrafusion.twin.scenario.commands import SETTLE_S, Driven, open_loop, settled, settling
+from terrafusion.twin.sensors.effects import as_driven
+from terrafusion.twin.simulate import RunSetup, drive_through
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+TOGETHER = 8
+"""Runs whose states are held at a time, which bounds the memory: 16 MB for 60 s at 100 Hz."""
+
+
+def attempt(work: Callable[..., T], *inputs: Any) -> T | Exception:
+    """`work(*inputs)`, or the exception it raises or finds among its inputs: a run takes no other along."""
+    failed = next((value for value in inputs if isinstance(value, Exception)), None)
+    if failed is not None:
+        return failed
+    try:
+        return work(*inputs)
+    except Exception as error:
+        return error
+
+
+def drive_many(setups: Sequence[RunSetup | Exception]) -> list[Driven | Exception]:
+    """The motions of runs of one vehicle and one scenario but for speeds and ground, in their order.
+
+    The same numbers as `drive_through` run by run, which is how scenarios with waypoints are driven.
+    A run that could not be set up, or that diverges, has its exception in place of a motion.
+    """
+    ready = [setup for setup in setups if isinstance(setup, RunSetup)]
+    if not ready or ready[0].scenario.waypoints:
+        return [attempt(drive_through, setup) for setup in setups]
+    together = attempt(_side_by_side, ready)
+    if isinstance(together, Exception):  # then each alone, so that only those fail that must
+        return [attempt(drive_through, setup) for setup in setups]
+    driven = iter(together)
+    return [setup if isinstance(setup, Exception) else next(driven) for setup in setups]
+
+
+def _side_by_side(setups: Sequence[RunSetup]) -> list[Driven | Exception]:
+    dt_s = 1.0 / setups[0].vehicle.sensors.imu.rate_hz
+    plants = [setup.plant for setup in setups]
+    rests = [settling(setup.scenario, dt_s) for setup in setups]
+    still = rests[0][1]
+    rested = integrate_many(
+        np.stack([x for x, _ in rests]), still, dt_s, plants, t0_s=-SETTLE_S, every=len(still) - 1
+    )
+    starts = [settled(setup.scenario, states[-1]) for setup, states in zip(setups, rested, strict=True)]
+    told = [open_loop(s.scenario, s.t_s, as_driven(s.vehicle, s.effects)) for s in setups]
+    motions = integrate_many(np.stack(starts), np.stack([inputs for _, inputs in told]), dt_s, plants)
+    return [attempt(_driven, *each, dt_s) for each in zip(told, motions, strict=True)]
+
+
+def _driven(told: tuple[Array, Array], states: Array, dt_s: float) -> Driven:
+    if not np.isfinite(states[-1]).all():  # a run that diverged is blank to its end
+        raise_if_diverged(states, 0.0, dt_s)
+    return Driven(*told, states)

@@ -1,0 +1,210 @@
+"""The runs of a sweep as rows of its table."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
+from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.physics.layout import INDEX, state_slice
+from terrafusion.twin.scenario.commands import Driven
+from terrafusion.twin.scenario.validity import check_slip
+from terrafusion.twin.simulate import RunSetup, set_up, simulate_run
+from terrafusion.twin.sweep.batch import TOGETHER, attempt, drive_many
+from terrafusion.twin.sweep.plan import Case, Sweep, at_speed, top_speed_mps
+
+Array = NDArray[np.float64]
+Row = dict[str, str | float | int | None]
+
+DONE, SPINNING, IMMOBILISED, SLID, FAILED = ("done", "spinning", "immobilised", "slid", "failed")
+STATUSES = (DONE, SPINNING, IMMOBILISED, SLID, FAILED)
+"""How a run ended: it drove on; its wheels turned, but it made less than a tenth of its way; it came
+to rest for good; it ended behind its start, as on too steep a slope; it could not be computed."""
+MOBILE_RATIO = 0.1
+"""A robot that makes less than this share of its commanded way spins (assumed)."""
+MIN_COMMANDED_M = 0.5
+"""A drive that is told to cover less has no travel ratio."""
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of the table: "int", "float" or "text", and what it holds."""
+
+    name: str
+    kind: str
+    about: str
+
+
+_AXES = (
+    Column("run", "int", "number of the run, from 0"),
+    Column("terrain", "text", "ground, or the grounds of the route"),
+    Column("friction", "float", "effective friction cap; null where the route's grounds differ in it"),
+    Column("slope_deg", "float", "slope of the plane, deg"),
+    Column("payload_kg", "float", "payload at the centre of gravity, kg"),
+    Column("speed_scale", "float", "commanded speeds over the scenario's"),
+    Column("speed_mps", "float", "fastest forward speed commanded, m/s"),
+    Column("seed", "int", "seed of the sensors' noise and of ground that varies"),
+)
+_RESULTS = (
+    Column("status", "text", f"one of {', '.join(STATUSES)}"),
+    Column("duration_s", "float", "length of the run, s"),
+    Column("distance_m", "float", "length of the path of the body origin, m"),
+    Column("travel_m", "float", "net way forward, m"),
+    Column("travel_ratio", "float", "net way forward over the way commanded; null where none is"),
+    Column("mean_abs_slip", "float", "mean |1 - v_odom / v_truth| while moving; null if it never moved"),
+    Column("mean_slip_ratio", "float", "mean |w R - u| / max(|w R|, |u|) while moving; null likewise"),
+    Column("energy_j", "float", "energy drawn from the battery, J"),
+    Column("energy_per_m_j", "float", "energy over distance, J/m; null below 0.1 m"),
+    Column("mean_power_w", "float", "energy over duration, W"),
+    Column("peak_power_w", "float", "most power drawn from the battery between two samples, W"),
+    Column("motor_work_j", "float", "work of the motors at the wheels, J"),
+    Column("slip_work_j", "float", "of that, spent in the slip of the wheels, J"),
+    Column("resistance_work_j", "float", "of that, spent in rolling, compaction and drag, J"),
+    Column("heat_j", "float", "energy drawn less the motors' work, J"),
+    Column("immobilised_at_s", "float", "when the robot came to rest for good, s; null if it did not"),
+    Column("immobilised_cause", "text", "traction lost (wheels turn) or motors stalled; null likewise"),
+    Column("yaw_error_rad", "float", "heading turned by the wheels' odometry less the true one, at the end"),
+)
+_SENSORS = (
+    Column("odometry_error_pct", "float", "mean speed error of the odometry, % of the true speed"),
+    Column("imu_error_pct", "float", "mean speed error of the integrated IMU, %"),
+    Column("gnss_error_pct", "float", "mean speed error of the differenced GNSS positions, %"),
+)
+_ERROR = Column("error", "text", "why the run failed; null if it did not")
+
+
+def columns(sensors: bool) -> tuple[Column, ...]:
+    """The columns of a table with or without sensors."""
+    return (*_AXES, *_RESULTS, *(_SENSORS if sensors else ()), _ERROR)
+
+
+def run_chunk(sweep: Sweep, cases: Sequence[Case]) -> list[Row]:
+    """The rows of some runs, in their order. A run that fails is a row that says why."""
+    rows: list[Row] = []
+    for first in range(0, len(cases), TOGETHER):
+        some = cases[first : first + TOGETHER]
+        outcomes = _with_sensors(sweep, some) if sweep.sensors else _without(sweep, some)
+        rows += [_row(sweep, case, outcome) for case, outcome in zip(some, outcomes, strict=True)]
+    return rows
+
+
+def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
+    """The arguments of `simulate_run` for a run of the sweep."""
+    soils = dict(sweep.soils)
+    if case.friction is not None:
+        soils |= {name: _capped(soils[name], case.friction) for name in _grounds(sweep, case)}
+    return {
+        "scenario": at_speed(sweep.scenario, sweep.speed_scale(case)),
+        "vehicle": sweep.vehicle,
+        "terrain": case.terrain,
+        "slope_deg": case.slope_deg,
+        "payload_kg": case.payload_kg,
+        "seed": case.seed,
+        "soils": soils,
+    }
+
+
+def _grounds(sweep: Sweep, case: Case) -> list[str]:
+    """Names of the grounds along the route."""
+    return [case.terrain] if case.terrain is not None else [leg.terrain for leg in sweep.scenario.route]
+
+
+def _capped(soil: SoilParams, friction: float) -> SoilParams:
+    return dataclasses.replace(soil, shear=dataclasses.replace(soil.shear, friction_cap=friction))
+
+
+def _with_sensors(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
+    def sensed(case: Case) -> Row:
+        run = simulate_run(**arguments(sweep, case))
+        row = _results(run.t_s, run.wanted, run.states, run.summary, sweep.vehicle)
+        return row | _sensor_errors(run.recording, sweep.vehicle)
+
+    return [attempt(sensed, case) for case in cases]
+
+
+def _without(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
+    setups = [attempt(lambda c: set_up(**arguments(sweep, c)), case) for case in cases]
+    return [attempt(results, *run) for run in zip(setups, drive_many(setups), strict=True)]
+
+
+def _row(sweep: Sweep, case: Case, outcome: Row | Exception) -> Row:
+    row = _axes(sweep, case)
+    if isinstance(outcome, Exception):
+        known = isinstance(outcome, TerrafusionError)
+        row |= {"status": FAILED, "error": str(outcome) if known else f"{type(outcome).__name__}: {outcome}"}
+    else:
+        row |= outcome
+    return {column.name: _plain(row.get(column.name)) for column in columns(sweep.sensors)}
+
+
+def _axes(sweep: Sweep, case: Case) -> Row:
+    """The conditions of a run, those that no axis names among them."""
+    legs = _grounds(sweep, case)
+    soils = dict(sweep.soils)
+    caps = {soils[name].shear.friction_cap for name in legs} if case.friction is None else {case.friction}
+    scale = sweep.speed_scale(case)
+    return {
+        "run": case.run,
+        "terrain": " + ".join(dict.fromkeys(legs)),
+        "friction": caps.pop() if len(caps) == 1 else None,
+        "slope_deg": sweep.scenario.slope_deg if case.slope_deg is None else case.slope_deg,
+        "payload_kg": sweep.scenario.payload_kg if case.payload_kg is None else case.payload_kg,
+        "speed_scale": scale,
+        "speed_mps": scale * top_speed_mps(sweep.scenario),
+        "seed": case.seed,
+    }
+
+
+def results(setup: RunSetup, driven: Driven) -> Row:
+    """What comes of a run without sensors; the same checks as in `simulate_run`."""
+    motion = setup.motion(driven.states, driven.inputs)
+    slip = slip_ratios(driven.states, motion, setup.vehicle)
+    check_slip(setup.route, setup.plant.route.field, setup.t_s, driven.states, slip)
+    summary = summarise(driven, motion, setup.vehicle, slip)
+    return _results(setup.t_s, driven.wanted, driven.states, summary, setup.vehicle)
+
+
+def _results(t_s: Array, wanted: Array, states: Array, summary: RunSummary, vehicle: VehicleParams) -> Row:
+    travel = float(states[-1, INDEX["travel"]])
+    commanded = float(np.sum(wanted[:, 0])) * float(t_s[1] - t_s[0])
+    ratio = travel / commanded if abs(commanded) >= MIN_COMMANDED_M else None
+    status = DONE
+    if summary.immobilised_at_s is not None:
+        status = IMMOBILISED
+    elif ratio is not None and ratio < MOBILE_RATIO:
+        status = SLID if ratio < 0.0 else SPINNING
+    turned = float(states[-1, INDEX["yaw"]] - states[0, INDEX["yaw"]])
+    return dataclasses.asdict(summary) | {
+        "status": status,
+        "travel_m": travel,
+        "travel_ratio": ratio,
+        "yaw_error_rad": _odometry_yaw(states, vehicle) - turned,
+    }
+
+
+def _odometry_yaw(states: Array, vehicle: VehicleParams) -> float:
+    """Angle the robot turned by its wheels' angles, rad."""
+    left, right = (states[-1] - states[0])[state_slice("wheel_angle")].reshape(2, 2).mean(axis=0)
+    return float(right - left) * vehicle.odometry.wheel_radius_m / vehicle.odometry.track_m
+
+
+def _sensor_errors(recording: Recording, vehicle: VehicleParams) -> Row:
+    from terrafusion.twin.analysis.speeds import profiles_of, speed_errors
+
+    errors = speed_errors(profiles_of(recording, vehicle.odometry.wheel_radius_m))
+    return {"odometry_error_pct": errors.odometry, "imu_error_pct": errors.imu, "gnss_error_pct": errors.gnss}
+
+
+def _plain(value: Any) -> Any:
+    """None for a number that is not finite: the table has no NaN."""
+    return None if isinstance(value, float) and not math.isfinite(value) else value
