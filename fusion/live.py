@@ -25,10 +25,10 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import complete_rows, imu_kind, inputs_of
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.sensor_config import complete_rows, imu_kind, inputs_of
 
 Array = NDArray[np.float64]
 

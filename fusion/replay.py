@@ -16,13 +16,12 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
 from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import Inputs, complete_rows, inputs_of
 from terrafusion.fusion.estimate.estimate import Estimate, State
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
 from terrafusion.fusion.estimator.map_alignment import Placement
-from terrafusion.fusion.estimator.sensor_config import Inputs, complete_rows, inputs_of
-from terrafusion.fusion.estimator.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
@@ -34,6 +33,7 @@ from terrafusion.fusion.graph.key_state import (
     linear_sigma,
     quaternion_of,
 )
+from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.metrics.metrics import Outage, Scores, score
 from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.fusion.terrain.external import external_probabilities
@@ -317,7 +317,7 @@ def _smooth(chain: Chain, history: History, config: EstimatorConfig, placed: boo
     keys, covariances = batch.states(), batch.covariances()
     offset = len(keys) - len(history.states)
     history.states[:] = [
-        _smoothed(state, key, P, gyro_sigma_radps(config, row))
+        _smoothed(state, key, P, gyro_sigma_radps(config.rig.sensors.imu, config.keyframe_s, row))
         for state, key, P, row in zip(
             history.states, keys[offset:], covariances[offset:], history.rows, strict=True
         )

@@ -23,11 +23,13 @@ from terrafusion.twin.model.library import assumed
 from terrafusion.twin.model.motion import Motion, motion_of, wheel_shares
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_payload
-from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import Driven, drive
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.route import Route
-from terrafusion.twin.scenario.scenario import Scenario, load_scenario
+from terrafusion.twin.scenario.scenario import Scenario
 from terrafusion.twin.scenario.validity import check_ground, check_slip
 from terrafusion.twin.sensors import suite as sensors
 from terrafusion.twin.sensors.effects import as_driven, sensed, true_motion, with_effects

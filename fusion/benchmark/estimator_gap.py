@@ -22,7 +22,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import Log
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.diagnose import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.infer.refit import effects_at
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run

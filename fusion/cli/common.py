@@ -138,7 +138,7 @@ def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> None:
     Raises:
         DataError: the first such finding, with its evidence and what to do.
     """
-    from terrafusion.datasets.checks import run as examine
+    from terrafusion.datasets.checks import examine
 
     _refuse(log, examine(recording, rig_of(recording, rig)))
 

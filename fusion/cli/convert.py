@@ -57,8 +57,7 @@ def convert(
     """
     import dataclasses
 
-    from terrafusion.datasets.checks import run as examine
-    from terrafusion.datasets.checks import treat
+    from terrafusion.datasets.checks import examine, treat
     from terrafusion.datasets.readers import open_recording
 
     rig = load_rig(vehicle)

@@ -22,7 +22,7 @@ def demo(
 
     Example: terrafusion demo --out demo-out
     """
-    from terrafusion.fusion.demo import run_demo
+    from terrafusion.fusion.cli.demo_run import run_demo
 
     with progress_bar("demo") as progress:
         lines = run_demo(out, seed, progress)

@@ -23,7 +23,7 @@ from terrafusion.fusion.cli.common import (
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.benchmark.estimator_gap import Compared
-    from terrafusion.twin.gap.diagnose import Diagnosis
+    from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 
 RunsArgument = Annotated[
     list[str],

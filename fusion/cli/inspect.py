@@ -68,7 +68,7 @@ def examined(
     columns: Path | None = None,
 ) -> dict[str, Any]:
     """The page as plain data; see `terrafusion.datasets.checks.summary`."""
-    from terrafusion.datasets.checks import run as examine
+    from terrafusion.datasets.checks import examine
     from terrafusion.datasets.checks.measures import measure
     from terrafusion.datasets.checks.summary import summarise, summarise_all
     from terrafusion.datasets.readers import open_recordings

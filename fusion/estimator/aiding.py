@@ -15,8 +15,8 @@ from terrafusion.fusion.estimator.alignment import LEVEL_SIGMA_STILL_RAD, WINDOW
 from terrafusion.fusion.estimator.barometer import HeightAid
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.magnetometer import HeadingAid
-from terrafusion.fusion.estimator.streams import GnssFix, ImuStream
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream
 
 Array = NDArray[np.float64]
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.estimator.streams import GnssFix, ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.estimator.alignment import turn_between
-from terrafusion.fusion.estimator.streams import GnssFix
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.inputs.streams import GnssFix
 
 Array = NDArray[np.float64]
 

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
 from terrafusion.datasets.core.recording import Fix
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import Aids
@@ -31,7 +32,6 @@ from terrafusion.fusion.estimator.alignment import (
     heading_from_motion,
     level_start,
 )
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.friction import grip_of
 from terrafusion.fusion.estimator.gates import WheelGate
 from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
@@ -39,7 +39,6 @@ from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.skid import Slide
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.stationarity import RestDetector, forget_waiting, hold
-from terrafusion.fusion.estimator.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
@@ -48,6 +47,7 @@ from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, l
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
+from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.weighting.adaptive import TerrainWeights
 
 Array = NDArray[np.float64]
@@ -433,7 +433,10 @@ class Estimator:
             covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
             velocity_covariance=P[VELOCITY, VELOCITY].copy(),
             twist_covariance=twist_covariance(
-                P, R, key.velocity, gyro_sigma_radps(self.config, self.weights.row)
+                P,
+                R,
+                key.velocity,
+                gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, self.weights.row),
             ),
             bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),

@@ -19,9 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
-from terrafusion.fusion.estimator.config import EstimatorConfig
-from terrafusion.fusion.estimator.streams import GnssFix, ImuSegment
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.coulomb import slid
 from terrafusion.fusion.graph.key_state import ICR_X, SIDE_SLIP, VELOCITY, KeyState
@@ -29,6 +28,7 @@ from terrafusion.fusion.graph.link import imu_factor
 from terrafusion.fusion.graph.planar import ACCEL_DENSITY_MPS2
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]

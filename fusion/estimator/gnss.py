@@ -14,18 +14,18 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.recording import Fix
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
 from terrafusion.fusion.estimator.gates import GnssGate, Verdict
 from terrafusion.fusion.estimator.map_alignment import Placement, place
 from terrafusion.fusion.estimator.skid import Slide
-from terrafusion.fusion.estimator.streams import GnssFix
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
+from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import Surprise, Weighting
 from terrafusion.twin.sensors.gnss import best_fix

@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
-from terrafusion.fusion.estimator.streams import GnssFix
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import DRIFT, quaternion_of
 from terrafusion.fusion.graph.node import Node
+from terrafusion.fusion.inputs.streams import GnssFix
 
 Array = NDArray[np.float64]
 

@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.streams import ImuStream
 from terrafusion.fusion.graph.body_twist import bias_sigma, twist_covariance
 from terrafusion.fusion.graph.key_state import DIM, NAV, POSE, VELOCITY, KeyState, quaternion_of
 from terrafusion.fusion.graph.preintegration import Preintegrator
+from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]

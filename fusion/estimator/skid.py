@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.estimator.friction import Grip
-from terrafusion.fusion.estimator.streams import ImuSegment
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]

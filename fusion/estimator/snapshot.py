@@ -22,23 +22,21 @@ import sys
 from collections import deque
 from enum import Enum
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol, TypeVar
 
 import gtsam
 import numpy as np
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.annotations import fits, hints_of
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.odometry import Propagator
+from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factor_numbers import FactorNumbers, factor_from, numbers_of
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.noise.policy import Policy
 from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel
-
-if TYPE_CHECKING:
-    from terrafusion.fusion.estimator.estimator import Estimator
 
 MAGIC = b"terrafusion.snapshot/1\n"
 _HEAD = len(MAGIC) + 32 + 8
@@ -58,7 +56,17 @@ _FIXED = (
 _OWN = ("terrafusion.fusion.", "terrafusion.datasets.")
 
 
-def dump(estimator: Estimator) -> bytes:
+class Running(Protocol):
+    """What a snapshot needs to know of an estimator."""
+
+    config: EstimatorConfig
+    chain: Chain
+
+
+R = TypeVar("R", bound=Running)
+
+
+def dump(estimator: Running) -> bytes:
     """The estimator's state; the configuration is not part of it, only its hash.
 
     Raises:
@@ -79,7 +87,7 @@ def dump(estimator: Estimator) -> bytes:
     return MAGIC + hashlib.sha256(body).digest() + body
 
 
-def restore(fresh: Estimator, data: bytes) -> Estimator:
+def restore(fresh: R, data: bytes) -> R:
     """The same estimator, fresh until now, filled with a dumped state.
 
     Raises:

@@ -23,9 +23,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
-from terrafusion.fusion.estimator.streams import GnssFix, ImuStream, WheelStream
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import at_rest
+from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
 

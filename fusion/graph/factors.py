@@ -11,9 +11,9 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.fusion.estimator.streams import ImuSegment
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]

@@ -7,9 +7,9 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.estimator.streams import ImuSegment
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import ImuSegment
 
 Array = NDArray[np.float64]
 

@@ -22,9 +22,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec
-from terrafusion.fusion.estimator.streams import ImuSegment, WheelStream
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.preintegration import INTEGRATION_SIGMA_M, Preintegrator
+from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]

@@ -10,7 +10,7 @@ import numpy as np
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec
-from terrafusion.fusion.estimator.streams import ImuSegment
+from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
 
 INTEGRATION_SIGMA_M = 1e-4

@@ -21,7 +21,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
 
 Array = NDArray[np.float64]

@@ -11,22 +11,20 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State, WeightChange
-from terrafusion.fusion.estimator.config import EstimatorConfig
-from terrafusion.fusion.estimator.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.terrain.features import slip_without_prior
-from terrafusion.fusion.weighting.weighting import weighting_for
+from terrafusion.fusion.weighting.modes import weighting_for
+from terrafusion.fusion.weighting.weighting import NOTEWORTHY
 
 Array = NDArray[np.float64]
 
 UPDATE_NS = 500_000_000
 WINDOW_NS = 1_000_000_000
-NOTEWORTHY = 0.1
-"""Relative change of a weight that is worth a record."""
-
 KEPT_CHANGES = 1000
 """Records kept where nobody takes them: a robot that runs for days must not grow."""
 

@@ -24,12 +24,18 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.modes import InnovationTuning
-from terrafusion.fusion.weighting.adaptive import NOTEWORTHY, TerrainWeights
-from terrafusion.fusion.weighting.weighting import Surprise, Weighting, tested_wheels, widened
+from terrafusion.fusion.weighting.weighting import (
+    NOTEWORTHY,
+    NoiseInForce,
+    Surprise,
+    Weighting,
+    tested_wheels,
+    widened,
+)
 
 Array = NDArray[np.float64]
 
@@ -88,11 +94,11 @@ class Variational:
 class InnovationWeighting(Weighting):
     """Follows `wheel_sigma_mps` and `gnss_inflation` of the row in force."""
 
-    def __init__(self, config: EstimatorConfig, weights: TerrainWeights) -> None:
+    def __init__(self, config: EstimatorConfig, noise: NoiseInForce) -> None:
         self.method = config.innovation_method
         tuning: InnovationTuning = getattr(config.tuning, config.innovation_method)
         kind = SageHusa if self.method == "sage_husa" else Variational
-        self._weights, row, span2 = weights, weights.row, tuning.wheel_span**2
+        self._noise, row, span2 = noise, noise.row, tuning.wheel_span**2
         start = row.wheel_sigma_mps**2
         self._wheels = kind(start, tuning.wheel_memory, start / span2, start * span2)
         self._gnss = kind(1.0, tuning.gnss_memory, 0.0, math.inf)
@@ -107,7 +113,7 @@ class InnovationWeighting(Weighting):
         if abs(wheels.distance_m) < MOVING_MPS * dt_s:
             return wheels
         tested = tested_wheels(t_ns, wheels, innovation_m, variance_m2, dt_s)
-        own_m2, before = float(tested.noise_m2[0]), self._weights.row.wheel_sigma_mps
+        own_m2, before = float(tested.noise_m2[0]), self._noise.row.wheel_sigma_mps
         quantum_m2 = own_m2 - (before * dt_s) ** 2
         predicted = tested.predicted_m2 + quantum_m2
         self._wheels.update(dataclasses.replace(tested, predicted_m2=predicted))
@@ -116,7 +122,7 @@ class InnovationWeighting(Weighting):
 
     def gnss(self, tested: Surprise) -> tuple[float, float]:
         """Learn from a fix, and weigh it by what was learnt."""
-        before, unit2 = self._weights.row.gnss_inflation, float(np.mean(tested.unit_m**2))
+        before, unit2 = self._noise.row.gnss_inflation, float(np.mean(tested.unit_m**2))
         white = float(np.mean(tested.noise_m2)) / unit2
         drift = tested.drift_m2 / unit2
         least = tested.white_share
@@ -128,15 +134,15 @@ class InnovationWeighting(Weighting):
         self._gnss.update(tested)
         inflation = math.sqrt(min(self._gnss.value + drift, self._gnss.value / least))
         self._set(tested.t_ns, "gnss", "gnss_inflation", min(max(inflation, self._low), self._high), "")
-        now = self._weights.row.gnss_inflation
+        now = self._noise.row.gnss_inflation
         return math.sqrt(_white(now**2, drift, least) / _white(before**2, drift, least)), 1.0
 
     def _set(self, t_ns: int, sensor: str, name: str, value: float, unit: str) -> None:
-        self._weights.row = dataclasses.replace(self._weights.row, **{name: value})
+        self._noise.row = dataclasses.replace(self._noise.row, **{name: value})
         before = self._noted[name]
         if abs(value - before) > NOTEWORTHY * before:
             why = f"{name}: innovations ({self.method})"
-            self._weights.changes.append(WeightChange(t_ns, sensor, before, value, unit, why))
+            self._noise.note(WeightChange(t_ns, sensor, before, value, unit, why))
             self._noted[name] = value
 
 

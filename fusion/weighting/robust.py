@@ -24,15 +24,14 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.graph import gnss_factor
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.modes import RobustTuning
-from terrafusion.fusion.weighting.adaptive import TerrainWeights
-from terrafusion.fusion.weighting.weighting import Surprise, Weighting, tested_wheels, widened
+from terrafusion.fusion.weighting.weighting import NoiseInForce, Surprise, Weighting, tested_wheels, widened
 
 Array = NDArray[np.float64]
 
@@ -48,11 +47,11 @@ GNC_STEPS = 20
 class RobustWeighting(Weighting):
     """Weights of single measurements under the robust loss of the configuration."""
 
-    def __init__(self, config: EstimatorConfig, weights: TerrainWeights) -> None:
+    def __init__(self, config: EstimatorConfig, noise: NoiseInForce) -> None:
         self.loss = config.robust_loss
         self.tuning: RobustTuning = getattr(config.tuning, config.robust_loss)
         self.passed_nis = self.tuning.gate_sigma**2
-        self._weights = weights
+        self._noise = noise
         self._wheels_doubted = False
 
     def wheels(
@@ -66,7 +65,7 @@ class RobustWeighting(Weighting):
             before, after = (1.0, w) if self._wheels_doubted else (DOUBTED, w)
             what = "doubted" if self._wheels_doubted else "believed again"
             why = f"cauchy loss: increments {what}, innovation {tested.innovation_m[0]:.3f} m"
-            self._weights.changes.append(WeightChange(tested.t_ns, "wheels", before, after, "", why))
+            self._noise.note(WeightChange(tested.t_ns, "wheels", before, after, "", why))
         return widened(wheels, float(w**-0.5))
 
     def gnss(self, tested: Surprise) -> tuple[float, float]:
@@ -120,7 +119,7 @@ class RobustWeighting(Weighting):
     def _record(self, t_ns: int, before: float, after: float, off: float, unit: str = "m") -> None:
         what = "doubted" if after < DOUBTED else "believed again"
         why = f"{self.loss} loss: fix {what}, {off:.1f} {unit} off"
-        self._weights.changes.append(WeightChange(t_ns, "gnss", before, after, "", why))
+        self._noise.note(WeightChange(t_ns, "gnss", before, after, "", why))
 
 
 def cauchy_weight(tested: Surprise, c: float) -> float:

@@ -4,18 +4,29 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-if TYPE_CHECKING:
-    from terrafusion.fusion.estimator.config import EstimatorConfig
-    from terrafusion.fusion.graph.chain import Chain
-    from terrafusion.fusion.graph.wheel_factor import WheelIncrement
-    from terrafusion.fusion.weighting.adaptive import TerrainWeights
+from terrafusion.fusion.estimate.estimate import WeightChange
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
+
+NOTEWORTHY = 0.1
+"""Relative change of a weight that is worth a record."""
+
+
+class NoiseInForce(Protocol):
+    """The sensor noise that a mode may change, and where it records what it changed."""
+
+    row: SensorNoise
+
+    def note(self, change: WeightChange) -> None:
+        """Record a change."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,16 +87,3 @@ def tested_wheels(
 def widened(wheels: WheelIncrement, scale: float) -> WheelIncrement:
     """The increment with `scale` times the sigma along body x."""
     return dataclasses.replace(wheels, sigma=wheels.sigma * np.array([scale, 1.0, 1.0, 1.0]))
-
-
-def weighting_for(config: EstimatorConfig, weights: TerrainWeights) -> Weighting:
-    """The weighting of the mode asked for; what it changes is told in `weights.changes`."""
-    if config.mode == "robust":
-        from terrafusion.fusion.weighting.robust import RobustWeighting
-
-        return RobustWeighting(config, weights)
-    if config.mode == "innovation":
-        from terrafusion.fusion.weighting.innovation import InnovationWeighting
-
-        return InnovationWeighting(config, weights)
-    return Weighting()

@@ -18,7 +18,7 @@ from terrafusion.fusion.benchmark.arms import (
 )
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import START_NS, simulate
 
 POLICY = load_policy()

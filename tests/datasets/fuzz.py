@@ -149,8 +149,7 @@ def mutated(rng: np.random.Generator, sample: Path, folder: Path) -> Path:
 
 def open_and_examine(path: Path, repair_clock: bool) -> None:
     """What `inspect` and `convert --apply-fixes` do with a log; a pickle's hash counts as known."""
-    from terrafusion.datasets.checks import run as examine
-    from terrafusion.datasets.checks import treat
+    from terrafusion.datasets.checks import examine, treat
     from terrafusion.datasets.core.conventions import Conventions, apply
     from terrafusion.datasets.readers.formats import Request, format_of
     from terrafusion.datasets.readers.sets.single_wheel import read_wheel_trials

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.core.lag import Lag, lag_between
 from terrafusion.datasets.core.recording import Imu, Recording, Wheels
 

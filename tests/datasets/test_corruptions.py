@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
-from terrafusion.datasets.checks import treat
+from terrafusion.datasets.checks import examine, treat
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Channel, Recording, Wheels
@@ -21,7 +20,8 @@ from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.scenario.scenario import Scenario, load_scenario
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import Scenario
 from terrafusion.twin.simulate import simulate
 
 SCENARIO = """\

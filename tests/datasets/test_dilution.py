@@ -7,8 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
-from terrafusion.datasets.checks import treat
+from terrafusion.datasets.checks import examine, treat
 from terrafusion.datasets.core.recording import Fix, Recording
 
 from .test_doctor_physics import lively_drive

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.core.recording import Imu, Recording
 
 from .test_doctor_physics import (

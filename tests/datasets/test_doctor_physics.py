@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
-from terrafusion.datasets.checks import treat
+from terrafusion.datasets.checks import examine, treat
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.recording import Command, Fix, Gnss, Imu, Overrides, Recording, Wheels
 from terrafusion.datasets.core.sensors import Rig, axes_matrix

@@ -10,8 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import Finding, Patient, treat
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import Finding, Patient, examine, treat
 from terrafusion.datasets.checks.delays import _finding
 from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
 from terrafusion.datasets.core.lag import Lag

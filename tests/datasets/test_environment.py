@@ -8,8 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
-from terrafusion.datasets.checks import treat
+from terrafusion.datasets.checks import examine, treat
 from terrafusion.datasets.checks.environment import circle
 from terrafusion.datasets.checks.summary import summarise
 from terrafusion.datasets.core.errors import DataError

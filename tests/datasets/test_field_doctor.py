@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
-from terrafusion.datasets.checks import treat
+from terrafusion.datasets.checks import examine, treat
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.readers import open as opening
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Fix, Imu, Overrides, Recording, differences

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.checks.summary import summarise, summarise_all
 from terrafusion.datasets.core.recording import Recording

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.core.lag import lag_between
 from terrafusion.datasets.core.recording import Fix, Recording
 from terrafusion.datasets.readers import open_recording

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
-from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, replay

@@ -11,12 +11,12 @@ import pytest
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.gnss import keyframe_of
-from terrafusion.fusion.estimator.streams import GnssFix, ImuSegment
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import SURGE_SPEED_MPS, wheel_increment
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, KeyState
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, residual, slip_of
+from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle

@@ -11,8 +11,8 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
 from terrafusion.datasets.core.recording import Fix, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import choose_vehicle, replay, split_fixes

@@ -14,13 +14,13 @@ from scipy.stats import chi2
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.dead_reckoning import MotionTrack, Pair
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.gates import GnssGate, Verdict
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, checked_fix
-from terrafusion.fusion.estimator.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

@@ -12,15 +12,15 @@ import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import Inputs, inputs_of
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.estimator import friction as grips
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.friction import Grip, grip_of
-from terrafusion.fusion.estimator.sensor_config import Inputs, inputs_of
-from terrafusion.fusion.estimator.streams import GnssFix, ImuSegment
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.live import messages
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, choose_vehicle, replay

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.policy import load_policy

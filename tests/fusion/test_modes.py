@@ -13,7 +13,7 @@ from scipy.optimize import minimize_scalar
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.noise.labels import GroundLabels

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.estimator.slip_monitor import SPINNING, STALLED, MotionMonitor
 from terrafusion.fusion.estimator.stationarity import CREEP_MPS, RestDetector, likelihood_ratio, shaking
-from terrafusion.fusion.estimator.streams import ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.slip_trials import alarms, poisson_interval, spinning_hill, stuck_trial
 

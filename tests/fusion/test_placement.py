@@ -9,12 +9,12 @@ import pytest
 
 from terrafusion.datasets.core.frames import wrap_angle
 from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
 from tests.fusion.test_aided_drives import aided
 

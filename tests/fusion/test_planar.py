@@ -15,12 +15,12 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2, wrap_angle
 from terrafusion.datasets.core.recording import Imu, Recording, Wheels
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import write_log_folder
-from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import Inputs, complete_rows, inputs_of
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.sensor_config import Inputs, complete_rows, inputs_of
-from terrafusion.fusion.estimator.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, in_a_turn, yaw_of_wheels
+from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.twin.model.vehicle import load_vehicle

@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import Inputs
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.odometry import Propagator
-from terrafusion.fusion.estimator.sensor_config import Inputs
-from terrafusion.fusion.estimator.streams import ImuStream
 from terrafusion.fusion.graph.key_state import IMU_ROTATION, LINEAR, NAV, KeyState
+from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.twin.model.vehicle import load_vehicle
 
 ROTATION = np.array([0.01, -0.03, 0.02])

@@ -15,9 +15,9 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.skid import Slide
-from terrafusion.fusion.estimator.streams import GnssFix
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.live import messages
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.twin.model.soil import load_soil

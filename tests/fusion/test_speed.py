@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.fusion.estimator.config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.graph.batch import Batch
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate

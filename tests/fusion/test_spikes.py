@@ -11,8 +11,8 @@ import pytest
 from terrafusion.datasets.core.recording import Imu, Recording
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.estimate.estimate import Estimate
-from terrafusion.fusion.estimator.streams import RECENT, SHOCK_MPS2, SPIN_RADPS, ImuStream
 from terrafusion.fusion.graph.preintegration import HELD_INFLATION, Preintegrator
+from terrafusion.fusion.inputs.streams import RECENT, SHOCK_MPS2, SPIN_RADPS, ImuStream
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.twin.model.vehicle import load_vehicle

@@ -12,11 +12,11 @@ import pytest
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import Inputs
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.alignment import turn_between
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.sensor_config import Inputs
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.fusion.estimator.streams import WheelStream
+from terrafusion.fusion.inputs.streams import WheelStream
 
 STEP_NS = 20_000_000
 

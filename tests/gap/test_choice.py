@@ -12,7 +12,6 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.gap.answer.verdict import UNKNOWN
 from terrafusion.twin.gap.blind import plan
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.residuals import state_sigmas
 from terrafusion.twin.gap.infer import cause_posterior as choice_module
 from terrafusion.twin.gap.infer.cause_posterior import Told, Weights, probabilities, weights
 from terrafusion.twin.gap.infer.channels import RIDGE, Block, Products, Table
@@ -22,6 +21,7 @@ from terrafusion.twin.gap.infer.nonlinear_refit import Fitter, bounds, sizes
 from terrafusion.twin.gap.infer.posterior import Pool
 from terrafusion.twin.gap.null.null import learn
 from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.gap.rollout.residuals import state_sigmas
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.blind.development import (
     Trial,

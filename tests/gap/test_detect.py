@@ -7,7 +7,7 @@ import pytest
 
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.null.detect import detect, judged
+from terrafusion.twin.gap.infer.detect import detect, judged
 from terrafusion.twin.gap.null.score import Score
 
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "wheel_radius_asymmetry", "slope"])

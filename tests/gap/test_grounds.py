@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.residuals import SOIL_STATE, reach, state_sigmas, within_limits
 from terrafusion.twin.gap.infer.cause_posterior import linear
 from terrafusion.twin.gap.infer.channels import Table
 from terrafusion.twin.gap.infer.evidence import Bench, gather
@@ -17,6 +16,7 @@ from terrafusion.twin.gap.infer.posterior import Pool
 from terrafusion.twin.gap.infer.refit import Tried, errors_of
 from terrafusion.twin.gap.null.null import learn
 from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.gap.rollout.residuals import SOIL_STATE, reach, state_sigmas, within_limits
 from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import runs

@@ -8,7 +8,6 @@ import pytest
 from terrafusion.twin.calibrate.log import Log, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.residuals import state_sigmas
 from terrafusion.twin.gap.data.samples import layout
 from terrafusion.twin.gap.infer.channels import Table
 from terrafusion.twin.gap.infer.evidence import gather, prepared, starting_model
@@ -17,6 +16,7 @@ from terrafusion.twin.gap.infer.posterior import Pool
 from terrafusion.twin.gap.null.null import learn
 from terrafusion.twin.gap.null.score import learnt_sigma, score
 from terrafusion.twin.gap.rollout.delay import DELAYS, GROWING, IMU, in_time, late_layout
+from terrafusion.twin.gap.rollout.residuals import state_sigmas
 from terrafusion.twin.gap.rollout.sensitivities import Ask, predictions
 from terrafusion.twin.model.vehicle import load_vehicle
 

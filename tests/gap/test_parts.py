@@ -16,17 +16,17 @@ from terrafusion.twin.effects.form import Form, one
 from terrafusion.twin.gap.answer.classes import done, likeness
 from terrafusion.twin.gap.answer.verdict import HeldOut, null_probability
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.residuals import raw_of, state_sigmas, whitened
 from terrafusion.twin.gap.data.samples import layout
+from terrafusion.twin.gap.infer.detect import choices
 from terrafusion.twin.gap.infer.discrepancy import FUNCTIONS, modulated
 from terrafusion.twin.gap.infer.evidence import prepared, starting_model
 from terrafusion.twin.gap.infer.posterior import Pool, beliefs
 from terrafusion.twin.gap.null.channel_noise import first_noise
-from terrafusion.twin.gap.null.detect import choices
 from terrafusion.twin.gap.null.null import learn
 from terrafusion.twin.gap.null.score import Score, score
 from terrafusion.twin.gap.rollout import batch as side_by_side
 from terrafusion.twin.gap.rollout.batch import graphs, groups, what_moves
+from terrafusion.twin.gap.rollout.residuals import raw_of, state_sigmas, whitened
 from terrafusion.twin.gap.rollout.sensitivities import Ask, drive, placed, predictions, signatures
 from terrafusion.twin.model.vehicle import load_vehicle
 

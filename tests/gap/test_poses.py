@@ -12,8 +12,8 @@ from terrafusion.twin.calibrate.log import Log
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import PAIRS, settled, settled_start, turns
-from terrafusion.twin.gap.data.residuals import Drives, raw
 from terrafusion.twin.gap.infer.evidence import prepared, starting_model
+from terrafusion.twin.gap.rollout.residuals import Drives, raw
 from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import run

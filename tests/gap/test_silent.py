@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.residuals import state_sigmas
 from terrafusion.twin.gap.infer import candidate_selection as choosing
 from terrafusion.twin.gap.infer.cause_posterior import linear
 from terrafusion.twin.gap.infer.channels import Table
@@ -14,6 +13,7 @@ from terrafusion.twin.gap.infer.nonlinear_refit import Fitter
 from terrafusion.twin.gap.infer.posterior import Pool, beliefs
 from terrafusion.twin.gap.null.null import learn
 from terrafusion.twin.gap.null.score import learnt_sigma, score
+from terrafusion.twin.gap.rollout.residuals import state_sigmas
 from terrafusion.twin.model.vehicle import load_vehicle
 
 from .drives import runs

@@ -24,7 +24,7 @@ from terrafusion.twin.calibrate.identifiability import TOLD, UNTOLD
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 
 SOILS = ("asphalt", "loose_sand", "medium_sand", "mud")

@@ -20,8 +20,9 @@ import numpy as np
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import lookup
+from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.diagnose import Diagnosis, diagnose
+from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.rollout.sensitivities import Drive
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario

@@ -17,10 +17,12 @@ from numpy.typing import NDArray
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import INDEX, STATES, soil_vector, vehicle_vector
+from terrafusion.twin.physics.layout import INDEX, STATES
 from terrafusion.twin.scenario.commands import limit_slew, side_speeds, told
-from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 
 Array = NDArray[np.float64]

@@ -28,14 +28,9 @@ from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import (
-    SOIL_PARAMETERS,
-    STATES,
-    VEHICLE_PARAMETERS,
-    soil_vector,
-    vehicle_vector,
-)
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 from terrafusion.twin.scenario.commands import told
 
 Array = NDArray[np.float64]

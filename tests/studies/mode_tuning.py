@@ -44,7 +44,7 @@ from terrafusion.fusion.noise.modes import ModeTuning, bounds, load_modes, write
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import replay
 from terrafusion.fusion.training.drives import GROUNDS, Grid, scattered_soil
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
 
 OUTAGE = Outage(55.0, 30.0)

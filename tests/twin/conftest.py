@@ -11,8 +11,9 @@ import pytest
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import STATES, soil_vector, vehicle_vector
+from terrafusion.twin.physics.layout import STATES
 from terrafusion.twin.scenario.commands import told
 
 

@@ -13,16 +13,9 @@ from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import (
-    INDEX,
-    INPUTS,
-    STATES,
-    VEHICLE_PARAMETERS,
-    soil_vector,
-    state_slice,
-    vehicle_vector,
-)
+from terrafusion.twin.physics.layout import INDEX, INPUTS, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import follow, told
 
 ELEVATE = load_vehicle("elevate")

@@ -22,11 +22,13 @@ from terrafusion.twin.analysis.summary import (
     summarise,
 )
 from terrafusion.twin.engine.integrate import integrate
+from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import Battery, VehicleParams, load_vehicle
-from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import battery, gear_loss, motor_current, motor_torque
 from terrafusion.twin.scenario.commands import Driven, told
-from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import drive_through, set_up, simulate_run
 
 ELEVATE = load_vehicle("elevate")

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.dynamics import wheel_loads
 from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice, vehicle_vector
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import motor_current
 from terrafusion.twin.physics.wheel import Ground, WheelShape, footprint
 

@@ -20,8 +20,9 @@ from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.form import Form, Parameter, one
 from terrafusion.twin.model.ground import Variation, under_wheels
 from terrafusion.twin.model.measurement import measured
-from terrafusion.twin.physics.layout import OUTPUTS, mounting_vector
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.model.vectors import mounting_vector
+from terrafusion.twin.physics.layout import OUTPUTS
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import drive_through, set_up, simulate, simulate_run
 
 DOCS = Path(__file__).parents[2] / "docs" / "effects.md"

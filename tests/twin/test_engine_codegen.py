@@ -20,8 +20,9 @@ from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.engine.packing import packs
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import STATES, soil_vector, vehicle_vector
+from terrafusion.twin.physics.layout import STATES
 from terrafusion.twin.scenario.commands import told
 
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")

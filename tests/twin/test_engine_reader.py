@@ -10,15 +10,9 @@ from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vectors import mounting_vector, soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import (
-    INPUTS,
-    STATES,
-    WHEELS,
-    mounting_vector,
-    soil_vector,
-    vehicle_vector,
-)
+from terrafusion.twin.physics.layout import INPUTS, STATES, WHEELS
 
 pytestmark = pytest.mark.skipif(not compiled(), reason="no C compiler")
 

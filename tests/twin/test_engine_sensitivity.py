@@ -12,15 +12,9 @@ from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
 from terrafusion.twin.model.plant import Plant, RouteTable, SoilField
 from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import (
-    INDEX,
-    SOIL_PARAMETERS,
-    STATES,
-    VEHICLE_PARAMETERS,
-    soil_vector,
-    vehicle_vector,
-)
+from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
 from terrafusion.twin.scenario.commands import told
 
 DT_S = 0.01

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import terrafusion.twin.params
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa, pressure_at
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix

@@ -13,7 +13,8 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Overrides
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
-from terrafusion.twin.scenario.scenario import DriveSegment, load_scenario, scenario_names
+from terrafusion.twin.scenario.file import load_scenario, scenario_names
+from terrafusion.twin.scenario.scenario import DriveSegment
 from terrafusion.twin.simulate import simulate_run
 
 PARAMS = resources.files("terrafusion.twin.params")

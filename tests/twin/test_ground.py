@@ -8,8 +8,9 @@ import pytest
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.model.plant import Plant, RouteTable, SoilField
 from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, soil_vector, vehicle_vector
+from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES
 from terrafusion.twin.scenario.commands import told
 
 RAMP = np.clip(np.arange(601) / 100.0, 0.0, 1.0)[:, None] * np.array([5.0, 5.0])

@@ -11,8 +11,10 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.ground import Patches, Variation, gaussian_field, soil_field, value_at
 from terrafusion.twin.model.plant import SoilField
 from terrafusion.twin.model.soil import load_soil
-from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, soil_vector
-from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.model.vectors import soil_vector
+from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 
 CELLS, CELL_M, LENGTH_M = 128, 0.25, 1.5

@@ -13,9 +13,10 @@ from terrafusion.twin.engine import codegen, compiler, integrate, native
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.soil import load_soil, soil_names
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
-from terrafusion.twin.physics.layout import INDEX, INPUTS, soil_vector, vehicle_vector
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.physics.layout import INDEX, INPUTS
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 
 needs_compiler = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C compiler")

@@ -10,18 +10,11 @@ import pytest
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.model.measurement import corrections, measured, measured_jacobians
 from terrafusion.twin.model.soil import load_soil
+from terrafusion.twin.model.vectors import mounting_vector, soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
-from terrafusion.twin.physics.layout import (
-    INDEX,
-    INPUTS,
-    OUTPUTS,
-    SOIL_PARAMETERS,
-    STATES,
-    mounting_vector,
-    soil_vector,
-    vehicle_vector,
-)
-from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.physics.layout import INDEX, INPUTS, OUTPUTS, SOIL_PARAMETERS, STATES
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import SimulatedRun, simulate_run
 
 SLOPE_DEG, ASPECT_DEG = 8.0, 35.0

@@ -16,8 +16,10 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.core.recording import Fix
 from terrafusion.twin.model.dynamics import wheel_loads
 from terrafusion.twin.model.motion import wheel_shares
+from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, with_payload
-from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS, vehicle_vector
+from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import (
     Canopy,
     DriveSegment,
@@ -26,7 +28,6 @@ from terrafusion.twin.scenario.scenario import (
     Scenario,
     Stretch,
     inside,
-    load_scenario,
 )
 from terrafusion.twin.simulate import set_up, simulate, simulate_run
 

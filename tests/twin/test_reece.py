@@ -21,7 +21,7 @@ from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES
 from terrafusion.twin.physics.terramechanics import WheelShape, static_sinkage
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 
 from .effect_cases import plant, samples, soil

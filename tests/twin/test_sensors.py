@@ -11,7 +11,8 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.core.recording import Fix
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.scenario.scenario import DriveSegment, Interval, RouteLeg, Scenario, load_scenario
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.sensors import suite as sensors
 from terrafusion.twin.simulate import simulate
 

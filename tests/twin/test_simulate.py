@@ -13,7 +13,8 @@ from terrafusion.datasets.core.recording import TERRAINS, Recording
 from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX
-from terrafusion.twin.scenario.scenario import Interval, load_scenario, scenario_names
+from terrafusion.twin.scenario.file import load_scenario, scenario_names
+from terrafusion.twin.scenario.scenario import Interval
 from terrafusion.twin.simulate import simulate, simulate_run
 
 

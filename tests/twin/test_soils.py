@@ -17,8 +17,9 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import TERRAINS
 from terrafusion.twin.model.soil import Validity, load_soil, soil_names
 from terrafusion.twin.model.soil_table import published_soils
+from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
-from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, soil_vector, state_slice
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, state_slice
 from terrafusion.twin.physics.wheel import Ground, WheelShape, steady_contact
 from terrafusion.twin.scenario.route import Route
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.sweep.plan import Axis, at_speed, top_speed_mps
 from terrafusion.twin.sweep.run import Sweep, load_sweep, sweep_names
 

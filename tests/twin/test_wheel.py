@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from terrafusion.twin.model.soil import load_soil, soil_names
-from terrafusion.twin.physics.layout import SOIL_PARAMETERS, soil_vector
+from terrafusion.twin.model.vectors import soil_vector
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS
 from terrafusion.twin.physics.wheel import Contact, Ground, WheelShape, contact, footprint, steady_contact
 
 LOAD_N = 80.0

@@ -165,7 +165,7 @@ def main(vehicle: str = "elevate", hours: float = 2.0, seeds: int = 4) -> list[s
 
 
 def command(arguments: list[str] | None = None) -> int:
-    """`python -m terrafusion.twin.analysis.allan [VEHICLE]`: 0 when done, 1 with one line for an unknown vehicle."""
+    """Print the Allan table; 0 when done, 1 for an unknown vehicle."""
     import argparse
     import sys
 

@@ -20,8 +20,9 @@ from terrafusion.datasets.core.config import Quantity
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.catalogue import parameters
 from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS, soil_vector, vehicle_vector
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 

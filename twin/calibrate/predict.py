@@ -21,7 +21,8 @@ from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.readings import readings
 from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensitivity
 from terrafusion.twin.model.plant import Plant, RouteTable
-from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, soil_vector, state_slice
+from terrafusion.twin.model.vectors import soil_vector
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import told
 
 Array = NDArray[np.float64]

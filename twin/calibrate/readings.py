@@ -19,7 +19,8 @@ from terrafusion.twin.model.measurement import (
 )
 from terrafusion.twin.model.motion import plane_rotation
 from terrafusion.twin.model.plant import Plant, RouteTable
-from terrafusion.twin.physics.layout import INDEX, OUTPUTS, WHEELS, mounting_vector
+from terrafusion.twin.model.vectors import mounting_vector
+from terrafusion.twin.physics.layout import INDEX, OUTPUTS, WHEELS
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from terrafusion.twin.calibrate.model import resolve
 from terrafusion.twin.calibrate.problem import Problem
 from terrafusion.twin.calibrate.result import Calibration
 from terrafusion.twin.calibrate.solver import first_noise
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 
 Array = NDArray[np.float64]

@@ -8,7 +8,6 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,25 +15,24 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
+from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.answer.next_run import NextRun, propose
-from terrafusion.twin.gap.answer.shrink import Shrink, adapted, own_error, shrink
+from terrafusion.twin.gap.answer.shrink import adapted, own_error, shrink
 from terrafusion.twin.gap.answer.verdict import HeldOut, Search, Verdict, alike, floor_of, judge
-from terrafusion.twin.gap.answer.where import Cell, gap_map
+from terrafusion.twin.gap.answer.where import gap_map
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
-from terrafusion.twin.gap.data.residuals import Evidence, state_sigmas
 from terrafusion.twin.gap.infer.candidate_selection import chosen
-from terrafusion.twin.gap.infer.cause_posterior import Choice
 from terrafusion.twin.gap.infer.channels import Table
+from terrafusion.twin.gap.infer.detect import detect
 from terrafusion.twin.gap.infer.discrepancy import modulated
 from terrafusion.twin.gap.infer.evidence import Bench, Soils, gather
 from terrafusion.twin.gap.infer.nonlinear_refit import Fitted, Fitter
 from terrafusion.twin.gap.infer.posterior import Beliefs, Pool, beliefs
 from terrafusion.twin.gap.infer.refit import Refit, scored
-from terrafusion.twin.gap.null.detect import Detection, detect
+from terrafusion.twin.gap.infer.replicates import COUNT, replicates
 from terrafusion.twin.gap.null.null import Null, learn
-from terrafusion.twin.gap.null.replicates import COUNT, replicates
 from terrafusion.twin.gap.null.score import Score, learnt_sigma, score
-from terrafusion.twin.gap.result import as_dict
+from terrafusion.twin.gap.rollout.residuals import Evidence, state_sigmas
 from terrafusion.twin.gap.rollout.sensitivities import Drive
 from terrafusion.twin.gap.threads import one_blas_thread
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -42,54 +40,6 @@ from terrafusion.twin.model.vehicle import VehicleParams
 Array = NDArray[np.float64]
 
 SIGNIFICANCE = 0.05
-
-
-@dataclass(frozen=True, eq=False)
-class Diagnosis:
-    """What `diagnose` finds.
-
-    Attributes:
-        runs, references, vehicle: names.
-        seconds: length of what was judged.
-        detection: the permutation test.
-        significance: threshold of its p-value.
-        uncalibrated: whether twin replicates stood in for references.
-        where: cells of the gap map, most important first.
-        choice: what each cause leaves of the gap, and its odds.
-        verdict: causes and the judgement.
-        shrinking: how far the gap shrinks on runs left out.
-        next_run: drive that would separate look-alikes.
-        refits: by effect, failures included.
-        bench: the evidence, for plots.
-        notes: what was assumed, in sentences.
-        elapsed_s: time the diagnosis took.
-    """
-
-    runs: tuple[str, ...]
-    references: tuple[str, ...]
-    vehicle: str
-    seconds: float
-    detection: Detection
-    significance: float
-    uncalibrated: bool
-    where: list[Cell]
-    choice: Choice
-    verdict: Verdict
-    shrinking: Shrink | None
-    next_run: NextRun | None
-    refits: dict[str, Refit]
-    bench: Bench
-    notes: tuple[str, ...]
-    elapsed_s: float
-
-    @property
-    def detected(self) -> bool:
-        """Whether there is a gap at this significance."""
-        return self.detection.p_value <= self.significance
-
-    def to_json(self) -> dict[str, Any]:
-        """The answer as `docs/schemas/diagnosis.schema.json` has it."""
-        return as_dict(self)
 
 
 @one_blas_thread()

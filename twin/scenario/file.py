@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.config import Quantity, checked_number, shown
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Fix
 from terrafusion.twin.model.ground import Patches, Variation
+from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.scenario.scenario import (
     MAX_SLOPE_DEG,
     PLACE,
@@ -51,6 +53,21 @@ _LENGTH = Quantity("m", 0.1, 1000.0)
 _PERCENT = Quantity("%", 0.0, 500.0)
 _VARIATION = {"strength_sigma": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
 _PATCHES = {"share": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Names of the scenarios that come with the library."""
+    return known_names("scenarios")
+
+
+def load_scenario(name_or_path: str | Path) -> Scenario:
+    """A scenario by its name in the library, or from a YAML file.
+
+    Raises:
+        ConfigError: unknown name (the known ones are listed), unknown key, or a value out of range.
+    """
+    raw, file = read_named("scenarios", name_or_path, kind="scenario")
+    return scenario_of(raw, file, Path(str(name_or_path)).stem)
 
 
 def scenario_of(raw: dict[str, Any], file: str, stem: str) -> Scenario:

@@ -12,7 +12,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.ground import Patches, Variation, soil_field
 from terrafusion.twin.model.plant import RouteTable
 from terrafusion.twin.model.soil import SoilParams, load_soil
-from terrafusion.twin.physics.layout import soil_vector
+from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.scenario.scenario import Scenario
 
 Array = NDArray[np.float64]

@@ -18,7 +18,6 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,7 +26,6 @@ from terrafusion.datasets.core.config import Quantity, checked_number
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Fix
 from terrafusion.twin.model.ground import Patches, Variation
-from terrafusion.twin.model.library import known_names, read_named
 
 Array = NDArray[np.float64]
 
@@ -226,20 +224,3 @@ def _check_slope(name: str, value_deg: float, low_deg: float) -> None:
         raise ConfigError(
             f"{name} {value_deg:g} deg is out of range", remedy=f"give {low_deg:g} to {MAX_SLOPE_DEG:g} deg"
         )
-
-
-def scenario_names() -> tuple[str, ...]:
-    """Names of the scenarios that come with the library."""
-    return known_names("scenarios")
-
-
-def load_scenario(name_or_path: str | Path) -> Scenario:
-    """A scenario by its name in the library, or from a YAML file.
-
-    Raises:
-        ConfigError: unknown name (the known ones are listed), unknown key, or a value out of range.
-    """
-    from terrafusion.twin.scenario.file import scenario_of
-
-    raw, file = read_named("scenarios", name_or_path, kind="scenario")
-    return scenario_of(raw, file, Path(str(name_or_path)).stem)

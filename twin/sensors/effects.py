@@ -20,8 +20,9 @@ from terrafusion.twin.model.ground import under_wheels
 from terrafusion.twin.model.measurement import corrections, measured
 from terrafusion.twin.model.motion import Motion
 from terrafusion.twin.model.plant import Plant
+from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import INPUTS, OUTPUTS, VEHICLE_PARAMETERS, mounting_vector
+from terrafusion.twin.physics.layout import INPUTS, OUTPUTS, VEHICLE_PARAMETERS
 from terrafusion.twin.sensors.noise import rows_at_rate, sample_rate_hz
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from terrafusion.twin.model.soil import SoilParams, load_soil
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE
 from terrafusion.twin.study.published import FRICTION

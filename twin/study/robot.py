@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.scenario.scenario import load_scenario
+from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE
 
 _RPM = 30.0 / math.pi

@@ -24,7 +24,8 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
-from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG, Scenario, load_scenario
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG, Scenario
 from terrafusion.twin.sweep.plan import AXES, Axis, Sweep, top_speed_mps
 
 MAX_LEVELS = 10_000

@@ -14,7 +14,7 @@ from terrafusion.fusion.benchmark.estimator_gap import Compared
 from terrafusion.fusion.reports.gap import plots
 from terrafusion.fusion.reports.gap.words import sentences
 from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
-from terrafusion.twin.gap.diagnose import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 
 MOST_RUNS = 3
 """Runs beyond these have no plots of their own."""

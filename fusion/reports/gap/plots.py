@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from terrafusion.fusion.reports import style
+from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES
-from terrafusion.twin.gap.diagnose import Diagnosis
 from terrafusion.twin.gap.rollout.nuisance import NAMES
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import math
 
+from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
 from terrafusion.twin.gap.answer.verdict import Cause
 from terrafusion.twin.gap.answer.where import LEAST_REFERENCES
-from terrafusion.twin.gap.diagnose import Diagnosis
 
 MOST_LISTED = 4
 

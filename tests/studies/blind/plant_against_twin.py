@@ -16,7 +16,8 @@ from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, state_slice
-from terrafusion.twin.scenario.scenario import DriveSegment, load_scenario
+from terrafusion.twin.scenario.file import load_scenario
+from terrafusion.twin.scenario.scenario import DriveSegment
 from terrafusion.twin.simulate import SimulatedRun, simulate_run
 
 Array = NDArray[np.float64]

@@ -30,10 +30,10 @@ def detections(
 ) -> list[float]:
     """P-value of each group of runs against the references, as `diagnose` has it."""
     from terrafusion.twin.gap.data.candidates import Candidates
-    from terrafusion.twin.gap.data.residuals import state_sigmas
+    from terrafusion.twin.gap.infer.detect import detect
     from terrafusion.twin.gap.infer.evidence import gather
-    from terrafusion.twin.gap.null.detect import detect
     from terrafusion.twin.gap.null.score import learnt_sigma, score
+    from terrafusion.twin.gap.rollout.residuals import state_sigmas
 
     candidates = Candidates.of(None)
     bench = gather([run for group in groups for run in group], references, vehicle, None, candidates, jobs=1)

@@ -27,14 +27,14 @@ from urllib.parse import quote
 import numpy as np
 
 from terrafusion.datasets.catalog.catalog import CatalogFile, at_hand, data_folders, load_catalog
-from terrafusion.datasets.checks import run as examine
+from terrafusion.datasets.checks import examine
 from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors_of
 from terrafusion.datasets.core.files import check_folder
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, plan_outages, until
 from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, write_part
-from terrafusion.fusion.estimator.config import MODES
+from terrafusion.fusion.config.estimator_config import MODES
 from terrafusion.fusion.metrics.health import examine_estimate, rolled_until_m
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, choose_vehicle, replay

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.graph.batch import Batch
 from terrafusion.fusion.graph.chain import Chain

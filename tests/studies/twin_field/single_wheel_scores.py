@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from terrafusion.twin.model.soil import load_soil
-from terrafusion.twin.physics.layout import SOIL_PARAMETERS, soil_vector
+from terrafusion.twin.model.vectors import soil_vector
+from terrafusion.twin.physics.layout import SOIL_PARAMETERS
 from tests.studies.twin_field.bootstrap import resamples
 from tests.studies.twin_field.single_wheel_fit import (
     EXPONENT,

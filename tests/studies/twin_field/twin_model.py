@@ -14,16 +14,9 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import (
-    INDEX,
-    SOIL_PARAMETERS,
-    STATES,
-    VEHICLE_PARAMETERS,
-    soil_vector,
-    state_slice,
-    vehicle_vector,
-)
+from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import told
 from tests.studies.twin_field.fitting import Bounded, fit
 from tests.studies.twin_field.forks import N_PAST, Forks

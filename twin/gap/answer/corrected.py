@@ -13,7 +13,7 @@ from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams
 
 if TYPE_CHECKING:
-    from terrafusion.twin.gap.diagnose import Diagnosis
+    from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 
 FIELDS = {
     "mass/at_cg": (("body.mass_kg", "times"), ("body.yaw_inertia_kgm2", "times")),

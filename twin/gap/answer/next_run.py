@@ -16,11 +16,11 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import Log
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.answer.classes import TELLING, likeness
-from terrafusion.twin.gap.data.residuals import SOIL_STATE, Evidence, raw_of, whitened
 from terrafusion.twin.gap.infer.evidence import WINDOW_S, Bench
 from terrafusion.twin.gap.infer.posterior import Pool
 from terrafusion.twin.gap.null.null import JITTER, Null
 from terrafusion.twin.gap.null.score import score
+from terrafusion.twin.gap.rollout.residuals import SOIL_STATE, Evidence, raw_of, whitened
 from terrafusion.twin.gap.rollout.sensitivities import drive, signatures
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.scenario.commands import open_loop

@@ -12,13 +12,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.data.residuals import Evidence
 from terrafusion.twin.gap.infer.evidence import Bench
 from terrafusion.twin.gap.infer.posterior import Pool
 from terrafusion.twin.gap.infer.refit import Refit, Tried, effects_at, errors_of
 from terrafusion.twin.gap.null.null import Null
 from terrafusion.twin.gap.null.score import Score
 from terrafusion.twin.gap.rollout.nuisance import NAMES
+from terrafusion.twin.gap.rollout.residuals import Evidence
 
 Array = NDArray[np.float64]
 

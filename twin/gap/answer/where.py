@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.data.residuals import Evidence
-from terrafusion.twin.gap.null.detect import choices
+from terrafusion.twin.gap.infer.detect import choices
 from terrafusion.twin.gap.rollout.nuisance import NAMES, told_twist
+from terrafusion.twin.gap.rollout.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.data.residuals import Evidence
 from terrafusion.twin.gap.null.null import common_offset
 from terrafusion.twin.gap.null.score import Score
+from terrafusion.twin.gap.rollout.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.data.residuals import Evidence
 from terrafusion.twin.gap.rollout.nuisance import BASIS, basis
+from terrafusion.twin.gap.rollout.residuals import Evidence
 
 Array = NDArray[np.float64]
 

@@ -18,8 +18,10 @@ from terrafusion.twin.calibrate.log import Log, grounds, prepare
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import Noise
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.outliers import bounded
-from terrafusion.twin.gap.data.residuals import (
+from terrafusion.twin.gap.null.channel_noise import learnt_noise
+from terrafusion.twin.gap.rollout.batch import in_threads
+from terrafusion.twin.gap.rollout.outliers import bounded
+from terrafusion.twin.gap.rollout.residuals import (
     SOIL_STATE,
     Drives,
     Evidence,
@@ -32,8 +34,6 @@ from terrafusion.twin.gap.data.residuals import (
     whitened_error,
     without_probes,
 )
-from terrafusion.twin.gap.null.channel_noise import learnt_noise
-from terrafusion.twin.gap.rollout.batch import in_threads
 from terrafusion.twin.gap.rollout.sensitivities import Ask, Drive, settled_predictions
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, told_geometry, with_overrides

@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
-from terrafusion.twin.gap.data.residuals import SOIL_STATE, WITHIN
 from terrafusion.twin.gap.infer.channels import Left, Table
 from terrafusion.twin.gap.infer.evidence import Bench
 from terrafusion.twin.gap.infer.posterior import Pool
@@ -25,6 +24,7 @@ from terrafusion.twin.gap.infer.refit import Refit, Tried, effects_at, errors_of
 from terrafusion.twin.gap.null.null import Null
 from terrafusion.twin.gap.null.score import Score
 from terrafusion.twin.gap.rollout.delay import DELAYS
+from terrafusion.twin.gap.rollout.residuals import SOIL_STATE, WITHIN
 
 Array = NDArray[np.float64]
 

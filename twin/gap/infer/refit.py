@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.data.residuals import Evidence, carried_back, on_own_ground, whitened_error
 from terrafusion.twin.gap.infer.evidence import Bench
 from terrafusion.twin.gap.null.score import Score
+from terrafusion.twin.gap.rollout.residuals import Evidence, carried_back, on_own_ground, whitened_error
 from terrafusion.twin.gap.rollout.sensitivities import Ask, settled_predictions
 
 Array = NDArray[np.float64]

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.noise import Noise, autoregressive, clipped, gauss_markov
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.residuals import (
+from terrafusion.twin.gap.data.samples import layout
+from terrafusion.twin.gap.rollout.residuals import (
     Raw,
     projected,
     stacked,
@@ -18,7 +19,6 @@ from terrafusion.twin.gap.data.residuals import (
     whitened_columns,
     without_probes,
 )
-from terrafusion.twin.gap.data.samples import layout
 
 Array = NDArray[np.float64]
 Series = list[tuple[NDArray[np.int64], Array]]

@@ -30,7 +30,8 @@ from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import samples_of
 from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.plant import Plant
-from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, WHEELS, mounting_vector
+from terrafusion.twin.model.vectors import mounting_vector
+from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, WHEELS
 from terrafusion.twin.scenario.commands import told
 from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
 

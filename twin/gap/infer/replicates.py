@@ -12,9 +12,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.data.residuals import Evidence
 from terrafusion.twin.gap.infer.refit import scored
 from terrafusion.twin.gap.null.score import Score, score
+from terrafusion.twin.gap.rollout.residuals import Evidence
 
 Array = NDArray[np.float64]
 

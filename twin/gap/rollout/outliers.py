@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.data.residuals import (
+from terrafusion.twin.gap.rollout.residuals import (
     OUTLIER_SIGMAS,
     ROBUST_STEPS,
     Evidence,

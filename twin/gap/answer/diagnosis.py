@@ -1,16 +1,69 @@
-"""The answer as the contract has it: `diagnosis.json`."""
+"""`Diagnosis`: what a diagnosis found, and the same as `diagnosis.json` has it."""
 
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass
+from typing import Any
 
-if TYPE_CHECKING:
-    from terrafusion.twin.gap.answer.shrink import Shrink
-    from terrafusion.twin.gap.answer.verdict import Cause
-    from terrafusion.twin.gap.diagnose import Diagnosis
+from terrafusion.twin.gap.answer.next_run import NextRun
+from terrafusion.twin.gap.answer.shrink import METRIC, Shrink
+from terrafusion.twin.gap.answer.verdict import Cause, Verdict
+from terrafusion.twin.gap.answer.where import Cell
+from terrafusion.twin.gap.infer.cause_posterior import Choice
+from terrafusion.twin.gap.infer.detect import Detection
+from terrafusion.twin.gap.infer.evidence import Bench
+from terrafusion.twin.gap.infer.refit import Refit
 
 SCHEMA = "terrafusion.gap/1"
+
+
+@dataclass(frozen=True, eq=False)
+class Diagnosis:
+    """What `diagnose` finds.
+
+    Attributes:
+        runs, references, vehicle: names.
+        seconds: length of what was judged.
+        detection: the permutation test.
+        significance: threshold of its p-value.
+        uncalibrated: whether twin replicates stood in for references.
+        where: cells of the gap map, most important first.
+        choice: what each cause leaves of the gap, and its odds.
+        verdict: causes and the judgement.
+        shrinking: how far the gap shrinks on runs left out.
+        next_run: drive that would separate look-alikes.
+        refits: by effect, failures included.
+        bench: the evidence, for plots.
+        notes: what was assumed, in sentences.
+        elapsed_s: time the diagnosis took.
+    """
+
+    runs: tuple[str, ...]
+    references: tuple[str, ...]
+    vehicle: str
+    seconds: float
+    detection: Detection
+    significance: float
+    uncalibrated: bool
+    where: list[Cell]
+    choice: Choice
+    verdict: Verdict
+    shrinking: Shrink | None
+    next_run: NextRun | None
+    refits: dict[str, Refit]
+    bench: Bench
+    notes: tuple[str, ...]
+    elapsed_s: float
+
+    @property
+    def detected(self) -> bool:
+        """Whether there is a gap at this significance."""
+        return self.detection.p_value <= self.significance
+
+    def to_json(self) -> dict[str, Any]:
+        """The answer as `docs/schemas/diagnosis.schema.json` has it; what is not known is null."""
+        return as_dict(self)
 
 
 def as_dict(d: Diagnosis) -> dict[str, Any]:
@@ -75,8 +128,6 @@ def _cause(d: Diagnosis, cause: Cause) -> dict[str, Any]:
 
 
 def _shrink(s: Shrink) -> dict[str, Any]:
-    from terrafusion.twin.gap.answer.shrink import METRIC
-
     return {
         "metric": METRIC,
         "before": s.before,

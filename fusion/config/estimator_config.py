@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.estimator.sensor_config import Inputs
+from terrafusion.fusion.config.sensor_config import Inputs
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.noise.policy import Policy, load_policy
