@@ -1,0 +1,76 @@
+"""Dilutions of precision are told from sigmas, and sigmas are left alone."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.checks import examine, treat
+from terrafusion.datasets.core.recording import Fix, Recording
+from tests.datasets.checks.test_doctor_physics import lively_drive
+
+RNG = np.random.default_rng(5)
+TENTHS = RNG.integers(7, 15, 300) / 10
+
+
+def with_sigma(drive: Recording, flat: np.ndarray, fix: Fix, north: float = 1.0) -> Recording:
+    assert drive.gnss is not None
+    sigma = np.stack([flat, north * flat, 2.0 * flat], axis=1)
+    classes = np.full(len(flat), fix, dtype=np.uint8)
+    return dataclasses.replace(drive, gnss=dataclasses.replace(drive.gnss, sigma_enu_m=sigma, fix=classes))
+
+
+def codes(recording: Recording) -> set[str]:
+    return {finding.code for finding in examine(recording)}
+
+
+@pytest.mark.parametrize("fix", [Fix.SINGLE, Fix.DGPS, Fix.FLOAT, Fix.FIXED])
+def test_dilutions_are_named(drive: Recording, fix: Fix) -> None:
+    assert codes(with_sigma(drive, TENTHS, fix)) == {"sigma-dilution"}
+
+
+def test_they_survive_the_square_root_of_a_covariance(drive: Recording) -> None:
+    assert codes(with_sigma(drive, np.sqrt(TENTHS**2), Fix.SINGLE)) == {"sigma-dilution"}
+
+
+def test_a_class_that_contradicts_its_sigma_is_named(drive: Recording) -> None:
+    assert codes(with_sigma(drive, np.full(300, 0.9), Fix.FIXED)) == {"sigma-dilution"}
+
+
+@pytest.mark.parametrize(
+    ("flat", "north"),
+    [
+        (np.full(300, 1.5), 1.0),  # a driver's constant
+        (RNG.uniform(0.7, 1.5, 300), 1.0),  # a receiver's own estimate
+        (TENTHS, 1.2),  # not the same to the east and to the north
+        (TENTHS / 10, 1.0),  # centimetres in steps of one
+    ],
+)
+def test_sigmas_are_left_alone(drive: Recording, flat: np.ndarray, north: float) -> None:
+    assert codes(with_sigma(drive, flat, Fix.SINGLE, north)) == set()
+
+
+def test_the_repair_takes_the_class_for_its_worth(drive: Recording) -> None:
+    mended, done = treat(with_sigma(drive, TENTHS, Fix.SINGLE))
+    assert [finding.code for finding in done] == ["sigma-dilution"]
+    assert mended.gnss is not None
+    np.testing.assert_allclose(mended.gnss.sigma_enu_m[:, 0], 3.0 * TENTHS)
+    np.testing.assert_allclose(mended.gnss.sigma_enu_m[:, 2], 6.0 * TENTHS)
+    assert treat(mended) == (mended, [])
+
+
+def test_what_would_change_nothing_is_no_repair(drive: Recording) -> None:
+    (found,) = examine(with_sigma(drive, TENTHS, Fix.DGPS))
+    assert found.repair is None
+
+
+def test_fixes_that_scatter_as_they_claim_claim_metres() -> None:
+    good = lively_drive()
+    assert good.gnss is not None
+    noise = np.random.default_rng(6).normal(0.0, 0.4, good.gnss.enu_m.shape)
+    noisy = dataclasses.replace(good, gnss=dataclasses.replace(good.gnss, enu_m=good.gnss.enu_m + noise))
+    claims = with_sigma(noisy, np.full(len(good.gnss), 0.4), Fix.FIXED)
+    assert "sigma-dilution" not in codes(claims)
+    assert "sigma-dilution" in codes(with_sigma(good, np.full(len(good.gnss), 0.4), Fix.FIXED))

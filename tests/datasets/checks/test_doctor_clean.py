@@ -1,0 +1,87 @@
+"""Logs that are short, lack sensors, or drive oddly are no faulty logs."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.checks import examine
+from terrafusion.datasets.core.recording import Imu, Recording
+from tests.datasets.checks.test_doctor_physics import (
+    EFFECTIVE_TRACK_M,
+    RADIUS_M,
+    START_NS,
+    Fault,
+    after,
+    body_speed,
+    gnss_with,
+    imu_with,
+    lively_drive,
+    times,
+    wheels_with,
+    without,
+)
+
+
+@pytest.mark.parametrize("rows_kept", [1, 2, 5, 30])
+def test_short_recordings_are_taken(rows_kept: int) -> None:
+    good = lively_drive()
+    for name in ("wheels", "imu", "gnss", "command"):
+        examine(dataclasses.replace(good, **{name: getattr(good, name).select(slice(0, rows_kept))}))
+    assert good.truth is not None
+    examine(dataclasses.replace(good, truth=good.truth.select(slice(0, rows_kept))))
+
+
+BARE: dict[str, Fault] = {
+    "gyro z alone": imu_with(
+        gyro_radps=times(np.nan, np.nan, 1.0), accel_mps2=lambda a: np.full_like(a, np.nan)
+    ),
+    "no gyro": imu_with(gyro_radps=lambda g: np.full_like(g, np.nan)),
+    "accelerometer lacks z": imu_with(accel_mps2=times(1.0, 1.0, np.nan)),
+    "body speed": body_speed,
+    "no wheels": lambda r: without(r, "wheels"),
+    "wheels unknown": wheels_with(lambda s: np.full_like(s, np.nan)),
+    "no fixes": lambda r: without(r, "gnss"),
+    "positions unknown": gnss_with(enu_m=lambda e: np.full_like(e, np.nan)),
+    "sigmas unknown, no height": gnss_with(enu_m=times(1.0, 1.0, np.nan)),
+    "velocities unknown": gnss_with(velocity_enu_mps=lambda v: np.full_like(v, np.nan)),
+    "wheels and fixes": lambda r: without(r, "imu", "command", "truth"),
+    "imu alone": lambda r: without(r, "wheels", "gnss", "command", "truth"),
+    "every tenth unknown": after(
+        imu_with(gyro_radps=lambda g: np.where(np.arange(len(g))[:, None] % 10 == 3, np.nan, g)),
+        wheels_with(lambda s: np.where(np.arange(len(s))[:, None] % 10 == 3, np.nan, s)),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BARE)
+def test_a_log_with_less_is_clean_too(name: str) -> None:
+    found = {finding.code for finding in examine(BARE[name](lively_drive()))}
+    assert found <= {"dead", "missing-values"}  # true of two of them
+
+
+def test_a_robot_that_spins_on_the_spot_is_clean() -> None:
+    good = lively_drive()
+    assert good.wheels is not None
+    assert good.imu is not None
+    n = len(good.wheels)
+    rate = 0.6 + 0.3 * np.sin(0.3 * np.arange(n) / 20.0)
+    sides = np.stack([-rate, rate], axis=1) * EFFECTIVE_TRACK_M / 2 / RADIUS_M
+    gyro = good.imu.gyro_radps.copy()
+    t = (good.imu.t_ns - START_NS) * 1e-9
+    gyro[:, 2] += np.interp(t, np.arange(n) / 20.0, rate) - motion_rate(good, t)
+    imu = Imu(good.imu.t_ns, gyro, good.imu.accel_mps2 * [0.01, 0.01, 1.0])
+    spinning = without(good, "gnss", "truth", "command")
+    spinning = dataclasses.replace(spinning, imu=imu, wheels=dataclasses.replace(good.wheels, speed=sides))
+    assert examine(spinning) == []
+    stuck = dataclasses.replace(spinning, imu=None)
+    assert [(f.code, f.severity, f.repair) for f in examine(stuck)] == [("wheel-sign", "warning", None)]
+    assert examine(dataclasses.replace(stuck, terrain_name="snow")) == []
+
+
+def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:
+    """The yaw rate of the drive as commanded."""
+    assert r.command is not None
+    return np.interp(t_s, (r.command.t_ns - START_NS) * 1e-9, r.command.yaw_rate_radps)

@@ -1,0 +1,75 @@
+"""`demo`: the command a newcomer runs first."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from terrafusion.datasets.readers import open_recording
+
+ROOT = Path(__file__).parents[3]
+ENTRY = "from terrafusion.fusion.cli.main import main; main()"
+FILES = {"metrics.json", "estimate.csv", "trajectory.tum", "weights.jsonl", "report.html"}
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The folder of a demo run as the shell runs it, with every warning shown, and what it printed."""
+    folder = tmp_path_factory.mktemp("demo")
+    done = subprocess.run(
+        [sys.executable, "-c", ENTRY, "demo", "--out", "first"], capture_output=True, text=True, timeout=300,
+        check=False, cwd=folder, env=os.environ | {"PYTHONWARNINGS": "default"},
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    return folder / "first", done.stdout
+
+
+def test_the_comparison_is_printed(demo: tuple[Path, str]) -> None:
+    _, out = demo
+    lines = out.splitlines()
+    assert "asphalt, loose_sand, mud" in lines[0]
+    assert lines[1].split() == ["fixed", "adaptive"]
+    assert lines[-1] == f"report: {Path('first') / 'report.html'}"
+    for row in ("position error", "median error in the outage", "heading error", "real-time factor"):
+        line = next(line for line in lines if line.startswith(row))
+        assert len(re.findall(r"\d+\.\d\d", line)) == 2, line
+
+
+def test_its_files(demo: tuple[Path, str]) -> None:
+    folder, out = demo
+    assert {path.name for path in folder.iterdir()} == {"log", "fixed", "adaptive", "report.html"}
+    schema = json.loads((ROOT / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8"))
+    printed = next(line for line in out.splitlines() if line.startswith("position error")).split()[-2:]
+    for mode, shown in zip(("fixed", "adaptive"), printed, strict=True):
+        assert {path.name for path in (folder / mode).iterdir()} == FILES
+        metrics = json.loads((folder / mode / "metrics.json").read_text())
+        jsonschema.validate(metrics, schema)
+        assert metrics["mode"] == mode
+        assert f"{metrics['ate_m']:.2f}" == shown
+        assert metrics["outages"][0]["distance_m"] > 20.0
+    report = (folder / "report.html").read_text(encoding="utf-8")
+    assert "fixed" in report
+    assert "adaptive" in report
+    assert 'src="http' not in report
+
+
+def test_its_log_can_be_read_again(demo: tuple[Path, str]) -> None:
+    folder, _ = demo
+    recording = open_recording(folder / "log")
+    assert set(recording.channels()) == {"command", "wheels", "imu", "gnss", "motor", "terrain"}
+    assert recording.duration_s() == pytest.approx(150.0, abs=0.1)
+
+
+def test_it_runs_twice_into_the_same_folder(demo: tuple[Path, str], terrafusion) -> None:
+    folder, _ = demo
+    before = (folder / "fixed" / "estimate.csv").read_bytes()
+    outcome = terrafusion("demo", "--out", folder)
+    assert (outcome.status, outcome.err) == (0, "")
+    assert (folder / "fixed" / "estimate.csv").read_bytes() == before

@@ -1,0 +1,90 @@
+"""`terrafusion gap` from log folders to its two files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jsonschema
+import pytest
+
+from terrafusion.datasets.writers.log_folder import write_log_folder
+from tests.twin.gap.drives import runs
+
+SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gap")
+    for recording in [*runs(100, 6), *runs(300, 2, {"wheel_radius/scale": 0.03})]:
+        write_log_folder(recording, folder / recording.name)
+    return folder
+
+
+def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Path, terrafusion) -> None:
+    arguments = ["gap", str(logs / "run300"), str(logs / "run301"), "--out", str(tmp_path / "out")]
+    for i in range(6):
+        arguments += ["--reference", str(logs / f"run{100 + i}")]
+    done = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"))
+    assert done.status == 0, done.err
+    answer = json.loads((tmp_path / "out/diagnosis.json").read_text("utf-8"))
+    jsonschema.validate(answer, SCHEMA)
+    assert answer["named"] == ["wheel_radius"]
+    page = (tmp_path / "out/report.html").read_text("utf-8")
+    assert "wheel_radius" in page
+    assert "Before and after" in page
+    assert "wheel_radius" in done.out
+    assert "wheel.radius_m" in done.out
+    assert (tmp_path / "corrected.yaml").is_file()
+
+
+def test_gap_refuses_an_unknown_effect_in_one_line(logs: Path, tmp_path: Path, terrafusion) -> None:
+    done = terrafusion(
+        "gap", str(logs / "run300"), "--effects", "wheels_fell_off", "--out", str(tmp_path / "o")
+    )
+    assert done.status == 1
+    assert done.err.count("\n") == 1
+    assert "wheels_fell_off" in done.err
+
+
+@pytest.mark.parametrize("option", ["--out", "--write-vehicle"])
+def test_what_cannot_be_written_is_refused_before_anything_is_computed(
+    logs: Path, tmp_path: Path, terrafusion, monkeypatch: pytest.MonkeyPatch, option: str
+) -> None:
+    monkeypatch.setattr("terrafusion.twin.gap.diagnose.diagnose", lambda *_, **__: pytest.fail("computed"))
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    targets = {"--out": tmp_path / "out", option: taken if option == "--out" else taken / "vehicle.yaml"}
+    words = [str(word) for pair in targets.items() for word in pair]
+    done = terrafusion("gap", str(logs / "run300"), *words)
+    done.refused("cannot be written", "taken")
+    assert taken.read_text() == "mine"
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_blind_check_refuses_a_file_for_a_folder(tmp_path: Path, terrafusion) -> None:
+    taken = tmp_path / "taken"
+    taken.write_text("mine")
+    done = terrafusion("gap-blind", "--quick", "--out", str(taken))
+    assert done.status == 1
+    assert done.err.startswith("error: ")
+    assert "cannot be written" in done.err
+    assert taken.read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "told"),
+    [
+        (("--input", "bogus"), 1, "unknown input 'bogus'"),
+        (("--effects", ","), 1, "no effect is named"),
+        (("--seed", "-1"), 2, "--seed"),
+    ],
+)
+def test_gap_refuses_what_it_cannot_mean(
+    logs: Path, tmp_path: Path, terrafusion, words: tuple[str, ...], status: int, told: str
+) -> None:
+    done = terrafusion("gap", str(logs / "run300"), *words, "--out", str(tmp_path / "out"))
+    assert done.status == status
+    assert told in done.err
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,321 @@
+"""Each verdict occurs on the right data, through the whole diagnosis and without any truth channel."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jsonschema
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.fusion.reports.gap.plots import plot_shrink
+from terrafusion.fusion.reports.gap.words import sentences
+from terrafusion.twin.gap import Diagnosis, diagnose
+from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
+from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES
+from terrafusion.twin.gap.answer.verdict import LAW_MOVES, UNKNOWN
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
+from tests.twin.gap.drives import runs
+
+SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
+VEHICLE = load_vehicle("elevate")
+WIDE = {"wheel_radius/scale": 0.03}
+
+
+@pytest.fixture(scope="module")
+def references() -> list[Recording]:
+    """Six: with two judged runs 28 choices, the fewest that can be significant at 5 %."""
+    return runs(100, 6)
+
+
+@pytest.fixture(scope="module")
+def wide(references: list[Recording]) -> Diagnosis:
+    """Wheels 3 % larger than the twin's."""
+    return diagnose(runs(300, 2, WIDE), references, VEHICLE)
+
+
+def checked(d: Diagnosis) -> dict:
+    answer = d.to_json()
+    jsonschema.validate(answer, SCHEMA)
+    probabilities = [c["probability"] for c in answer["causes"]]
+    assert probabilities == sorted(probabilities, reverse=True)
+    assert sum(probabilities) + answer["p_unknown"] + answer["p_null"] == pytest.approx(1.0, abs=1e-6)
+    return answer
+
+
+def test_no_gap_runs_like_the_references(references: list[Recording]) -> None:
+    answer = checked(diagnose(runs(200, 2), references, VEHICLE))
+    assert answer["verdict"] == "no_gap"
+    assert answer["named"] == []
+    assert not answer["gap"]["detected"]
+
+
+def test_no_gap_where_all_runs_share_a_commissioning_error() -> None:
+    wrong = {"track_width/scale": 0.1, "gyro_scale/scale": 0.02}
+    answer = checked(diagnose(runs(800, 2, wrong), runs(810, 6, wrong), VEHICLE))
+    assert answer["verdict"] == "no_gap"
+
+
+def test_effect_a_wider_track(references: list[Recording]) -> None:
+    answer = checked(diagnose(runs(720, 2, {"track_width/scale": 0.1}), references, VEHICLE))
+    assert answer["verdict"] == "effect"
+    assert answer["named"] == ["track_width"]
+    assert not answer["gap"]["uncalibrated"]
+    assert answer["causes"][0]["parameters"]["track_width/scale"]["value"] == pytest.approx(0.1, abs=0.01)
+    assert {c["effect"] for c in answer["causes"]} == set(Candidates.of().effects)
+    assert answer["next_run"] is None
+
+
+def test_ambiguous_larger_wheels_and_grousers(wide: Diagnosis) -> None:
+    answer = checked(wide)
+    assert answer["verdict"] == "ambiguous"
+    assert answer["named"] == ["wheel_radius"]
+    assert set(answer["causes"][0]["class"]) == {"wheel_radius", "grousers"}
+    number = answer["causes"][0]["parameters"]["wheel_radius/scale"]
+    assert number["value"] == pytest.approx(0.03, abs=0.004)
+    assert LAW_MOVES * number["value"] <= number["sigma"] < 0.02  # the robot's law may be another
+    following = answer["next_run"]
+    assert following["scenario"] in DRIVES
+    assert set(following["separates"]) == {"wheel_radius", "grousers"}
+    assert wide.next_run is not None
+    assert wide.next_run.sigmas > 3.0
+
+
+def test_an_encoder_in_the_loop_is_told_from_larger_wheels(references: list[Recording]) -> None:
+    """On sand: a larger wheel sinks and pulls otherwise than one that merely turns faster."""
+    answer = checked(diagnose(runs(310, 2, {"encoder_scale/in_loop": 0.03}), references, VEHICLE))
+    assert answer["named"] == ["encoder_scale"]
+    assert "wheel_radius" not in answer["causes"][0]["class"]
+
+
+def test_ambiguous_encoder_scale_and_lost_counts_with_a_second_effect(references: list[Recording]) -> None:
+    both = {"gyro_scale/scale": 0.08, "encoder_dropout/share": 0.03}
+    answer = checked(diagnose(runs(700, 2, both), references, VEHICLE))
+    assert answer["verdict"] == "ambiguous"
+    assert len(answer["named"]) == 2
+    assert "gyro_scale" in answer["named"]
+    by_name = {c["effect"]: c["class"] for c in answer["causes"]}
+    (other,) = set(answer["named"]) - {"gyro_scale"}
+    assert {"encoder_scale", "encoder_dropout"} <= set(by_name[other])
+    assert answer["next_run"]["scenario"] == BY_HAND  # lost counts are a scale whatever is driven
+
+
+def test_a_small_effect_is_named_beside_a_large_one(references: list[Recording]) -> None:
+    """Of the whole gap it explains almost nothing, of what the large one leaves nearly all."""
+    both = {"wheel_radius/scale": 0.1, "imu_yaw_misalignment/rotation": 0.15}
+    found = diagnose(runs(740, 2, both), references, VEHICLE)
+    answer = checked(found)
+    assert answer["named"] == ["wheel_radius", "imu_yaw_misalignment"]
+    said = " ".join(sentences(found))
+    assert "The most probable causes act together (probability 9" in said
+    assert all(key in said for key in both)
+    values = {k: v for c in answer["causes"][:2] for k, v in c["parameters"].items()}
+    for key, value in both.items():
+        assert values[key]["value"] == pytest.approx(value, rel=0.2)
+
+
+def test_parameters_ground_of_stiffer_bearing(references: list[Recording]) -> None:
+    """The ground varies among the references too: it takes more of them to call a change of it a gap."""
+    softer = runs(400, 2, {"soil_strength/bearing": 0.9})
+    answer = checked(diagnose(softer, [*references, *runs(106, 4)], VEHICLE))
+    assert answer["verdict"] == "parameters"
+    assert answer["named"] == ["soil_strength"]
+
+
+def test_unknown_an_encoder_that_hears_the_other(references: list[Recording]) -> None:
+    """An effect that no catalogue has."""
+    odd = [_with_encoder_crosstalk(run) for run in runs(600, 2)]
+    answer = checked(diagnose(odd, references, VEHICLE))
+    assert answer["verdict"] == "unknown"
+    assert answer["named"] == []
+    assert answer["p_unknown"] > max(UNKNOWN, answer["causes"][0]["probability"])
+
+
+def _with_encoder_crosstalk(run: Recording) -> Recording:
+    """3 % of the right wheels' speed on the left ones'."""
+    assert run.wheels is not None
+    speed = run.wheels.speed.copy()
+    speed[:, 0] += 0.03 * speed[:, 1]
+    return dataclasses.replace(run, wheels=dataclasses.replace(run.wheels, speed=speed, angle_rad=None))
+
+
+def test_unknown_motor_current_in_the_gyro(references: list[Recording]) -> None:
+    """No catalogue has it; a bias explains its mean and no more."""
+    odd = [_with_crosstalk(run) for run in runs(600, 2)]
+    answer = checked(diagnose(odd, references, VEHICLE))
+    assert answer["gap"]["detected"]
+    assert answer["verdict"] == "unknown"
+    assert answer["named"] == []
+    assert answer["causes"][0]["effect"] == "gyro_bias"
+
+
+def _with_crosstalk(run: Recording) -> Recording:
+    """2 mrad/s of yaw rate an ampere of all motors."""
+    assert run.imu is not None
+    assert run.motor is not None
+    gyro = run.imu.gyro_radps.copy()
+    gyro[:, 2] += 2e-3 * np.interp(run.imu.t_ns, run.motor.t_ns, run.motor.current_a.sum(axis=1))
+    return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
+
+
+def test_unknown_a_gyro_that_swings_by_itself(references: list[Recording]) -> None:
+    """An effect that no catalogue has, and that looks like none in it."""
+    odd = [_swinging(run) for run in runs(600, 2)]
+    answer = checked(diagnose(odd, references, VEHICLE))
+    assert answer["verdict"] == "unknown"
+    assert answer["named"] == []
+    assert answer["p_unknown"] > 0.5
+
+
+def _swinging(run: Recording) -> Recording:
+    """50 mrad/s at 0.4 Hz on the yaw rate."""
+    assert run.imu is not None
+    gyro = run.imu.gyro_radps.copy()
+    gyro[:, 2] += 0.05 * np.sin(2.0 * np.pi * 0.4 * 1e-9 * (run.imu.t_ns - run.start_ns))
+    return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
+
+
+def test_the_gap_shrinks_on_runs_left_out(wide: Diagnosis) -> None:
+    s = wide.to_json()["shrink"]
+    assert s["after"] < s["before"]
+    assert s["after"] < 1.2 * s["floor"]
+    assert s["recalibration_only"] > s["after"]
+    assert set(s["per_channel"]) >= {"gnss_position", "yaw_rate", "wheel_left"}
+
+
+def test_the_map_names_a_cell_of_the_gap(wide: Diagnosis) -> None:
+    cells = wide.to_json()["where"]
+    assert cells[0]["p_value"] <= 0.05
+    assert sum(c["share"] for c in cells) == pytest.approx(1.0, abs=1e-6)
+
+
+@pytest.fixture(scope="module")
+def fresh() -> list[Recording]:
+    """Runs that no fit has seen."""
+    return runs(320, 2, WIDE)
+
+
+@pytest.fixture(scope="module")
+def unreferred(fresh: list[Recording]) -> Diagnosis:
+    """Against the uncorrected twin alone."""
+    return diagnose(fresh, [], VEHICLE)
+
+
+def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferred: Diagnosis) -> None:
+    answer = checked(unreferred)
+    assert answer["gap"]["uncalibrated"]
+    assert answer["gap"]["detected"]
+    assert answer["reference_runs"] == []
+    assert answer["where"] == []
+    assert any("that takes 2 references" in sentence for sentence in sentences(unreferred))
+    assert answer["shrink"]["floor"] is None
+    assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale", "grousers")
+
+
+def test_a_plot_names_references_where_there_are_any(wide: Diagnosis, unreferred: Diagnosis) -> None:
+    for found, labels in ((wide, ["before", "after", "references"]), (unreferred, ["before", "after"])):
+        legend = plot_shrink(found)[1].get_legend()
+        assert legend is not None
+        assert {text.get_text() for text in legend.get_texts()} == {*labels}
+
+
+@pytest.mark.parametrize("first", [410, 430])
+def test_without_references_the_twins_own_runs_are_no_gap(first: int) -> None:
+    """Whatever its sensors drew for the run: an offset and a gain of each current sensor among it."""
+    answer = checked(diagnose(runs(first, 2), [], VEHICLE))
+    assert answer["gap"]["uncalibrated"]
+    assert answer["verdict"] == "no_gap"
+
+
+def test_the_same_input_gives_the_same_bits(fresh: list[Recording], unreferred: Diagnosis) -> None:
+    assert json.dumps(diagnose(fresh, [], VEHICLE).to_json()) == json.dumps(unreferred.to_json())
+
+
+def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
+    wide: Diagnosis, fresh: list[Recording], unreferred: Diagnosis, tmp_path: Path
+) -> None:
+    target = tmp_path / "corrected.yaml"
+    said = write_corrected(wide, "elevate", target)
+    corrected = load_vehicle(target)
+    shift = values_of(wide)["wheel_radius/scale"]
+    assert corrected.wheel.radius_m == pytest.approx(VEHICLE.wheel.radius_m * (1.0 + shift))
+    assert any("radius_m" in line for line in said)
+    assert with_overrides(corrected, Overrides(wheel_radius_m=0.175)).wheel == corrected.wheel
+
+    after = diagnose(fresh, [], corrected)
+    assert unreferred.detected
+    assert after.detection.statistic < 0.2 * unreferred.detection.statistic
+    assert unreferred.shrinking is not None
+    assert after.shrinking is not None
+    assert after.shrinking.before < 0.7 * unreferred.shrinking.before
+    assert not after.detected
+
+
+ACROSS = {"cross_slope/uniform": 0.0873}
+"""The robot crabs: it points elsewhere than its track."""
+
+
+@pytest.fixture(scope="module")
+def across(references: list[Recording]) -> Diagnosis:
+    """On a slope of 5 deg to the left."""
+    return diagnose(runs(310, 2, ACROSS), references, VEHICLE)
+
+
+def test_a_slope_is_taken_in_the_direction_it_has_to_a_robot_that_crabs(across: Diagnosis) -> None:
+    answer = checked(across)
+    assert answer["named"] == ["cross_slope"]
+    assert values_of(across)["cross_slope/uniform"] == pytest.approx(0.0873, abs=0.0015)
+    assert across.shrinking is not None
+    assert across.shrinking.after < 0.93
+
+
+def test_an_effect_that_is_no_number_of_the_vehicle_goes_into_its_file(
+    across: Diagnosis, tmp_path: Path
+) -> None:
+    target, fresh = tmp_path / "corrected.yaml", runs(330, 2, ACROSS)
+    assert any("cross_slope/uniform" in line for line in write_corrected(across, "elevate", target))
+    corrected = load_vehicle(target)
+    assert corrected.effects == values_of(across)
+    before, after = (diagnose(fresh, [], vehicle) for vehicle in (VEHICLE, corrected))
+    assert after.detection.statistic < 0.1 * before.detection.statistic
+    assert before.shrinking is not None
+    assert after.shrinking is not None
+    assert before.shrinking.before > 5.0
+    assert after.shrinking.before < 1.0  # noise variances
+    assert not after.detected
+
+
+def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: Diagnosis) -> None:
+    on_it = dataclasses.replace(VEHICLE, effects=values_of(across))
+    found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], on_it, effects=("gyro_bias",))
+    assert found.bench.candidates.effects == ("gyro_bias", "cross_slope")
+    assert {*found.verdict.named} == {"gyro_bias", "cross_slope"}
+    assert values_of(found)["cross_slope/uniform"] < -0.07  # these runs are on level ground
+
+
+@pytest.mark.parametrize("effects", [("gyro_bias",), None])
+def test_without_references_a_large_effect_does_not_pass_for_noise(effects: tuple[str, ...] | None) -> None:
+    """Also where all candidates are of the sensors."""
+    found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], VEHICLE, effects=effects)
+    assert found.verdict.named == ("gyro_bias",)
+    assert values_of(found)["gyro_bias/constant"] == pytest.approx(0.05, abs=0.005)
+
+
+def test_nonsense_is_refused(references: list[Recording]) -> None:
+    with pytest.raises(DataError, match="no run"):
+        diagnose([], references, VEHICLE)
+    renamed = dataclasses.replace(references[0], name="again")
+    with pytest.raises(DataError, match="again: the same log as run100; give each once"):
+        diagnose(references[:1], [renamed, *references[1:]], VEHICLE)
+    assert references[0].motor is not None
+    motor = dataclasses.replace(references[0].motor, current_a=references[0].motor.current_a + 1.0)
+    assert diagnose(references[:1], [dataclasses.replace(renamed, motor=motor)], VEHICLE).references
+    with pytest.raises(ConfigError, match="unknown effect"):
+        diagnose(references[:1], references[1:], VEHICLE, effects=["wheels_fell_off"])
+    with pytest.raises(ConfigError, match="significance"):
+        diagnose(references[:1], references[1:], VEHICLE, significance=np.nan)

@@ -1,0 +1,49 @@
+"""Where no compiler is found the diagnosis runs in CasADi's virtual machine, which is not safe in threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.effects import catalogue
+from terrafusion.twin.effects.form import Form, one
+from terrafusion.twin.engine import compiler, native
+from terrafusion.twin.engine.integrate import compiled
+from terrafusion.twin.engine.reader import reader
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.infer.evidence import Bench, gather
+from terrafusion.twin.model.vehicle import load_vehicle
+from tests.twin.gap.drives import runs
+
+
+@pytest.mark.skipif(not compiled(), reason="no C compiler")
+def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    given, candidates = (runs(970, 1), runs(975, 2)), Candidates.of(["gyro_bias"])
+
+    def evidence() -> Bench:
+        return gather(*given, load_vehicle("elevate"), None, candidates, jobs=2)
+
+    fast = evidence()
+    monkeypatch.setattr(compiler, "find_compiler", lambda: None)
+    native.forget()
+    reader.cache_clear()
+    try:
+        slow = evidence()
+    finally:
+        native.forget()
+        reader.cache_clear()
+    assert (fast.jobs, slow.jobs) == (2, 1)
+    for mine, its in zip([*fast.runs, *fast.references], [*slow.runs, *slow.references], strict=True):
+        difference = mine.rows - its.rows  # in units of the noise
+        assert 0.0 < np.abs(difference).max() < 0.1
+        assert np.sqrt(np.mean(difference**2)) < 3e-3
+
+
+def test_an_effect_that_is_not_written_as_c_has_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    import casadi as ca
+
+    monkeypatch.setattr(catalogue, "_OWN", {})
+    body = {"body": lambda q, e: {"body_force_x_n": q["body_force_x_n"] - ca.if_else(q["u"] > 0.5, e, 0.0)}}
+    catalogue.register(Form("trailer", "brake", one("N", 10.0, 0.0, 200.0), body, "force e beyond 0.5 m/s"))
+    given = runs(970, 1), runs(975, 1), load_vehicle("elevate"), None
+    assert gather(*given, Candidates.of(["trailer"]), jobs=2).jobs == 1
