@@ -15,8 +15,8 @@ from typing import Any
 from terrafusion.datasets.catalog.catalog import load_catalog
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.json_text import to_json
 from terrafusion.datasets.readers import files_of
-from terrafusion.fusion.reports.replay.outputs import to_json
 
 FOLDER = "parts"
 LIBRARIES = ("casadi", "gtsam", "numpy", "scipy")

@@ -157,7 +157,7 @@ def evaluate_learner(model: Path, logs: list[str], out: Path | None) -> None:
 
 def write_figures(report: dict[str, Any], out: Path | None) -> None:
     """Write figures as JSON where a file is asked for."""
-    from terrafusion.fusion.reports.replay.outputs import to_json
+    from terrafusion.datasets.core.json_text import to_json
 
     if out is not None:
         out.write_text(to_json(report, indent=1) + "\n", encoding="utf-8")

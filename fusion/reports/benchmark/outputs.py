@@ -18,6 +18,7 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.json_text import to_json
 from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
 from terrafusion.fusion.benchmark.drives import FIELD
 from terrafusion.fusion.benchmark.parts import LIBRARIES, hash_sources, sources_sha256
@@ -30,7 +31,6 @@ from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports import page
 from terrafusion.fusion.reports.benchmark.plots import plot_ratios
 from terrafusion.fusion.reports.benchmark.text import Table, markdown, tables
-from terrafusion.fusion.reports.replay.outputs import to_json
 from tests.studies.twin_consistency import Cell
 
 SCHEMA = "terrafusion.benchmark/1"

@@ -13,7 +13,6 @@ and empty cells in CSV. The same estimate gives the same bytes.
 from __future__ import annotations
 
 import dataclasses
-import json
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
@@ -148,26 +148,6 @@ def write_outputs(
         "weights.jsonl": lambda path: _write_lines(path, _change_lines(estimate, recording.start_ns)),
     }
     return {name: write_atomically(directory / name, write) for name, write in writers.items()}
-
-
-def finite(value: Any) -> Any:
-    """The same JSON value with plain Python numbers, and None for every number that is not finite."""
-    if isinstance(value, Mapping):
-        return {str(key): finite(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return finite(value.tolist())
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    if isinstance(value, np.generic):
-        return finite(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
-def to_json(value: Any, *, indent: int | None = None) -> str:
-    """`value` as strict JSON: never NaN or Infinity."""
-    return json.dumps(finite(value), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.files import write_atomically
-from terrafusion.fusion.reports.replay.outputs import finite, to_json
+from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.fusion.reports.study.page import write_study_page
 from terrafusion.twin.study.agreement import BASES, Row, counts
 from terrafusion.twin.study.batch import CellResult

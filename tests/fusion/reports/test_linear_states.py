@@ -13,6 +13,7 @@ import pytest
 from jsonschema import Draft202012Validator
 from typer.testing import CliRunner
 
+from terrafusion.datasets.core.json_text import to_json
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -20,7 +21,7 @@ from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.metrics.metrics import score
 from terrafusion.fusion.reports.replay.linear_states import QUANTITIES, calibration, cells, series
-from terrafusion.fusion.reports.replay.outputs import build_metrics, estimate_columns, final_status, to_json
+from terrafusion.fusion.reports.replay.outputs import build_metrics, estimate_columns, final_status
 from terrafusion.fusion.reports.replay.page import ReportRun, write_report
 from terrafusion.fusion.reports.replay.plots_states import drawn, plot_skid_steering
 from terrafusion.fusion.reports.replay.ros_estimate import written_estimate

@@ -13,16 +13,15 @@ from jsonschema import Draft202012Validator
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.readers.text.tum import read_tum
 from terrafusion.fusion.metrics.metrics import HeldOut, Outage, Scores, score
 from terrafusion.fusion.reports.replay.outputs import (
     MODES,
     build_metrics,
     final_status,
-    finite,
     rejected_counts,
     terrain_shares,
-    to_json,
     write_outputs,
 )
 
