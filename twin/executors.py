@@ -39,7 +39,7 @@ _CONTINUE = "finished runs are kept, and the same command continues"
 
 
 @dataclass(frozen=True)
-class Pool:
+class Workers:
     """An executor (None: this process) and how to use it.
 
     Attributes:
@@ -73,7 +73,7 @@ class Pool:
 
 
 @contextlib.contextmanager
-def open_pool(backend: str, jobs: int, address: str | None = None) -> Iterator[Pool]:
+def open_workers(backend: str, jobs: int, address: str | None = None) -> Iterator[Workers]:
     """A pool of `jobs` processes on this machine, or of the workers of the Dask scheduler at `address`.
 
     Raises:
@@ -94,12 +94,12 @@ def open_pool(backend: str, jobs: int, address: str | None = None) -> Iterator[P
         with _dask(address) as pool:
             yield pool
     elif jobs == 1:
-        yield Pool(None)
+        yield Workers(None)
     else:
         with warnings.catch_warnings(), _loky(jobs) as executor:
             warnings.filterwarnings("ignore", message=REPLACED, category=UserWarning)
             # Less than loky hands on at once (2 jobs + 1): it stops cleanly only when none waits inside it.
-            yield Pool(executor, at_once=2 * jobs)
+            yield Workers(executor, at_once=2 * jobs)
 
 
 def _result(future: Future[T]) -> T:
@@ -145,7 +145,7 @@ def _loky(jobs: int) -> Iterator[Executor]:
 
 
 @contextlib.contextmanager
-def _dask(address: str) -> Iterator[Pool]:
+def _dask(address: str) -> Iterator[Workers]:
     try:
         from distributed import Client
     except ImportError:
@@ -159,7 +159,7 @@ def _dask(address: str) -> Iterator[Pool]:
         except Exception as error:  # of many kinds: what answers may be anything
             raise _no_scheduler(address, _first_line(error)) from None
         _check_workers(client, address)
-        yield Pool(client.get_executor(pure=False), check=_Watch(client, address))
+        yield Workers(client.get_executor(pure=False), check=_Watch(client, address))
 
 
 def _knock(address: str) -> None:

@@ -20,13 +20,13 @@ from terrafusion.twin.effects.catalogue import checked
 from terrafusion.twin.engine.integrate import compiled, integrate
 from terrafusion.twin.model.ground import patch_share
 from terrafusion.twin.model.library import assumed
-from terrafusion.twin.model.motion import Motion, motion_of, wheel_shares
+from terrafusion.twin.model.motion import BodyMotion, motion_of, wheel_shares
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_payload
 from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice
-from terrafusion.twin.scenario.commands import Driven, drive
+from terrafusion.twin.scenario.commands import DrivenStates, drive
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.route import Route
 from terrafusion.twin.scenario.scenario import Scenario
@@ -78,7 +78,7 @@ class RunSetup:
     t_s: Array
     effects: Mapping[str, float] = field(default_factory=dict)
 
-    def motion(self, states: Array, inputs: Array | None = None) -> Motion:
+    def motion(self, states: Array, inputs: Array | None = None) -> BodyMotion:
         """The body's motion in the world from the states (N, X); some effects need the inputs (N, U), too."""
         motion = motion_of(self.t_s, states, self.vehicle, *self.scenario.plane())
         return true_motion(motion, states, inputs, self.plant, self.vehicle) if self.plant.effects else motion
@@ -197,7 +197,7 @@ def set_up(
     return RunSetup(scenario, vehicle, route, plant, np.arange(count) / rate, known)
 
 
-def drive_through(setup: RunSetup, backend: str = "auto") -> Driven:
+def drive_through(setup: RunSetup, backend: str = "auto") -> DrivenStates:
     """The run's motion, without any sensor."""
     dt_s = 1.0 / setup.vehicle.sensors.imu.rate_hz
 
@@ -242,7 +242,7 @@ def _check_stands(scenario: Scenario, vehicle: VehicleParams) -> None:
         )
 
 
-def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Noise) -> Recording:
+def _record(setup: RunSetup, driven: DrivenStates, motion: BodyMotion, noise: sensors.Noise) -> Recording:
     """The channels at their own rates, all on the clock of the IMU."""
     scenario, vehicle, route = setup.scenario, setup.vehicle, setup.route
     states, rate = driven.states, vehicle.sensors.imu.rate_hz
@@ -273,7 +273,7 @@ def _record(setup: RunSetup, driven: Driven, motion: Motion, noise: sensors.Nois
     )
 
 
-def _truth(t_ns: NDArray[np.int64], motion: Motion) -> Trajectory:
+def _truth(t_ns: NDArray[np.int64], motion: BodyMotion) -> Trajectory:
     zero = np.zeros((len(t_ns), 2))
     twist = np.hstack([motion.velocity_body_mps, zero, motion.yaw_rate_radps[:, None]])
     return Trajectory(t_ns, motion.position_m, matrix_to_quaternion(motion.rotation), twist)
@@ -295,7 +295,7 @@ def _description(setup: RunSetup, seed: int, noiseless: bool) -> str:
     )
 
 
-def _notes(setup: RunSetup, motion: Motion, vehicle: str | Path | VehicleParams) -> list[str]:
+def _notes(setup: RunSetup, motion: BodyMotion, vehicle: str | Path | VehicleParams) -> list[str]:
     """What the reader of a recording should know of how it was made."""
     notes = []
     scenario = setup.scenario

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.infer.refit import effects_at
@@ -93,7 +93,7 @@ def _mean(group: Sequence[Marks], name: str) -> float | None:
 
 
 def twin_of(
-    recording: Recording, log: Log, model: Model, effects: Mapping[str, float], seed: int
+    recording: Recording, log: PreparedLog, model: Model, effects: Mapping[str, float], seed: int
 ) -> Recording:
     """The twin's log of a drive: the channels the recording has, no truth, noise by the vehicle's file.
 
@@ -115,7 +115,7 @@ def twin_of(
     )  # fmt: skip
 
 
-def scenario_of(log: Log, model: Model) -> Scenario:
+def scenario_of(log: PreparedLog, model: Model) -> Scenario:
     """The drive of a log as commands: the speeds its sides were told, at the vehicle's radius and track."""
     every = round(STEP_S / DT_S)
     rim = model.vehicle.wheel.radius_m * log.sides[: len(log.sides) // every * every]
@@ -125,6 +125,6 @@ def scenario_of(log: Log, model: Model) -> Scenario:
     return Scenario(log.name, len(v) * STEP_S, route=_route(log), route_over="time", drive=drive)
 
 
-def _route(log: Log) -> tuple[RouteLeg, ...]:
+def _route(log: PreparedLog) -> tuple[RouteLeg, ...]:
     lengths = [float(x) for x in np.diff(np.concatenate([[0.0], log.borders]))]
     return (*(RouteLeg(g, x) for g, x in zip(log.labels, lengths, strict=False)), RouteLeg(log.labels[-1]))

@@ -16,7 +16,7 @@ from terrafusion.fusion.benchmark.field_logs import drives_of
 from terrafusion.fusion.benchmark.measure import Row, measure
 from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, write_part
 from terrafusion.fusion.benchmark.plan import Job, Plan
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from tests.studies.field_table.table import Refusal
 
 
@@ -56,7 +56,7 @@ def run_benchmark(
     check_folder(out / FOLDER)
     found = {job: kept for job in wanted if (kept := _kept(out, job)) is not None}
     missing = [job for job in wanted if job not in found]
-    with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
+    with open_workers("loky", min(jobs, max(len(missing), 1))) as pool:
         for job, new in pool.results(run_job, [(job,) for job in missing]):
             found[job] = Found.read(write_part(out, job.key, dataclasses.asdict(new), _state(job)))
             if progress is not None:

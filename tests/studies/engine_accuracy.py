@@ -20,7 +20,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES
-from terrafusion.twin.scenario.commands import limit_slew, side_speeds, told
+from terrafusion.twin.scenario.commands import delayed_inputs, limit_slew, side_speeds
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
@@ -42,7 +42,7 @@ def path_of(scenario: str, terrain: str, substeps: int) -> Array:
     plan, vehicle = load_scenario(scenario), load_vehicle("elevate")
     t_s: Array = np.arange(round(plan.duration_s / DT_S) + 1, dtype=float) * DT_S
     twist = limit_slew(plan.commanded(t_s), DT_S, vehicle, plan, np.zeros(2))
-    inputs = told(side_speeds(twist, vehicle), DT_S)
+    inputs = delayed_inputs(side_speeds(twist, vehicle), DT_S)
     return integrate(np.zeros(len(STATES)), inputs, DT_S, _plant(terrain), substeps=substeps)[:, :2]
 
 
@@ -64,7 +64,7 @@ def motion_seconds(backend: str, repeats: int = 3) -> float:
     """Wall time of 300 s of motion without sensors on loose sand, the best of `repeats`, s."""
     speed = 1.0 + 0.5 * np.sin(0.001 * np.arange(30001)[:, None])
     radius = load_vehicle("elevate").odometry.wheel_radius_m
-    inputs = told(np.tile(speed / radius, (1, 2)), DT_S)
+    inputs = delayed_inputs(np.tile(speed / radius, (1, 2)), DT_S)
     plant = _plant("loose_sand")
     start = np.zeros(len(STATES))
     return best_of(repeats, lambda: integrate(start, inputs, DT_S, plant, backend=backend))

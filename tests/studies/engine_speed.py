@@ -31,7 +31,7 @@ from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 Array = NDArray[np.float64]
 
@@ -83,7 +83,7 @@ def inputs(seconds: float, phase: float = 0.0) -> Array:
     speed = np.minimum(t, 1.0) * (1.0 + 0.5 * np.sin(0.1 * t + phase))
     turn = 0.1 * np.sin(0.3 * t + 2.0 * phase)
     radius = load_vehicle("elevate").odometry.wheel_radius_m
-    return told(np.stack([speed * (1.0 - turn), speed * (1.0 + turn)], axis=1) / radius, DT_S)
+    return delayed_inputs(np.stack([speed * (1.0 - turn), speed * (1.0 + turn)], axis=1) / radius, DT_S)
 
 
 def plant(terrain: str = "loose_sand", slope_rad: float = 0.0) -> Plant:

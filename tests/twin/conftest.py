@@ -14,7 +14,7 @@ from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import STATES
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 
 @pytest.fixture
@@ -44,6 +44,6 @@ def run() -> Callable[..., np.ndarray]:
         route = RouteTable("travel", np.zeros(1), soil_vector(soil)[None])
         vehicle = vehicle_vector(load_vehicle("elevate"), slope_rad=slope_rad)
         x0 = np.zeros(len(STATES)) if start is None else start
-        return integrate(x0, told(sides, 0.01), 0.01, Plant(vehicle, route), **kw)
+        return integrate(x0, delayed_inputs(sides, 0.01), 0.01, Plant(vehicle, route), **kw)
 
     return call

@@ -16,7 +16,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, INPUTS, STATES, VEHICLE_PARAMETERS, state_slice
-from terrafusion.twin.scenario.commands import follow, told
+from terrafusion.twin.scenario.commands import delayed_inputs, follow
 
 ELEVATE = load_vehicle("elevate")
 RADIUS_M = ELEVATE.wheel.radius_m
@@ -82,7 +82,7 @@ def drive(
     """States, inputs and outputs of a drive, from rest unless told, in the graph of all effects."""
     effects = dict.fromkeys(KEYS, NAMED) | values
     own = plant(terrain, effects)
-    inputs = told(sides, DT_S, values.get("dead_time/transport", 0.0))
+    inputs = delayed_inputs(sides, DT_S, values.get("dead_time/transport", 0.0))
     x0 = np.zeros(len(STATES)) if start is None else start
     states = integrate(x0, inputs, DT_S, own)
     return states, inputs, measured(states, inputs, own.vehicle, soil(terrain), MOUNTING, effects)

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import gear_loss, motor_current, motor_voltage, winding_loss
-from terrafusion.twin.scenario.commands import Driven
+from terrafusion.twin.scenario.commands import DrivenStates
 
 Array = NDArray[np.float64]
 
@@ -94,7 +94,7 @@ class Energy:
         return self.battery_j - lost - self.slip_j - self.resistance_j - self.potential_j - self.kinetic_j
 
 
-def slip_ratios(states: Array, motion: Motion, vehicle: VehicleParams) -> Array:
+def slip_ratios(states: Array, motion: BodyMotion, vehicle: VehicleParams) -> Array:
     """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest."""
     rim = states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
     half = 0.5 * vehicle.body.track_m * np.array([1.0, -1.0, 1.0, -1.0])
@@ -103,7 +103,7 @@ def slip_ratios(states: Array, motion: Motion, vehicle: VehicleParams) -> Array:
     return np.where(larger > 1e-3, (rim - hub) / np.maximum(larger, 1e-3), 0.0)
 
 
-def summarise(driven: Driven, motion: Motion, vehicle: VehicleParams, slip: Array) -> RunSummary:
+def summarise(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams, slip: Array) -> RunSummary:
     """The run in a few numbers, from its states and slip ratios (N, 4)."""
     states, t_s = driven.states, motion.t_s
     speed = motion.velocity_body_mps[:, 0]
@@ -138,7 +138,7 @@ def summarise(driven: Driven, motion: Motion, vehicle: VehicleParams, slip: Arra
 
 
 def _immobilised(
-    t_s: Array, motion: Motion, driven: Driven, vehicle: VehicleParams
+    t_s: Array, motion: BodyMotion, driven: DrivenStates, vehicle: VehicleParams
 ) -> tuple[float, float, float, str] | tuple[None, None, None, None]:
     """When, where (x, y) and why the robot came to rest for good, or nothing."""
     moving = np.hypot(motion.velocity_body_mps[:, 0], motion.velocity_body_mps[:, 1]) > STOPPED_MPS

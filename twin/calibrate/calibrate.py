@@ -16,12 +16,12 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
 from terrafusion.twin.calibrate.identifiability import UNTOLD, Identifiability, examine
 from terrafusion.twin.calibrate.inputs import check_source
-from terrafusion.twin.calibrate.log import Log, grounds, prepare
+from terrafusion.twin.calibrate.log import PreparedLog, grounds, prepare
 from terrafusion.twin.calibrate.model import Model, resolve
 from terrafusion.twin.calibrate.predict import FOLLOWING
 from terrafusion.twin.calibrate.problem import Problem
 from terrafusion.twin.calibrate.residuals import channel_fits
-from terrafusion.twin.calibrate.result import CONVERGED, Calibration, Fitted
+from terrafusion.twin.calibrate.result import CONVERGED, Calibration, FittedParameter
 from terrafusion.twin.calibrate.sandwich import scattered
 from terrafusion.twin.calibrate.solver import OUTCOMES, Solution, solve
 from terrafusion.twin.model.soil import SoilParams, load_soil
@@ -29,7 +29,7 @@ from terrafusion.twin.model.vehicle import (
     VehicleParams,
     geometry_notes,
     load_vehicle,
-    told_geometry,
+    reported_geometry,
     with_overrides,
 )
 from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
@@ -122,7 +122,7 @@ def calibrate(
     _refuse_followed(numbers, logs)
     problem = Problem(logs, start, coordinates, robust=robust)
     solution, told = search(problem, progress)
-    notes = [*geometry_notes(robot, told_geometry(logs_in))]
+    notes = [*geometry_notes(robot, reported_geometry(logs_in))]
     notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
     return _answer(problem, solution, told, [*notes, *misfits(problem, solution), *assumptions(problem)])
 
@@ -202,7 +202,7 @@ def _answer(problem: Problem, solution: Solution, told: Identifiability, notes: 
     )  # fmt: skip
 
 
-def _marked(model: Model, fitted: Sequence[Fitted]) -> Model:
+def _marked(model: Model, fitted: Sequence[FittedParameter]) -> Model:
     """The model whose vehicle knows which of its numbers the logs told (`VehicleParams.measured`)."""
     told = {
         f.name.removeprefix("vehicle.")
@@ -213,9 +213,9 @@ def _marked(model: Model, fitted: Sequence[Fitted]) -> Model:
     return dataclasses.replace(model, vehicle=dataclasses.replace(model.vehicle, measured=names))
 
 
-def _fitted(c: Coordinate, w: float, sigma: float, status: str, ratio: float) -> Fitted:
+def _fitted(c: Coordinate, w: float, sigma: float, status: str, ratio: float) -> FittedParameter:
     low, high = c.bounds()
-    return Fitted(
+    return FittedParameter(
         c.name, c.unit, c.value(w), c.rate(w) * sigma, c.value(w - 2.0 * sigma), c.value(w + 2.0 * sigma),
         c.start, c.prior, c.rate(0.0), status, ratio, w <= low + 1e-9 or w >= high - 1e-9,
     )  # fmt: skip
@@ -276,7 +276,7 @@ def _start(
     effects: Mapping[str, float],
 ) -> tuple[Model, str | None]:
     """The model to start from, and the name of the one ground where there is one for all logs."""
-    loaded, present = with_overrides(vehicle, told_geometry(recordings)), {**vehicle.effects, **effects}
+    loaded, present = with_overrides(vehicle, reported_geometry(recordings)), {**vehicle.effects, **effects}
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
         return Model(loaded, {soil.name: soil}, present), soil.name
@@ -311,7 +311,7 @@ def _spelt(name: str, model: Model) -> list[str]:
     return [f"{s}.{name.removeprefix('soil.')}" for s in model.soils] if name.startswith("soil.") else [name]
 
 
-def _refuse_followed(numbers: Mapping[str, object], logs: Sequence[Log]) -> None:
+def _refuse_followed(numbers: Mapping[str, object], logs: Sequence[PreparedLog]) -> None:
     """Refuse parameters of motors and speed loop where the twin's wheels follow measured ones in all logs."""
     if not all(log.follows for log in logs):
         return

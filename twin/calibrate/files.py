@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.files import write_atomically
-from terrafusion.twin.calibrate.result import Calibration, Fitted
+from terrafusion.twin.calibrate.result import Calibration, FittedParameter
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.soil_table import is_published, published_soil
 
@@ -50,7 +50,9 @@ def write_files(
     return written
 
 
-def _updated(raw: dict[str, Any], values: Any, fitted: Mapping[str, Fitted], logs: str) -> dict[str, Any]:
+def _updated(
+    raw: dict[str, Any], values: Any, fitted: Mapping[str, FittedParameter], logs: str
+) -> dict[str, Any]:
     out = copy.deepcopy(raw)
     for name, f in fitted.items():
         section, parts = out, name.split(".")
@@ -71,7 +73,7 @@ def _entry(before: Any, value: Any, source: str) -> dict[str, Any]:
     return {"value": value, "source": f"{source}; outside the validity range {valid} of the file before"}
 
 
-def _source(f: Fitted, logs: str) -> str:
+def _source(f: FittedParameter, logs: str) -> str:
     if f.status == "told":
         return f"calibrated from {logs}: 1 sigma {f.sigma:.3g}"
     return f"{f.status} by the calibration from {logs} (1 sigma {f.sigma:.3g}); before: {f.start:.6g}"

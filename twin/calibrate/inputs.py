@@ -40,7 +40,7 @@ def check_source(source: str) -> None:
 
 
 @dataclass(frozen=True, eq=False)
-class Told:
+class TwinInput:
     """The twin's input.
 
     Attributes:
@@ -62,7 +62,7 @@ class Told:
         return (len(self.sides) - 1) * DT_S
 
 
-def told_by(recording: Recording, vehicle: VehicleParams, source: str) -> Told:
+def twin_input(recording: Recording, vehicle: VehicleParams, source: str) -> TwinInput:
     """The input from one of `SOURCES`.
 
     Raises:
@@ -84,7 +84,7 @@ def told_by(recording: Recording, vehicle: VehicleParams, source: str) -> Told:
     return _measured(recording, vehicle)
 
 
-def _measured(recording: Recording, vehicle: VehicleParams) -> Told:
+def _measured(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     wheels = recording.wheels
     assert wheels is not None
     notes = [
@@ -102,10 +102,10 @@ def _measured(recording: Recording, vehicle: VehicleParams) -> Told:
     grid = DT_S * np.arange(round(float(t_s[-1]) / DT_S) + 1)
     sides = np.stack([np.interp(grid, centre, side) for side in measured.T], axis=1)
     far = np.flatnonzero(np.diff(t_s) > LONGEST_GAP_S)
-    return Told(start, sides, True, np.stack([t_s[far], t_s[far + 1]], axis=1), tuple(notes))
+    return TwinInput(start, sides, True, np.stack([t_s[far], t_s[far + 1]], axis=1), tuple(notes))
 
 
-def _commands(recording: Recording, vehicle: VehicleParams) -> Told:
+def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     """Commanded twists within the vehicle's own limits.
 
     Between two commands the twist runs smoothly; a sudden change is a step.
@@ -134,7 +134,7 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> Told:
     gaps = _holes(t_s)
     notes = [f"the commands have {len(gaps)} hole(s) of up to {np.diff(gaps).max():.1f} s: what falls into "
              "them is not compared, the last command is held"] if len(gaps) else []  # fmt: skip
-    return Told(start, sides, False, gaps, tuple(notes))
+    return TwinInput(start, sides, False, gaps, tuple(notes))
 
 
 def _holes(t_s: Array) -> Array:

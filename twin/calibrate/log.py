@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS, told_by
+from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS, twin_input
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed, observe
 from terrafusion.twin.calibrate.window_starts import window_starts
@@ -24,7 +24,7 @@ LEAST_ROWS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Log:
+class PreparedLog:
     """One drive as the fit sees it; times in seconds from the first input, on a grid of `inputs.DT_S`.
 
     Attributes:
@@ -64,7 +64,7 @@ def prepare(
     window_s: float = 10.0,
     ground: str | None = None,
     channels: tuple[str, ...] | None = None,
-) -> Log:
+) -> PreparedLog:
     """The log as the fit needs it.
 
     Args:
@@ -77,7 +77,7 @@ def prepare(
     Raises:
         DataError: no input, or nothing to compare the twin with.
     """
-    told = told_by(recording, model.vehicle, source)
+    told = twin_input(recording, model.vehicle, source)
     notes = list(told.notes)
     observed = observe(recording, model.vehicle, told.start_ns, wheels=not told.follows, truth=truth)
     if channels is not None:
@@ -100,7 +100,7 @@ def prepare(
     start, posed = window_starts(recording, model, told.start_ns, at_s, window_s, truth=truth)
     if model.slope_rad > 0.0 and not posed:
         notes.append("on a slope, and nothing in the log says its heading: taken as 0 at the start")
-    return Log(
+    return PreparedLog(
         recording.name, told.sides, told.follows, labels, borders, windows, start, observed, posed,
         tuple(notes),
     )  # fmt: skip

@@ -32,7 +32,7 @@ OUTLIER_SIGMAS = 4.0
 
 
 @dataclass(frozen=True)
-class Noise:
+class ResidualNoise:
     """Covariance sigma_i sigma_j scale^2 rho(|slot_i - slot_j|) of a channel's rows.
 
     Attributes:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.readings import readings
@@ -23,7 +23,7 @@ from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensi
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 Array = NDArray[np.float64]
 
@@ -52,14 +52,14 @@ class Prediction:
     by_pose: Array
 
 
-def predict(log: Log, model: Model, names: Sequence[str], start: Array) -> list[Prediction]:
+def predict(log: PreparedLog, model: Model, names: Sequence[str], start: Array) -> list[Prediction]:
     """The channels of `log.observed` for the windows' starts (W, 3), with derivatives by the named numbers.
 
     Raises:
         TerrafusionError: the run diverged.
     """
     plant, directions = plant_of(log, model, names)
-    inputs = told(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
+    inputs = delayed_inputs(log.sides, DT_S, 0.0 if log.follows else model.vehicle.drive.dead_time_s)
     states, changes = _run(log, plant, directions, inputs, start)
     samples = np.concatenate([np.arange(first, last + 1) for first, last in log.windows])
     channels = tuple(o.channel for o in log.observed)
@@ -76,7 +76,7 @@ def predict(log: Log, model: Model, names: Sequence[str], start: Array) -> list[
     return out
 
 
-def plant_of(log: Log, model: Model, names: Sequence[str]) -> tuple[Plant, Directions]:
+def plant_of(log: PreparedLog, model: Model, names: Sequence[str]) -> tuple[Plant, Directions]:
     """The plant, and as directions the named numbers, then x, y and yaw of a start."""
     route = route_of(log, model)
     vehicle, count = model.vehicle_vector(), len(names)
@@ -110,7 +110,7 @@ def _follow(vehicle: Array, d: Directions) -> None:
     d.vehicle[list(at.values())] = 0.0
 
 
-def route_of(log: Log, model: Model) -> RouteTable:
+def route_of(log: PreparedLog, model: Model) -> RouteTable:
     """The ground over the log's time."""
     vectors = np.array([soil_vector(model.soils[label]) for label in log.labels])
     if len(log.labels) == 1:
@@ -120,14 +120,14 @@ def route_of(log: Log, model: Model) -> RouteTable:
     return RouteTable("time", at, np.repeat(vectors, 2, axis=0)[1:-1])
 
 
-def _knot_labels(log: Log) -> list[str]:
+def _knot_labels(log: PreparedLog) -> list[str]:
     """Ground at each knot of `route_of`."""
     if len(log.labels) == 1:
         return list(log.labels)
     return [label for label in log.labels for _ in range(2)][1:-1]
 
 
-def _run(log: Log, plant: Plant, d: Directions, inputs: Array, start: Array) -> tuple[Array, Array]:
+def _run(log: PreparedLog, plant: Plant, d: Directions, inputs: Array, start: Array) -> tuple[Array, Array]:
     """States (N, X) at all samples of all windows, one after the other, and derivatives (N, X, M).
 
     The last window's pose enters the next one's inner states on a slope only, by its heading; that is left
@@ -185,13 +185,13 @@ def _carried(
     return xs[-1].copy(), Ss[-1].copy()
 
 
-def led_in(log: Log, plant: Plant, d: Directions, inputs: Array) -> tuple[Array, Array]:
+def led_in(log: PreparedLog, plant: Plant, d: Directions, inputs: Array) -> tuple[Array, Array]:
     """State (X,) and derivatives (X, M) at the first window, after driving as first told for `LEAD_S`."""
     x, before = run_up(log, plant, inputs)
     return _carried(plant, d, before, x, np.zeros((len(STATES), d.count)), -LEAD_S)
 
 
-def run_up(log: Log, plant: Plant, inputs: Array) -> tuple[Array, Array]:
+def run_up(log: PreparedLog, plant: Plant, inputs: Array) -> tuple[Array, Array]:
     """State (X,) `LEAD_S` before the log, and the inputs from there up to the first window."""
     x = np.zeros(len(STATES))
     x[INDEX["yaw"]] = log.start[0, 2]
@@ -205,7 +205,7 @@ def run_up(log: Log, plant: Plant, inputs: Array) -> tuple[Array, Array]:
 
 
 def averaging(
-    observed: Observed, log: Log, shift: NDArray[np.int64], window: NDArray[np.int64] | None = None
+    observed: Observed, log: PreparedLog, shift: NDArray[np.int64], window: NDArray[np.int64] | None = None
 ) -> tuple[NDArray[np.int64], Array]:
     """Stacked samples (n, k) that a row depends on, and their weights (n, k): its mean over its interval.
 

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.noise import Noise
+from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.predict import POSE, Prediction, predict
 from terrafusion.twin.calibrate.sensor_offsets import sensor_errors
 
@@ -53,7 +53,7 @@ class Point:
 
 
 @dataclass(frozen=True, eq=False)
-class Block:
+class ResidualBlock:
     """Residuals (twin less log) of one channel in one window, and their derivatives by what is local to it.
 
     Attributes:
@@ -109,7 +109,7 @@ class Problem:
     """Logs, a model and the coordinates of what is unknown."""
 
     def __init__(
-        self, logs: Sequence[Log], model: Model, coordinates: Sequence[Coordinate], *, robust: bool
+        self, logs: Sequence[PreparedLog], model: Model, coordinates: Sequence[Coordinate], *, robust: bool
     ) -> None:
         self.logs, self.model, self.coordinates, self.robust = tuple(logs), model, tuple(coordinates), robust
         self.names = tuple(c.name for c in coordinates)
@@ -141,7 +141,7 @@ class Problem:
             for log, pose in zip(self.logs, point.pose, strict=True)
         ]
 
-    def blocks(self, point: Point) -> list[Block]:
+    def blocks(self, point: Point) -> list[ResidualBlock]:
         """Residuals and derivatives, in a fixed order."""
         rate = np.array([c.rate(float(x)) for c, x in zip(self.coordinates, point.w, strict=True)])
         out = []
@@ -152,7 +152,7 @@ class Problem:
                 change = np.hstack([gain * p.change * rate, by, gain * p.by_pose * self.pose_sigma(log)])
                 for window in np.unique(self.windows[i][j]):
                     rows = np.flatnonzero(self.windows[i][j] == window)
-                    out.append(Block(i, j, int(window), rows, residual[rows], change[rows]))
+                    out.append(ResidualBlock(i, j, int(window), rows, residual[rows], change[rows]))
         return out
 
     def _sensor(self, channel: str, value: Array, errors: Array) -> tuple[float, Array]:
@@ -165,11 +165,11 @@ class Problem:
         return gain, by
 
     @staticmethod
-    def pose_sigma(log: Log) -> Array:
+    def pose_sigma(log: PreparedLog) -> Array:
         """Prior sigma (3,) of a window's start, m and rad."""
         return POSE_SIGMA if log.posed else np.array([*POSE_SIGMA[:2], UNPOSED_YAW_SIGMA])
 
-    def whitened(self, block: Block, noise: dict[Key, Noise]) -> tuple[Array, Array]:
+    def whitened(self, block: ResidualBlock, noise: dict[Key, ResidualNoise]) -> tuple[Array, Array]:
         """Residual (n,) and derivatives with white noise of variance one, outliers weighed down."""
         observed = self.logs[block.log].observed[block.channel]
         columns = np.column_stack([block.residual, block.change])
@@ -190,14 +190,16 @@ class Problem:
         outlier = np.abs(r) > HUBER
         return 0.5 * float(np.sum(np.where(outlier, 2.0 * r * r - HUBER**2, r * r)))
 
-    def normal(self, point: Point, blocks: Sequence[Block], noise: dict[Key, Noise]) -> Normal:
+    def normal(
+        self, point: Point, blocks: Sequence[ResidualBlock], noise: dict[Key, ResidualNoise]
+    ) -> Normal:
         """Normal equations of parameters and offsets, priors included."""
         P, B, Q = len(self.coordinates), len(self.errors), len(POSE)
         size = P + B * len(self.logs)
         H, g = np.eye(size), np.concatenate([point.w, point.errors.ravel()])
         cost = point.prior_cost()
         poses: dict[Key, Eliminated] = {}
-        by_window: dict[Key, list[Block]] = {}
+        by_window: dict[Key, list[ResidualBlock]] = {}
         for block in blocks:
             by_window.setdefault((block.log, block.window), []).append(block)
         for (i, k), mine in by_window.items():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.problem import Block, Problem
+from terrafusion.twin.calibrate.problem import Problem, ResidualBlock
 from terrafusion.twin.calibrate.result import ChannelFit
 from terrafusion.twin.calibrate.solver import Solution, by_channel
 
@@ -43,7 +43,7 @@ def _neighbours(white: list[Array]) -> float:
     return sum(float(w[1:] @ w[:-1]) for w in white) / below if below > 0.0 else 0.0
 
 
-def _nuisances_fitted(problem: Problem, solution: Solution) -> list[Block]:
+def _nuisances_fitted(problem: Problem, solution: Solution) -> list[ResidualBlock]:
     """The first blocks after one step of sensor errors and poses, which enter all but linearly."""
     point, P = problem.start(), len(problem.coordinates)
     normal = problem.normal(point, solution.first, solution.noise)
@@ -53,5 +53,5 @@ def _nuisances_fitted(problem: Problem, solution: Solution) -> list[Block]:
     out = []
     for b in solution.first:
         local = np.concatenate([np.zeros(P), derrors[b.log], dpose[b.log][b.window]])
-        out.append(Block(b.log, b.channel, b.window, b.rows, b.residual + b.change @ local, b.change))
+        out.append(ResidualBlock(b.log, b.channel, b.window, b.rows, b.residual + b.change @ local, b.change))
     return out

@@ -19,7 +19,7 @@ CONVERGED = ("converged", "at_bound")
 
 
 @dataclass(frozen=True)
-class Fitted:
+class FittedParameter:
     """One number.
 
     Attributes:
@@ -93,7 +93,7 @@ class Calibration:
         notes: what was assumed.
     """
 
-    fitted: tuple[Fitted, ...]
+    fitted: tuple[FittedParameter, ...]
     correlation: Array
     covariance: Array
     identifiability: Identifiability
@@ -107,7 +107,7 @@ class Calibration:
     seconds_of_data: float
     notes: tuple[str, ...]
 
-    def __getitem__(self, name: str) -> Fitted:
+    def __getitem__(self, name: str) -> FittedParameter:
         """A number by its name; `soil.` stands for the ground where there is one only."""
         return next(f for f in self.fitted if f.name == name or self._is_soil(name, f.name))
 
@@ -118,7 +118,7 @@ class Calibration:
         """Whether the search came to its end; if not, values and sigma are not to be trusted."""
         return self.outcome in CONVERGED
 
-    def untold(self) -> tuple[Fitted, ...]:
+    def untold(self) -> tuple[FittedParameter, ...]:
         """Numbers that the data do not tell by themselves."""
         return tuple(f for f in self.fitted if f.status != TOLD)
 
@@ -162,7 +162,7 @@ class Calibration:
         }  # fmt: skip
 
 
-def _entry(f: Fitted, converged: bool) -> dict[str, Any]:
+def _entry(f: FittedParameter, converged: bool) -> dict[str, Any]:
     return {
         "value": f.value, "sigma": f.sigma, "unit": f.unit, "interval_2_sigma": [f.low, f.high],
         "start": f.start, "prior": f.prior, "prior_sigma": f.prior_sigma, "status": f.status,

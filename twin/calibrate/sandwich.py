@@ -13,9 +13,9 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.noise import Noise
+from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.observations import BIN_S
-from terrafusion.twin.calibrate.problem import Block, Key, Normal, Problem
+from terrafusion.twin.calibrate.problem import Key, Normal, Problem, ResidualBlock
 
 Array = NDArray[np.float64]
 
@@ -23,7 +23,9 @@ MEMORY_S = 2.0
 """Scores further apart than this are taken as independent."""
 
 
-def scattered(problem: Problem, blocks: Sequence[Block], normal: Normal, noise: dict[Key, Noise]) -> Array:
+def scattered(
+    problem: Problem, blocks: Sequence[ResidualBlock], normal: Normal, noise: dict[Key, ResidualNoise]
+) -> Array:
     """Covariance (G, G) of parameters and sensor errors from the scatter of the scores."""
     inverse = np.linalg.inv(normal.H)
     meat = np.eye(len(inverse))
@@ -33,7 +35,7 @@ def scattered(problem: Problem, blocks: Sequence[Block], normal: Normal, noise: 
 
 
 def _series(
-    problem: Problem, blocks: Sequence[Block], normal: Normal, noise: dict[Key, Noise]
+    problem: Problem, blocks: Sequence[ResidualBlock], normal: Normal, noise: dict[Key, ResidualNoise]
 ) -> dict[int, Array]:
     """Scores (bins, G) of each log, poses eliminated, added up over its channels in bins of `BIN_S`."""
     others = len(problem.coordinates) + len(problem.errors)

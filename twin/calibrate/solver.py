@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.twin.calibrate.noise import Noise, autoregressive, clipped, gauss_markov
-from terrafusion.twin.calibrate.problem import Block, Key, Normal, Point, Problem
+from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, gauss_markov
+from terrafusion.twin.calibrate.problem import Key, Normal, Point, Problem, ResidualBlock
 
 Array = NDArray[np.float64]
 
@@ -61,12 +61,12 @@ class Solution:
     """
 
     point: Point
-    blocks: Sequence[Block]
+    blocks: Sequence[ResidualBlock]
     normal: Normal | None
-    noise: dict[Key, Noise]
+    noise: dict[Key, ResidualNoise]
     outcome: str
     runs: int
-    first: Sequence[Block]
+    first: Sequence[ResidualBlock]
     history: tuple[tuple[float, ...], ...]
 
 
@@ -78,7 +78,7 @@ class Search:
         bounds = np.array([c.bounds() for c in problem.coordinates])
         self.low, self.high = bounds[:, 0], bounds[:, 1]
 
-    def blocks(self, point: Point) -> list[Block] | None:
+    def blocks(self, point: Point) -> list[ResidualBlock] | None:
         """Residuals at a point; None where the twin diverges."""
         self.runs += 1
         if self.progress is not None:
@@ -130,21 +130,25 @@ def solve(
 
 
 def raised(
-    problem: Problem, blocks: Sequence[Block], normal: Normal, noise: dict[Key, Noise]
-) -> dict[Key, Noise]:
+    problem: Problem, blocks: Sequence[ResidualBlock], normal: Normal, noise: dict[Key, ResidualNoise]
+) -> dict[Key, ResidualNoise]:
     """The first guess, raised to what the residuals are at the start: so far off, none is to be trusted."""
     new = rescaled(problem, blocks, normal, noise)
-    return {k: Noise(max(n.scale, noise[k].scale), n.rho) for k, n in new.items()}
+    return {k: ResidualNoise(max(n.scale, noise[k].scale), n.rho) for k, n in new.items()}
 
 
-def _ahead(problem: Problem, noise: dict[Key, Noise], new: dict[Key, Noise]) -> dict[Key, Noise]:
+def _ahead(
+    problem: Problem, noise: dict[Key, ResidualNoise], new: dict[Key, ResidualNoise]
+) -> dict[Key, ResidualNoise]:
     """Scales that fall are taken down as much again: they do so because the numbers are still off."""
     share = {k: min(1.0, max(new[k].scale / noise[k].scale, MOST_AHEAD)) for k in new}
     least = {k: problem.logs[k[0]].observed[k[1]].least for k in new}
-    return {k: Noise(max(n.scale * share[k], least[k]), n.rho) for k, n in new.items()}
+    return {k: ResidualNoise(max(n.scale * share[k], least[k]), n.rho) for k, n in new.items()}
 
 
-Learn = Callable[[Problem, Sequence[Block], Normal, dict[Key, Noise]], dict[Key, Noise]]
+Learn = Callable[
+    [Problem, Sequence[ResidualBlock], Normal, dict[Key, ResidualNoise]], dict[Key, ResidualNoise]
+]
 
 
 def _passes(whole: bool) -> list[tuple[Learn | None, float]]:
@@ -162,12 +166,12 @@ def _passes(whole: bool) -> list[tuple[Learn | None, float]]:
 def _descend(
     search: Search,
     point: Point,
-    blocks: list[Block],
+    blocks: list[ResidualBlock],
     normal: Normal,
-    noise: dict[Key, Noise],
+    noise: dict[Key, ResidualNoise],
     free: NDArray[np.bool_],
     goal: float,
-) -> tuple[Point, list[Block], Normal, str, tuple[float, ...]]:
+) -> tuple[Point, list[ResidualBlock], Normal, str, tuple[float, ...]]:
     """Steps until one promises less than `goal`: point, blocks, normal equations, outcome and costs."""
     problem, damping, costs = search.problem, DAMPING[0], [normal.cost]
     while True:
@@ -222,10 +226,10 @@ def _moved(search: Search, point: Point, normal: Normal, d: Array) -> Point:
     return Point(np.clip(new.w, search.low, search.high), new.errors, new.pose)
 
 
-def first_noise(problem: Problem) -> dict[Key, Noise]:
+def first_noise(problem: Problem) -> dict[Key, ResidualNoise]:
     """White noise of the data sheets' sigma, with the correlation they tell."""
     return {
-        (i, j): Noise(1.0, _sheet_rho(problem, i, j) or (1.0,))
+        (i, j): ResidualNoise(1.0, _sheet_rho(problem, i, j) or (1.0,))
         for i, log in enumerate(problem.logs)
         for j in range(len(log.observed))
     }
@@ -248,23 +252,23 @@ def _lags(problem: Problem, i: int, j: int) -> int:
 
 
 def learnt_noise(
-    problem: Problem, blocks: Sequence[Block], normal: Normal, _: dict[Key, Noise]
-) -> dict[Key, Noise]:
+    problem: Problem, blocks: Sequence[ResidualBlock], normal: Normal, _: dict[Key, ResidualNoise]
+) -> dict[Key, ResidualNoise]:
     """The noise of every channel as its residuals show it."""
-    found: dict[Key, Noise] = {}
+    found: dict[Key, ResidualNoise] = {}
     for key, mine in by_channel(blocks).items():
         observed = problem.logs[key[0]].observed[key[1]]
         rho = _sheet_rho(problem, *key)
         if rho is None:
             series = [(observed.slot[b.rows], clipped(b.residual / observed.sigma[b.rows])) for b in mine]
             rho = autoregressive(series, _lags(problem, *key))
-        found[key] = Noise(1.0, rho)
+        found[key] = ResidualNoise(1.0, rho)
     return rescaled(problem, blocks, normal, found)
 
 
 def rescaled(
-    problem: Problem, blocks: Sequence[Block], normal: Normal, noise: dict[Key, Noise]
-) -> dict[Key, Noise]:
+    problem: Problem, blocks: Sequence[ResidualBlock], normal: Normal, noise: dict[Key, ResidualNoise]
+) -> dict[Key, ResidualNoise]:
     """The noise, scaled so that whitened residuals have variance one (less what the fit has used up)."""
     out = {}
     used = degrees_used(problem, blocks, normal, noise)
@@ -273,12 +277,12 @@ def rescaled(
         freedom = max(len(whitened) - used[key], 0.5 * len(whitened), 1.0)
         variance = float(whitened @ whitened) / freedom
         scale = max(noise[key].scale * math.sqrt(variance), problem.logs[key[0]].observed[key[1]].least)
-        out[key] = Noise(scale, noise[key].rho)
+        out[key] = ResidualNoise(scale, noise[key].rho)
     return out
 
 
 def degrees_used(
-    problem: Problem, blocks: Sequence[Block], normal: Normal, noise: dict[Key, Noise]
+    problem: Problem, blocks: Sequence[ResidualBlock], normal: Normal, noise: dict[Key, ResidualNoise]
 ) -> dict[Key, float]:
     """Degrees of freedom the fit takes from each channel: trace of J (J'J + prior)^-1 J' over its rows."""
     covariance = np.linalg.inv(normal.H)
@@ -295,9 +299,9 @@ def degrees_used(
     return out
 
 
-def by_channel(blocks: Sequence[Block]) -> dict[Key, list[Block]]:
+def by_channel(blocks: Sequence[ResidualBlock]) -> dict[Key, list[ResidualBlock]]:
     """Blocks of each log's channels."""
-    out: dict[Key, list[Block]] = {}
+    out: dict[Key, list[ResidualBlock]] = {}
     for block in blocks:
         out.setdefault((block.log, block.channel), []).append(block)
     return out

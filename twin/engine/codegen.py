@@ -11,7 +11,7 @@ from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import (
     CALLS,
     INPUT,
-    Graph,
+    OperationGraph,
     Outputs,
     UnsupportedOperationError,
     read,
@@ -133,7 +133,7 @@ def _with_tangent(f: Any) -> Any:
                        {"cse": True})  # fmt: skip
 
 
-def _read_states(graph: Graph, outputs: Outputs) -> str:
+def _read_states(graph: OperationGraph, outputs: Outputs) -> str:
     """Defines the states whose tangents others depend on, by the graph or by their place on the ground."""
     inputs = (graph.values[n] for n in graph.reached(outputs["dx_wide"]) if graph.ops[n] == INPUT)
     read = sorted({i for name, i in inputs if name == "x_wide"} | {INDEX["travel"]})

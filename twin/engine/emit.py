@@ -14,7 +14,14 @@ import heapq
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 
-from terrafusion.twin.engine.graph import BINARY, CONST, INPUT, Graph, Outputs, UnsupportedOperationError
+from terrafusion.twin.engine.graph import (
+    BINARY,
+    CONST,
+    INPUT,
+    OperationGraph,
+    Outputs,
+    UnsupportedOperationError,
+)
 from terrafusion.twin.engine.packing import WHEELS, Atom, LaneOf, packs
 
 _LATENCY = {"sqrt": 21, "div": 13, "exp": 70, "log": 80, "sin": 60, "cos": 60}
@@ -54,7 +61,7 @@ class Emitter:
         short: whether numbers have 32 bits.
     """
 
-    graph: Graph
+    graph: OperationGraph
     outputs: Outputs
     late: Collection[str]
     wide: Collection[str]

@@ -29,7 +29,7 @@ class UnsupportedOperationError(ValueError):
 
 
 @dataclass(eq=False)
-class Graph:
+class OperationGraph:
     """Operations without repetition.
 
     Attributes:
@@ -86,7 +86,7 @@ Outputs = dict[str, list[int]]
 """Nodes of each output by its name."""
 
 
-def read(function: Any, element: Callable[[str, int], int]) -> tuple[Graph, Outputs]:
+def read(function: Any, element: Callable[[str, int], int]) -> tuple[OperationGraph, Outputs]:
     """The graph of a CasADi SX `Function` and the nodes of its outputs.
 
     `element(argument, i)` is where the C code holds the argument's i-th element.
@@ -94,7 +94,7 @@ def read(function: Any, element: Callable[[str, int], int]) -> tuple[Graph, Outp
     Raises:
         UnsupportedOperationError: an operation that cannot be written as C here.
     """
-    graph = Graph()
+    graph = OperationGraph()
     outputs = {name: [graph.const(0.0)] * function.numel_out(i) for i, name in enumerate(function.name_out())}
     in_slot: dict[int, int] = {}
     names = _operations()
@@ -123,7 +123,7 @@ def _operations() -> dict[int, str]:
     return {getattr(ca, name): name for name in dir(ca) if name.startswith("OP_")}
 
 
-def _translated(graph: Graph, op: str, *args: int) -> int:
+def _translated(graph: OperationGraph, op: str, *args: int) -> int:
     """Node of a CasADi operation."""
     name = op.removeprefix("OP_").lower()
     if name == "sq":
@@ -142,8 +142,8 @@ def _translated(graph: Graph, op: str, *args: int) -> int:
 
 
 def with_reciprocals(
-    graph: Graph, outputs: Outputs, late: Collection[str], main: str
-) -> tuple[Graph, Outputs]:
+    graph: OperationGraph, outputs: Outputs, late: Collection[str], main: str
+) -> tuple[OperationGraph, Outputs]:
     """The graph with a / b as a (1 / b) where 1 / b serves several times.
 
     That is where b does not depend on the `late` arguments, or divides more than one number on the way to
@@ -152,7 +152,7 @@ def with_reciprocals(
     is_late = graph.depends(late)
     divisions = Counter(graph.args[n][1] for n in graph.reached(outputs[main]) if graph.ops[n] == "div")
 
-    def rule(new: Graph, n: int, args: tuple[int, ...]) -> int:
+    def rule(new: OperationGraph, n: int, args: tuple[int, ...]) -> int:
         if graph.ops[n] == "div":
             by = graph.args[n][1]
             one = graph.ops[graph.args[n][0]] == CONST and graph.values[graph.args[n][0]] == 1.0
@@ -163,8 +163,8 @@ def with_reciprocals(
     return _rewritten(graph, outputs, rule)
 
 
-def _rewritten(graph: Graph, outputs: Outputs, rule: Any) -> tuple[Graph, Outputs]:
-    new = Graph()
+def _rewritten(graph: OperationGraph, outputs: Outputs, rule: Any) -> tuple[OperationGraph, Outputs]:
+    new = OperationGraph()
     moved: dict[int, int] = {}
     for n in graph.reached(_all(outputs)):
         moved[n] = rule(new, n, tuple(moved[a] for a in graph.args[n]))

@@ -11,19 +11,19 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Collection
 
-from terrafusion.twin.engine.graph import CONST, INPUT, Graph, Outputs
+from terrafusion.twin.engine.graph import CONST, INPUT, OperationGraph, Outputs
 
 _Edges = dict[int, dict[int, int]]
 """vertex -> {neighbour: node of the coefficient}"""
 
 
 def eliminated(
-    graph: Graph,
+    graph: OperationGraph,
     outputs: Outputs,
     wide: Collection[str],
     late: Collection[str],
     is_zero: Callable[[str, int], bool],
-) -> tuple[Graph, Outputs]:
+) -> tuple[OperationGraph, Outputs]:
     """The graph with as few late terms in the tangents as greedy elimination finds.
 
     Args:
@@ -54,7 +54,7 @@ def eliminated(
     return _rebuilt(graph, outputs, vertices, before, zeros)
 
 
-def _terms(graph: Graph, v: int, is_wide: list[bool]) -> dict[int, int]:
+def _terms(graph: OperationGraph, v: int, is_wide: list[bool]) -> dict[int, int]:
     """What a vertex is made of: {vertex: coefficient}."""
     op, args = graph.ops[v], graph.args[v]
     one, minus = graph.const(1.0), graph.const(-1.0)
@@ -79,7 +79,7 @@ def _growth(before: _Edges, after: _Edges, v: int) -> int:
     return new - len(before[v]) - len(after[v])
 
 
-def _eliminate(graph: Graph, before: _Edges, after: _Edges, v: int) -> set[int]:
+def _eliminate(graph: OperationGraph, before: _Edges, after: _Edges, v: int) -> set[int]:
     """Join the neighbours of a vertex; those whose `_growth` may have changed."""
     touched = {*before[v], *after[v]}
     for s, outer in after.pop(v).items():
@@ -94,8 +94,8 @@ def _eliminate(graph: Graph, before: _Edges, after: _Edges, v: int) -> set[int]:
 
 
 def _rebuilt(
-    graph: Graph, outputs: Outputs, vertices: list[int], before: _Edges, moved: dict[int, int]
-) -> tuple[Graph, Outputs]:
+    graph: OperationGraph, outputs: Outputs, vertices: list[int], before: _Edges, moved: dict[int, int]
+) -> tuple[OperationGraph, Outputs]:
     """The graph made of the terms that are left; `moved` holds where nodes went and is filled."""
     for v in vertices:
         terms = before.get(v)
@@ -108,11 +108,11 @@ def _rebuilt(
     return graph, {name: [moved.get(n, n) for n in nodes] for name, nodes in outputs.items()}
 
 
-def _is(graph: Graph, n: int, value: float) -> bool:
+def _is(graph: OperationGraph, n: int, value: float) -> bool:
     return graph.ops[n] == CONST and graph.values[n] == value
 
 
-def _product(graph: Graph, a: int, b: int) -> int:
+def _product(graph: OperationGraph, a: int, b: int) -> int:
     for this, other in ((a, b), (b, a)):
         if _is(graph, this, 1.0):
             return other
@@ -121,7 +121,7 @@ def _product(graph: Graph, a: int, b: int) -> int:
     return graph.node("mul", a, b)
 
 
-def _sum(graph: Graph, a: int | None, b: int) -> int:
+def _sum(graph: OperationGraph, a: int | None, b: int) -> int:
     if a is None:
         return b
     if graph.ops[b] == "neg":

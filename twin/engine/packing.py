@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Hashable, Iterable
 from typing import NamedTuple
 
-from terrafusion.twin.engine.graph import INPUT, Graph
+from terrafusion.twin.engine.graph import INPUT, OperationGraph
 
 WHEELS = 4
 Atom = tuple[int, ...]
@@ -25,7 +25,9 @@ class _Trait(NamedTuple):
     height: int
 
 
-def packs(graph: Graph, nodes: Iterable[int], key: Callable[[int], Hashable], lane_of: LaneOf) -> list[Atom]:
+def packs(
+    graph: OperationGraph, nodes: Iterable[int], key: Callable[[int], Hashable], lane_of: LaneOf
+) -> list[Atom]:
     """Groups of four nodes, one for each wheel in their order, with the same operation.
 
     Any choice of groups gives right code; a good one gives fast code. Here nodes of single wheels that look
@@ -56,7 +58,7 @@ def packs(graph: Graph, nodes: Iterable[int], key: Callable[[int], Hashable], la
     return found
 
 
-def _traits(graph: Graph, nodes: Iterable[int], lane_of: LaneOf) -> dict[int, _Trait]:
+def _traits(graph: OperationGraph, nodes: Iterable[int], lane_of: LaneOf) -> dict[int, _Trait]:
     traits: dict[int, _Trait] = {}
     numbers: dict[Hashable, int] = {}  # a short name for each shape
     for n in nodes:

@@ -27,7 +27,7 @@ ARGUMENTS = ("x", "u", "vehicle", "soil", "effects")
 
 
 @dataclass(frozen=True, eq=False)
-class Graph:
+class ModelGraph:
     """The model as expressions.
 
     Attributes:
@@ -64,7 +64,7 @@ def rhs(effects: tuple[str, ...] = ()) -> Any:
 
 
 @functools.cache
-def graph(effects: tuple[str, ...] = ()) -> Graph:
+def graph(effects: tuple[str, ...] = ()) -> ModelGraph:
     """The model with the named optional parameters, as expressions."""
     import casadi as ca
 
@@ -92,7 +92,7 @@ def graph(effects: tuple[str, ...] = ()) -> Graph:
     if terms.at("body"):  # what reaches the body from elsewhere than the wheels is spent, or given, there
         d["resistance_work"] = d["resistance_work"] + _power(forces, q) - _power(q, q)
     derivative = ca.vertcat(*(d[name] for name in STATES))
-    return Graph((x, u, pv, ca.vec(ps), pe), terms, q, wheels, derivative)
+    return ModelGraph((x, u, pv, ca.vec(ps), pe), terms, q, wheels, derivative)
 
 
 def wheel_positions(p: dict[str, Any]) -> list[tuple[Any, Any]]:
@@ -156,7 +156,7 @@ def _supply(q: dict[str, Any]) -> dict[str, Any]:
 def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, Any]:
     """Everything known of one wheel: its corner of the body, its ground, its motor, its forces."""
     from terrafusion.twin.physics.terramechanics import following
-    from terrafusion.twin.physics.wheel import Ground, WheelShape, contact, slipping
+    from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, contact, slipping
 
     name, side, end = WHEELS[i], SIDES[i], ENDS[i]
     forward, left = wheel_positions(q)[i]
@@ -178,7 +178,7 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
     w["following"] = following(*origin_velocity(q), q["wheelbase_m"], w["width_m"], end)
     w = terms.apply("ground", w)
     c = contact(
-        Ground(*(w[name] for name in SOIL_PARAMETERS)), w["load_n"], w["rim_mps"], hub,
+        WheelSoil(*(w[name] for name in SOIL_PARAMETERS)), w["load_n"], w["rim_mps"], hub,
         (w["shear_x_m"], w["shear_y_m"]), w["brake"], w["clog"],
         WheelShape(w["radius_m"], w["width_m"], w["grouser_height_m"], w["grouser_count"]), w["following"],
     )  # fmt: skip
@@ -217,7 +217,7 @@ def _power(forces: dict[str, Any], q: dict[str, Any]) -> Any:
 
 def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> dict[str, Any]:
     """dx/dt by the names of `STATES`."""
-    from terrafusion.twin.physics.wheel import Ground, clog_rate
+    from terrafusion.twin.physics.wheel import WheelSoil, clog_rate
 
     d: dict[str, Any] = dict.fromkeys(STATES, 0.0)
     d |= {state: q[f"d_{state}"] for state in STATES if f"d_{state}" in q}
@@ -228,7 +228,7 @@ def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> dict[str, A
         d[f"torque_{name}"], d[f"speed_error_{name}"] = w["d_torque"], w["d_speed_error"]
         d[f"brake_{name}"], d[f"play_{name}"] = w["brake_rate"], w["d_play"]
         d[f"wheel_angle_{name}"] = w["wheel_speed"]
-        ground = Ground(*(w[name] for name in SOIL_PARAMETERS))
+        ground = WheelSoil(*(w[name] for name in SOIL_PARAMETERS))
         d["clog"] = d["clog"] + 0.25 * clog_rate(ground, q["clog"], w["rim_mps"], w["ground_slip"])
         d["motor_work"] = d["motor_work"] + w["drive_torque_nm"] * w["wheel_speed"]
         slipping, lost = _dissipated(w)

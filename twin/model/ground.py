@@ -48,7 +48,7 @@ class Variation:
 
 
 @dataclass(frozen=True)
-class Patches:
+class SoilPatches:
     """Patches of `terrain` that cover `share` of the plane; `length_m` sets their size."""
 
     terrain: str
@@ -73,7 +73,7 @@ def gaussian_field(cells: int, cell_m: float, length_m: float, rng: np.random.Ge
 
 
 def soil_field(
-    variation: Variation | None, patches: Patches | None, patch_soil: Array | None, seed: int
+    variation: Variation | None, patches: SoilPatches | None, patch_soil: Array | None, seed: int
 ) -> SoilField | None:
     """The field of one seed, None where the ground neither varies nor has patches.
 

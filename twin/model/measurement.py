@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.twin.model.dynamics import ARGUMENTS, Graph, graph, origin_velocity
+from terrafusion.twin.model.dynamics import ARGUMENTS, ModelGraph, graph, origin_velocity
 from terrafusion.twin.physics.layout import INDEX, INPUTS, MOUNTING, OUTPUTS, VEHICLE_PARAMETERS, WHEELS
 
 Array = NDArray[np.float64]
@@ -160,7 +160,7 @@ def _expressions(effects: tuple[str, ...]) -> tuple[list[Any], Any]:
     return [*g.arguments, symbols], ca.vertcat(*(q[name] for name in OUTPUTS))
 
 
-def _known(g: Graph) -> dict[str, Any]:
+def _known(g: ModelGraph) -> dict[str, Any]:
     """What a sensor's error may depend on besides the outputs: all of the body, and means over the wheels."""
     means = {name: sum(w[name] for w in g.wheels) / len(g.wheels) for name in ("rim_mps", "slip")}
     play = {f"d_play_{name}": w["d_play"] for name, w in zip(WHEELS, g.wheels, strict=True)}
@@ -168,7 +168,7 @@ def _known(g: Graph) -> dict[str, Any]:
 
 
 def _readings(
-    g: Graph, q: Mapping[str, Any], wheels: list[dict[str, Any]], mounting: Mapping[str, Any]
+    g: ModelGraph, q: Mapping[str, Any], wheels: list[dict[str, Any]], mounting: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Outputs by name of sensors that err in nothing."""
     from terrafusion.twin.physics.motors import motor_current
@@ -195,7 +195,7 @@ def _readings(
     }
 
 
-def _specific_force(g: Graph, q: Mapping[str, Any], mounting: Mapping[str, Any]) -> tuple[Any, Any]:
+def _specific_force(g: ModelGraph, q: Mapping[str, Any], mounting: Mapping[str, Any]) -> tuple[Any, Any]:
     """Specific force at the IMU along body x and y, m/s2: acceleration of its point less gravity.
 
     a = dv/dt + w x v + dw/dt x l + w x (w x l), l from the centre of gravity, whose v the states hold.
@@ -211,7 +211,7 @@ def _specific_force(g: Graph, q: Mapping[str, Any], mounting: Mapping[str, Any])
 
 
 def _antenna(
-    g: Graph, q: Mapping[str, Any], origin: tuple[Any, Any], mounting: Mapping[str, Any]
+    g: ModelGraph, q: Mapping[str, Any], origin: tuple[Any, Any], mounting: Mapping[str, Any]
 ) -> list[Any]:
     """East and north of the antenna, m, and its velocity, m/s.
 
@@ -242,7 +242,7 @@ def plane_to_world(p: Mapping[str, Any]) -> list[tuple[Any, Any, Any]]:
     return [(1.0 - sx * sx * share, -sx * sy * share, -sx), (-sx * sy * share, 1.0 - sy * sy * share, -sy)]
 
 
-def _rates(g: Graph, q: Mapping[str, Any]) -> dict[str, Any]:
+def _rates(g: ModelGraph, q: Mapping[str, Any]) -> dict[str, Any]:
     """Time derivative `d_<output>` of each output along the motion, by AD."""
     import casadi as ca
 

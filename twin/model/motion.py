@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class BodyMotion:
     """Body motion at the samples.
 
     Attributes:
@@ -58,7 +58,7 @@ def plane_rotation(slope_rad: float, aspect_rad: float) -> Array:
 
 def motion_of(
     t_s: Array, states: Array, vehicle: VehicleParams, slope_rad: float, aspect_rad: float
-) -> Motion:
+) -> BodyMotion:
     """Motion of the body origin from the states (N, 38), whose velocities are the centre of gravity's."""
     world_plane = plane_rotation(slope_rad, aspect_rad)
     x, y, yaw, u, v, r = (states[:, INDEX[name]] for name in ("x", "y", "yaw", "u", "v", "r"))
@@ -73,7 +73,7 @@ def motion_of(
     )
     origin = np.stack([u + r * vehicle.body.cg_left_m, v - r * vehicle.body.cg_forward_m, zero], axis=1)
     position = np.stack([x, y, zero], axis=1) @ world_plane.T
-    return Motion(t_s, position, world_plane @ heading, yaw, origin, r)
+    return BodyMotion(t_s, position, world_plane @ heading, yaw, origin, r)
 
 
 def wheel_shares(yaw_rad: ArrayLike, vehicle: VehicleParams, slope_rad: float, aspect_rad: float) -> Array:

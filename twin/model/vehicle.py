@@ -54,7 +54,7 @@ class Wheel:
 
 
 @dataclass(frozen=True)
-class Drive:
+class DriveTrain:
     """One motor and gearbox a wheel, its speed loop, and the command limits.
 
     Torque-speed line: stall torque at rest falling to zero at the no-load
@@ -118,7 +118,7 @@ class VehicleParams:
     description: str
     body: Body
     wheel: Wheel
-    drive: Drive
+    drive: DriveTrain
     odometry: Odometry
     sensors: SensorSuite
     realism: SensorRealism
@@ -217,7 +217,7 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
     return dataclasses.replace(vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors)
 
 
-def told_geometry(recordings: Sequence[Recording]) -> Overrides:
+def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
     """What logs of one vehicle tell of its geometry.
 
     Raises:

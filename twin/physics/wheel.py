@@ -18,8 +18,8 @@ from terrafusion.twin.physics.terramechanics import SLIP_SPEED_MPS, WheelShape
 __all__ = [
     "Contact",
     "Footprint",
-    "Ground",
     "WheelShape",
+    "WheelSoil",
     "clog_rate",
     "contact",
     "footprint",
@@ -43,7 +43,7 @@ SHEAR_DAMPING_FADE_MPS = 0.05
 """Speed at which that damping has fallen to half: a rolling wheel meets fresh soil."""
 
 
-class Ground(NamedTuple):
+class WheelSoil(NamedTuple):
     """Ground under one wheel: the soil numbers of `soil.SoilParams` as expressions (SI units)."""
 
     k_c: Scalar
@@ -114,7 +114,7 @@ def slipping(rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar]) -> tuple[Scalar, S
 
 
 def footprint(
-    ground: Ground,
+    ground: WheelSoil,
     load_n: Scalar,
     rim_mps: Scalar,
     hub_mps: tuple[Scalar, Scalar],
@@ -142,13 +142,13 @@ def footprint(
     return Footprint(z, _chord(ground, z, shape), skid, saturate(grown + rut, limit))
 
 
-def _chord(ground: Ground, depth_m: Scalar, shape: WheelShape) -> Scalar:
+def _chord(ground: WheelSoil, depth_m: Scalar, shape: WheelShape) -> Scalar:
     """Length of the contact of a wheel that stands at a depth, m."""
     return ca.sqrt(2.0 * shape.radius_m * depth_m - depth_m * depth_m + ground.contact_floor_m**2)
 
 
 def contact(
-    ground: Ground,
+    ground: WheelSoil,
     load_n: Scalar,
     rim_mps: Scalar,
     hub_mps: tuple[Scalar, Scalar],
@@ -212,7 +212,7 @@ def contact(
 
 
 def steady_contact(
-    ground: Ground, load_n: Scalar, rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar], shape: WheelShape
+    ground: WheelSoil, load_n: Scalar, rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar], shape: WheelShape
 ) -> Contact:
     """The contact in steady motion on fresh ground: shear and bristle at rest in closed form."""
     slip_x, slip_y, transport, _ = slipping(rim_mps, hub_mps)
@@ -223,7 +223,7 @@ def steady_contact(
 
 
 def _shear_stiffness(
-    ground: Ground, load_n: Scalar, shear_m: tuple[Scalar, Scalar], length_m: Scalar, shape: WheelShape
+    ground: WheelSoil, load_n: Scalar, shear_m: tuple[Scalar, Scalar], length_m: Scalar, shape: WheelShape
 ) -> Scalar:
     """Thrust over shear displacement, N/m: Mohr-Coulomb strength, mobilised by shear, below the cap."""
     ratio = ca.sqrt((shear_m[0] ** 2 + shear_m[1] ** 2) / ground.shear_modulus_m**2 + 1e-4)
@@ -235,7 +235,7 @@ def _shear_stiffness(
 
 
 def _bulldozing(
-    ground: Ground, depth_m: tuple[Scalar, Scalar], length_m: tuple[Scalar, Scalar], shape: WheelShape
+    ground: WheelSoil, depth_m: tuple[Scalar, Scalar], length_m: tuple[Scalar, Scalar], shape: WheelShape
 ) -> tuple[Scalar, Scalar]:
     """Passive force of the soil on the wheel's front and on its side, N, where fully mobilised.
 
@@ -247,7 +247,7 @@ def _bulldozing(
     return ground.bulldozing * front, ground.bulldozing * side
 
 
-def clog_rate(ground: Ground, clog: Scalar, rim_mps: Scalar, slip: Scalar) -> Scalar:
+def clog_rate(ground: WheelSoil, clog: Scalar, rim_mps: Scalar, slip: Scalar) -> Scalar:
     """dq/dt of the clogging state, 1/s: picked up and shed with wheel travel (see `soil.Mud`)."""
     travel = smooth_abs(rim_mps, RESISTANCE_SPEED_MPS) - RESISTANCE_SPEED_MPS
     pickup = ground.pickup_per_m * (1.0 + ground.churn_gain * clog * slip * slip) * (1.0 - clog)

@@ -27,7 +27,7 @@ MAX_STEERING_RADPS = 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Driven:
+class DrivenStates:
     """What was wanted, told and driven: twist (N, 2) before limits, inputs (N, U), states (N, X)."""
 
     wanted: Array
@@ -70,7 +70,7 @@ def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
     return np.stack([twist[:, 0] - half, twist[:, 0] + half], axis=1) / vehicle.odometry.wheel_radius_m
 
 
-def told(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
+def delayed_inputs(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
     """Inputs (N, 4), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, that arrive late.
 
     Linear between samples; before the first sample the first one held. The
@@ -115,21 +115,21 @@ def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[A
     dt = float(t_s[-1]) / (len(t_s) - 1)
     wanted = scenario.commanded(t_s)
     twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
-    return wanted, told(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
+    return wanted, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
 
 
-def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator) -> Driven:
+def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator) -> DrivenStates:
     """Drive the scenario at the samples t_s (N,), uniformly spaced from 0."""
     start = at_rest(scenario, float(t_s[-1]) / (len(t_s) - 1), integrate)
     if scenario.waypoints:
         return _steer(scenario, t_s, vehicle, integrate, start)
     wanted, inputs = open_loop(scenario, t_s, vehicle)
-    return Driven(wanted, inputs, integrate(start, inputs, 0.0))
+    return DrivenStates(wanted, inputs, integrate(start, inputs, 0.0))
 
 
 def _steer(
     scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator, start: Array
-) -> Driven:
+) -> DrivenStates:
     """Steer along the waypoints by the true pose, renewed every `STEERING_PERIOD_S`."""
     dt = float(t_s[-1]) / (len(t_s) - 1)
     period, reach = max(1, round(STEERING_PERIOD_S / dt)), math.ceil(vehicle.drive.dead_time_s / dt) + 2
@@ -147,11 +147,13 @@ def _steer(
         block = np.tile(wish, (last - first, 1))
         twists[first + 1 : last + 1] = limit_slew(block, dt, vehicle, scenario, twists[first])
         known = max(0, first - reach)
-        inputs = told(side_speeds(twists[known : last + 1], vehicle), dt, vehicle.drive.dead_time_s)
+        inputs = delayed_inputs(side_speeds(twists[known : last + 1], vehicle), dt, vehicle.drive.dead_time_s)
         states[first : last + 1] = integrate(states[first], inputs[first - known :], float(t_s[first]))
         wanted[first + 1 : last + 1] = wish
         first = last
-    return Driven(wanted, told(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s), states)
+    return DrivenStates(
+        wanted, delayed_inputs(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s), states
+    )
 
 
 def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:

@@ -9,7 +9,7 @@ from typing import Any
 from terrafusion.datasets.core.config import Quantity, checked_number, shown
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Fix
-from terrafusion.twin.model.ground import Patches, Variation
+from terrafusion.twin.model.ground import SoilPatches, Variation
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.scenario.scenario import (
     MAX_SLOPE_DEG,
@@ -105,7 +105,7 @@ def scenario_of(raw: dict[str, Any], file: str, stem: str) -> Scenario:
     if "variation" in raw:
         values["variation"] = Variation(**_section(raw, "variation", _VARIATION, file))
     if "patches" in raw:
-        values["patches"] = Patches(**_section(raw, "patches", _PATCHES, file, "terrain"))
+        values["patches"] = SoilPatches(**_section(raw, "patches", _PATCHES, file, "terrain"))
     if not values["drive"] and not points:
         raise ConfigError(
             "the scenario drives nowhere", file=file, remedy="add 'drive' segments or 'waypoints'"

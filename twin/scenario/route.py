@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.model.ground import Patches, Variation, soil_field
+from terrafusion.twin.model.ground import SoilPatches, Variation, soil_field
 from terrafusion.twin.model.plant import RouteTable
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vectors import soil_vector
@@ -30,7 +30,7 @@ class Route:
     coordinate: str
     transition: float
     variation: Variation | None = None
-    patches: Patches | None = None
+    patches: SoilPatches | None = None
     patch_soil: SoilParams | None = None
 
     @classmethod

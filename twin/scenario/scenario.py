@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.config import Quantity, checked_number
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Fix
-from terrafusion.twin.model.ground import Patches, Variation
+from terrafusion.twin.model.ground import SoilPatches, Variation
 
 Array = NDArray[np.float64]
 
@@ -141,7 +141,7 @@ class Scenario:
     route_over: str = "travel"
     transition: float = 0.3
     variation: Variation | None = None
-    patches: Patches | None = None
+    patches: SoilPatches | None = None
     slope_deg: float = 0.0
     cross_slope_deg: float = 0.0
     aspect_deg: float = 0.0

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.recording import Motor
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import state_slice
 from terrafusion.twin.physics.motors import motor_current, motor_voltage
-from terrafusion.twin.sensors.noise import Noise, rows_at_rate, sample_rate_hz, stepped
+from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz, stepped
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -18,11 +18,11 @@ TimesNs = NDArray[np.int64]
 
 def motor_channel(
     t_ns: TimesNs,
-    motion: Motion,
+    motion: BodyMotion,
     states: Array,
     parameters: dict[str, float],
     vehicle: VehicleParams,
-    noise: Noise,
+    noise: NoiseStreams,
 ) -> Motor:
     """Current of each side (sum of its two motors, A) and their mean voltage (V), at the wheels' rate.
 

@@ -18,7 +18,7 @@ from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
 from terrafusion.twin.effects.catalogue import moves
 from terrafusion.twin.model.ground import under_wheels
 from terrafusion.twin.model.measurement import corrections, measured
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -48,8 +48,8 @@ def as_driven(vehicle: VehicleParams, effects: Mapping[str, float]) -> VehiclePa
 
 
 def true_motion(
-    motion: Motion, states: Array, inputs: Array | None, plant: Plant, vehicle: VehicleParams
-) -> Motion:
+    motion: BodyMotion, states: Array, inputs: Array | None, plant: Plant, vehicle: VehicleParams
+) -> BodyMotion:
     """The motion with the body origin's velocity as effects have it that move the centre of gravity."""
     told = np.zeros((len(states), len(INPUTS))) if inputs is None else inputs
     ground = np.tile(plant.route.soil[0], 4)  # the origin's velocity does not depend on it
@@ -61,7 +61,7 @@ def true_motion(
 
 def sensed(
     recording: Recording,
-    motion: Motion,
+    motion: BodyMotion,
     states: Array,
     inputs: Array,
     plant: Plant,

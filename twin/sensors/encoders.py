@@ -6,17 +6,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.recording import Wheels
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import WHEELS, state_slice
-from terrafusion.twin.sensors.noise import Noise, rows_at_rate, sample_rate_hz
+from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
 
 def wheels_channel(
-    t_ns: TimesNs, motion: Motion, states: Array, vehicle: VehicleParams, noise: Noise
+    t_ns: TimesNs, motion: BodyMotion, states: Array, vehicle: VehicleParams, noise: NoiseStreams
 ) -> Wheels:
     """Four encoders: counted angle, and speed as counts over the controller's interval before the stamp.
 
@@ -36,7 +36,7 @@ def wheels_channel(
     return Wheels(stamps, speed, WHEELS, "radps", angle)
 
 
-def counted(angle_rad: Array, vehicle: VehicleParams, noise: Noise) -> Array:
+def counted(angle_rad: Array, vehicle: VehicleParams, noise: NoiseStreams) -> Array:
     """Wheel angles (N, 4) as the counters have them: with the error of the code wheel, in whole quanta."""
     real, quantum = vehicle.realism.encoder, vehicle.sensors.wheels.quantum_rad
     if real.position_error_rad > 0.0:

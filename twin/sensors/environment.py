@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.atmosphere import pressure_at
 from terrafusion.datasets.core.recording import Barometer, Magnetometer
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.sensors.noise import Noise, rows_at_rate, sample_rate_hz
+from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -37,7 +37,7 @@ def earth_field_t() -> Array:
 
 
 def barometer_channel(
-    t_ns: TimesNs, motion: Motion, datum_height_m: float, vehicle: VehicleParams, noise: Noise
+    t_ns: TimesNs, motion: BodyMotion, datum_height_m: float, vehicle: VehicleParams, noise: NoiseStreams
 ) -> Barometer | None:
     """Static pressure at the sensor, `datum_height_m` + its ENU height above sea level."""
     spec, real = vehicle.sensors.barometer, vehicle.realism.barometer
@@ -57,7 +57,7 @@ def barometer_channel(
 
 
 def magnetometer_channel(
-    t_ns: TimesNs, motion: Motion, vehicle: VehicleParams, noise: Noise
+    t_ns: TimesNs, motion: BodyMotion, vehicle: VehicleParams, noise: NoiseStreams
 ) -> Magnetometer | None:
     """Magnetic flux density in body axes."""
     spec, real = vehicle.sensors.magnetometer, vehicle.realism.magnetometer

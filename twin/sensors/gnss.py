@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.recording import Fix, Gnss
 from terrafusion.datasets.core.sensors import GnssSpec
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.sensor_realism import GnssRealism
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.scenario.scenario import Canopy, Scenario, Zone, inside
-from terrafusion.twin.sensors.noise import Noise, gauss_markov, rows_at_rate, sample_rate_hz
+from terrafusion.twin.sensors.noise import NoiseStreams, gauss_markov, rows_at_rate, sample_rate_hz
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -59,7 +59,12 @@ def best_fix(spec: GnssSpec) -> Fix:
 
 
 def gnss_channel(
-    t_ns: TimesNs, motion: Motion, travel_m: Array, vehicle: VehicleParams, scenario: Scenario, noise: Noise
+    t_ns: TimesNs,
+    motion: BodyMotion,
+    travel_m: Array,
+    vehicle: VehicleParams,
+    scenario: Scenario,
+    noise: NoiseStreams,
 ) -> Gnss:
     """Antenna position and velocity with the sigma the receiver reports; no row where it has no fix.
 
@@ -142,7 +147,7 @@ def _class_sigma(fix: NDArray[np.uint8], vehicle: VehicleParams) -> Array:
 
 
 def _position_error(
-    fix: NDArray[np.uint8], weaker: Array, interval_s: float, vehicle: VehicleParams, noise: Noise
+    fix: NDArray[np.uint8], weaker: Array, interval_s: float, vehicle: VehicleParams, noise: NoiseStreams
 ) -> tuple[Array, Array]:
     """Error (N, 3) of the position and its 1-sigma (N, 3), white in part and Gauss-Markov in the rest.
 
@@ -164,7 +169,7 @@ def _position_error(
 
 
 def _multipath(
-    position_m: Array, fix: NDArray[np.uint8], sky: Sky, vehicle: VehicleParams, noise: Noise
+    position_m: Array, fix: NDArray[np.uint8], sky: Sky, vehicle: VehicleParams, noise: NoiseStreams
 ) -> Array:
     """Displacement (N, 3) by reflections under canopy: a fixed field of the place, unknown to the receiver.
 

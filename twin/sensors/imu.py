@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.recording import Imu
-from terrafusion.twin.model.motion import Motion
+from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.sensors.noise import Noise, band_noise, flicker, stepped, white_and_walk
+from terrafusion.twin.sensors.noise import NoiseStreams, band_noise, flicker, stepped, white_and_walk
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -25,11 +25,11 @@ GYRO_SHAPE = (1.0, 0.8, 0.35)
 
 def imu_channel(
     t_ns: TimesNs,
-    motion: Motion,
+    motion: BodyMotion,
     vehicle: VehicleParams,
     shares: dict[str, tuple[SoilParams, Array]],
     rim_speed_mps: Array,
-    noise: Noise,
+    noise: NoiseStreams,
 ) -> Imu:
     """IMU at every sample but the first (N - 1 rows): increments over intervals, stamped at their ends.
 
@@ -49,7 +49,7 @@ def imu_channel(
     return Imu(t_ns[1:], *_measured(gyro, accel, rate_hz, vehicle, noise))
 
 
-def _truth(motion: Motion, position_m: tuple[float, ...]) -> tuple[Array, Array]:
+def _truth(motion: BodyMotion, position_m: tuple[float, ...]) -> tuple[Array, Array]:
     """Mean angular rate and specific force (N - 1, 3) of the IMU's point over the intervals."""
     dt = np.diff(motion.t_s)
     gravity = np.array([0.0, 0.0, -GRAVITY_MPS2])
@@ -61,7 +61,7 @@ def _truth(motion: Motion, position_m: tuple[float, ...]) -> tuple[Array, Array]
 
 
 def _measured(
-    gyro: Array, accel: Array, rate_hz: float, vehicle: VehicleParams, noise: Noise
+    gyro: Array, accel: Array, rate_hz: float, vehicle: VehicleParams, noise: NoiseStreams
 ) -> tuple[Array, Array]:
     """What the triads make of the angular rate and specific force (N, 3) they feel."""
     spec, real = vehicle.sensors.imu, vehicle.realism.imu
@@ -99,4 +99,4 @@ def _digitised(values: Array, limit: float, quantum: float) -> Array:
 def at_rest(vehicle: VehicleParams, count: int, seed: int) -> tuple[Array, Array]:
     """Gyro and accelerometer (count, 3) of an IMU that stands level, without vibration."""
     rest = np.tile([0.0, 0.0, GRAVITY_MPS2], (count, 1))
-    return _measured(np.zeros((count, 3)), rest, vehicle.sensors.imu.rate_hz, vehicle, Noise(seed))
+    return _measured(np.zeros((count, 3)), rest, vehicle.sensors.imu.rate_hz, vehicle, NoiseStreams(seed))

@@ -22,7 +22,7 @@ FLOOR_PER_INSTABILITY = math.sqrt(2.0 * math.log(2.0) / math.pi)
 
 
 @dataclass(frozen=True)
-class Noise:
+class NoiseStreams:
     """Named random streams of one seed, or none of them when noiseless."""
 
     seed: int

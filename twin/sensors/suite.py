@@ -17,10 +17,10 @@ from terrafusion.twin.sensors.encoders import wheels_channel
 from terrafusion.twin.sensors.environment import barometer_channel, magnetometer_channel
 from terrafusion.twin.sensors.gnss import best_fix, gnss_channel
 from terrafusion.twin.sensors.imu import imu_channel
-from terrafusion.twin.sensors.noise import Noise, rows_at_rate
+from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate
 
 __all__ = [
-    "Noise",
+    "NoiseStreams",
     "barometer_channel",
     "best_fix",
     "gnss_channel",

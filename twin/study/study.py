@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from terrafusion.twin.study.agreement import Row, judge
 from terrafusion.twin.study.batch import CellResult, grid, run_cell, slip_cells
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
@@ -143,7 +143,7 @@ def _run_all(
     """The results of all calls, in the order of `work` whatever the number of processes."""
     results: list[Any] = [None] * len(work)
     numbered = ((number, function, arguments) for number, (function, arguments) in enumerate(work))
-    with open_pool("loky", jobs) as pool:
+    with open_workers("loky", jobs) as pool:
         for done, (number, result) in enumerate(pool.results(_numbered, numbered), 1):
             results[number] = result
             if progress is not None:

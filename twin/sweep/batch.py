@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.engine.integrate import raise_if_diverged
 from terrafusion.twin.engine.lanes import integrate_many
-from terrafusion.twin.scenario.commands import SETTLE_S, Driven, open_loop, settled, settling
+from terrafusion.twin.scenario.commands import SETTLE_S, DrivenStates, open_loop, settled, settling
 from terrafusion.twin.sensors.effects import as_driven
 from terrafusion.twin.simulate import RunSetup, drive_through
 
@@ -32,7 +32,7 @@ def attempt(work: Callable[..., T], *inputs: Any) -> T | Exception:
         return error
 
 
-def drive_many(setups: Sequence[RunSetup | Exception]) -> list[Driven | Exception]:
+def drive_many(setups: Sequence[RunSetup | Exception]) -> list[DrivenStates | Exception]:
     """The motions of runs of one vehicle and one scenario but for speeds and ground, in their order.
 
     The same numbers as `drive_through` run by run, which is how scenarios with waypoints are driven.
@@ -48,7 +48,7 @@ def drive_many(setups: Sequence[RunSetup | Exception]) -> list[Driven | Exceptio
     return [setup if isinstance(setup, Exception) else next(driven) for setup in setups]
 
 
-def _side_by_side(setups: Sequence[RunSetup]) -> list[Driven | Exception]:
+def _side_by_side(setups: Sequence[RunSetup]) -> list[DrivenStates | Exception]:
     dt_s = 1.0 / setups[0].vehicle.sensors.imu.rate_hz
     plants = [setup.plant for setup in setups]
     rests = [settling(setup.scenario, dt_s) for setup in setups]
@@ -62,7 +62,7 @@ def _side_by_side(setups: Sequence[RunSetup]) -> list[Driven | Exception]:
     return [attempt(_driven, *each, dt_s) for each in zip(told, motions, strict=True)]
 
 
-def _driven(told: tuple[Array, Array], states: Array, dt_s: float) -> Driven:
+def _driven(told: tuple[Array, Array], states: Array, dt_s: float) -> DrivenStates:
     if not np.isfinite(states[-1]).all():  # a run that diverged is blank to its end
         raise_if_diverged(states, 0.0, dt_s)
-    return Driven(*told, states)
+    return DrivenStates(*told, states)

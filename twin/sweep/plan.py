@@ -59,7 +59,7 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Case:
+class SweepPoint:
     """One run of a sweep; None stands for what the scenario and its soils say themselves."""
 
     run: int
@@ -100,19 +100,19 @@ class Sweep:
             return self.random
         return math.prod(len(axis.levels) for axis in self.axes)
 
-    def cases(self) -> Iterator[Case]:
+    def cases(self) -> Iterator[SweepPoint]:
         """All runs in their order."""
         if self.random is None:
             shape = tuple(len(axis.levels) for axis in self.axes)
             for run, place in enumerate(np.ndindex(shape)):
                 values = {a.name: a.levels[i] for a, i in zip(self.axes, place, strict=True)}
-                yield Case(run, **values)
+                yield SweepPoint(run, **values)
         else:
             for run, shares in enumerate(_hypercube(self.random, len(self.axes), self.random_seed)):
                 values = {a.name: a.at(s) for a, s in zip(self.axes, shares, strict=True)}
-                yield Case(run, **values)
+                yield SweepPoint(run, **values)
 
-    def speed_scale(self, case: Case) -> float:
+    def speed_scale(self, case: SweepPoint) -> float:
         """Commanded speeds of a run over the scenario's."""
         if case.speed_mps is not None:
             return case.speed_mps / top_speed_mps(self.scenario)

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.sweep.plan import Case, Sweep
+from terrafusion.twin.sweep.plan import Sweep, SweepPoint
 from terrafusion.twin.sweep.rows import arguments
 
 FORMATS = ("folder", "mcap")
@@ -54,7 +54,7 @@ def write_recordings(
     wanted = set(runs)
     work = [(sweep, case, Path(folder), form) for case in sweep.cases() if case.run in wanted]
     failures = []
-    with open_pool("loky", min(jobs, len(work)) or 1) as pool:
+    with open_workers("loky", min(jobs, len(work)) or 1) as pool:
         for number, failure in enumerate(pool.results(_write, work), 1):
             failures += [failure] if failure else []
             if progress is not None:
@@ -62,7 +62,7 @@ def write_recordings(
     return sorted(failures)
 
 
-def _write(sweep: Sweep, case: Case, folder: Path, form: str) -> str | None:
+def _write(sweep: Sweep, case: SweepPoint, folder: Path, form: str) -> str | None:
     """Write one run; why it could not be, or None."""
     from terrafusion.datasets.writers.log_folder import write_log_folder
     from terrafusion.datasets.writers.mcap import write_mcap

@@ -17,11 +17,11 @@ from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, state_slice
-from terrafusion.twin.scenario.commands import Driven
+from terrafusion.twin.scenario.commands import DrivenStates
 from terrafusion.twin.scenario.validity import check_slip
 from terrafusion.twin.simulate import RunSetup, set_up, simulate_run
 from terrafusion.twin.sweep.batch import TOGETHER, attempt, drive_many
-from terrafusion.twin.sweep.plan import Case, Sweep, at_speed, top_speed_mps
+from terrafusion.twin.sweep.plan import Sweep, SweepPoint, at_speed, top_speed_mps
 
 Array = NDArray[np.float64]
 Row = dict[str, str | float | int | None]
@@ -88,7 +88,7 @@ def columns(sensors: bool) -> tuple[Column, ...]:
     return (*_AXES, *_RESULTS, *(_SENSORS if sensors else ()), _ERROR)
 
 
-def run_chunk(sweep: Sweep, cases: Sequence[Case]) -> list[Row]:
+def run_chunk(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row]:
     """The rows of some runs, in their order. A run that fails is a row that says why."""
     rows: list[Row] = []
     for first in range(0, len(cases), TOGETHER):
@@ -98,7 +98,7 @@ def run_chunk(sweep: Sweep, cases: Sequence[Case]) -> list[Row]:
     return rows
 
 
-def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
+def arguments(sweep: Sweep, case: SweepPoint) -> dict[str, Any]:
     """The arguments of `simulate_run` for a run of the sweep."""
     soils = dict(sweep.soils)
     if case.friction is not None:
@@ -114,7 +114,7 @@ def arguments(sweep: Sweep, case: Case) -> dict[str, Any]:
     }
 
 
-def _grounds(sweep: Sweep, case: Case) -> list[str]:
+def _grounds(sweep: Sweep, case: SweepPoint) -> list[str]:
     """Names of the grounds along the route."""
     return [case.terrain] if case.terrain is not None else [leg.terrain for leg in sweep.scenario.route]
 
@@ -123,8 +123,8 @@ def _capped(soil: SoilParams, friction: float) -> SoilParams:
     return dataclasses.replace(soil, shear=dataclasses.replace(soil.shear, friction_cap=friction))
 
 
-def _with_sensors(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
-    def sensed(case: Case) -> Row:
+def _with_sensors(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row | Exception]:
+    def sensed(case: SweepPoint) -> Row:
         run = simulate_run(**arguments(sweep, case))
         row = _results(run.t_s, run.wanted, run.states, run.summary, sweep.vehicle)
         return row | _sensor_errors(run.recording, sweep.vehicle)
@@ -132,12 +132,12 @@ def _with_sensors(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
     return [attempt(sensed, case) for case in cases]
 
 
-def _without(sweep: Sweep, cases: Sequence[Case]) -> list[Row | Exception]:
+def _without(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row | Exception]:
     setups = [attempt(lambda c: set_up(**arguments(sweep, c)), case) for case in cases]
     return [attempt(results, *run) for run in zip(setups, drive_many(setups), strict=True)]
 
 
-def _row(sweep: Sweep, case: Case, outcome: Row | Exception) -> Row:
+def _row(sweep: Sweep, case: SweepPoint, outcome: Row | Exception) -> Row:
     row = _axes(sweep, case)
     if isinstance(outcome, Exception):
         known = isinstance(outcome, TerrafusionError)
@@ -147,7 +147,7 @@ def _row(sweep: Sweep, case: Case, outcome: Row | Exception) -> Row:
     return {column.name: _plain(row.get(column.name)) for column in columns(sweep.sensors)}
 
 
-def _axes(sweep: Sweep, case: Case) -> Row:
+def _axes(sweep: Sweep, case: SweepPoint) -> Row:
     """The conditions of a run, those that no axis names among them."""
     legs = _grounds(sweep, case)
     soils = dict(sweep.soils)
@@ -165,7 +165,7 @@ def _axes(sweep: Sweep, case: Case) -> Row:
     }
 
 
-def results(setup: RunSetup, driven: Driven) -> Row:
+def results(setup: RunSetup, driven: DrivenStates) -> Row:
     """What comes of a run without sensors; the same checks as in `simulate_run`."""
     motion = setup.motion(driven.states, driven.inputs)
     slip = slip_ratios(driven.states, motion, setup.vehicle)

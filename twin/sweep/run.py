@@ -14,16 +14,16 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from terrafusion.twin.sweep.load import load_sweep, sweep_names
-from terrafusion.twin.sweep.plan import MAX_RUNS, Case, Sweep
+from terrafusion.twin.sweep.plan import MAX_RUNS, Sweep, SweepPoint
 from terrafusion.twin.sweep.recordings import check_runs, write_recordings
 from terrafusion.twin.sweep.rows import Row, run_chunk
 from terrafusion.twin.sweep.store import RUNS_FILE, Store
 
 __all__ = [
-    "Case",
     "Sweep",
+    "SweepPoint",
     "check_runs",
     "load_sweep",
     "read_table",
@@ -75,7 +75,7 @@ def run_sweep(
     if missing:
         cases = list(sweep.cases())
         work = [(sweep, number, [cases[run] for run in chunks[number]]) for number in missing]
-        with open_pool(backend, min(jobs, len(missing)), address) as pool:
+        with open_workers(backend, min(jobs, len(missing)), address) as pool:
             for number, rows in pool.results(_numbered, work):
                 store.write_part(number, rows)
                 done += len(rows)
@@ -92,5 +92,5 @@ def read_table(out: Path | str) -> Any:
     return pq.read_table(Path(out) / RUNS_FILE)
 
 
-def _numbered(sweep: Sweep, number: int, cases: Sequence[Case]) -> tuple[int, list[Row]]:
+def _numbered(sweep: Sweep, number: int, cases: Sequence[SweepPoint]) -> tuple[int, list[Row]]:
     return number, run_chunk(sweep, cases)

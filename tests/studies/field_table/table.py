@@ -38,7 +38,7 @@ from terrafusion.fusion.config.estimator_config import MODES
 from terrafusion.fusion.metrics.health import examine_estimate, rolled_until_m
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, choose_vehicle, replay
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from tests.studies.twin_field.joined import joined_drives
 from tests.studies.twin_field.sources import CUT, WHOLE
 
@@ -161,7 +161,7 @@ def run_tasks(
     """
     check_folder(out / FOLDER)
     missing = [task for task in tasks if read_part(out, task.key, log_state(task.log)) is None]
-    with open_pool("loky", min(jobs, max(len(missing), 1))) as pool:
+    with open_workers("loky", min(jobs, max(len(missing), 1))) as pool:
         for task, found in pool.results(run_task, [(task,) for task in missing]):
             runs = [dataclasses.asdict(r) for r in found if isinstance(r, Run)]
             refused = [dataclasses.asdict(r) for r in found if isinstance(r, Refusal)]

@@ -131,13 +131,13 @@ def _model(count: int, fixed: tuple[tuple[str, float], ...]) -> Any:
     """(values (P,), motion (4, N)) -> outputs (3, N) and derivatives (3, N P), trial by trial."""
     import casadi as ca
 
-    from terrafusion.twin.physics.wheel import Ground, WheelShape, steady_contact
+    from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, steady_contact
 
     values, motion = ca.SX.sym("values", len(FREE)), ca.SX.sym("motion", 4)
     numbers: dict[str, Any] = dict.fromkeys(SOIL_PARAMETERS, 0.0)
     numbers |= {"exponent": EXPONENT, "unit_weight_n_per_m3": UNIT_WEIGHT_N_PER_M3, "friction_cap": 10.0}
     numbers |= {name: values[i] for i, name in enumerate(FREE)} | dict(fixed)
-    ground = Ground(*(numbers[name] for name in SOIL_PARAMETERS))
+    ground = WheelSoil(*(numbers[name] for name in SOIL_PARAMETERS))
     shape = WheelShape(RADIUS_M, WIDTH_M)
     c = steady_contact(ground, motion[0], motion[1], (motion[2], motion[3]), shape)
     out = ca.vertcat(c.force_x_n, -c.force_y_n, c.sinkage_m)

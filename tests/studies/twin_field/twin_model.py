@@ -17,7 +17,7 @@ from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, state_slice
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 from tests.studies.twin_field.fitting import Bounded, fit
 from tests.studies.twin_field.forks import N_PAST, Forks
 from tests.studies.twin_field.runs import DT_S
@@ -119,16 +119,18 @@ class TwinModel:
         past = self._sides(forks.past_radps[k], motion, forks.given_turn)
         driven = self._plant(driven=True)
         before = _integrated(
-            self._start(past[0], motion[0]), told(past, DT_S, -FOLLOW_S), driven, SUBSTEPS_DRIVEN
+            self._start(past[0], motion[0]), delayed_inputs(past, DT_S, -FOLLOW_S), driven, SUBSTEPS_DRIVEN
         )
         start = self._corrected(before[-1], motion[N_PAST])
         if self.commanded:
             late = float(self.vehicle[_V["dead_time_s"]])
-            future = told(inputs, DT_S, late)[N_PAST:]
+            future = delayed_inputs(inputs, DT_S, late)[N_PAST:]
             start = self._at_work(start, before, future[0, :2], driven.vehicle)
             states = _integrated(start, future, self._plant(driven=False), SUBSTEPS)
         else:
-            states = _integrated(start, told(inputs[N_PAST:], DT_S, -FOLLOW_S), driven, SUBSTEPS_DRIVEN)
+            states = _integrated(
+                start, delayed_inputs(inputs[N_PAST:], DT_S, -FOLLOW_S), driven, SUBSTEPS_DRIVEN
+            )
         turn = states[:, INDEX["r"]]
         forward = states[:, INDEX["u"]] + turn * self.vehicle[_V["cg_left_m"]]
         aside = states[:, INDEX["v"]] - turn * self.vehicle[_V["cg_forward_m"]]

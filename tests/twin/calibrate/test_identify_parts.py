@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from terrafusion.datasets.core.config import Quantity
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.identifiability import COMBINED, TOLD, UNTOLD, examine
-from terrafusion.twin.calibrate.log import Log
-from terrafusion.twin.calibrate.noise import Noise, autoregressive, gauss_markov
+from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, gauss_markov
 from terrafusion.twin.calibrate.observations import Observed, binned
 from terrafusion.twin.calibrate.predict import averaging
 from terrafusion.twin.calibrate.sandwich import long_run_variance
@@ -34,7 +34,7 @@ def test_correlation_is_learnt_and_whitened(rho: float) -> None:
     windows = [(np.arange(100), series(rho, 100, seed)) for seed in range(30)]
     learnt = autoregressive(windows, 100)
     assert (learnt[1] if len(learnt) > 1 else 0.0) == pytest.approx(rho, abs=0.06)
-    noise = Noise(1.0, learnt)
+    noise = ResidualNoise(1.0, learnt)
     white = np.concatenate([noise.whiten(s, np.ones(100), v[:, None])[:, 0] for s, v in windows])
     assert 0.85 < white.var() < 1.08  # the white share that is added makes it a little less than one
     assert abs(np.mean(white[1:] * white[:-1])) < 0.06
@@ -42,7 +42,7 @@ def test_correlation_is_learnt_and_whitened(rho: float) -> None:
 
 def test_stretches_are_whitened_together_as_each_by_itself() -> None:
     rng = np.random.default_rng(4)
-    noise, slots = Noise(0.7, tuple(0.6**k for k in range(30))), np.array([0, 1, 2, 5, 6, 9])
+    noise, slots = ResidualNoise(0.7, tuple(0.6**k for k in range(30))), np.array([0, 1, 2, 5, 6, 9])
     sigma, columns = rng.uniform(0.5, 2.0, (3, 6)), rng.standard_normal((3, 6, 4))
     together = noise.whiten_alike(slots, sigma, columns)
     for one, s, c in zip(together, sigma, columns, strict=True):
@@ -52,7 +52,7 @@ def test_stretches_are_whitened_together_as_each_by_itself() -> None:
 def test_whitening_bridges_missing_rows() -> None:
     """The Cholesky factor of rows with gaps is that of their own covariance."""
     slots, rho = np.array([0, 1, 4, 9]), gauss_markov(0.7, 2.0, 0.5, 10)
-    root = Noise(1.0, rho).whiten(slots, np.ones(4), np.eye(4))
+    root = ResidualNoise(1.0, rho).whiten(slots, np.ones(4), np.eye(4))
     covariance = np.linalg.inv(root.T @ root)
     table = np.array(rho)
     expected = table[np.abs(slots[:, None] - slots[None, :])]
@@ -79,7 +79,9 @@ def test_mean_over_an_interval_is_exact_for_parabolas(c: list[float], begin: flo
         0.1,
         1.0,
     )
-    log = Log("x", np.zeros((101, 2)), False, ("a",), none, windows, np.zeros((1, 3)), (rows,), True, ())
+    log = PreparedLog(
+        "x", np.zeros((101, 2)), False, ("a",), none, windows, np.zeros((1, 3)), (rows,), True, ()
+    )
     at, weight = averaging(rows, log, np.zeros(1, dtype=int))
     t = 0.01 * np.arange(101)
     f = c[0] + c[1] * t + c[2] * t**2

@@ -23,7 +23,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import STATES
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
 KERNELS = """
@@ -198,7 +198,7 @@ def short_run() -> np.ndarray:
     route = RouteTable("travel", np.zeros(1), soil_vector(load_soil("loose_sand"))[None])
     plant = Plant(vehicle_vector(load_vehicle("elevate"), slope_rad=0.05, aspect_rad=1.0), route)
     assert native.driver(Variant(SINGLE, (), True)) is not None
-    alone = integrate(np.zeros(len(STATES)), told(sides, 0.01), 0.01, plant, backend="c")
+    alone = integrate(np.zeros(len(STATES)), delayed_inputs(sides, 0.01), 0.01, plant, backend="c")
     assert native.driver(Variant(LANES_32, (), True)) is not None
-    in_32_bits = integrate_many(alone[:1], told(sides, 0.01), 0.01, [plant], short=True)[0]
+    in_32_bits = integrate_many(alone[:1], delayed_inputs(sides, 0.01), 0.01, [plant], short=True)[0]
     return np.concatenate([alone, in_32_bits])

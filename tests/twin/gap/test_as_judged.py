@@ -12,7 +12,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.estimator_gap import judged, scenario_of, twin_of
 from terrafusion.fusion.benchmark.judge import ERROR, NIS, estimator_judge
-from terrafusion.twin.calibrate.log import Log, prepare
+from terrafusion.twin.calibrate.log import PreparedLog, prepare
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.infer.refit import Refit
 from terrafusion.twin.model.soil import load_soil
@@ -23,12 +23,12 @@ MODEL = Model(load_vehicle("elevate"), {"loose_sand": load_soil("loose_sand")})
 
 
 @pytest.fixture(scope="module")
-def driven() -> tuple[Recording, Log]:
+def driven() -> tuple[Recording, PreparedLog]:
     recording = run(500)
     return recording, prepare(recording, MODEL, source="wheels")
 
 
-def test_the_scenario_of_a_log_drives_as_its_wheels_did(driven: tuple[Recording, Log]) -> None:
+def test_the_scenario_of_a_log_drives_as_its_wheels_did(driven: tuple[Recording, PreparedLog]) -> None:
     recording, log = driven
     scenario = scenario_of(log, MODEL)
     assert scenario.duration_s == pytest.approx(recording.duration_s(), abs=0.5)
@@ -39,7 +39,7 @@ def test_the_scenario_of_a_log_drives_as_its_wheels_did(driven: tuple[Recording,
 
 
 def test_the_twin_of_a_run_turns_its_wheels_alike_and_lacks_what_the_log_lacks(
-    driven: tuple[Recording, Log],
+    driven: tuple[Recording, PreparedLog],
 ) -> None:
     recording, log = driven
     made = twin_of(dataclasses.replace(recording, gnss=None), log, MODEL, {}, seed=1)
@@ -57,12 +57,14 @@ def test_the_twin_of_a_run_turns_its_wheels_alike_and_lacks_what_the_log_lacks(
     assert np.abs(speeds(made) - speeds(recording)).mean() < 0.05
 
 
-def fake(found_fit: Refit | None, driven: tuple[Recording, Log]) -> SimpleNamespace:
+def fake(found_fit: Refit | None, driven: tuple[Recording, PreparedLog]) -> SimpleNamespace:
     bench = SimpleNamespace(model=MODEL, runs=[SimpleNamespace(log=driven[1])])
     return SimpleNamespace(bench=bench, verdict=SimpleNamespace(fit=found_fit))
 
 
-def test_marks_are_means_and_a_log_that_cannot_be_judged_is_told(driven: tuple[Recording, Log]) -> None:
+def test_marks_are_means_and_a_log_that_cannot_be_judged_is_told(
+    driven: tuple[Recording, PreparedLog],
+) -> None:
     def judge(log: Recording) -> dict[str, float]:
         if log.name == "bad":
             raise DataError("no wheels", file="bad")
@@ -76,7 +78,7 @@ def test_marks_are_means_and_a_log_that_cannot_be_judged_is_told(driven: tuple[R
     assert "no wheels" in failed[0]
 
 
-def test_the_estimator_gives_its_error_and_its_innovations(driven: tuple[Recording, Log]) -> None:
+def test_the_estimator_gives_its_error_and_its_innovations(driven: tuple[Recording, PreparedLog]) -> None:
     judge = estimator_judge("elevate")
     marks = judge(driven[0])
     assert 0.0 < marks[ERROR] < 5.0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import layout
@@ -25,7 +25,7 @@ CANDIDATES = Candidates.of(["imu_time_offset", "gnss_latency", "gyro_bias"])
 
 
 @pytest.fixture(scope="module")
-def log_and_model() -> tuple[Log, Model]:
+def log_and_model() -> tuple[PreparedLog, Model]:
     model, ground, _ = starting_model([run(1)], load_vehicle("elevate"), None)
     return prepared([run(1)], model, ground, "auto")[0], model
 

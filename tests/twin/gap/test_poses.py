@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import PAIRS, settled, settled_start, turns
@@ -26,12 +26,12 @@ def recording() -> Recording:
     return run(950)
 
 
-def log_of(recording: Recording) -> tuple[Log, Model]:
+def log_of(recording: Recording) -> tuple[PreparedLog, Model]:
     model, ground, _ = starting_model([recording], load_vehicle("elevate"), None)
     return prepared([recording], model, ground, "auto")[0], model
 
 
-def turned(log: Log, angle: float, shift: float) -> list[np.ndarray]:
+def turned(log: PreparedLog, angle: float, shift: float) -> list[np.ndarray]:
     """What the log observed, its tracks turned and shifted as a whole."""
     at = {o.channel: i for i, o in enumerate(log.observed)}
     values = [o.value.copy() for o in log.observed]

@@ -18,7 +18,7 @@ from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 DT_S = 0.01
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
@@ -48,7 +48,9 @@ def commands(count: int, seconds: float = 3.0) -> np.ndarray:
     t = np.arange(round(seconds / DT_S) + 1) * DT_S
     speed = np.interp(t, [0.0, 1.0, 0.7 * seconds, 0.8 * seconds], [0.0, 4.0, 4.0, 0.0])
     turns = np.linspace(-0.3, 0.3, count)
-    return np.array([told(np.stack([speed * (1 - k), speed * (1 + k)], axis=1), DT_S) for k in turns])
+    return np.array(
+        [delayed_inputs(np.stack([speed * (1 - k), speed * (1 + k)], axis=1), DT_S) for k in turns]
+    )
 
 
 def starts(count: int) -> np.ndarray:
@@ -169,7 +171,7 @@ def test_the_error_falls_as_the_order_of_the_steps_says(order: int, least: float
     """On a smooth command; halving the step takes away seven eighths of it, or fifteen sixteenths."""
     t = np.arange(201) * DT_S
     side = 2.0 + np.sin(2.0 * t)
-    inputs = told(np.stack([side, 1.2 * side], axis=1), DT_S)
+    inputs = delayed_inputs(np.stack([side, 1.2 * side], axis=1), DT_S)
     x0, plant = np.zeros(len(STATES)), plants()[:1]
     x0 = integrate_many(x0, inputs, DT_S, plant, substeps=32)[0, 100]
     ends = [integrate_many(x0, inputs[100:], DT_S, plant, substeps=n, order=order)[0, -1] for n in (4, 8, 64)]

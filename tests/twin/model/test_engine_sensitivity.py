@@ -15,7 +15,7 @@ from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 DT_S = 0.01
 needs_compiler = pytest.mark.skipif(not compiled(), reason="no C compiler")
@@ -29,7 +29,7 @@ def inputs(seconds: float = 6.0) -> np.ndarray:
     t = np.arange(round(seconds / DT_S) + 1) * DT_S
     speed = np.interp(t, [0.0, 1.0, 3.5, 4.0, 4.6, seconds], [0.0, 6.0, 6.0, 0.0, 0.0, -3.0])
     turn = 0.3 * np.sin(2.0 * np.pi * t / 3.0)
-    return told(np.stack([speed * (1.0 - turn), speed * (1.0 + turn)], axis=1), DT_S, 0.013)
+    return delayed_inputs(np.stack([speed * (1.0 - turn), speed * (1.0 + turn)], axis=1), DT_S, 0.013)
 
 
 def plant(*soils: str, varied: bool = False) -> Plant:

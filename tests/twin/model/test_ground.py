@@ -11,7 +11,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 
 RAMP = np.clip(np.arange(601) / 100.0, 0.0, 1.0)[:, None] * np.array([5.0, 5.0])
 
@@ -26,7 +26,12 @@ def field(log_gain: np.ndarray, patch: str = "asphalt", share: float = 0.0) -> S
 def drive(route: RouteTable, backend: str = "auto", dead_time_s: float = 0.0) -> np.ndarray:
     plant = Plant(vehicle_vector(load_vehicle("elevate"), slope_rad=0.1), route)
     return integrate(
-        np.zeros(len(STATES)), told(RAMP, 0.01, dead_time_s), 0.01, plant, substeps=3, backend=backend
+        np.zeros(len(STATES)),
+        delayed_inputs(RAMP, 0.01, dead_time_s),
+        0.01,
+        plant,
+        substeps=3,
+        backend=backend,
     )
 
 
@@ -70,11 +75,13 @@ def test_both_backends_agree_on_a_field() -> None:
 def test_a_late_command_is_the_same_command_later_and_its_rate_the_derivative() -> None:
     t = np.arange(401) * 0.01
     sides = np.stack([np.sin(t), np.cos(2 * t) - 1.0], axis=1)
-    np.testing.assert_allclose(told(sides, 0.01, 0.2)[20:, :2], sides[:-20], atol=1e-12)
-    np.testing.assert_array_equal(told(sides, 0.01, 0.2)[:20], np.repeat([[*sides[0], 0, 0]], 20, axis=0))
+    np.testing.assert_allclose(delayed_inputs(sides, 0.01, 0.2)[20:, :2], sides[:-20], atol=1e-12)
+    np.testing.assert_array_equal(
+        delayed_inputs(sides, 0.01, 0.2)[:20], np.repeat([[*sides[0], 0, 0]], 20, axis=0)
+    )
     for dead_time in (0.0, 0.113):
         eps = 1e-7
-        inputs, later = told(sides, 0.01, dead_time), told(sides, 0.01, dead_time + eps)
+        inputs, later = delayed_inputs(sides, 0.01, dead_time), delayed_inputs(sides, 0.01, dead_time + eps)
         moving = slice(round(dead_time * 100) + 2, None)
         change = (later[moving, :2] - inputs[moving, :2]) / eps
         np.testing.assert_allclose(change, -inputs[moving, 2:], atol=1e-6)

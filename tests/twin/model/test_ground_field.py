@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.model.ground import Patches, Variation, gaussian_field, soil_field, value_at
+from terrafusion.twin.model.ground import SoilPatches, Variation, gaussian_field, soil_field, value_at
 from terrafusion.twin.model.plant import SoilField
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
@@ -22,7 +22,7 @@ STRAIGHT = Scenario(
     "field", 12.0, drive=(DriveSegment(2.0), DriveSegment(10.0, v_mps=1.0)), route=(RouteLeg("loose_sand"),)
 )
 PATCHY = dataclasses.replace(
-    STRAIGHT, variation=Variation(0.3, 1.0), patches=Patches("asphalt", 0.3, 1.5)
+    STRAIGHT, variation=Variation(0.3, 1.0), patches=SoilPatches("asphalt", 0.3, 1.5)
 )  # fmt: skip
 
 
@@ -32,7 +32,7 @@ def fields(count: int = 60) -> np.ndarray:
     )
 
 
-def drawn(variation: Variation | None, patches: Patches | None, seed: int) -> SoilField:
+def drawn(variation: Variation | None, patches: SoilPatches | None, seed: int) -> SoilField:
     """The field of a seed, with mud in the patches."""
     field = soil_field(variation, patches, soil_vector(load_soil("mud")), seed)
     assert field is not None
@@ -90,7 +90,7 @@ def test_patches_cover_their_share(share) -> None:
     rng = np.random.default_rng(1)
     met = []
     for seed in range(20):
-        field = drawn(None, Patches("mud", share, 1.0), seed)
+        field = drawn(None, SoilPatches("mud", share, 1.0), seed)
         assert (field.patch_share > 0.5).mean() == pytest.approx(share, abs=1e-4)
         assert field.patch_share.min() >= 0.0
         assert field.patch_share.max() <= 1.0
@@ -101,12 +101,12 @@ def test_patches_cover_their_share(share) -> None:
 
 @pytest.mark.parametrize(("share", "everywhere"), [(0.0, 0.0), (1.0, 1.0)])
 def test_no_patches_and_nothing_but_patches(share, everywhere) -> None:
-    field = drawn(None, Patches("mud", share, 1.0), 0)
+    field = drawn(None, SoilPatches("mud", share, 1.0), 0)
     assert (field.patch_share == everywhere).all()
 
 
 def test_same_seed_same_bits_and_each_part_its_own_stream() -> None:
-    patches = Patches("mud", 0.3, 1.0)
+    patches = SoilPatches("mud", 0.3, 1.0)
     one, again, other = (drawn(Variation(0.2, 1.0), patches, seed) for seed in (7, 7, 8))
     stronger = drawn(Variation(0.4, 1.0), patches, 7)
     np.testing.assert_array_equal(one.log_gain, again.log_gain)
@@ -125,12 +125,14 @@ def test_even_ground_is_no_field() -> None:
 
 def test_lengths_too_far_apart_are_told() -> None:
     with pytest.raises(ConfigError, match=r"0.1 and 50 m do not fit one grid; keep them within"):
-        soil_field(Variation(0.2, 0.1), Patches("mud", 0.3, 50.0), None, 0)
+        soil_field(Variation(0.2, 0.1), SoilPatches("mud", 0.3, 50.0), None, 0)
 
 
 def test_symmetric_ground_gives_no_yaw_and_patchy_ground_does() -> None:
     assert np.abs(simulate_run(STRAIGHT, noiseless=True).states[:, INDEX["yaw"]]).max() < 1e-9
-    uniform = dataclasses.replace(PATCHY, variation=Variation(0.0, 1.0), patches=Patches("asphalt", 1.0, 1.0))
+    uniform = dataclasses.replace(
+        PATCHY, variation=Variation(0.0, 1.0), patches=SoilPatches("asphalt", 1.0, 1.0)
+    )
     assert np.abs(simulate_run(uniform, noiseless=True).states[:, INDEX["yaw"]]).max() < 1e-9
     yaws = np.array([simulate_run(PATCHY, noiseless=True, seed=s).states[:, INDEX["yaw"]] for s in range(4)])
     assert np.abs(yaws).max(axis=1).min() > 1e-2

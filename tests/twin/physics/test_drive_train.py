@@ -26,7 +26,7 @@ from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import Battery, VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import battery, gear_loss, motor_current, motor_torque
-from terrafusion.twin.scenario.commands import Driven, told
+from terrafusion.twin.scenario.commands import DrivenStates, delayed_inputs
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import drive_through, set_up, simulate_run
@@ -197,7 +197,7 @@ def test_a_battery_that_gives_out_does_not_make_the_step_unstable() -> None:
     """Ten times the resistance: the step of the integrator still resolves the loop of voltage and torque."""
     weak = dataclasses.replace(ELEVATE.battery, resistance_ohm=0.5)
     setup = set_up("staircase", vehicle=fed_by(weak), terrain="loose_sand", slope_deg=5.0)
-    sides = told(np.repeat([[0.0, 0.0], [11.0, 11.0]], [100, 900], axis=0), 0.01)
+    sides = delayed_inputs(np.repeat([[0.0, 0.0], [11.0, 11.0]], [100, 900], axis=0), 0.01)
     x0 = np.zeros(len(STATES))
     coarse, fine = (integrate(x0, sides, 0.01, setup.plant, substeps=n) for n in (3, 12))
     assert np.abs(coarse[-1, :6] - fine[-1, :6]).max() < 1e-3
@@ -227,7 +227,7 @@ def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps,
     setup = set_up("straight")
     states = np.zeros((len(setup.t_s), len(STATES)))
     states[:, state_slice("wheel_speed")] = wheel_radps
-    driven = Driven(setup.scenario.commanded(setup.t_s), np.zeros((len(states), 4)), states)
+    driven = DrivenStates(setup.scenario.commanded(setup.t_s), np.zeros((len(states), 4)), states)
     motion = setup.motion(states)
     summary = summarise(driven, motion, setup.vehicle, slip_ratios(states, motion, setup.vehicle))
     assert summary.immobilised_cause == cause

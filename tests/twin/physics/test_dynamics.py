@@ -14,7 +14,7 @@ from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import motor_current
-from terrafusion.twin.physics.wheel import Ground, WheelShape, footprint
+from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, footprint
 
 ELEVATE = load_vehicle("elevate")
 RADIUS_M = ELEVATE.wheel.radius_m
@@ -152,7 +152,7 @@ def test_wheel_loads_carry_the_weight_and_lean_downhill() -> None:
 def test_sinkage_is_bekkers_where_nothing_saturates() -> None:
     soil = load_soil("loose_sand")
     k_c, k_phi, n = soil.pressure.k_c_n_per_m_n1, soil.pressure.k_phi_n_per_m_n2, soil.pressure.exponent
-    ground = Ground(k_c, k_phi, n, *[0.0] * 18)
+    ground = WheelSoil(k_c, k_phi, n, *[0.0] * 18)
     bekker = (3 * 78.5 / ((3 - n) * (k_c + 0.145 * k_phi) * np.sqrt(0.35))) ** (2 / (2 * n + 1))
     z = footprint(ground, 78.5, 1.0, (1.0, 0.0), 0.0, WheelShape(0.175, 0.145)).sinkage_m
     assert float(z) == pytest.approx(bekker, rel=1e-4)

@@ -21,7 +21,7 @@ from terrafusion.twin.physics.layout import (
     VEHICLE_PARAMETERS,
     state_slice,
 )
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 from tests.twin.effect_cases import (
     DT_S,
     ELEVATE,
@@ -208,7 +208,7 @@ def test_a_larger_wheel_goes_faster_and_a_false_encoder_slower_by_its_share() ->
 
 def test_ground_stiffer_sideways_lets_the_robot_slide_less_for_good() -> None:
     on = plant("medium_sand", effects={"lateral_anisotropy/stiffness": 1.0}), plant("medium_sand")
-    inputs, aside = told(np.full((1001, 2), 5.0), DT_S), VEHICLE_PARAMETERS.index("gravity_y_mps2")
+    inputs, aside = delayed_inputs(np.full((1001, 2), 5.0), DT_S), VEHICLE_PARAMETERS.index("gravity_y_mps2")
     slides = []
     for ground in on:
         ground.vehicle[aside] = -1.0
@@ -257,7 +257,7 @@ def test_lags_of_the_command_delay_a_long_ramp_as_dead_time_does(key) -> None:
 
 def test_all_effects_at_once_run_in_both_backends() -> None:
     values = {key: value for form in FORMS for key, value in at(form, "scale").items()}
-    own, inputs = plant(effects=values), told(exciting()[:1001], DT_S)
+    own, inputs = plant(effects=values), delayed_inputs(exciting()[:1001], DT_S)
     c, vm = (integrate(np.zeros(len(STATES)), inputs, DT_S, own, backend=name) for name in ("auto", "vm"))
     np.testing.assert_allclose(c, vm, rtol=1e-7, atol=1e-7)
 
@@ -273,7 +273,9 @@ def test_sensitivities_of_a_run_to_an_effect_meet_finite_differences(key) -> Non
     ends = [drive({key: sign * step}, sides)[0] for sign in (1.0, -1.0)]
     directions = Directions.zeros(plant(), 1, [key])
     directions.effects[key][0] = 1.0
-    tangent = integrate_with_sensitivity(rest, told(sides, DT_S), DT_S, plant(), directions)[1][:, :, 0]
+    tangent = integrate_with_sensitivity(rest, delayed_inputs(sides, DT_S), DT_S, plant(), directions)[1][
+        :, :, 0
+    ]
     for name in ("x", "y", "yaw", "u", "r"):
         expected = (ends[0] - ends[1])[:, INDEX[name]] / (2.0 * step)
         got = tangent[:, INDEX[name]]

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
-from terrafusion.twin.physics.wheel import Contact, Ground, WheelShape, contact, footprint, steady_contact
+from terrafusion.twin.physics.wheel import Contact, WheelShape, WheelSoil, contact, footprint, steady_contact
 
 LOAD_N = 80.0
 SMOOTH = WheelShape(0.175, 0.145)
@@ -24,12 +24,12 @@ SOILS = st.sampled_from(soil_names())
 FEW = settings(max_examples=60, deadline=None)
 
 
-def ground(name: str, **changed: float) -> Ground:
-    return Ground(*soil_vector(load_soil(name)))._replace(**changed)
+def ground(name: str, **changed: float) -> WheelSoil:
+    return WheelSoil(*soil_vector(load_soil(name)))._replace(**changed)
 
 
 def steady(
-    on: Ground, rim: float, hub: tuple[float, float], load: float = LOAD_N, shape: WheelShape = SMOOTH
+    on: WheelSoil, rim: float, hub: tuple[float, float], load: float = LOAD_N, shape: WheelShape = SMOOTH
 ) -> Contact:
     """The steady contact in plain numbers."""
     return Contact(*(float(value) for value in steady_contact(on, load, rim, hub, shape)))
@@ -131,7 +131,7 @@ def test_a_term_takes_power_and_is_absent_at_zero(number) -> None:
     base = ground("mud", **{number: 0.0})
     with_it = base._replace(**{number: DEAR[number]})
 
-    def power(on: Ground) -> float:
+    def power(on: WheelSoil) -> float:
         rim, u = (0.6, 1.0) if number == "skid_sinkage" else (1.0, 0.7)
         wheel = steady(on, rim, (u, 0.2))
         drag = wheel.drag_torque_nm / SMOOTH.radius_m
@@ -188,7 +188,7 @@ def _graph() -> tuple[Any, Any]:
     """All inputs of a contact as one vector, and its outputs."""
     x = ca.SX.sym("x", 8)
     soil = ca.SX.sym("soil", len(SOIL_PARAMETERS))
-    on = Ground(*(soil[i] for i in range(len(SOIL_PARAMETERS))))
+    on = WheelSoil(*(soil[i] for i in range(len(SOIL_PARAMETERS))))
     c = contact(on, x[7], x[0], (x[1], x[2]), (x[3], x[4]), x[5], x[6], SPIKED, 0.5)
     return ca.vertcat(x, soil), ca.vertcat(*c)
 

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
-from terrafusion.twin.scenario.commands import follow, told
+from terrafusion.twin.scenario.commands import delayed_inputs, follow
 
 SPEEDS = st.floats(-3.0, 3.0).map(lambda v: round(v, 2))
 
@@ -35,8 +35,8 @@ def test_a_step_is_a_ramp_that_ends_on_the_goal() -> None:
 
 def test_a_command_that_is_not_late_is_the_limit_of_one_that_is_hardly_late() -> None:
     sides = np.random.default_rng(1).normal(size=(50, 2))
-    prompt = told(sides, 0.01)
+    prompt = delayed_inputs(sides, 0.01)
     np.testing.assert_array_equal(prompt[:, :2], sides)
-    hardly = told(sides, 0.01, 1e-12)
+    hardly = delayed_inputs(sides, 0.01, 1e-12)
     np.testing.assert_allclose(hardly[1:], prompt[1:], atol=1e-6)
     np.testing.assert_array_equal(prompt[0, 2:], 0.0)

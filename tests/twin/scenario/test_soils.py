@@ -20,7 +20,7 @@ from terrafusion.twin.model.soil_table import published_soils
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, state_slice
-from terrafusion.twin.physics.wheel import Ground, WheelShape, steady_contact
+from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, steady_contact
 from terrafusion.twin.scenario.route import Route
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.scenario.validity import check_slip, check_wheel, ground_pressure_pa
@@ -192,7 +192,7 @@ def test_an_unknown_published_soil_is_told_with_the_known_ones() -> None:
 )
 def test_effective_friction_is_the_studys(name, low, high) -> None:
     """Source study, Tab. 3: the most a wheel of the nominal platform pulls, over its load."""
-    ground = Ground(*soil_vector(load_soil(name)))
+    ground = WheelSoil(*soil_vector(load_soil(name)))
     load = 0.25 * ELEVATE.body.mass_kg * 9.81
     shape = WheelShape(ELEVATE.wheel.radius_m, ELEVATE.wheel.width_m)
     hubs = [(1.0 - slip, 0.0) for slip in (0.3, 0.6, 0.99)]

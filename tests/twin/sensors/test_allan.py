@@ -8,13 +8,13 @@ import pytest
 from terrafusion.twin.analysis.allan import allan_deviation, command, expected_deviation, inertial_noise
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
-from terrafusion.twin.sensors.noise import Noise, flicker, white_and_walk
+from terrafusion.twin.sensors.noise import NoiseStreams, flicker, white_and_walk
 
 RATE_HZ = 100.0
 
 
 def white(count: int, seed: int, density: float = 1.0) -> np.ndarray:
-    return white_and_walk(Noise(seed).stream("white"), count, RATE_HZ, density, 0.0, 0.0)
+    return white_and_walk(NoiseStreams(seed).stream("white"), count, RATE_HZ, density, 0.0, 0.0)
 
 
 def test_white_noise_falls_with_the_root_of_the_cluster_time() -> None:
@@ -26,7 +26,7 @@ def test_white_noise_falls_with_the_root_of_the_cluster_time() -> None:
 
 
 def test_a_random_walk_rises_with_the_root_of_the_cluster_time() -> None:
-    walk = white_and_walk(Noise(2).stream("walk"), 400_000, RATE_HZ, 0.0, 1.0, 0.0)
+    walk = white_and_walk(NoiseStreams(2).stream("walk"), 400_000, RATE_HZ, 0.0, 1.0, 0.0)
     curves = [allan_deviation(column, RATE_HZ) for column in walk.T]
     mean = np.sqrt(np.mean([c.deviation**2 for c in curves], axis=0))
     tau = curves[0].tau_s
@@ -55,7 +55,7 @@ def test_the_interval_holds_the_true_value_as_often_as_it_says() -> None:
 def test_bias_instability_is_a_flat_floor() -> None:
     floors = []
     for seed in range(6):
-        series = flicker(Noise(seed).stream("flicker"), 720_000, RATE_HZ, 1.0)
+        series = flicker(NoiseStreams(seed).stream("flicker"), 720_000, RATE_HZ, 1.0)
         floors += [allan_deviation(column, RATE_HZ, 1) for column in series.T]
     tau = floors[0].tau_s
     mean = np.sqrt(np.mean([c.deviation**2 for c in floors], axis=0))

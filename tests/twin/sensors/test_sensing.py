@@ -17,7 +17,7 @@ from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, R
 from terrafusion.twin.sensors.encoders import counted
 from terrafusion.twin.sensors.gnss import LADDERS, Sky, fix_classes
 from terrafusion.twin.sensors.imu import triad
-from terrafusion.twin.sensors.noise import Noise, gauss_markov
+from terrafusion.twin.sensors.noise import NoiseStreams, gauss_markov
 from terrafusion.twin.simulate import simulate, simulate_run
 
 ELEVATE = load_vehicle("elevate")
@@ -49,7 +49,7 @@ def test_counts_err_evenly_within_a_quantum() -> None:
         sensors=dataclasses.replace(ELEVATE.sensors, wheels=plain),
     )
     angle = np.cumsum(np.random.default_rng(0).uniform(0.0, 0.3, (20_000, 4)), axis=0)
-    error = counted(angle, vehicle, Noise(3)) - angle
+    error = counted(angle, vehicle, NoiseStreams(3)) - angle
     assert np.ptp(error, axis=0).max() < quantum
     np.testing.assert_allclose(error.std(axis=0), quantum / np.sqrt(12.0), rtol=0.03)
     speed_error = np.diff(error, axis=0)
@@ -63,7 +63,7 @@ def test_an_eccentric_code_wheel_errs_once_a_turn_of_its_shaft() -> None:
         sensors=dataclasses.replace(ELEVATE.sensors, wheels=fine),
     )
     turn = np.linspace(0.0, 2.0 * np.pi, 2001)[:, None] * np.ones(4)
-    error = counted(turn, vehicle, Noise(1)) - turn
+    error = counted(turn, vehicle, NoiseStreams(1)) - turn
     np.testing.assert_allclose(0.5 * np.ptp(error, axis=0), 4.0 * ARCMIN, rtol=1e-3)
     np.testing.assert_allclose(error[::200], 0.0, atol=1e-12)  # ten periods a turn of the wheel
     spectrum = np.abs(np.fft.rfft(error[:-1, 0] - error[:-1, 0].mean()))
@@ -87,13 +87,13 @@ def test_late_stamps_keep_their_order_and_the_controllers_speed() -> None:
 def test_scale_and_misalignment_are_found_by_regression() -> None:
     """Of the gyro about z over a drive with turns, and of the accelerometers over three attitudes."""
     vehicle = realistic("imu", gyro_scale_sigma=0.02, accel_scale_sigma=0.02, misalignment_sigma_rad=0.01)
-    wanted = triad(Noise(7).stream("gyro triad"), 0.02, 0.01)
+    wanted = triad(NoiseStreams(7).stream("gyro triad"), 0.02, 0.01)
     exact, made = simulate("spin", noiseless=True).imu, simulate("spin", vehicle=vehicle, seed=7).imu
     design = np.stack([exact.gyro_radps[:, 2], np.ones(len(exact))], axis=1)
     for axis in range(3):
         gain, _ = np.linalg.lstsq(design, made.gyro_radps[:, axis], rcond=None)[0]
         assert gain == pytest.approx(wanted[axis, 2], abs=2e-3)
-    wanted = triad(Noise(7).stream("accel triad"), 0.02, 0.01)
+    wanted = triad(NoiseStreams(7).stream("accel triad"), 0.02, 0.01)
     tilts = [
         {},
         {"slope_deg": 20.0},
@@ -257,7 +257,7 @@ def test_a_current_sensor_has_gain_offset_and_steps() -> None:
     made, exact = (simulate(straight(60.0), vehicle=vehicle, noiseless=n).motor for n in (False, True))
     steps = made.current_a / 0.25
     np.testing.assert_allclose(steps, np.round(steps), atol=1e-9)
-    gain, offset = Noise(0).stream("current sensor").normal(size=(2, 2))
+    gain, offset = NoiseStreams(0).stream("current sensor").normal(size=(2, 2))
     for side in range(2):
         slope, at_zero = np.polyfit(exact.current_a[:, side], made.current_a[:, side], 1)
         assert slope == pytest.approx(1.0 + 0.1 * gain[side], abs=0.02)

@@ -19,10 +19,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from terrafusion.twin.sweep import run as module
 from terrafusion.twin.sweep.rows import columns
-from terrafusion.twin.sweep.run import Case, Sweep, load_sweep, read_table, run_sweep, write_recordings
+from terrafusion.twin.sweep.run import Sweep, SweepPoint, load_sweep, read_table, run_sweep, write_recordings
 
 SWEEP = """\
 scenario: drive.yaml
@@ -49,7 +49,7 @@ def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     runs: list[int] = []
     honest = module.run_chunk
 
-    def counting(sweep: Sweep, cases: Sequence[Case]) -> Any:
+    def counting(sweep: Sweep, cases: Sequence[SweepPoint]) -> Any:
         runs.extend(case.run for case in cases)
         return honest(sweep, cases)
 
@@ -118,7 +118,7 @@ def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Pat
 
 def test_a_worker_that_dies_is_told() -> None:
     words = "a worker process died .* fewer --jobs; finished runs are kept"
-    with pytest.raises(TerrafusionError, match=words), open_pool("loky", 2) as pool:
+    with pytest.raises(TerrafusionError, match=words), open_workers("loky", 2) as pool:
         list(pool.results(os._exit, [(1,)]))
 
 
@@ -126,7 +126,7 @@ def test_a_worker_that_is_replaced_is_no_news_and_other_warnings_are() -> None:
     replaced = "A worker stopped while some jobs were given to the executor. This can be ..."
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
-        with open_pool("loky", 2):
+        with open_workers("loky", 2):
             warnings.warn(replaced, UserWarning, stacklevel=1)
             warnings.warn("another", UserWarning, stacklevel=1)
         warnings.warn(replaced, UserWarning, stacklevel=1)
@@ -145,7 +145,7 @@ def test_a_worker_that_is_replaced_is_no_news_and_other_warnings_are() -> None:
 def test_options_that_make_no_sense_are_refused(
     backend: str, jobs: int, address: str | None, words: str
 ) -> None:
-    with pytest.raises(ConfigError, match=words), open_pool(backend, jobs, address):
+    with pytest.raises(ConfigError, match=words), open_workers(backend, jobs, address):
         pass
 
 

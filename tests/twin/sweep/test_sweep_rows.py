@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.twin.scenario.commands import Driven
+from terrafusion.twin.scenario.commands import DrivenStates
 from terrafusion.twin.simulate import drive_through, set_up, simulate_run
 from terrafusion.twin.sweep import batch
 from terrafusion.twin.sweep import rows as rows_module
@@ -163,7 +163,7 @@ def test_runs_side_by_side_are_the_runs_one_by_one(scenario: str, tmp_path: Path
     sweep = dataclasses.replace(sweep, scenario=dataclasses.replace(sweep.scenario, duration_s=12.0))
     setups = [set_up(**arguments(sweep, case)) for case in sweep.cases()]
     for setup, found in zip(setups, batch.drive_many(setups), strict=True):
-        assert isinstance(found, Driven)
+        assert isinstance(found, DrivenStates)
         alone = drive_through(setup)
         np.testing.assert_array_equal(found.wanted, alone.wanted)
         np.testing.assert_allclose(found.states, alone.states, rtol=1e-9, atol=1e-12)

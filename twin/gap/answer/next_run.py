@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.answer.classes import TELLING, likeness
 from terrafusion.twin.gap.infer.evidence import WINDOW_S, Bench
@@ -128,7 +128,7 @@ def _forecast(bench: Bench, name: str, effects: set[str]) -> Evidence:
     _, inputs = open_loop(scenario, t_s, dataclasses.replace(model.vehicle, drive=prompt))
     windows = _windows(len(t_s))
     end = float(windows[-1, 1]) * DT_S
-    log = Log(
+    log = PreparedLog(
         name, inputs[:, :2], template.follows, (label,), np.zeros(0), windows,
         np.zeros((len(windows), 3)), tuple(_rows(o, end) for o in template.observed), True, (),
     )  # fmt: skip

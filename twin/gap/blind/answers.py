@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.executors import open_pool
+from terrafusion.twin.executors import open_workers
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.plan import VEHICLE, Trial, specs
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
@@ -101,7 +101,7 @@ def answer_all(
     missing = [trial for trial in trials if trial.trial not in done]
     seal.forbid(folder)
     try:
-        with open_pool("loky", jobs) as pool, (folder / seal.ANSWERS).open("a", encoding="utf-8") as file:
+        with open_workers("loky", jobs) as pool, (folder / seal.ANSWERS).open("a", encoding="utf-8") as file:
             questions = ((case, diagnose, folder) for case in cases(missing))
             for entry in pool.results(answer, questions):
                 file.write(json.dumps(entry) + "\n")
@@ -149,7 +149,7 @@ def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, jobs: in
     asked = [t for t in trials if t.trial in told and t.family in ("same", "shifted")]
     effects = {t.trial: t.effects() for t in asked}
     missing = [t for t in asked if t.trial not in done]
-    with open_pool("loky", jobs) as pool, (folder / ORACLE).open("a", encoding="utf-8") as file:
+    with open_workers("loky", jobs) as pool, (folder / ORACLE).open("a", encoding="utf-8") as file:
         questions = ((c, functools.partial(oracle, effects=effects[c.trial]), None) for c in cases(missing))
         for entry in pool.results(answer, questions):
             done[entry["trial"]] = entry

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ TURN_SIGMA = 0.5
 """1 sigma of the guess's heading, rad (assumed): a window in which the robot stands keeps it."""
 
 
-def turns(log: Log, values: Sequence[Array]) -> Array:
+def turns(log: PreparedLog, values: Sequence[Array]) -> Array:
     """Angles (W,) by which predicted tracks, a channel each of `log.observed`, turn onto those observed.
 
     Least squares over rotation and shift of every window (Umeyama 1991, without scale), positions and
@@ -39,7 +39,7 @@ def turns(log: Log, values: Sequence[Array]) -> Array:
     return np.arctan2(cross, dot)
 
 
-def settled(log: Log, values: Sequence[Array]) -> list[Array]:
+def settled(log: PreparedLog, values: Sequence[Array]) -> list[Array]:
     """Predicted channels, the track of every window turned and shifted onto the one observed."""
     out, angles = list(values), turns(log, values)
     at = {o.channel: i for i, o in enumerate(log.observed)}
@@ -55,7 +55,7 @@ def settled(log: Log, values: Sequence[Array]) -> list[Array]:
     return out
 
 
-def settled_start(log: Log, values: Sequence[Array], start: Array) -> Array:
+def settled_start(log: PreparedLog, values: Sequence[Array], start: Array) -> Array:
     """Poses (W, 3) at the windows' starts from which the predicted tracks would lie on those observed, for
     predictions from the poses `start`."""
     out, angles = start.copy(), turns(log, values)
@@ -71,7 +71,9 @@ def _rotation(angle: float) -> Array:
     return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
 
 
-def _tracks(log: Log, values: Sequence[Array]) -> list[tuple[bool, Array, Array, NDArray[np.int64], float]]:
+def _tracks(
+    log: PreparedLog, values: Sequence[Array]
+) -> list[tuple[bool, Array, Array, NDArray[np.int64], float]]:
     """Of positions and velocities, where the log has them: whether they shift, observed and predicted
     (n, 2), the window of each row and their sigma."""
     at = {o.channel: i for i, o in enumerate(log.observed)}

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import averaging
 
@@ -38,10 +38,10 @@ class Layout:
     coarse: list[tuple[Rows, Array]]
 
 
-_KNOWN: WeakKeyDictionary[Log, Layout] = WeakKeyDictionary()
+_KNOWN: WeakKeyDictionary[PreparedLog, Layout] = WeakKeyDictionary()
 
 
-def layout(log: Log) -> Layout:
+def layout(log: PreparedLog) -> Layout:
     """The layout of a log, found once."""
     known = _KNOWN.get(log)
     if known is None:
@@ -53,19 +53,19 @@ def layout(log: Log) -> Layout:
     return known
 
 
-def samples_of(log: Log, every: int) -> Rows:
+def samples_of(log: PreparedLog, every: int) -> Rows:
     """Grid samples of all windows, one after the other; a border belongs to both."""
     return np.concatenate([np.arange(first, last + 1, every) for first, last in log.windows])
 
 
-def among_all(log: Log) -> Rows:
+def among_all(log: PreparedLog) -> Rows:
     """Which of all samples of the windows are the `EVERY`-th ones."""
     counts = np.diff(log.windows, axis=1).ravel() + 1
     begins = np.cumsum(counts) - counts
     return np.concatenate([b + np.arange(0, n, EVERY) for b, n in zip(begins, counts, strict=True)])
 
 
-def coarse_counts(log: Log) -> Rows:
+def coarse_counts(log: PreparedLog) -> Rows:
     """Number (W,) of `EVERY`-th samples of each window."""
     return np.diff(log.windows, axis=1).ravel() // EVERY + 1
 
@@ -87,7 +87,7 @@ def weighty(at: Rows, weight: Array) -> tuple[Rows, Array]:
     return np.take_along_axis(at, order, axis=1), np.take_along_axis(weight, order, axis=1)
 
 
-def _blocks(log: Log) -> list[tuple[int, int, Rows]]:
+def _blocks(log: PreparedLog) -> list[tuple[int, int, Rows]]:
     out = []
     for i, observed in enumerate(log.observed):
         of = window_of(observed, log.windows)
@@ -95,7 +95,7 @@ def _blocks(log: Log) -> list[tuple[int, int, Rows]]:
     return out
 
 
-def _alike(log: Log, blocks: Sequence[tuple[int, int, Rows]]) -> list[tuple[int, Rows, Rows]]:
+def _alike(log: PreparedLog, blocks: Sequence[tuple[int, int, Rows]]) -> list[tuple[int, Rows, Rows]]:
     found: dict[tuple[int, bytes], list[Rows]] = {}
     place = 0
     for i, _, rows in blocks:
@@ -105,7 +105,7 @@ def _alike(log: Log, blocks: Sequence[tuple[int, int, Rows]]) -> list[tuple[int,
     return [(i, *np.stack(some, axis=1)) for (i, _), some in found.items()]
 
 
-def _coarse(observed: Observed, log: Log) -> tuple[Rows, Array]:
+def _coarse(observed: Observed, log: PreparedLog) -> tuple[Rows, Array]:
     """Coarse samples (n, 6) that a row depends on and their weights: a mean of three linear
     interpolations."""
     step, counts = EVERY * DT_S, coarse_counts(log)

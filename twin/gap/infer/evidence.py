@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.calibrate.log import Log, grounds, prepare
+from terrafusion.twin.calibrate.log import PreparedLog, grounds, prepare
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.noise import Noise
+from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.null.channel_noise import learnt_noise
 from terrafusion.twin.gap.rollout.batch import in_threads
@@ -36,7 +36,7 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 from terrafusion.twin.gap.rollout.sensitivities import Ask, Drive, settled_predictions
 from terrafusion.twin.model.soil import SoilParams, load_soil
-from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, told_geometry, with_overrides
+from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, reported_geometry, with_overrides
 
 Array = NDArray[np.float64]
 Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
@@ -71,7 +71,7 @@ class Bench:
     model: Model
     candidates: Candidates
     channels: tuple[str, ...]
-    noise: dict[str, Noise]
+    noise: dict[str, ResidualNoise]
     runs: list[Evidence]
     references: list[Evidence]
     raws: list[Raw]
@@ -90,7 +90,7 @@ def starting_model(
         ConfigError: a soil that was named is not known.
         DataError: the logs tell different geometries.
     """
-    told = told_geometry(recordings)
+    told = reported_geometry(recordings)
     loaded, notes = with_overrides(vehicle, told), list(geometry_notes(vehicle, told))
     if soils is not None and not isinstance(soils, Mapping):
         soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
@@ -111,12 +111,14 @@ def starting_model(
     return Model(loaded, found, loaded.effects), None, notes
 
 
-def prepared(recordings: Sequence[Recording], model: Model, ground: str | None, source: str) -> list[Log]:
+def prepared(
+    recordings: Sequence[Recording], model: Model, ground: str | None, source: str
+) -> list[PreparedLog]:
     """Logs of the recordings."""
     return [prepare(r, model, source=source, window_s=WINDOW_S, ground=ground) for r in recordings]
 
 
-def common_channels(logs: Sequence[Log]) -> tuple[str, ...]:
+def common_channels(logs: Sequence[PreparedLog]) -> tuple[str, ...]:
     """Channels that every log has.
 
     Raises:
@@ -128,23 +130,23 @@ def common_channels(logs: Sequence[Log]) -> tuple[str, ...]:
     return tuple(shared)
 
 
-def _names(log: Log) -> set[str]:
+def _names(log: PreparedLog) -> set[str]:
     return {o.channel for o in log.observed}
 
 
-def restricted(log: Log, channels: Sequence[str]) -> Log:
+def restricted(log: PreparedLog, channels: Sequence[str]) -> PreparedLog:
     """The log with these channels only."""
     by_name = {o.channel: o for o in log.observed}
     return dataclasses.replace(log, observed=tuple(by_name[c] for c in channels))
 
 
 def raws_of(
-    logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int, told: Callable[[], None]
+    logs: Sequence[PreparedLog], drives: Drives, channels: Sequence[str], jobs: int, told: Callable[[], None]
 ) -> list[Raw]:
     """Errors and derivatives of each run. The first run of each drive makes its signature, whichever thread
     is faster."""
 
-    def one(log: Log) -> Raw:
+    def one(log: PreparedLog) -> Raw:
         found = raw(log, drives, channels)
         told()
         return found
@@ -157,7 +159,7 @@ def raws_of(
     return [made[id(log)] for log in logs]
 
 
-def set_ground(logs: Sequence[Log], drives: Drives, channels: Sequence[str], jobs: int) -> Model:
+def set_ground(logs: Sequence[PreparedLog], drives: Drives, channels: Sequence[str], jobs: int) -> Model:
     """The twin with its ground's strength, bearing and rolling resistance set to the references.
 
     The other columns take part as nuisances of typical size, so that a commissioning error does not pass

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.noise import Noise, autoregressive, clipped, gauss_markov
+from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, clipped, gauss_markov
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.samples import layout
 from terrafusion.twin.gap.rollout.residuals import (
@@ -30,15 +30,15 @@ LEAST_SCALE = 0.2
 """No channel is taken as better than this share of what its data sheet and scatter say (assumed)."""
 
 
-def first_noise(runs: Sequence[Raw]) -> dict[str, Noise]:
+def first_noise(runs: Sequence[Raw]) -> dict[str, ResidualNoise]:
     """White noise of the data sheets' sigma, with the correlation they tell, by channel."""
-    out: dict[str, Noise] = {}
+    out: dict[str, ResidualNoise] = {}
     for run in runs:
         lags = _lags([run])
         for observed in run.log.observed:
             if observed.channel not in out:
                 rho = _sheet_rho([run], observed.channel, lags[observed.channel]) or (1.0,)
-                out[observed.channel] = Noise(1.0, rho)
+                out[observed.channel] = ResidualNoise(1.0, rho)
     return out
 
 
@@ -47,8 +47,8 @@ def learnt_noise(
     judged: Sequence[Raw],
     candidates: Candidates,
     jobs: int = 1,
-    before: dict[str, Noise] | None = None,
-) -> dict[str, Noise]:
+    before: dict[str, ResidualNoise] | None = None,
+) -> dict[str, ResidualNoise]:
     """Noise by channel, from residuals of reference runs that are fitted with all that could differ.
 
     What theta, a common set of effects and the poses explain is taken out (ridge, one typical size); what
@@ -90,19 +90,23 @@ def _sheet_rho(runs: Sequence[Raw], channel: str, lags: int) -> tuple[float, ...
     return None
 
 
-def _noise(channel: str, series: Series, every: Sequence[Raw], before: Noise, lags: int) -> Noise:
+def _noise(
+    channel: str, series: Series, every: Sequence[Raw], before: ResidualNoise, lags: int
+) -> ResidualNoise:
     values = np.concatenate([v for _, v in series]) if series else np.zeros(0)
     if len(values) < 4:
         return before
     rho = _sheet_rho(every, channel, lags)
     if rho is None:
         rho = autoregressive([(s, clipped(v)) for s, v in series], lags)
-    white = _whitened_series(Noise(1.0, rho), series)
+    white = _whitened_series(ResidualNoise(1.0, rho), series)
     robust = 1.4826 * float(np.median(np.abs(white)))
-    return Noise(max(float(np.sqrt(np.mean(np.minimum(white**2, (4.0 * robust) ** 2)))), LEAST_SCALE), rho)
+    return ResidualNoise(
+        max(float(np.sqrt(np.mean(np.minimum(white**2, (4.0 * robust) ** 2)))), LEAST_SCALE), rho
+    )
 
 
-def _whitened_series(noise: Noise, series: Series) -> Array:
+def _whitened_series(noise: ResidualNoise, series: Series) -> Array:
     """All residuals, white; windows whose rows are as far apart are whitened together."""
     alike: dict[bytes, Series] = {}
     for slots, values in series:
@@ -114,7 +118,7 @@ def _whitened_series(noise: Noise, series: Series) -> Array:
     return np.concatenate(parts)
 
 
-def _left_over(run: Raw, noise: Mapping[str, Noise], sigma: Array, size: float) -> dict[str, Series]:
+def _left_over(run: Raw, noise: Mapping[str, ResidualNoise], sigma: Array, size: float) -> dict[str, Series]:
     """Residuals of one run after its own fit, in first-guess sigmas, by channel and window; `size` is 1 sigma
     of the effects."""
     plain = without_probes(run)

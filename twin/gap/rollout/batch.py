@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.predict import LEAD_S, POSE, plant_of, run_up
 from terrafusion.twin.calibrate.readings import along
@@ -32,7 +32,7 @@ from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, WHEELS
-from terrafusion.twin.scenario.commands import told
+from terrafusion.twin.scenario.commands import delayed_inputs
 from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
 
 Array = NDArray[np.float64]
@@ -106,14 +106,17 @@ class Lane:
     """A run of the twin: on which log, by which plant, what it is told (N + 1, U), and its poses (W, 3) at
     the windows' starts."""
 
-    log: Log
+    log: PreparedLog
     plant: Plant
     inputs: Array
     start: Array
 
 
 def lanes_of(
-    asked: Sequence[tuple[Log, Effects, Array]], model: Model, candidates: Candidates, group: Sequence[str]
+    asked: Sequence[tuple[PreparedLog, Effects, Array]],
+    model: Model,
+    candidates: Candidates,
+    group: Sequence[str],
 ) -> list[Lane]:
     """The twin on each log with the effects and from the poses (W, 3) asked for; those of the group and of
     the ground are in its graph. Lanes that hear the same share the array."""
@@ -129,13 +132,13 @@ def lanes_of(
         present = {k: some.get(k, 0.0) or TINY * float(scales[k]) for k in sorted(named)}
         late_s = _late_s(log, model, some)
         if (id(log), late_s) not in heard:
-            heard[id(log), late_s] = np.ascontiguousarray(told(log.sides, DT_S, late_s))
+            heard[id(log), late_s] = np.ascontiguousarray(delayed_inputs(log.sides, DT_S, late_s))
         plant = Plant(vehicle, bases[id(log)].route, present)
         out.append(Lane(log, plant, heard[id(log), late_s], start))
     return out
 
 
-def _late_s(log: Log, model: Model, some: Effects) -> float:
+def _late_s(log: PreparedLog, model: Model, some: Effects) -> float:
     """By how much what the twin is told is late."""
     late = some.get(DEAD_TIME, 0.0)
     return late if log.follows else as_driven(model.vehicle, {DEAD_TIME: late}).drive.dead_time_s
@@ -197,7 +200,7 @@ def _led_in(lanes: Sequence[Lane], fleet: Fleet) -> list[Array]:
 class Sensors:
     """The sensors' readings at the samples (N,) of the runs of one log."""
 
-    def __init__(self, log: Log, model: Model, candidates: Candidates, samples: Rows) -> None:
+    def __init__(self, log: PreparedLog, model: Model, candidates: Candidates, samples: Rows) -> None:
         self.keys, self.samples = frozenset(candidates.keys), samples
         self.sensing = self.keys - {*candidates.moving} | {*GROUND} & self.keys
         self.mounting = mounting_vector(model.vehicle)

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import LEAD_S, averaging
 from terrafusion.twin.effects.sensing import CLOCK_S
@@ -40,7 +40,7 @@ def in_time(effects: Mapping[str, float]) -> dict[str, float]:
 
 
 def late_layout(
-    log: Log, effects: Mapping[str, float], rows: Layout
+    log: PreparedLog, effects: Mapping[str, float], rows: Layout
 ) -> list[tuple[NDArray[np.int64], Array]]:
     """`Layout.fine` of the log with the delays among the effects; `rows` is that without."""
     late = {key: effects[key] for key in DELAYS if effects.get(key, 0.0) != 0.0}

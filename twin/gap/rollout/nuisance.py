@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.inputs import DT_S
-from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.gap.rollout.sensitivities import Signature
@@ -46,7 +46,7 @@ NAMES = {
 """Contract name of the channel that each observed one belongs to."""
 
 
-def told_twist(log: Log, model: Model) -> tuple[Array, Array]:
+def told_twist(log: PreparedLog, model: Model) -> tuple[Array, Array]:
     """Times (N,) and told forward speed and turn rate (N, 2) of the log's grid, m/s and rad/s."""
     odometry = model.vehicle.odometry
     left, right = log.sides.T * odometry.wheel_radius_m
@@ -54,7 +54,7 @@ def told_twist(log: Log, model: Model) -> tuple[Array, Array]:
     return t_s, np.stack([0.5 * (left + right), (right - left) / odometry.track_m], axis=1)
 
 
-def basis(log: Log, model: Model, at_s: Array) -> Array:
+def basis(log: PreparedLog, model: Model, at_s: Array) -> Array:
     """The functions `BASIS` (n, B) of the commands at times (n,), each of order one."""
     t_s, twist = told_twist(log, model)
     width = max(1, round(SMOOTH_S / DT_S))
@@ -76,7 +76,9 @@ def names(channels: Sequence[str]) -> list[str]:
     return out
 
 
-def columns(log: Log, model: Model, observed: Observed, signature: Signature, order: Sequence[str]) -> Array:
+def columns(
+    log: PreparedLog, model: Model, observed: Observed, signature: Signature, order: Sequence[str]
+) -> Array:
     """Probes (n, G) of one channel's rows, in units of its sigma, among all those of `order` (channels)."""
     f = basis(log, model, 0.5 * (observed.begin_s + observed.end_s)) * np.median(observed.sigma)
     out = []

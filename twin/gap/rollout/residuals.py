@@ -17,9 +17,9 @@ from threading import Lock
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.log import Log
+from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.calibrate.noise import Noise
+from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import settled_start
 from terrafusion.twin.gap.data.samples import layout
@@ -73,7 +73,7 @@ class Raw:
         state, change, probe, pose: (n, T), (n, K), (n, G) and (n, 3) derivatives.
     """
 
-    log: Log
+    log: PreparedLog
     own: Array
     error: list[Array]
     state: list[Array]
@@ -98,7 +98,7 @@ class Evidence:
     """
 
     name: str
-    log: Log
+    log: PreparedLog
     gram: Array
     rows: NDArray[np.float32]
     frame: Array
@@ -120,7 +120,7 @@ class Drives:
     kept: dict[str, Drive] = field(default_factory=dict)
     lock: Lock = field(default_factory=Lock)
 
-    def name(self, log: Log) -> str:
+    def name(self, log: PreparedLog) -> str:
         """What runs that share a signature have in common."""
         sector = np.round(log.start[:1, 2] / SAME_YAW_RAD) + 0.0  # no negative zero
         key = hashlib.sha256(sector.tobytes())
@@ -129,7 +129,7 @@ class Drives:
         key.update(repr((log.labels, self.candidates.keys, sorted(self.model.effects.items()))).encode())
         return key.hexdigest()
 
-    def of(self, log: Log) -> Drive:
+    def of(self, log: PreparedLog) -> Drive:
         """The drive of a log, from the poses of the first run that was told the same."""
         name = self.name(log)
         with self.lock:
@@ -141,7 +141,7 @@ class Drives:
         return known
 
 
-def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
+def raw(log: PreparedLog, drives: Drives, channels: Sequence[str]) -> Raw:
     """Errors and derivatives of a run.
 
     Args:
@@ -160,7 +160,11 @@ def raw(log: Log, drives: Drives, channels: Sequence[str]) -> Raw:
 
 
 def raw_of(
-    log: Log, found: Sequence[Signature], model: Model, candidates: Candidates, channels: Sequence[str]
+    log: PreparedLog,
+    found: Sequence[Signature],
+    model: Model,
+    candidates: Candidates,
+    channels: Sequence[str],
 ) -> Raw:
     """Errors and derivatives of a run, from its signatures."""
     keys = candidates.keys
@@ -199,7 +203,7 @@ class _Search:
     gain: Array
     going: bool = True
 
-    def take(self, tried: Array, found: Sequence[Array] | None, noise: Mapping[str, Noise]) -> None:
+    def take(self, tried: Array, found: Sequence[Array] | None, noise: Mapping[str, ResidualNoise]) -> None:
         """A step is taken as long as it lowers the errors."""
         self.going = False
         if found is None:
@@ -216,7 +220,7 @@ class _Search:
 def at_own_ground(
     runs: Sequence[Raw],
     drives: Drives,
-    noise: Mapping[str, Noise],
+    noise: Mapping[str, ResidualNoise],
     most: Array | float = MOST_SOIL,
     jobs: int = 1,
 ) -> list[Raw]:
@@ -300,7 +304,7 @@ def state_sigmas(candidates: Candidates) -> Array:
     return np.array([*soil, *np.ones(len(OFFSETS) + 2 * len(CURRENTS))])
 
 
-def whitened_columns(log: Log, noise: Mapping[str, Noise], columns: Sequence[Array]) -> Array:
+def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], columns: Sequence[Array]) -> Array:
     """Columns (n, k) of all channels, one array a channel, in units and axes in which its noise is white."""
     out = np.empty((sum(map(len, columns)), columns[0].shape[1]))
     for i, rows, places in layout(log).alike:
@@ -311,7 +315,7 @@ def whitened_columns(log: Log, noise: Mapping[str, Noise], columns: Sequence[Arr
     return out
 
 
-def whitened(run: Raw, noise: Mapping[str, Noise]) -> Evidence:
+def whitened(run: Raw, noise: Mapping[str, ResidualNoise]) -> Evidence:
     """The run in units and axes in which its noise is white."""
     return projected(run, whitened_columns(run.log, noise, stacked(run)))
 
@@ -350,7 +354,9 @@ def _orthonormal(columns: Array) -> Array:
     return out
 
 
-def whitened_error(run: Raw, evidence: Evidence, noise: Mapping[str, Noise], error: Sequence[Array]) -> Array:
+def whitened_error(
+    run: Raw, evidence: Evidence, noise: Mapping[str, ResidualNoise], error: Sequence[Array]
+) -> Array:
     """Another error (n,) of the run in the evidence's rows, poses projected out, within its limits."""
     out = whitened_columns(run.log, noise, [e[:, None] for e in error])[:, 0]
     for k in np.unique(evidence.window):

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.twin.calibrate.log import Log, window_of
+from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.data.poses import PAIRS, settled, settled_start
@@ -79,7 +79,7 @@ class Ask:
     """What the twin is asked to predict: channels of a log with effects on top of the model's own, from poses
     (W, 3) at the windows' starts; None: the log's own."""
 
-    log: Log
+    log: PreparedLog
     effects: Mapping[str, float]
     start: Array | None = None
 
@@ -145,7 +145,7 @@ def predictions(
     return out
 
 
-def _companies(logs: Sequence[Log]) -> list[list[int]]:
+def _companies(logs: Sequence[PreparedLog]) -> list[list[int]]:
     """Runs, by number, that may go side by side: those on one ground, and those of each log on several."""
     out: dict[int, list[int]] = {}
     for i, log in enumerate(logs):
@@ -154,7 +154,7 @@ def _companies(logs: Sequence[Log]) -> list[list[int]]:
 
 
 def drive(
-    log: Log, model: Model, candidates: Candidates, start: Array, only: Collection[str] | None = None
+    log: PreparedLog, model: Model, candidates: Candidates, start: Array, only: Collection[str] | None = None
 ) -> Drive:
     """The twin's run at the model's own effects, with its derivatives.
 
@@ -181,7 +181,11 @@ def drive(
 
 
 def _readings(
-    log: Log, model: Model, candidates: Candidates, start: Array, sets: Mapping[str, Mapping[str, float]]
+    log: PreparedLog,
+    model: Model,
+    candidates: Candidates,
+    start: Array,
+    sets: Mapping[str, Mapping[str, float]],
 ) -> tuple[Array, Array, dict[str, Array]]:
     """Outputs of the twin as it is at every grid sample, its states (n, X) at every `EVERY`-th, and there the
     outputs (n, Y) with each set of effects."""
@@ -209,7 +213,7 @@ def _readings(
     return fine, coarse, read
 
 
-def placed(log: Log, found: Sequence[Signature], old: Array, new: Array) -> list[Signature]:
+def placed(log: PreparedLog, found: Sequence[Signature], old: Array, new: Array) -> list[Signature]:
     """Signatures of the channels of the log from other poses (W, 3) at the windows' starts than the old ones:
     on a level plane the drive shifts and turns as a whole."""
     if np.array_equal(old, new):
@@ -236,7 +240,7 @@ def placed(log: Log, found: Sequence[Signature], old: Array, new: Array) -> list
     return [dataclasses.replace(s, heading=s.heading + turn[k]) for s, k in zip(out, of, strict=True)]
 
 
-def signatures(log: Log, drive: Drive) -> list[Signature]:
+def signatures(log: PreparedLog, drive: Drive) -> list[Signature]:
     """Every channel of the log as the twin has it: means over the rows' own intervals."""
     rows, out = layout(log), []
     for observed, fine, coarse in zip(log.observed, rows.fine, rows.coarse, strict=True):
@@ -260,7 +264,7 @@ def _step(candidates: Candidates, i: int, at: float) -> float:
     return step if at + step <= candidates.high[i] else -step
 
 
-def _by_pose(log: Log, states: Array, y: Array) -> Array:
+def _by_pose(log: PreparedLog, states: Array, y: Array) -> Array:
     """Derivatives (N, Y, 3) of the outputs by x, y and yaw of the window's start: the run shifts and
     turns."""
     out = np.zeros((*y.shape, 3))
