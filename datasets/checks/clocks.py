@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient
+from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.sensor_pairs import (
     LEAST_R,
     Pair,
@@ -84,10 +84,10 @@ def clock_jumps(recording: Recording, pairs: Pairs) -> dict[str, list[Jump]]:
     return found
 
 
-def jump_findings(patient: Patient, jumps: dict[str, list[Jump]]) -> Iterator[Finding]:
+def jump_findings(context: CheckContext, jumps: dict[str, list[Jump]]) -> Iterator[Finding]:
     """What is to be said of leaps ahead."""
     for name, leaps in jumps.items():
-        at_s = patient.since_start_s(clocks_of(patient.recording)[name][leaps[0].row])
+        at_s = context.since_start_s(clocks_of(context.recording)[name][leaps[0].row])
         total_s = sum(leap.step_ns for leap in leaps) * 1e-9
 
         def repair(recording: Recording, name: str = name, leaps: list[Jump] = leaps) -> Recording:

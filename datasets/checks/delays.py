@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
-from terrafusion.datasets.checks.finding import Finding, Patient
+from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.sensor_pairs import (
     LEAST_R,
     SPEED_PAIRS,
@@ -41,17 +41,17 @@ grip of 1 m/s2 it takes 3 s until it goes at 3 m/s, and is half of that late on 
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
 
 
-def check_clocks(patient: Patient) -> Iterator[Finding]:
+def check_clocks(context: CheckContext) -> Iterator[Finding]:
     """Clocks beside each other. A jump hides a drift, either hides an offset: the first is told."""
-    pairs = signal_pairs(Patient(without_stuck(patient.recording), patient.rig))
-    jumps = clock_jumps(patient.recording, pairs)
-    yield from gap_findings(patient, {name: [jump.row for jump in found] for name, found in jumps.items()})
+    pairs = signal_pairs(CheckContext(without_stuck(context.recording), context.rig))
+    jumps = clock_jumps(context.recording, pairs)
+    yield from gap_findings(context, {name: [jump.row for jump in found] for name, found in jumps.items()})
     if jumps:
-        yield from jump_findings(patient, jumps)
-    elif drifts := clock_drifts(patient.recording, pairs):
-        yield drift_finding(patient.recording, drifts)
+        yield from jump_findings(context, jumps)
+    elif drifts := clock_drifts(context.recording, pairs):
+        yield drift_finding(context.recording, drifts)
     else:
-        yield from _offset_findings(patient.recording, pairs)
+        yield from _offset_findings(context.recording, pairs)
 
 
 def _offset_findings(recording: Recording, pairs: Pairs) -> Iterator[Finding]:

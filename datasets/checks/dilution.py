@@ -13,7 +13,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient
+from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.gnss import scatter_m
 from terrafusion.datasets.core.recording import Fix, Gnss, Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
@@ -26,9 +26,9 @@ CARRIER_PHASE_M = 0.3
 """Fixes of class "fixed" are good to centimetres; with more than this, class and sigma contradict."""
 
 
-def check_dilution(patient: Patient) -> Iterator[Finding]:
+def check_dilution(context: CheckContext) -> Iterator[Finding]:
     """Sigmas that look like dilutions of precision."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     if gnss is None:
         return
     rows = _told(gnss)
@@ -39,7 +39,7 @@ def check_dilution(patient: Patient) -> Iterator[Finding]:
     contradicts = bool(fixed.mean() > 0.5 and np.median(sigma[fixed, 0]) > CARRIER_PHASE_M)
     if not contradicts and not _in_steps(sigma):
         return
-    scatter = scatter_m(patient)
+    scatter = scatter_m(context)
     if scatter is not None and scatter > HONEST * np.median(sigma[:, :2]):
         return
     classes = [Fix(k) for k in np.unique(gnss.fix[rows])]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.mounting import gravity, heading, wheels_turn_backwards
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, places, wheel_speed
 from terrafusion.datasets.checks.yaw_signals import SURE_R, Account, account, agreement, seconds
@@ -21,16 +21,16 @@ LEAST_PROGRESS = 0.3
 """Way made good over way rolled, if the sides turn the same way, from which the robot does not spin."""
 
 
-def sides_opposed(patient: Patient) -> str | None:
+def sides_opposed(context: CheckContext) -> str | None:
     """Whether one side has the wrong sign: what tells it; "" where nothing does; None where none has.
 
     Sides of opposite sign nearly all the time may be a robot that spins on the spot: then the gyro
     turns as they say.
     """
-    wheels = patient.recording.wheels
+    wheels = context.recording.wheels
     if wheels is None or not wheels.has_sides():
         return None
-    sides = wheels.side_speeds_mps(patient.wheel_radius_m() or ANY_RADIUS_M)
+    sides = wheels.side_speeds_mps(context.wheel_radius_m() or ANY_RADIUS_M)
     known = np.isfinite(sides).all(axis=1)
     t_ns, sides = wheels.t_ns[known], sides[known]
     moving = (np.abs(sides) > 0.05 * np.abs(sides).max(initial=0.0)).all(axis=1) & sides.any(axis=1)
@@ -40,9 +40,9 @@ def sides_opposed(patient: Patient) -> str | None:
     apart, together = np.abs(sides[:, 1] - sides[:, 0]), sides.sum(axis=1)
     if np.abs(together[moving]).mean() > 0.5 * np.abs(sides[moving]).mean():
         return None
-    imu, start = patient.recording.imu, patient.recording.start_ns
-    gyro = None if imu is None else account(start, imu.t_ns, _upright_rate(patient, imu))
-    made_good = _progress(patient, account(start, t_ns, 0.5 * apart))
+    imu, start = context.recording.imu, context.recording.start_ns
+    gyro = None if imu is None else account(start, imu.t_ns, _upright_rate(context, imu))
+    made_good = _progress(context, account(start, t_ns, 0.5 * apart))
     if gyro is not None:
         rate = float(np.abs(gyro.rates(np.linspace(gyro.t_s[0], gyro.t_s[-1], 200))).mean())
         if rate * WIDEST_TRACK_M > float(apart.mean()):
@@ -61,17 +61,17 @@ def sides_opposed(patient: Patient) -> str | None:
     return ""
 
 
-def _upright_rate(patient: Patient, imu: Imu) -> Array:
+def _upright_rate(context: CheckContext, imu: Imu) -> Array:
     """Angular rate (N,) about the direction of gravity, up to its sign; about z where that is unknown."""
-    mean = gravity(patient)
+    mean = gravity(context)
     if mean is None or not imu.has_gyro() or not np.linalg.norm(mean) > 0.0:
         return imu.gyro_radps[:, 2]
     return np.asarray(imu.gyro_radps @ (mean / np.linalg.norm(mean)))
 
 
-def _progress(patient: Patient, rolled: Account | None) -> tuple[float, str] | None:
+def _progress(context: CheckContext, rolled: Account | None) -> tuple[float, str] | None:
     """Way made good over way rolled, both over 10 s, and what told it."""
-    for true in places(patient.recording):
+    for true in places(context.recording):
         grid = np.arange(true.t_s[0], true.t_s[-1], 10.0)
         if rolled is None or len(grid) < 3:
             continue
@@ -82,18 +82,18 @@ def _progress(patient: Patient, rolled: Account | None) -> tuple[float, str] | N
     return None
 
 
-def runs_backwards(patient: Patient) -> str | None:
+def runs_backwards(context: CheckContext) -> str | None:
     """What tells that the wheels say backwards when the robot drives forward; None where nothing does."""
-    driven = wheel_speed(patient, patient.wheel_radius_m() or ANY_RADIUS_M)
+    driven = wheel_speed(context, context.wheel_radius_m() or ANY_RADIUS_M)
     if driven is None:
         return None
-    found = heading(patient)
+    found = heading(context)
     if found is not None and found.angle is not None:
-        backwards = abs(found.angle) > 0.75 * np.pi and wheels_turn_backwards(patient)
+        backwards = abs(found.angle) > 0.75 * np.pi and wheels_turn_backwards(context)
         return "acceleration answers them with the opposite sign" if backwards else None
     t, v = driven
     way = Account(t, np.concatenate([[0.0], np.cumsum(0.5 * (v[1:] + v[:-1]) * np.diff(t))]))
-    for name, there in _forward_ways(patient).items():
+    for name, there in _forward_ways(context).items():
         start, end = max(t[0], there.t_s[0]), min(t[-1], there.t_s[-1])
         if end - start < LEAST_S:
             continue
@@ -105,12 +105,12 @@ def runs_backwards(patient: Patient) -> str | None:
             return f"{name} goes the other way (correlation {r:.2f})" if r < -SURE_R else None
     total = float(np.abs(v).sum())
     mostly = total > 0.0 and float(v.sum()) / total < -0.8 and t[-1] - t[0] > LEAST_S
-    return "they run backwards nearly all the time" if mostly and wheels_turn_backwards(patient) else None
+    return "they run backwards nearly all the time" if mostly and wheels_turn_backwards(context) else None
 
 
-def _forward_ways(patient: Patient) -> dict[str, Account]:
+def _forward_ways(context: CheckContext) -> dict[str, Account]:
     """The way driven forward (m), by what tells it with its sign."""
-    recording, start = patient.recording, patient.recording.start_ns
+    recording, start = context.recording, context.recording.start_ns
     truth, command = recording.truth, recording.command
     found: dict[str, Account | None] = {}
     if truth is not None and truth.quaternion is not None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
@@ -29,9 +29,9 @@ HARD_IRON = 0.1
 """Horizontal offset over the horizontal field from which the heading errs by up to 6 deg."""
 
 
-def check_pressure(patient: Patient) -> Iterator[Finding]:
+def check_pressure(context: CheckContext) -> Iterator[Finding]:
     """Pressures must be those of the atmosphere, in pascal."""
-    barometer = patient.recording.barometer
+    barometer = context.recording.barometer
     known = (
         barometer.pressure_pa[np.isfinite(barometer.pressure_pa)] if barometer is not None else np.empty(0)
     )
@@ -54,9 +54,9 @@ def check_pressure(patient: Patient) -> Iterator[Finding]:
         )
 
 
-def check_field(patient: Patient) -> Iterator[Finding]:
+def check_field(context: CheckContext) -> Iterator[Finding]:
     """Fields must be as long as Earth's, in tesla, and turn about zero when the robot turns."""
-    magnetometer = patient.recording.magnetometer
+    magnetometer = context.recording.magnetometer
     if magnetometer is None:
         return
     field = magnetometer.field_t[np.isfinite(magnetometer.field_t).all(axis=1)]

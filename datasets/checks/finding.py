@@ -42,7 +42,7 @@ class Finding:
 
 
 @dataclass(frozen=True)
-class Patient:
+class CheckContext:
     """What a check looks at: the recording, and the robot's geometry where known."""
 
     recording: Recording

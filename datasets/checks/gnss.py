@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, compare, places, wheel_speed
 from terrafusion.datasets.checks.timing import GAP_PERIODS
 from terrafusion.datasets.checks.yaw_signals import seconds, typical_sigma
@@ -25,9 +25,9 @@ FLIGHT_FIXES, CLOSED = 25, 0.3
 """A jump is taken back within so many fixes, up to this share of its size; else the path stays displaced."""
 
 
-def check_classes(patient: Patient) -> Iterator[Finding]:
+def check_classes(context: CheckContext) -> Iterator[Finding]:
     """Positions of class "none" are no fixes, and are not used."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     if gnss is None:
         return
     placed = np.isfinite(gnss.enu_m[:, :2]).all(axis=1)
@@ -40,7 +40,7 @@ def check_classes(patient: Patient) -> Iterator[Finding]:
         "warning",
         "gnss",
         f"{int(none.sum())} of {len(gnss)} fixes have positions but the class 'none'",
-        f"first at t = {patient.since_start_s(gnss.t_ns[int(np.flatnonzero(none)[0])]):.2f} s",
+        f"first at t = {context.since_start_s(gnss.t_ns[int(np.flatnonzero(none)[0])]):.2f} s",
         "give the class of fix, if the log only lacks it: as it is, none is used"
         if every
         else "drop them: they are not used",
@@ -48,9 +48,9 @@ def check_classes(patient: Patient) -> Iterator[Finding]:
     )
 
 
-def check_sigma(patient: Patient) -> Iterator[Finding]:
+def check_sigma(context: CheckContext) -> Iterator[Finding]:
     """A sigma of a fix must be a positive number."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     if gnss is None or not len(gnss):
         return
     bad = _impossible(gnss)
@@ -58,7 +58,7 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
     if rows.any():
         first = int(np.flatnonzero(rows)[0])
         missing_only = bool(np.isnan(gnss.sigma_enu_m[bad]).all())  # such fixes are left out, others mislead
-        at_s, said = patient.since_start_s(gnss.t_ns[first]), gnss.sigma_enu_m[first].tolist()
+        at_s, said = context.since_start_s(gnss.t_ns[first]), gnss.sigma_enu_m[first].tolist()
         usual = ", ".join(f"{fix.name.lower()} {sigma:g}" for fix, sigma in ASSUMED_SIGMA_M.items() if fix)
         yield Finding(
             "sigma-impossible",
@@ -68,20 +68,20 @@ def check_sigma(patient: Patient) -> Iterator[Finding]:
             f"first at t = {at_s:.2f} s: {said} m",
             "take the median of the other fixes of the class; where there is none, the usual value "
             f"({usual} m, heights twice), or the scatter about wheels and gyro where that is larger",
-            functools.partial(_with_usual_sigma, least_m=scatter_m(patient) or 0.0),
+            functools.partial(_with_usual_sigma, least_m=scatter_m(context) or 0.0),
         )
 
 
-def check_velocity_sigma(patient: Patient) -> Iterator[Finding]:
+def check_velocity_sigma(context: CheckContext) -> Iterator[Finding]:
     """The sigma of a velocity must not be zero or negative; one that is not told is no fault."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     if gnss is None or gnss.velocity_enu_mps is None or gnss.sigma_v_mps is None:
         return
     told = np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)
     bad = told & (gnss.sigma_v_mps <= 0.0)
     if bad.any():
         first = int(np.flatnonzero(bad)[0])
-        at_s = patient.since_start_s(gnss.t_ns[first])
+        at_s = context.since_start_s(gnss.t_ns[first])
         yield Finding(
             "velocity-sigma-impossible",
             "warning",
@@ -122,12 +122,12 @@ def _with_usual_sigma(recording: Recording, least_m: float) -> Recording:
     return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, sigma_enu_m=sigma))
 
 
-def check_scatter(patient: Patient) -> Iterator[Finding]:
+def check_scatter(context: CheckContext) -> Iterator[Finding]:
     """Fixes must not scatter far more than their sigma says."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     if gnss is None:
         return
-    sigma, scatter = typical_sigma(gnss), scatter_m(patient)
+    sigma, scatter = typical_sigma(gnss), scatter_m(context)
     if scatter is None or sigma <= 0.0 or scatter < max(LEAST_SCATTER_M, OVERCONFIDENT * sigma):
         return
     factor = scatter / sigma
@@ -143,10 +143,10 @@ def check_scatter(patient: Patient) -> Iterator[Finding]:
     )
 
 
-def scatter_m(patient: Patient) -> float | None:
+def scatter_m(context: CheckContext) -> float | None:
     """Scatter of the fixes about the path by wheels and gyro, 1 sigma along one axis, without slow errors."""
-    true = next((one for one in places(patient.recording) if one.source == "gnss"), None)
-    windows = compare(patient, true) if true is not None else None
+    true = next((one for one in places(context.recording) if one.source == "gnss"), None)
+    windows = compare(context, true) if true is not None else None
     return float(np.median(windows.scatter_m)) if windows is not None else None
 
 
@@ -157,9 +157,9 @@ def _with_scaled_sigma(recording: Recording, factor: float) -> Recording:
     return dataclasses.replace(recording, gnss=scaled)
 
 
-def check_jumps(patient: Patient) -> Iterator[Finding]:
+def check_jumps(context: CheckContext) -> Iterator[Finding]:
     """Steps between fixes that no drive explains."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     if gnss is None or len(gnss) < 10:
         return
     off, limit = _steps_off(gnss)
@@ -173,7 +173,7 @@ def check_jumps(patient: Patient) -> Iterator[Finding]:
         "warning",
         "gnss",
         f"{jumps.size} jump{'s' if jumps.size > 1 else ''} of position",
-        f"largest {abs(off[worst]):.2f} m at t = {patient.since_start_s(gnss.t_ns[worst + 1]):.2f} s",
+        f"largest {abs(off[worst]):.2f} m at t = {context.since_start_s(gnss.t_ns[worst + 1]):.2f} s",
         f"drop the {int(away.sum())} fixes that are away from the path"
         if closed
         else "multipath or a changed fix; the path does not come back: nothing tells which part is right",
@@ -214,15 +214,15 @@ def _flights(off: NDArray[np.complex128], jumps: NDArray[np.int64], count: int) 
     return away, closed
 
 
-def check_frozen(patient: Patient) -> Iterator[Finding]:
+def check_frozen(context: CheckContext) -> Iterator[Finding]:
     """A position must not stand still, digit for digit, while the wheels roll."""
-    gnss = patient.recording.gnss
-    driven = wheel_speed(patient, patient.wheel_radius_m() or ANY_RADIUS_M)
+    gnss = context.recording.gnss
+    driven = wheel_speed(context, context.wheel_radius_m() or ANY_RADIUS_M)
     if gnss is None or driven is None or len(gnss) < 3:
         return
     t, v = driven
     rolled = np.concatenate([[0.0], np.cumsum(0.5 * np.abs(v[1:] + v[:-1]) * np.diff(t))])
-    t_fix = seconds(gnss.t_ns, patient.recording.start_ns)
+    t_fix = seconds(gnss.t_ns, context.recording.start_ns)
     same = (np.diff(gnss.enu_m[:, :2], axis=0) == 0.0).all(axis=1)
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(int)))
     begins, ends = edges[::2], edges[1::2]  # runs of fixes begins .. ends, both included

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import compare, places
 from terrafusion.datasets.checks.yaw_signals import account, course_agreement, seconds, typical_sigma
 from terrafusion.datasets.core.frames import geodetic_to_enu
@@ -26,14 +26,14 @@ UNIT_ERROR, ANGLE_ERROR, SURE_R = 0.1, np.radians(20.0), 0.8
 CHORD_S = (0.5, 10.0)
 
 
-def check_degrees(patient: Patient) -> Iterator[Finding]:
+def check_degrees(context: CheckContext) -> Iterator[Finding]:
     """Positions must be metres, not latitude and longitude."""
-    gnss = patient.recording.gnss
-    true = next((one for one in places(patient.recording) if one.source == "gnss"), None)
+    gnss = context.recording.gnss
+    true = next((one for one in places(context.recording) if one.source == "gnss"), None)
     if gnss is None or true is None:
         return
     largest = float(max(np.abs(true.place.real).max(), np.abs(true.place.imag).max()))
-    windows = compare(patient, dataclasses.replace(true, sigma_m=0.0)) if largest <= 180.0 else None
+    windows = compare(context, dataclasses.replace(true, sigma_m=0.0)) if largest <= 180.0 else None
     if windows is None:
         return
     ratio = float(np.median(windows.span_ratio))
@@ -42,7 +42,7 @@ def check_degrees(patient: Patient) -> Iterator[Finding]:
         ("radians", 180.0 / np.pi, RADIAN_RATIO),
     ):
         if low < ratio < high and largest * to_degrees <= 180.0:
-            swapped, assumed = _latitude_east(patient, gnss, to_degrees)
+            swapped, assumed = _latitude_east(context, gnss, to_degrees)
             yield Finding(
                 "gnss-degrees",
                 "error",
@@ -56,17 +56,17 @@ def check_degrees(patient: Patient) -> Iterator[Finding]:
             return
 
 
-def _latitude_east(patient: Patient, gnss: Gnss, to_degrees: float) -> tuple[bool, bool]:
+def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tuple[bool, bool]:
     """Whether the latitude stands in the east column, and whether that is only assumed."""
     known = np.abs(gnss.enu_m[np.isfinite(gnss.enu_m[:, :2]).all(axis=1), :2]) * to_degrees
     if known.max(axis=0).max() > 90.0:
         return bool(known[:, 1].max() > 90.0), False
-    imu = patient.recording.imu
-    turned = None if imu is None else account(patient.recording.start_ns, imu.t_ns, imu.gyro_radps[:, 2])
+    imu = context.recording.imu
+    turned = None if imu is None else account(context.recording.start_ns, imu.t_ns, imu.gyro_radps[:, 2])
     if turned is None:
         return False, True
-    metric = _to_metres(patient.recording, to_degrees, swapped=False).gnss
-    both = course_agreement(turned, metric, patient.recording.start_ns) if metric is not None else None
+    metric = _to_metres(context.recording, to_degrees, swapped=False).gnss
+    both = course_agreement(turned, metric, context.recording.start_ns) if metric is not None else None
     if both is None or abs(both.r) < SURE_R:
         return False, True
     return both.r < 0.0, False
@@ -126,11 +126,11 @@ def velocity_fit(gnss: Gnss) -> VelocityFit | None:
     return VelocityFit(straight / uu, abs(straight) / power, mirrored / uu, abs(mirrored) / power)
 
 
-def check_velocity(patient: Patient) -> Iterator[Finding]:
+def check_velocity(context: CheckContext) -> Iterator[Finding]:
     """The receiver's velocities must be the rate of its positions."""
-    gnss = patient.recording.gnss
+    gnss = context.recording.gnss
     fit = velocity_fit(gnss) if gnss is not None else None
-    if gnss is None or fit is None or _mirrored(patient, gnss):
+    if gnss is None or fit is None or _mirrored(context, gnss):
         return
     found = _velocity_fault(fit)
     if found is None:
@@ -144,9 +144,9 @@ def check_velocity(patient: Patient) -> Iterator[Finding]:
     yield Finding("gnss-velocity", "warning", "gnss", f"velocities {what}", evidence, fix, repair)
 
 
-def _mirrored(patient: Patient, gnss: Gnss) -> bool:
+def _mirrored(context: CheckContext, gnss: Gnss) -> bool:
     """Whether it is the positions that turn the wrong way, by the gyro: see turns.check_turns."""
-    imu, start = patient.recording.imu, patient.recording.start_ns
+    imu, start = context.recording.imu, context.recording.start_ns
     turned = None if imu is None else account(start, imu.t_ns, imu.gyro_radps[:, 2])
     both = course_agreement(turned, gnss, start) if turned is not None else None
     return both is not None and both.r < -0.5

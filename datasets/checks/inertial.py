@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient
+from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.mounting import gravity, is_metric
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
@@ -25,9 +25,9 @@ LARGE_BIAS_RADPS, STILL_RADPS = 0.02, 0.05
 (standard deviation of its tenths of a second) is not at rest."""
 
 
-def check_gravity(patient: Patient) -> Iterator[Finding]:
+def check_gravity(context: CheckContext) -> Iterator[Finding]:
     """The mean specific force must be as long as gravity, in m/s2."""
-    mean = gravity(patient)
+    mean = gravity(context)
     if mean is None or is_metric(mean):
         return
     size = float(np.linalg.norm(mean))
@@ -60,10 +60,10 @@ def _to_mps2(recording: Recording) -> Recording:
     return dataclasses.replace(recording, imu=imu)
 
 
-def check_bias(patient: Patient) -> Iterator[Finding]:
+def check_bias(context: CheckContext) -> Iterator[Finding]:
     """The gyro must say next to nothing while the wheels stand."""
-    imu = patient.recording.imu
-    resting = at_rest(patient)
+    imu = context.recording.imu
+    resting = at_rest(context)
     if imu is None or resting.sum() < 50:
         return
     gyro = imu.gyro_radps[resting]
@@ -84,9 +84,9 @@ def check_bias(patient: Patient) -> Iterator[Finding]:
     )
 
 
-def at_rest(patient: Patient) -> NDArray[np.bool_]:
+def at_rest(context: CheckContext) -> NDArray[np.bool_]:
     """Mask (N,) of the IMU's samples inside stretches in which all wheels stand still."""
-    wheels, imu = patient.recording.wheels, patient.recording.imu
+    wheels, imu = context.recording.wheels, context.recording.imu
     if wheels is None or imu is None or len(wheels) < 2:
         return np.zeros(0 if imu is None else len(imu), dtype=bool)
     top = np.nanmax(np.abs(wheels.speed), initial=0.0) if np.isfinite(wheels.speed).any() else 0.0

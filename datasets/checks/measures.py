@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.delays import opposed
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.path import Places, Windows, compare, dead_reckoned, places, scale_of
 from terrafusion.datasets.checks.plausibility import check_magnitude
 from terrafusion.datasets.checks.sensor_pairs import far_lag, near_lag
@@ -130,25 +130,25 @@ def measure(recordings: Sequence[Recording], rig: Rig | None = None) -> Measures
         rig: geometry of the robot; without it and without a wheel radius of the log, wheel rates
             in rad/s are not turned into speeds.
     """
-    patients = [Patient(recording, rig) for recording in recordings]
-    patients = [patient for patient in patients if not list(check_magnitude(patient))]
-    if not patients:
+    contexts = [CheckContext(recording, rig) for recording in recordings]
+    contexts = [context for context in contexts if not list(check_magnitude(context))]
+    if not contexts:
         return Measures()  # numbers beyond anything possible are not computed with
-    lags = tuple(_lags(patients[0])) if len(recordings) == 1 else ()
-    together = [_brought_together(patient, lags) for patient in patients]
+    lags = tuple(_lags(contexts[0])) if len(recordings) == 1 else ()
+    together = [_brought_together(context, lags) for context in contexts]
     return Measures(
-        gravity=_gravity(patients),
+        gravity=_gravity(contexts),
         yaw=_yaw(together),
         speed_ratio=_speed_ratios(together),
         lags=lags,
-        path_m=_paths(patients),
-        sigma_m=_sigma(patients),
-        held=_held(patients),
+        path_m=_paths(contexts),
+        sigma_m=_sigma(contexts),
+        held=_held(contexts),
     )
 
 
-def _gravity(patients: Sequence[Patient]) -> Gravity | None:
-    imus = [p.recording.imu for p in patients]
+def _gravity(contexts: Sequence[CheckContext]) -> Gravity | None:
+    imus = [p.recording.imu for p in contexts]
     readings = [imu.accel_mps2 for imu in imus if imu is not None and imu.has_accel()]
     if not readings:
         return None
@@ -162,8 +162,8 @@ def _gravity(patients: Sequence[Patient]) -> Gravity | None:
     return Gravity((x, y, z), size, f"{'+' if mean[k] > 0 else '-'}{'xyz'[k]}", float(tilt))
 
 
-def _yaw(patients: Sequence[Patient]) -> YawFit | None:
-    pairs = [pair for patient in patients if (pair := _yaw_pair(patient)) is not None]
+def _yaw(contexts: Sequence[CheckContext]) -> YawFit | None:
+    pairs = [pair for context in contexts if (pair := _yaw_pair(context)) is not None]
     if not pairs:
         return None
     turn, rate = (np.concatenate([pair[k] for pair in pairs]) for k in range(2))
@@ -171,14 +171,14 @@ def _yaw(patients: Sequence[Patient]) -> YawFit | None:
         return None
     covariance = np.cov(turn, rate)
     r = float(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]))
-    metric = all(patient.wheel_radius_m() is not None for patient in patients)
+    metric = all(context.wheel_radius_m() is not None for context in contexts)
     track = float(covariance[0, 1] / covariance[1, 1]) if metric and abs(r) > LEAST_TRACK_R else None
     return YawFit(r, track, len(turn) * WINDOW_S)
 
 
-def _yaw_pair(patient: Patient) -> tuple[Array, Array] | None:
+def _yaw_pair(context: CheckContext) -> tuple[Array, Array] | None:
     """Half-second means of right less left wheel speed and of gyro z, each (N,)."""
-    known = accounts(patient)
+    known = accounts(context)
     if "wheels" not in known or "gyro" not in known:
         return None
     wheels, gyro = known["wheels"], known["gyro"]
@@ -187,15 +187,15 @@ def _yaw_pair(patient: Patient) -> tuple[Array, Array] | None:
     return (wheels.rates(grid), gyro.rates(grid)) if len(grid) > 1 else None
 
 
-def _speed_ratios(patients: Sequence[Patient]) -> dict[str, Ratio]:
+def _speed_ratios(contexts: Sequence[CheckContext]) -> dict[str, Ratio]:
     found: dict[str, Ratio] = {}
     for source in ("gnss", "truth"):
         parts = [
             windows
-            for patient in patients
-            for true in places(patient.recording)
+            for context in contexts
+            for true in places(context.recording)
             if true.source == source
-            and (windows := compare(patient, true) or _whole(patient, true)) is not None
+            and (windows := compare(context, true) or _whole(context, true)) is not None
         ]
         if not parts:
             continue
@@ -209,9 +209,9 @@ def _speed_ratios(patients: Sequence[Patient]) -> dict[str, Ratio]:
     return found
 
 
-def _whole(patient: Patient, true: Places) -> Windows | None:
+def _whole(context: CheckContext, true: Places) -> Windows | None:
     """A recording too short for windows as one window; see `path.compare`."""
-    reckoned = dead_reckoned(patient)
+    reckoned = dead_reckoned(context)
     if reckoned is None:
         return None
     t, _, path = reckoned
@@ -233,12 +233,12 @@ def _whole(patient: Patient, true: Places) -> Windows | None:
     )
 
 
-def _lags(patient: Patient) -> Iterator[PairLag]:
+def _lags(context: CheckContext) -> Iterator[PairLag]:
     """Lags between the channels of `LAG_PAIRS` that are there."""
-    radius = patient.wheel_radius_m() or 1.0
+    radius = context.wheel_radius_m() or 1.0
     told = {
-        "yaw rate": yaw_rates(patient.recording, radius),
-        "speed": speeds(patient.recording, radius),
+        "yaw rate": yaw_rates(context.recording, radius),
+        "speed": speeds(context.recording, radius),
     }
     for quantity, pairs in LAG_PAIRS.items():
         signals = told[quantity]
@@ -256,30 +256,30 @@ def _lags(patient: Patient) -> Iterator[PairLag]:
                 yield PairLag(quantity, other, one, -late, -high, -low, lag.r)
 
 
-def _brought_together(patient: Patient, lags: Sequence[PairLag]) -> Patient:
-    """The patient with the wheels' times brought onto the clock that their lag was measured against."""
-    wheels = patient.recording.wheels
+def _brought_together(context: CheckContext, lags: Sequence[PairLag]) -> CheckContext:
+    """The context with the wheels' times brought onto the clock that their lag was measured against."""
+    wheels = context.recording.wheels
     lag = next(
         (lag for lag in lags if "wheels" in (lag.earlier, lag.later) and lag.earlier != "command"), None
     )
     if wheels is None or lag is None:
-        return patient
+        return context
     late_ns = round((lag.seconds if lag.later == "wheels" else -lag.seconds) * 1e9)
     moved = dataclasses.replace(wheels, t_ns=wheels.t_ns - late_ns)
-    return dataclasses.replace(patient, recording=dataclasses.replace(patient.recording, wheels=moved))
+    return dataclasses.replace(context, recording=dataclasses.replace(context.recording, wheels=moved))
 
 
-def _paths(patients: Sequence[Patient]) -> dict[str, float]:
+def _paths(contexts: Sequence[CheckContext]) -> dict[str, float]:
     """Lengths of path by channel, summed over the recordings."""
     total: dict[str, float] = {}
-    for patient in patients:
-        for name, length in _path_lengths(patient):
+    for context in contexts:
+        for name, length in _path_lengths(context):
             total[name] = total.get(name, 0.0) + length
     return total
 
 
-def _path_lengths(patient: Patient) -> Iterator[tuple[str, float]]:
-    recording, radius = patient.recording, patient.wheel_radius_m()
+def _path_lengths(context: CheckContext) -> Iterator[tuple[str, float]]:
+    recording, radius = context.recording, context.wheel_radius_m()
     wheels, gnss, truth = recording.wheels, recording.gnss, recording.truth
     if wheels is not None and radius is not None and len(wheels) > 1:
         v = np.nan_to_num(np.abs(wheels.side_speeds_mps(radius).mean(axis=1)))
@@ -308,8 +308,8 @@ def _ruler_path_m(position_m: Array, ruler_m: float) -> float:
     return length + step
 
 
-def _sigma(patients: Sequence[Patient]) -> Sigma | None:
-    sigmas = [p.recording.gnss.sigma_enu_m[:, :2].ravel() for p in patients if p.recording.gnss is not None]
+def _sigma(contexts: Sequence[CheckContext]) -> Sigma | None:
+    sigmas = [p.recording.gnss.sigma_enu_m[:, :2].ravel() for p in contexts if p.recording.gnss is not None]
     known = np.concatenate([np.zeros(0), *sigmas])
     known = known[np.isfinite(known)]
     if not known.size:
@@ -317,11 +317,11 @@ def _sigma(patients: Sequence[Patient]) -> Sigma | None:
     return Sigma(float(known.min()), float(np.median(known)), float(known.max()))
 
 
-def _held(patients: Sequence[Patient]) -> dict[str, Updates]:
+def _held(contexts: Sequence[CheckContext]) -> dict[str, Updates]:
     """Channels that hold their values, by the median over the recordings."""
     rates: dict[str, list[tuple[float, float]]] = {}
-    for patient in patients:
-        for name, t_ns, values in _sensed(patient.recording):
+    for context in contexts:
+        for name, t_ns, values in _sensed(context.recording):
             span_s = float(t_ns[-1] - t_ns[0]) * 1e-9 if len(t_ns) > 1 else 0.0
             rows = held_rows(values)
             if span_s > 0.0 and rows > 1:

@@ -15,7 +15,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, wheel_speed
 from terrafusion.datasets.checks.yaw_signals import Account, account, accounts, agreement
 from terrafusion.datasets.core.conventions import Conventions, apply
@@ -41,9 +41,9 @@ LEAST_ACCEL = 0.02
 """m/s2; a drive more even than this tells nothing."""
 
 
-def gravity(patient: Patient) -> Array | None:
+def gravity(context: CheckContext) -> Array | None:
     """Mean specific force (3,), m/s2, where all three axes are known."""
-    imu = patient.recording.imu
+    imu = context.recording.imu
     if imu is None or not imu.has_accel() or len(imu) < 10:
         return None
     return np.asarray(np.nanmean(imu.accel_mps2, axis=0))
@@ -54,9 +54,9 @@ def is_metric(mean: Array) -> bool:
     return bool(0.85 * GRAVITY_MPS2 < np.linalg.norm(mean) < 1.15 * GRAVITY_MPS2)
 
 
-def stands_up(patient: Patient) -> bool:
+def stands_up(context: CheckContext) -> bool:
     """Whether gravity, where it is known, stands on +z."""
-    mean = gravity(patient)
+    mean = gravity(context)
     return mean is None or bool(mean[2] >= MOST_TILT * np.linalg.norm(mean))
 
 
@@ -75,19 +75,19 @@ class Heading:
     turn: float
 
 
-def heading_of(patient: Patient, accel: Array, yaw_rate: Array) -> Heading | None:
+def heading_of(context: CheckContext, accel: Array, yaw_rate: Array) -> Heading | None:
     """How the horizontal specific force answers the changes of speed and the turns.
 
     Args:
-        patient: gives the wheels and the IMU's times.
+        context: gives the wheels and the IMU's times.
         accel: (N, 2) horizontal specific force, m/s2, the second axis left of the first.
         yaw_rate: (N,) about the upward axis, rad/s.
 
     Returns:
         None where the drive does not tell: too short, too even, too noisy.
     """
-    imu, start = patient.recording.imu, patient.recording.start_ns
-    driven = wheel_speed(patient, patient.wheel_radius_m() or ANY_RADIUS_M)
+    imu, start = context.recording.imu, context.recording.start_ns
+    driven = wheel_speed(context, context.wheel_radius_m() or ANY_RADIUS_M)
     if imu is None or driven is None:
         return None
     t_wheel, v = driven
@@ -123,29 +123,29 @@ def _lively(values: Array | NDArray[np.complex128]) -> NDArray[np.complex128]:
     return np.asarray(values - np.convolve(values, kernel, "same") / count)
 
 
-def turning_axis(patient: Patient) -> str | None:
+def turning_axis(context: CheckContext) -> str | None:
     """The axis of the gyro, with its sign, that turns as the wheels (else the truth) do."""
-    imu, known = patient.recording.imu, accounts(patient)
+    imu, known = context.recording.imu, accounts(context)
     other = known.get("wheels") or known.get("truth")
     if imu is None or other is None:
         return None
     best, name = 0.0, None
     for k, axis in enumerate("xyz"):
-        turned = account(patient.recording.start_ns, imu.t_ns, imu.gyro_radps[:, k])
+        turned = account(context.recording.start_ns, imu.t_ns, imu.gyro_radps[:, k])
         both = agreement(turned, other) if turned is not None else None
         if both is not None and both.is_sure() and abs(both.r) > best:
             best, name = abs(both.r), f"{'+' if both.r > 0 else '-'}{axis}"
     return name
 
 
-def check_axes(patient: Patient) -> Iterator[Finding]:
+def check_axes(context: CheckContext) -> Iterator[Finding]:
     """Gravity must stand on +z, and the specific force must answer the wheels along +x and +y."""
-    mean, imu = gravity(patient), patient.recording.imu
+    mean, imu = gravity(context), context.recording.imu
     if mean is None or imu is None or not is_metric(mean):
         return
     evidence = f"mean specific force ({mean[0]:.2f}, {mean[1]:.2f}, {mean[2]:.2f}) m/s2"
-    if stands_up(patient):
-        yield from _check_forward(patient)
+    if stands_up(context):
+        yield from _check_forward(context)
         return
     k = int(np.argmax(np.abs(mean)))
     up = f"{'+' if mean[k] > 0 else '-'}{'xyz'[k]}"
@@ -153,32 +153,32 @@ def check_axes(patient: Patient) -> Iterator[Finding]:
         what, fix, repair = "gravity lies between the axes", "rotate the IMU to x forward, y left, z up", None
     else:
         what = f"gravity stands on {up}, not on +z"
-        told, fix, repair = _uprighted(patient, imu, up)
+        told, fix, repair = _uprighted(context, imu, up)
         evidence += told
     yield Finding("imu-axes", "error", "imu", what, evidence, fix, repair)
 
 
-def _uprighted(patient: Patient, imu: Imu, up: str) -> tuple[str, str, Repair]:
+def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repair]:
     """What else the data tell of the mounting, what to do, and the repair."""
-    turning = turning_axis(patient)
+    turning = turning_axis(context)
     alone = turning == "+z"  # the gyro is right as it is: the accelerometer has axes of its own
     if alone and up == "-z":
         return "; gyro z turns with the wheels", "change the sign of the specific force", _negated
-    axes, told = _axes_for(patient, imu, up, alone)
+    axes, told = _axes_for(context, imu, up, alone)
     said = f"turn the {'accelerometer' if alone else 'IMU'} so that {', '.join(axes)} point forward, left, up"
     if turning is not None:
         told = f"; the gyro turns with the wheels about {turning}{told}"
     return told, said, lambda recording: _turned(recording, axes, gyro=not alone)
 
 
-def _axes_for(patient: Patient, imu: Imu, up: str, alone: bool) -> tuple[Axes, str]:
+def _axes_for(context: CheckContext, imu: Imu, up: str, alone: bool) -> tuple[Axes, str]:
     """The axes with z `up` that the drive determines, else those nearest to the log's; and which it was."""
     choices = [axes for axes in _all_axes() if axes[2] == up]
     nearest = max(choices, key=lambda axes: (np.trace(axes_matrix(axes)), axes[0] == "+x"))
     R = axes_matrix(nearest)
     accel = imu.accel_mps2 @ R.T
     rate = imu.gyro_radps[:, 2] if alone else _column(imu.gyro_radps, up)
-    found = heading_of(patient, accel[:, :2], rate)
+    found = heading_of(context, accel[:, :2], rate)
     if found is None or found.angle is None:
         return nearest, "; nothing tells which axis is forward: the nearest rotation is assumed"
     quarter = round(found.angle / (0.5 * np.pi)) % 4
@@ -187,21 +187,21 @@ def _axes_for(patient: Patient, imu: Imu, up: str, alone: bool) -> tuple[Axes, s
     return axes, f"; acceleration follows the wheels along {axes[0]}"
 
 
-def heading(patient: Patient) -> Heading | None:
+def heading(context: CheckContext) -> Heading | None:
     """`heading_of` the IMU's x and y, with its gyro z."""
-    imu = patient.recording.imu
-    if imu is None or not stands_up(patient):
+    imu = context.recording.imu
+    if imu is None or not stands_up(context):
         return None
-    return heading_of(patient, imu.accel_mps2[:, :2], imu.gyro_radps[:, 2])
+    return heading_of(context, imu.accel_mps2[:, :2], imu.gyro_radps[:, 2])
 
 
-def _check_forward(patient: Patient) -> Iterator[Finding]:
-    found = heading(patient)
+def _check_forward(context: CheckContext) -> Iterator[Finding]:
+    found = heading(context)
     angle = found.angle if found is not None else None
     if angle is None or abs(angle) < 0.25 * np.pi:
         return
     quarter = round(angle / (0.5 * np.pi)) % 4
-    if quarter == 2 and wheels_turn_backwards(patient):
+    if quarter == 2 and wheels_turn_backwards(context):
         return  # one fault explains both: see wheels.check_direction
     off = abs(np.angle(np.exp(1j * (angle - 0.5 * np.pi * quarter))))
     axes = {1: ("-y", "+x", "+z"), 2: ("-x", "-y", "+z"), 3: ("+y", "-x", "+z")}.get(quarter)
@@ -219,11 +219,11 @@ def _check_forward(patient: Patient) -> Iterator[Finding]:
     )
 
 
-def wheels_turn_backwards(patient: Patient) -> bool:
+def wheels_turn_backwards(context: CheckContext) -> bool:
     """Whether the wheels turn against gyro z; on a straight drive, whether they mostly run backwards."""
-    driven = wheel_speed(patient, patient.wheel_radius_m() or ANY_RADIUS_M)
-    wheels = patient.recording.wheels
-    axis = turning_axis(patient) if wheels is not None and wheels.has_sides() else None
+    driven = wheel_speed(context, context.wheel_radius_m() or ANY_RADIUS_M)
+    wheels = context.recording.wheels
+    axis = turning_axis(context) if wheels is not None and wheels.has_sides() else None
     return axis == "-z" or (axis is None and driven is not None and float(driven[1].mean()) < 0.0)
 
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.signals import Group, groups_of, stuck_cells
 from terrafusion.datasets.core.recording import Recording
 
@@ -28,10 +28,10 @@ FLOORS = {"gyro_radps": (0.5, 30.0), "accel_mps2": (150.0, 0.0), "speed": (0.5, 
 wheel shakes a Husky by 100 m/s2 for one sample of 100 Hz (BorealTC)."""
 
 
-def check_saturated(patient: Patient) -> Iterator[Finding]:
+def check_saturated(context: CheckContext) -> Iterator[Finding]:
     """Inertial sensors must not stand at the end of their range."""
     found = []
-    for group in groups_of(patient.recording):
+    for group in groups_of(context.recording):
         mask = _clipped(group) if group.channel == "imu" else np.zeros(0, dtype=bool)
         if mask.any():
             found.append((group, mask))
@@ -95,14 +95,14 @@ def _emptied(cells: list[tuple[str, Mask]]) -> Repair:
     return repair
 
 
-def check_spikes(patient: Patient) -> Iterator[Finding]:
+def check_spikes(context: CheckContext) -> Iterator[Finding]:
     """Single samples far from those before and after."""
     found: dict[str, Mask] = {}
     largest: dict[str, tuple[float, str, int]] = {}
-    for group in groups_of(patient.recording):
+    for group in groups_of(context.recording):
         if len(group.t_ns) < 4 * NEAR_ROWS:
             continue
-        unit = (patient.wheel_radius_m() or 0.15) if group.field == "speed" else 1.0
+        unit = (context.wheel_radius_m() or 0.15) if group.field == "speed" else 1.0
         least, rate = FLOORS[group.field]
         floor = max(least, rate * float(np.median(np.diff(group.t_ns))) * 1e-9) / unit
         for k in group.known():
@@ -118,7 +118,7 @@ def check_spikes(patient: Patient) -> Iterator[Finding]:
             continue
         size_, name, row = largest[channel]
         count = int(mask.sum())
-        at_s = patient.since_start_s(getattr(patient.recording, channel).t_ns[row])
+        at_s = context.since_start_s(getattr(context.recording, channel).t_ns[row])
 
         def repair(recording: Recording, channel: str = channel, mask: Mask = mask) -> Recording:
             return dataclasses.replace(recording, **{channel: getattr(recording, channel).select(~mask)})

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.yaw_signals import account, seconds, typical_sigma
 from terrafusion.datasets.core.recording import Recording
 
@@ -90,34 +90,34 @@ def places(recording: Recording) -> list[Places]:
     return [one for one in found if len(one.t_s) >= 2 * LEAST_FIXES]
 
 
-def wheel_speed(patient: Patient, radius_m: float | None) -> tuple[Array, Array] | None:
+def wheel_speed(context: CheckContext, radius_m: float | None) -> tuple[Array, Array] | None:
     """Times (N,) s since the start and mean speed (N,) m/s of both sides; None where it is not known."""
-    wheels = patient.recording.wheels
+    wheels = context.recording.wheels
     if wheels is None or radius_m is None:
         return None
     speed = wheels.side_speeds_mps(radius_m).mean(axis=1)
     known = np.isfinite(speed)
     if known.sum() < 10:
         return None
-    return seconds(wheels.t_ns[known], patient.recording.start_ns), speed[known]
+    return seconds(wheels.t_ns[known], context.recording.start_ns), speed[known]
 
 
-def dead_reckoned(patient: Patient, point_m: complex = 0j) -> tuple[Array, Array, Complex] | None:
+def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, Array, Complex] | None:
     """The way by wheels and gyro z; straight ahead without a gyro.
 
     Args:
-        patient: the recording and what is known of its wheels.
+        context: the recording and what is known of its wheels.
         point_m: place in the body (forward + i left) whose path is wanted.
 
     Returns:
         Times (N,) s since the start, way rolled (N,) m, and positions (N,) m, east + i north, of a
         robot that starts eastwards; None where wheels or their radius lack.
     """
-    imu, driven = patient.recording.imu, wheel_speed(patient, patient.wheel_radius_m())
+    imu, driven = context.recording.imu, wheel_speed(context, context.wheel_radius_m())
     if driven is None:
         return None
     t, v = driven
-    turned = None if imu is None else account(patient.recording.start_ns, imu.t_ns, imu.gyro_radps[:, 2])
+    turned = None if imu is None else account(context.recording.start_ns, imu.t_ns, imu.gyro_radps[:, 2])
     heading = np.zeros(len(t))
     if turned is not None:
         within = (t >= turned.t_s[0]) & (t <= turned.t_s[-1])
@@ -131,9 +131,9 @@ def dead_reckoned(patient: Patient, point_m: complex = 0j) -> tuple[Array, Array
     return t, rolled, np.concatenate([[0.0], np.cumsum(steps)]) + point_m * ahead
 
 
-def compare(patient: Patient, true: Places) -> Windows | None:
+def compare(context: CheckContext, true: Places) -> Windows | None:
     """Fit the dead-reckoned path to the positions window by window; None where too few can be used."""
-    reckoned = dead_reckoned(patient, _antenna(patient) if true.source == "gnss" else 0j)
+    reckoned = dead_reckoned(context, _antenna(context) if true.source == "gnss" else 0j)
     if reckoned is None:
         return None
     t, rolled, path = reckoned
@@ -159,9 +159,9 @@ def _crude_scale(t: Array, rolled: Array, t_fix: Array, g: Complex) -> float:
     return ratio if WHEEL_UNITS[0] < ratio < WHEEL_UNITS[1] else 1.0
 
 
-def _antenna(patient: Patient) -> complex:
-    rig = patient.rig
-    arm = patient.recording.overrides.antenna_m or (rig.sensors.gnss.antenna_m if rig else None)
+def _antenna(context: CheckContext) -> complex:
+    rig = context.rig
+    arm = context.recording.overrides.antenna_m or (rig.sensors.gnss.antenna_m if rig else None)
     return complex(arm[0], arm[1]) if arm is not None else 0j
 
 
@@ -201,11 +201,11 @@ def scale_of(windows: Windows, source: str) -> Scale | None:
     return Scale(float(np.sum(weight * scale) / weight.sum()), low, high, int(use.sum()), source)
 
 
-def scales(patient: Patient) -> list[tuple[Scale, Windows]]:
+def scales(context: CheckContext) -> list[tuple[Scale, Windows]]:
     """The scale by every source of positions that allows one."""
     found = []
-    for true in places(patient.recording):
-        windows = compare(patient, true)
+    for true in places(context.recording):
+        windows = compare(context, true)
         scale = scale_of(windows, true.source) if windows is not None else None
         if windows is not None and scale is not None:
             found.append((scale, windows))

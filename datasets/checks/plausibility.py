@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
@@ -38,10 +38,10 @@ LIMITS = {
 (4000 deg/s), accelerometers at 2000 m/s2 (200 g); projected coordinates at 1e7 m."""
 
 
-def check_magnitude(patient: Patient) -> Iterator[Finding]:
+def check_magnitude(context: CheckContext) -> Iterator[Finding]:
     """Numbers that no robot reaches: a wrong unit, or memory read as numbers."""
-    yield from _check_duration(patient)
-    for name, (t_ns, bad) in _beyond(patient.recording).items():
+    yield from _check_duration(context)
+    for name, (t_ns, bad) in _beyond(context.recording).items():
         if not bad:
             continue
         rows = np.logical_or.reduce([over for _, over, _ in bad])
@@ -53,18 +53,18 @@ def check_magnitude(patient: Patient) -> Iterator[Finding]:
             "error",
             name,
             f"{column} is {values[first]:g}, beyond anything possible",
-            f"at t = {patient.since_start_s(t_ns[first]):.3f} s; {int(over.sum())} of {len(over)} values "
+            f"at t = {context.since_start_s(t_ns[first]):.3f} s; {int(over.sum())} of {len(over)} values "
             f"beyond {limit:g}" + (f", {int(rows.sum())} rows in all" if len(bad) > 1 else ""),
             "leave these rows out" if few else "is the unit right? too many rows are wrong to leave them out",
             _without_rows(name) if few else None,
         )
 
 
-def _check_duration(patient: Patient) -> Iterator[Finding]:
+def _check_duration(context: CheckContext) -> Iterator[Finding]:
     """A channel that lasts longer than any drive has a leap in its times, or another unit of them."""
-    clocks = {name: channel.t_ns for name, channel in patient.recording.channels().items()}
-    if patient.recording.truth is not None and len(patient.recording.truth):
-        clocks["truth"] = patient.recording.truth.t_ns
+    clocks = {name: channel.t_ns for name, channel in context.recording.channels().items()}
+    if context.recording.truth is not None and len(context.recording.truth):
+        clocks["truth"] = context.recording.truth.t_ns
     for name, t_ns in clocks.items():
         days = (float(t_ns[-1]) - float(t_ns[0])) * 1e-9 / 86400.0
         if days > LONGEST_DAYS:
@@ -75,7 +75,7 @@ def _check_duration(patient: Patient) -> Iterator[Finding]:
                 "error",
                 name,
                 f"its times span {days:.0f} days",
-                f"longest interval {leap_s:.3g} s after t = {patient.since_start_s(t_ns[row]):.3f} s",
+                f"longest interval {leap_s:.3g} s after t = {context.since_start_s(t_ns[row]):.3f} s",
                 "is the unit of time right? split the log where the clock leaps",
             )
 

@@ -1,4 +1,4 @@
-"""`examine` a recording, and `treat` what it finds."""
+"""`run_checks` a recording, and `repair` what it finds."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from terrafusion.datasets.checks import (
     wheels,
 )
 from terrafusion.datasets.checks import yaw_agreement as turns
-from terrafusion.datasets.checks.finding import Finding, Patient
+from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.plausibility import check_magnitude
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
-Check = Callable[[Patient], Iterator[Finding]]
+Check = Callable[[CheckContext], Iterator[Finding]]
 
 CHECKS: tuple[Check, ...] = (
     timing.check_spans,
@@ -76,19 +76,19 @@ MAX_ROUNDS = 20
 SEVERAL = ("wheel-odd", "clock-jump")
 
 
-def examine(recording: Recording, rig: Rig | None = None) -> list[Finding]:
+def run_checks(recording: Recording, rig: Rig | None = None) -> list[Finding]:
     """All findings of all checks, errors first.
 
     Args:
         recording: the drive.
         rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
     """
-    patient = Patient(recording, rig)
-    findings = list(check_magnitude(patient))
+    context = CheckContext(recording, rig)
+    findings = list(check_magnitude(context))
     if not findings:  # the others would compute with impossible numbers
-        findings = [finding for check in CHECKS for finding in check(patient)]
+        findings = [finding for check in CHECKS for finding in check(context)]
     elif _may_be_units(recording, findings):
-        units = [finding for check in UNIT_CHECKS for finding in check(patient) if finding.code in UNIT_CODES]
+        units = [finding for check in UNIT_CHECKS for finding in check(context) if finding.code in UNIT_CODES]
         explained = {finding.channel for finding in units}
         findings = units + [finding for finding in findings if finding.channel not in explained]
     return sorted(findings, key=lambda finding: finding.severity != "error")
@@ -110,22 +110,22 @@ def _fault(finding: Finding) -> tuple[str, str, str]:
     return finding.code, finding.channel, finding.what if finding.code in SEVERAL else ""
 
 
-def treat(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:
+def repair(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:
     """Make the repairs that the findings propose, one after the other, looking again after each.
 
     Returns:
         The mended recording, with a note for every repair, and the findings that were mended, in
-        the order of their repairs. What `examine` still finds afterwards nobody could mend.
+        the order of their repairs. What `run_checks` still finds afterwards nobody could mend.
     """
     mended: list[Finding] = []
     for _ in range(MAX_ROUNDS):
         done = {_fault(finding) for finding in mended}
-        open_findings = [f for f in examine(recording, rig) if f.repair and _fault(f) not in done]
+        open_findings = [f for f in run_checks(recording, rig) if f.repair and _fault(f) not in done]
         if not open_findings:
             break
         first = open_findings[0]
         assert first.repair is not None
-        note = f"mended: {first.channel}: {first.what} ({first.evidence}); {first.fix}"
+        note = f"repaired: {first.channel}: {first.what} ({first.evidence}); {first.fix}"
         recording = first.repair(recording).with_notes(note)
         mended.append(first)
     return recording, mended

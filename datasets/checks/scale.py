@@ -9,7 +9,7 @@ from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import Scale, scales, wheel_speed
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import TERRAINS, Recording
@@ -43,10 +43,10 @@ UNITS = {
 }
 
 
-def check_speed_scale(patient: Patient) -> Iterator[Finding]:
+def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
     """Wheel speed against the speed over ground: a unit, a radius, or slip."""
-    wheels, radius = patient.recording.wheels, patient.wheel_radius_m()
-    found = scales(patient)
+    wheels, radius = context.recording.wheels, context.wheel_radius_m()
+    found = scales(context)
     if wheels is None or radius is None or not found:
         return
     scale, windows = min(found, key=lambda both: both[0].high - both[0].low)
@@ -55,8 +55,8 @@ def check_speed_scale(patient: Patient) -> Iterator[Finding]:
     )
     if scale.source == "truth":
         evidence += "; scores against this truth are then not independent of it"
-    commanded = command_ratio(patient)
-    units = _units(patient, scale, float(np.std(windows.scale) / np.median(windows.scale)), commanded)
+    commanded = command_ratio(context)
+    units = _units(context, scale, float(np.std(windows.scale) / np.median(windows.scale)), commanded)
     if units:
         factor = units[0].factor
         names = " or ".join(unit.name for unit in units)
@@ -70,8 +70,8 @@ def check_speed_scale(patient: Patient) -> Iterator[Finding]:
             partial(_scaled, factor=factor) if len(units) == 1 else None,
         )
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
-        yield _too_small(patient, scale, evidence, wheels.unit, radius)
-    elif scale.ratio < SMALL and is_firm(patient.recording):
+        yield _too_small(context, scale, evidence, wheels.unit, radius)
+    elif scale.ratio < SMALL and is_firm(context.recording):
         yield Finding(
             "wheel-scale",
             "warning",
@@ -82,8 +82,8 @@ def check_speed_scale(patient: Patient) -> Iterator[Finding]:
         )
 
 
-def _too_small(patient: Patient, scale: Scale, evidence: str, unit: str, radius: float) -> Finding:
-    downhill = _descent(patient.recording) > STEEPEST
+def _too_small(context: CheckContext, scale: Scale, evidence: str, unit: str, radius: float) -> Finding:
+    downhill = _descent(context.recording) > STEEPEST
     mended = radius * scale.ratio
     if scale.ratio > LARGEST_RADIUS_ERROR or downhill:
         repair: Repair | None = None
@@ -100,16 +100,16 @@ def _too_small(patient: Patient, scale: Scale, evidence: str, unit: str, radius:
     return Finding("wheel-radius", "warning", "wheels", what, evidence, fix, repair)
 
 
-def command_ratio(patient: Patient) -> float | None:
+def command_ratio(context: CheckContext) -> float | None:
     """Commanded speed over wheel speed, by least squares; None without a command they follow."""
-    driven, command = wheel_speed(patient, patient.wheel_radius_m()), patient.recording.command
+    driven, command = wheel_speed(context, context.wheel_radius_m()), context.recording.command
     if driven is None or command is None:
         return None
     known = np.isfinite(command.v_mps)
     if known.sum() < 10:
         return None
     t, v = driven
-    asked = np.interp(t, (command.t_ns[known] - patient.recording.start_ns) * 1e-9, command.v_mps[known])
+    asked = np.interp(t, (command.t_ns[known] - context.recording.start_ns) * 1e-9, command.v_mps[known])
     power = float(np.sum(v**2)), float(np.sum(asked**2))
     if min(power) <= 0.0:
         return None
@@ -117,17 +117,17 @@ def command_ratio(patient: Patient) -> float | None:
     return float(np.sqrt(power[1] / power[0])) if r > 0.8 else None
 
 
-def _units(patient: Patient, scale: Scale, spread: float, commanded: float | None) -> list[Unit]:
+def _units(context: CheckContext, scale: Scale, spread: float, commanded: float | None) -> list[Unit]:
     """The units that explain the ratio, where slip does not."""
-    wheels, radius = patient.recording.wheels, patient.wheel_radius_m()
+    wheels, radius = context.recording.wheels, context.wheel_radius_m()
     assert wheels is not None
     assert radius is not None
     units = list(UNITS[wheels.unit])
     if wheels.unit == "radps":
         units.append(Unit("m/s", 1.0 / radius))
     else:
-        rig = patient.rig
-        own = patient.recording.overrides.wheel_radius_m or (rig.wheel_radius_m if rig else None)
+        rig = context.rig
+        own = context.recording.overrides.wheel_radius_m or (rig.wheel_radius_m if rig else None)
         units += [Unit("rad/s", own)] if own is not None else []
     fitting = [unit for unit in units if abs(scale.ratio / unit.factor - 1.0) < UNIT_ERROR]
     if commanded is not None:

@@ -10,7 +10,7 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.yaw_sources import Signal, speeds, yaw_rates
 from terrafusion.datasets.core.lag import Lag, lag_between
 from terrafusion.datasets.core.recording import Recording
@@ -30,13 +30,13 @@ FAR_R = 0.87
 """A lag far off counts where the correlation is this high."""
 
 
-def signal_pairs(patient: Patient) -> Pairs:
+def signal_pairs(context: CheckContext) -> Pairs:
     """The accounts of one quantity by two channels, for all pairs that are there."""
-    radius = patient.wheel_radius_m() or 1.0
+    radius = context.wheel_radius_m() or 1.0
     found = {}
     for accounts, pairs in (
-        (yaw_rates(patient.recording, radius), YAW_PAIRS),
-        (speeds(patient.recording, radius), SPEED_PAIRS),
+        (yaw_rates(context.recording, radius), YAW_PAIRS),
+        (speeds(context.recording, radius), SPEED_PAIRS),
     ):
         for one, other in pairs:
             if one in accounts and other in accounts:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.yaw_sources import yaw_rates
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
@@ -58,9 +58,9 @@ def groups_of(recording: Recording) -> list[Group]:
     return found
 
 
-def check_held(patient: Patient) -> Iterator[Finding]:
+def check_held(context: CheckContext) -> Iterator[Finding]:
     """Values repeated between true samples: the rate of the log is not the rate of the sensor."""
-    for name, channel in patient.recording.channels().items():
+    for name, channel in context.recording.channels().items():
         values = _sensed(channel)
         share, run = _held_share(channel.t_ns, values)
         rows = held_rows(values)
@@ -114,16 +114,16 @@ def _held_share(t_ns: TimesNs, values: Array) -> tuple[float, float]:
     return share, 1.0 / max(1.0 - share, 1e-3)
 
 
-def check_stuck(patient: Patient) -> Iterator[Finding]:
+def check_stuck(context: CheckContext) -> Iterator[Finding]:
     """Axes that keep one value while the others of their sensor move."""
     stuck: dict[str, list[tuple[Group, Mask]]] = {}
-    for group in groups_of(patient.recording):
+    for group in groups_of(context.recording):
         mask = stuck_cells(group)
         if mask.any():
             stuck.setdefault(group.channel, []).append((group, mask))
     for channel, found in stuck.items():
         said = [
-            _told(patient, group, mask, k)
+            _told(context, group, mask, k)
             for group, mask in found
             for k in np.flatnonzero(mask.any(axis=0)).tolist()
         ]
@@ -138,9 +138,9 @@ def check_stuck(patient: Patient) -> Iterator[Finding]:
         )
 
 
-def _told(patient: Patient, group: Group, mask: Mask, k: int) -> tuple[str, str]:
+def _told(context: CheckContext, group: Group, mask: Mask, k: int) -> tuple[str, str]:
     rows = np.flatnonzero(mask[:, k])
-    first, last = (patient.since_start_s(group.t_ns[row]) for row in (rows[0], rows[-1]))
+    first, last = (context.since_start_s(group.t_ns[row]) for row in (rows[0], rows[-1]))
     return group.names[
         k
     ], f"{group.names[k]} is {group.values[rows[0], k]:.4g} from {first:.2f} to {last:.2f} s"
@@ -230,9 +230,9 @@ def _without(cells: list[tuple[str, Mask]], channel: str) -> Repair:
     return repair
 
 
-def check_dead(patient: Patient) -> Iterator[Finding]:
+def check_dead(context: CheckContext) -> Iterator[Finding]:
     """Sensors that say nothing all along while the robot moves."""
-    recording = patient.recording
+    recording = context.recording
     imu, wheels = recording.imu, recording.wheels
     if wheels is not None and len(wheels) >= STUCK_ROWS and not np.nan_to_num(wheels.speed).any():
         extent_m = _extent_m(recording)
@@ -250,7 +250,7 @@ def check_dead(patient: Patient) -> Iterator[Finding]:
         return
     constant = [bool((v[1:] == v[:-1]).all()) for v in imu.gyro_radps.T if np.isfinite(v).any()]
     lively = [bool((v[1:] != v[:-1]).mean() > 0.5) for v in imu.accel_mps2.T if np.isfinite(v).any()]
-    turn = _turn_radps(patient)
+    turn = _turn_radps(context)
     still = (
         wheels is not None
         and not np.nan_to_num(wheels.speed).any()
@@ -286,16 +286,16 @@ def _diagonal_m(position_m: Array) -> float:
     return float(np.hypot(*np.ptp(known, axis=0))) if len(known) else 0.0
 
 
-def _turn_radps(patient: Patient) -> float:
+def _turn_radps(context: CheckContext) -> float:
     """Root mean square of the yaw rate that truth, or wheels on a track of 1 m, tell; 0 where none does."""
-    accounts = yaw_rates(patient.recording, patient.wheel_radius_m() or 0.15)
+    accounts = yaw_rates(context.recording, context.wheel_radius_m() or 0.15)
     told = [accounts[name][1] for name in ("truth", "wheels") if name in accounts]
     return float(np.sqrt(np.nanmean(told[0] ** 2))) if told else 0.0
 
 
-def check_missing(patient: Patient) -> Iterator[Finding]:
+def check_missing(context: CheckContext) -> Iterator[Finding]:
     """Cells without a number in columns that have some."""
-    for name, channel in patient.recording.channels().items():
+    for name, channel in context.recording.channels().items():
         if name not in ("command", "wheels", "imu", "motor") or len(channel) < STUCK_ROWS:
             continue
         columns = {c: np.isnan(v) for c, v in channel.columns().items() if v.dtype.kind == "f"}

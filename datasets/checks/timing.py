@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.sensor_pairs import clocks_of, period_s, retimed
 from terrafusion.datasets.core.recording import Channel, Recording
 
@@ -27,9 +27,9 @@ SAME_SPAN = 0.1
 """Channels whose durations differ by less than this share were recorded together."""
 
 
-def check_spans(patient: Patient) -> Iterator[Finding]:
+def check_spans(context: CheckContext) -> Iterator[Finding]:
     """Channels must share a stretch of time."""
-    clocks = {name: t for name, t in clocks_of(patient.recording).items() if name in (*CLOCKED, "truth")}
+    clocks = {name: t for name, t in clocks_of(context.recording).items() if name in (*CLOCKED, "truth")}
     apart = {
         name: [o for o, t in clocks.items() if t[0] > own[-1] or t[-1] < own[0]]
         for name, own in clocks.items()
@@ -46,9 +46,9 @@ def check_spans(patient: Patient) -> Iterator[Finding]:
         "error",
         lonely,
         f"begins after {' and '.join(apart[lonely])} ended" if late else "ended before the others begin",
-        f"it runs from {patient.since_start_s(own[0]):.2f} to {patient.since_start_s(own[-1]):.2f} s, "
-        f"the others from {patient.since_start_s(np.int64(begins)):.2f} "
-        f"to {patient.since_start_s(np.int64(ends)):.2f} s",
+        f"it runs from {context.since_start_s(own[0]):.2f} to {context.since_start_s(own[-1]):.2f} s, "
+        f"the others from {context.since_start_s(np.int64(begins)):.2f} "
+        f"to {context.since_start_s(np.int64(ends)):.2f} s",
         "let it start with the others: they last equally long; correlation finds what is left"
         if alike
         else "bring the channels onto one clock; their durations differ, so nobody knows how",
@@ -67,9 +67,9 @@ def _moved(name: str, by_ns: int) -> Repair:
     return repair
 
 
-def check_steps(patient: Patient) -> Iterator[Finding]:
+def check_steps(context: CheckContext) -> Iterator[Finding]:
     """Steps of a clock that the reader had to take out."""
-    jumps = patient.recording.clock_jumps
+    jumps = context.recording.clock_jumps
     for name in dict.fromkeys(jump.channel for jump in jumps):
         own = [jump for jump in jumps if jump.channel == name]
         worst = max(own, key=lambda jump: abs(jump.step_s))
@@ -83,15 +83,15 @@ def check_steps(patient: Patient) -> Iterator[Finding]:
             "error",
             name,
             f"its clock was set {len(own)} time{'s' if len(own) > 1 else ''}",
-            f"largest step {worst.step_s:+.3f} s at t = {patient.since_start_s(np.int64(worst.t_ns)):.2f} s",
+            f"largest step {worst.step_s:+.3f} s at t = {context.since_start_s(np.int64(worst.t_ns)):.2f} s",
             "keep the times as they were mended on reading: good to a sampling period",
             repair,
         )
 
 
-def check_coarse(patient: Patient) -> Iterator[Finding]:
+def check_coarse(context: CheckContext) -> Iterator[Finding]:
     """Stamps coarser than the rate of the channel."""
-    for name, channel in _clocked(patient.recording):
+    for name, channel in _clocked(context.recording):
         tick_s = coarse_tick_s(channel)
         if not tick_s:
             continue
@@ -158,9 +158,9 @@ def _even(t_ns: TimesNs, gap_s: float) -> TimesNs:
     return np.maximum.accumulate(even)
 
 
-def check_jitter(patient: Patient) -> Iterator[Finding]:
+def check_jitter(context: CheckContext) -> Iterator[Finding]:
     """Intervals that scatter: a clock of arrival rather than of measurement."""
-    for name, channel in _clocked(patient.recording):
+    for name, channel in _clocked(context.recording):
         dt = np.diff(channel.t_ns) * 1e-9
         if len(dt) < LEAST_ROWS or coarse_tick_s(channel):
             continue
@@ -190,9 +190,9 @@ def check_jitter(patient: Patient) -> Iterator[Finding]:
         )
 
 
-def gap_findings(patient: Patient, jumps: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
+def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
     """Stretches without samples. `jumps` are rows by channel that a clock jump parts, which are none."""
-    for name, channel in _clocked(patient.recording):
+    for name, channel in _clocked(context.recording):
         dt = np.diff(channel.t_ns) * 1e-9
         dt[np.array(jumps.get(name, ()), dtype=int) - 1] = 0.0
         if not (dt > 0).any() or coarse_tick_s(channel):
@@ -204,7 +204,7 @@ def gap_findings(patient: Patient, jumps: Mapping[str, Sequence[int]]) -> Iterat
             worst = int(gaps[np.argmax(dt[gaps])])
             what = f"{gaps.size} gap{'s' if gaps.size > 1 else ''}"
             evidence = (
-                f"longest {dt[worst]:.2f} s from t = {patient.since_start_s(channel.t_ns[worst]):.2f} s, "
+                f"longest {dt[worst]:.2f} s from t = {context.since_start_s(channel.t_ns[worst]):.2f} s, "
                 f"{dt[gaps].sum():.2f} s in all"
             )
         elif missing > MISSING_SHARE * (len(channel) + missing):
@@ -223,9 +223,9 @@ def _missing(steps: Array) -> int:
     return int((np.rint(long) - 1.0).sum()) if long.size and whole.mean() > 0.8 else 0
 
 
-def check_duplicates(patient: Patient) -> Iterator[Finding]:
+def check_duplicates(context: CheckContext) -> Iterator[Finding]:
     """Samples that share their time."""
-    for name, channel in patient.recording.channels().items():
+    for name, channel in context.recording.channels().items():
         repeated = np.flatnonzero(np.diff(channel.t_ns) == 0)
         if not repeated.size or (name in CLOCKED and coarse_tick_s(channel)):
             continue
@@ -240,7 +240,7 @@ def check_duplicates(patient: Patient) -> Iterator[Finding]:
             "warning",
             name,
             f"{repeated.size} repeated times",
-            f"first at t = {patient.since_start_s(channel.t_ns[repeated[0]]):.3f} s",
+            f"first at t = {context.since_start_s(channel.t_ns[repeated[0]]):.3f} s",
             "keep the first sample of each time",
             repair,
         )

@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Finding, Patient
+from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, compare, places, wheel_speed
 from terrafusion.datasets.checks.yaw_signals import seconds
 from terrafusion.datasets.core.frames import rpy_to_quaternion
@@ -27,9 +27,9 @@ UNITS = {"mm": 1000.0, "cm": 100.0, "feet": 1.0 / 0.3048}
 UNIT_ERROR = 0.1
 
 
-def check_yaw(patient: Patient) -> Iterator[Finding]:
+def check_yaw(context: CheckContext) -> Iterator[Finding]:
     """The truth must face the way it goes, driving forward."""
-    offset = yaw_offset(patient)
+    offset = yaw_offset(context)
     if offset is None or abs(offset[0]) < LARGE_OFFSET:
         return
     angle, chords, r = offset
@@ -44,20 +44,20 @@ def check_yaw(patient: Patient) -> Iterator[Finding]:
     )
 
 
-def yaw_offset(patient: Patient) -> tuple[float, int, float] | None:
+def yaw_offset(context: CheckContext) -> tuple[float, int, float] | None:
     """Mean of yaw less course of the truth (rad), the chords it was found from, and how alike they are.
 
     Where the wheels run backwards the course is taken the other way. None where the truth, or the sign
     of the wheels' speed, is not known well enough.
     """
-    truth = patient.recording.truth
-    driven = wheel_speed(patient, patient.wheel_radius_m() or ANY_RADIUS_M)
+    truth = context.recording.truth
+    driven = wheel_speed(context, context.wheel_radius_m() or ANY_RADIUS_M)
     if truth is None or truth.quaternion is None or driven is None:
         return None
     known = np.isfinite(truth.position_m[:, :2]).all(axis=1) & np.isfinite(truth.quaternion).all(axis=1)
     if known.sum() < 2 * LEAST_CHORDS:
         return None
-    t, yaw = seconds(truth.t_ns[known], patient.recording.start_ns), np.unwrap(truth.yaw_rad()[known])
+    t, yaw = seconds(truth.t_ns[known], context.recording.start_ns), np.unwrap(truth.yaw_rad()[known])
     place = truth.position_m[known, 0] + 1j * truth.position_m[known, 1]
     t_wheel, v = driven
     grid = np.arange(max(t[0], t_wheel[0]), min(t[-1], t_wheel[-1]), CHORD_S)
@@ -93,10 +93,10 @@ def _turned(recording: Recording, angle: float) -> Recording:
     )
 
 
-def check_unit(patient: Patient) -> Iterator[Finding]:
+def check_unit(context: CheckContext) -> Iterator[Finding]:
     """The truth's positions must be metres."""
-    true = next((one for one in places(patient.recording) if one.source == "truth"), None)
-    windows = compare(patient, true) if true is not None else None
+    true = next((one for one in places(context.recording) if one.source == "truth"), None)
+    windows = compare(context, true) if true is not None else None
     if windows is None:
         return
     ratio = float(np.median(windows.span_ratio))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.directions import runs_backwards, sides_opposed
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.scale import is_firm
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording, Wheels
@@ -20,9 +20,9 @@ DEAD, LEAST_R, ODD_SCALE = 0.02, 0.9, 0.15
 """Speed of a wheel over its partner's below which it is dead; correlation and error of scale that are odd."""
 
 
-def check_each_wheel(patient: Patient) -> Iterator[Finding]:
+def check_each_wheel(context: CheckContext) -> Iterator[Finding]:
     """Of four wheels, each must run as the other one of its side does."""
-    wheels = patient.recording.wheels
+    wheels = context.recording.wheels
     if wheels is None or len(wheels.names) != 4:
         return
     known = np.isfinite(wheels.speed).all(axis=1)
@@ -88,10 +88,10 @@ def _one_wheel(wheel: int, partner: int, factor: float | None) -> Repair:
     return mended
 
 
-def check_wheel_signs(patient: Patient) -> Iterator[Finding]:
+def check_wheel_signs(context: CheckContext) -> Iterator[Finding]:
     """Left and right must mostly turn the same way, unless the robot spins on the spot."""
-    wheels, told = patient.recording.wheels, sides_opposed(patient)
-    if wheels is None or told is None or (not told and not is_firm(patient.recording)):
+    wheels, told = context.recording.wheels, sides_opposed(context)
+    if wheels is None or told is None or (not told and not is_firm(context.recording)):
         return  # on soft ground a robot may well turn its wheels on the spot and not get round
     side = backward_side(wheels)
     yield Finding(
@@ -113,10 +113,10 @@ def backward_side(wheels: Wheels) -> str:
     return "left" if left < right else "right"
 
 
-def check_direction(patient: Patient) -> Iterator[Finding]:
+def check_direction(context: CheckContext) -> Iterator[Finding]:
     """The wheels must run forwards when the robot does."""
-    told = runs_backwards(patient)
-    if told is None or sides_opposed(patient) is not None:
+    told = runs_backwards(context)
+    if told is None or sides_opposed(context) is not None:
         return
     yield Finding(
         "wheel-reversed",

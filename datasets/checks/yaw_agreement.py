@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from terrafusion.datasets.checks.directions import runs_backwards, sides_opposed
-from terrafusion.datasets.checks.finding import Finding, Patient, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.mounting import heading, stands_up
 from terrafusion.datasets.checks.yaw_signals import (
@@ -46,9 +46,9 @@ CODES = {
 }
 
 
-def check_gyro_unit(patient: Patient) -> Iterator[Finding]:
+def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
     """The gyro must be in rad/s."""
-    found = _pairs(patient)
+    found = _pairs(context)
     for other, limit in DEGREES_SLOPE.items():
         both = found.get(("gyro", other))
         if both is None or not both.is_sure() or abs(both.slope) < limit:
@@ -70,10 +70,10 @@ def check_gyro_unit(patient: Patient) -> Iterator[Finding]:
         return
 
 
-def check_turns(patient: Patient) -> Iterator[Finding]:
+def check_turns(context: CheckContext) -> Iterator[Finding]:
     """All channels must turn to the same side; the fewest that contradict are at fault."""
-    found = _pairs(patient)
-    signs = _signs(patient, found)
+    found = _pairs(context)
+    signs = _signs(context, found)
     against = [pair for pair, sign in signs.items() if sign < 0.0]
     if not against:
         return
@@ -89,13 +89,13 @@ def check_turns(patient: Patient) -> Iterator[Finding]:
             "check the axes and signs of all of them",
         )
         return
-    if frozenset({"wheels"}) in blamed and runs_backwards(patient) is not None:
+    if frozenset({"wheels"}) in blamed and runs_backwards(context) is not None:
         return  # one fault explains both: see wheels.check_direction
     for name in sorted(blamed[0]):
         pairs = [pair for pair in against if name in pair]
-        if not pairs or (name == "gyro" and not stands_up(patient)):
+        if not pairs or (name == "gyro" and not stands_up(context)):
             continue  # an IMU that does not stand up: see mounting.check_axes
-        fix, repair = _remedy(patient, name)
+        fix, repair = _remedy(context, name)
         other = next(one for one in pairs[0] if one != name)
         if len(blamed) > 1:
             fix += f" (assumed: no third channel tells whether {NAMES[name]} or {NAMES[other]} is wrong)"
@@ -110,15 +110,15 @@ def check_turns(patient: Patient) -> Iterator[Finding]:
         )
 
 
-def _signs(patient: Patient, found: Pairs) -> Signs:
+def _signs(context: CheckContext, found: Pairs) -> Signs:
     """By pair of channels 1 where they surely turn alike, -1 where they turn against each other."""
-    known = accounts(patient)
+    known = accounts(context)
     signs = {}
     for (a, b), both in found.items():
         late = both.r < 0.0 and a in known and b in known and is_late(known[a], known[b], both.r)
         if both.is_sure() and not late:
             signs[a, b] = float(np.sign(both.r))
-    pressed = heading(patient)
+    pressed = heading(context)
     if pressed is not None and pressed.turn and ("gyro", "wheels") in signs:
         signs["gyro", "accelerometer"] = pressed.turn
     return signs
@@ -138,14 +138,14 @@ def _told(pairs: list[tuple[str, str]], signs: Signs, found: Pairs) -> str:
     return ", ".join(parts)
 
 
-def _remedy(patient: Patient, name: str) -> tuple[str, Repair | None]:
+def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
     """What to do where one channel turns the wrong way."""
     if name == "gyro":
         return "change the sign of gyro z (left turn positive)", _gyro_sign
     if name == "wheels":
         return "swap left and right wheels", _swap_sides
     if name == "gnss":
-        return reflection(patient.recording)
+        return reflection(context.recording)
     if name == "truth":
         return "check the truth's frame: its yaw must grow to the left", None
     if name == "accelerometer":
@@ -153,9 +153,9 @@ def _remedy(patient: Patient, name: str) -> tuple[str, Repair | None]:
     return "change the sign of the commanded yaw rate (left turn positive)", _command_sign
 
 
-def check_unrelated(patient: Patient) -> Iterator[Finding]:
+def check_unrelated(context: CheckContext) -> Iterator[Finding]:
     """Gyro z must follow the wheels, whatever its sign."""
-    both = _pairs(patient).get(("gyro", "wheels"))
+    both = _pairs(context).get(("gyro", "wheels"))
     if (
         both is None
         or both.windows < MANY
@@ -174,10 +174,10 @@ def check_unrelated(patient: Patient) -> Iterator[Finding]:
     )
 
 
-def _pairs(patient: Patient) -> Pairs:
+def _pairs(context: CheckContext) -> Pairs:
     """What can be compared, without wheels of which one side has the wrong sign: they tell no turn."""
-    found = agreements(patient)
-    if any("wheels" in pair for pair in found) and sides_opposed(patient) is not None:
+    found = agreements(context)
+    if any("wheels" in pair for pair in found) and sides_opposed(context) is not None:
         found = {pair: both for pair, both in found.items() if "wheels" not in pair}
     return found
 

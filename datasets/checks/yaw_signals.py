@@ -11,7 +11,7 @@ from itertools import combinations, product
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.core.recording import Gnss
 
 Array = NDArray[np.float64]
@@ -72,15 +72,15 @@ def account(start_ns: int, t_ns: NDArray[np.int64], rate: Array) -> Account | No
     return Account(t_s, np.concatenate([[0.0], np.cumsum(steps)]))
 
 
-def accounts(patient: Patient) -> dict[str, Account]:
+def accounts(context: CheckContext) -> dict[str, Account]:
     """The accounts of gyro z, wheels, truth and command, where the recording has them."""
-    recording = patient.recording
+    recording = context.recording
     found: dict[str, Account | None] = {}
     start, truth = recording.start_ns, recording.truth
     if recording.imu is not None:
         found["gyro"] = account(start, recording.imu.t_ns, recording.imu.gyro_radps[:, 2])
     if recording.wheels is not None and recording.wheels.has_sides():
-        sides = recording.wheels.side_speeds_mps(patient.wheel_radius_m() or 0.15)
+        sides = recording.wheels.side_speeds_mps(context.wheel_radius_m() or 0.15)
         found["wheels"] = account(start, recording.wheels.t_ns, sides[:, 1] - sides[:, 0])
     if truth is not None and truth.quaternion is not None:
         yaw = truth.yaw_rad()
@@ -162,20 +162,20 @@ def typical_sigma(gnss: Gnss) -> float:
     return float(np.median(sigma)) if sigma.size else 0.0
 
 
-def agreements(patient: Patient) -> dict[tuple[str, str], Agreement]:
+def agreements(context: CheckContext) -> dict[tuple[str, str], Agreement]:
     """Agreement of every pair of channels that can be compared, in the order of `SUSPECTS`."""
-    known = accounts(patient)
+    known = accounts(context)
     found: dict[tuple[str, str], Agreement | None] = {}
     for one, other in combinations(SUSPECTS, 2):
         if one in known and other in known:
             window_s = TRUTH_WINDOW_S if "truth" in (one, other) else WINDOW_S
             found[one, other] = agreement(known[one], known[other], window_s)
-    gnss, track_m = patient.recording.gnss, patient.rig.track_m if patient.rig else 1.0
+    gnss, track_m = context.recording.gnss, context.rig.track_m if context.rig else 1.0
     if gnss is not None:
         for name, unit in (("gyro", 1.0), ("wheels", track_m)):
             if name in known:
                 turned = Account(known[name].t_s, known[name].angle / unit)
-                found[name, "gnss"] = course_agreement(turned, gnss, patient.recording.start_ns)
+                found[name, "gnss"] = course_agreement(turned, gnss, context.recording.start_ns)
     return {pair: both for pair, both in found.items() if both is not None}
 
 

@@ -133,14 +133,14 @@ def clock_accepted(recording: Recording) -> Recording:
 
 
 def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> None:
-    """Refuse a log whose numbers would mislead: what the input doctor calls an error.
+    """Refuse a log whose numbers would mislead: what the log checks call an error.
 
     Raises:
         DataError: the first such finding, with its evidence and what to do.
     """
-    from terrafusion.datasets.checks import examine
+    from terrafusion.datasets.checks import run_checks
 
-    _refuse(log, examine(recording, rig_of(recording, rig)))
+    _refuse(log, run_checks(recording, rig_of(recording, rig)))
 
 
 def refuse_impossible(log: str, recording: Recording) -> None:
@@ -149,9 +149,9 @@ def refuse_impossible(log: str, recording: Recording) -> None:
     Raises:
         DataError: the first of them.
     """
-    from terrafusion.datasets.checks import Patient, check_magnitude
+    from terrafusion.datasets.checks import CheckContext, check_magnitude
 
-    _refuse(log, list(check_magnitude(Patient(recording, None))))
+    _refuse(log, list(check_magnitude(CheckContext(recording, None))))
 
 
 def _refuse(log: str, findings: list[Finding]) -> None:

@@ -57,7 +57,7 @@ def convert(
     """
     import dataclasses
 
-    from terrafusion.datasets.checks import examine, treat
+    from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.readers import open_recording
 
     rig = load_rig(vehicle)
@@ -70,12 +70,12 @@ def convert(
     for note in recording.notes:
         print(f"note: {note}")
     if apply_fixes:
-        recording, mended = treat(recording, rig)
+        recording, mended = repair(recording, rig)
         for finding in mended:
-            print(f"mended: {_told(finding)}")
+            print(f"repaired: {_told(finding)}")
     for part in _write(log, recording, rig, out, overwrite):
         print(f"not in standard messages: {part}")
-    for finding in examine(recording, rig):
+    for finding in run_checks(recording, rig):
         if apply_fixes or finding.severity == "error":
             print(f"{finding.severity}: {_told(finding)}{_why_left(finding, apply_fixes)}")
     held = ", ".join(f"{name} {len(channel)}" for name, channel in recording.channels().items())

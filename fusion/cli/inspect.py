@@ -68,14 +68,14 @@ def examined(
     columns: Path | None = None,
 ) -> dict[str, Any]:
     """The page as plain data; see `terrafusion.datasets.checks.summary`."""
-    from terrafusion.datasets.checks import examine
+    from terrafusion.datasets.checks import run_checks
     from terrafusion.datasets.checks.measures import measure
     from terrafusion.datasets.checks.summary import summarise, summarise_all
     from terrafusion.datasets.readers import open_recordings
 
     rig = load_rig(vehicle)
     recordings = open_recordings(log, **reading(rig, topic, stamps, columns, repair_clock=True))
-    findings = [examine(recording, rig_of(recording, rig)) for recording in recordings]
+    findings = [run_checks(recording, rig_of(recording, rig)) for recording in recordings]
     measures = measure(recordings, rig_of(recordings[0], rig))
     if len(recordings) == 1:
         return summarise(recordings[0], measures, findings[0])

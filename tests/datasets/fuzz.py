@@ -1,4 +1,4 @@
-"""Fuzzing of all readers and of the input doctor: mutated files may be refused, nothing else.
+"""Fuzzing of all readers and of the log checks: mutated files may be refused, nothing else.
 
     python tests/datasets/fuzz.py --count 2000 --seed 0
 
@@ -149,7 +149,7 @@ def mutated(rng: np.random.Generator, sample: Path, folder: Path) -> Path:
 
 def open_and_examine(path: Path, repair_clock: bool) -> None:
     """What `inspect` and `convert --apply-fixes` do with a log; a pickle's hash counts as known."""
-    from terrafusion.datasets.checks import examine, treat
+    from terrafusion.datasets.checks import repair, run_checks
     from terrafusion.datasets.core.conventions import Conventions, apply
     from terrafusion.datasets.readers.formats import Request, format_of
     from terrafusion.datasets.readers.sets.single_wheel import read_wheel_trials
@@ -161,8 +161,8 @@ def open_and_examine(path: Path, repair_clock: bool) -> None:
     request = Request(path, repair_clock=repair_clock, trusted=True)
     for recording in list(form.read(request))[:20]:
         recording = apply(recording, Conventions())
-        examine(recording)
-        treat(recording)
+        run_checks(recording)
+        repair(recording)
 
 
 def outcome_of(path: Path, repair_clock: bool) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.lag import Lag, lag_between
 from terrafusion.datasets.core.recording import Imu, Recording, Wheels
 
@@ -112,7 +112,7 @@ def joined(recordings: Sequence[Recording]) -> Recording:
 
 
 def codes(recording: Recording) -> set[str]:
-    return {finding.code for finding in examine(recording)}
+    return {finding.code for finding in run_checks(recording)}
 
 
 def changing_share(recording: Recording, channel: str) -> float:

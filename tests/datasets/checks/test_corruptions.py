@@ -1,4 +1,4 @@
-"""One good log, spoilt in many ways: each is named by its finding, no other error is, and it is mended."""
+"""One good log, corrupted in many ways: each is named by its finding, no other error is, and it is repaired."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine, treat
+from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Channel, Recording, Wheels
@@ -49,18 +49,18 @@ RADIUS_M = 0.175
 
 @dataclass(frozen=True)
 class Case:
-    """A corruption, the finding it must be named by, and whether `treat` mends it.
+    """A corruption, the finding it must be named by, and whether `repair` mends it.
 
     Mended means: of the channel at least `kept` of the rows are left, their times those of the good
     log to `time_s`, their values to `share` of the largest in the column, and no finding but those of
     the codes `left`, such as the gap where bad rows were. The columns `lost` are empty then.
-    `good` makes of the good log what the mended one is to be compared with.
+    `good` makes of the good log what the repaired one is to be compared with.
     """
 
-    spoil: Spoil
+    corrupt: Spoil
     code: str
     channel: str
-    mended: bool = True
+    repaired: bool = True
     time_s: float = 0.0
     share: float = 1e-9
     kept: float = 1.0
@@ -89,27 +89,27 @@ def rig() -> Rig:
 def change(channel: str, **changed: Callable[[Any], Any]) -> Spoil:
     """Replace fields of a channel by functions of them."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         before = getattr(r, channel)
         after = {name: function(getattr(before, name)) for name, function in changed.items()}
         return dataclasses.replace(r, **{channel: dataclasses.replace(before, **after)})
 
-    return spoil
+    return corrupt
 
 
 def rows(channel: str, choose: Callable[[Any], Any]) -> Spoil:
     """Take the chosen rows of a channel, by mask, slice or index."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         before = getattr(r, channel)
         return dataclasses.replace(r, **{channel: before.select(choose(before))})
 
-    return spoil
+    return corrupt
 
 
 def chain(*spoils: Spoil) -> Spoil:
     """One after the other."""
-    return lambda r: functools.reduce(lambda done, spoil: spoil(done), spoils, r)
+    return lambda r: functools.reduce(lambda done, corrupt: corrupt(done), spoils, r)
 
 
 def turned(axes: Any) -> Spoil:
@@ -137,12 +137,12 @@ def wheels_scaled(factor: Any) -> Spoil:
 def in_mps(factor: float) -> Spoil:
     """Wheel speeds as rim speeds, called m/s, times a factor."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         assert r.wheels is not None
         speed = r.wheels.speed[:, :2] * RADIUS_M * factor
         return dataclasses.replace(r, wheels=Wheels(r.wheels.t_ns, speed, ("left", "right"), "mps"))
 
-    return spoil
+    return corrupt
 
 
 def sigmas(horizontal_m: float, up_m: float) -> Spoil:
@@ -170,14 +170,14 @@ def without_angles(r: Recording) -> Recording:
 def held(channel: str, each: int) -> Spoil:
     """Every value stands for so many rows."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         before = getattr(r, channel)
         index = np.arange(len(before)) // each * each
         return dataclasses.replace(
             r, **{channel: dataclasses.replace(before.select(index), t_ns=before.t_ns)}
         )
 
-    return spoil
+    return corrupt
 
 
 def late(channel: str, by_s: float, after_s: float = -1.0) -> Spoil:
@@ -227,7 +227,7 @@ IMU_CASES: dict[str, Case] = {
     "accel: in g": Case(change("imu", accel_mps2=lambda a: a / 9.80665), "accel-in-g", "imu"),
     "accel: gravity removed": Case(
         change("imu", accel_mps2=lambda a: a - np.array([0.0, 0.0, 9.80665])),
-        "accel-magnitude", "imu", mended=False,
+        "accel-magnitude", "imu", repaired=False,
     ),
     "accel: saturated": Case(
         change("imu", accel_mps2=lambda a: np.clip(a, -10.2, 10.2)),
@@ -273,13 +273,13 @@ WHEEL_CASES: dict[str, Case] = {
         change("wheels", speed=lambda s: s * [1, 1, 0, 1], angle_rad=lambda a: None),
         "wheel-odd", "wheels", share=0.1, good=without_angles,
     ),
-    "wheels: 25 % too fast": Case(wheels_scaled(1.25), "wheel-scale", "wheels", mended=False),
+    "wheels: 25 % too fast": Case(wheels_scaled(1.25), "wheel-scale", "wheels", repaired=False),
     "wheels: 25 % too slow": Case(wheels_scaled(0.8), "wheel-radius", "wheels", good=wheels_scaled(0.8)),
     "wheels: rev/min as rad/s": Case(
         change("wheels", speed=lambda s: s * 60 / (2 * np.pi)), "wheel-unit", "wheels"
     ),
     "wheels: m/s as rad/s": Case(
-        change("wheels", speed=lambda s: s * RADIUS_M), "wheel-unit", "wheels", mended=False
+        change("wheels", speed=lambda s: s * RADIUS_M), "wheel-unit", "wheels", repaired=False
     ),
     "wheels: km/h as m/s": Case(in_mps(3.6), "wheel-unit", "wheels", good=in_mps(1.0)),
     "wheels: mm/s as m/s": Case(in_mps(1000.0), "wheel-unit", "wheels", good=in_mps(1.0)),
@@ -307,7 +307,7 @@ CLOCK_CASES: dict[str, Case] = {
         change("wheels", t_ns=lambda t: t // 10**9 * 10**9), "coarse-times", "wheels", time_s=0.03
     ),
     "clock: a gap": Case(
-        rows("imu", lambda imu: np.abs(np.arange(len(imu)) - 4000) > 150), "gaps", "imu", mended=False
+        rows("imu", lambda imu: np.abs(np.arange(len(imu)) - 4000) > 150), "gaps", "imu", repaired=False
     ),
 }  # fmt: skip
 
@@ -357,40 +357,40 @@ CASES = IMU_CASES | WHEEL_CASES | CLOCK_CASES | GNSS_CASES
 def test_good_logs_have_no_finding(terrain: str, seed: int, scenario: Scenario, rig: Rig) -> None:
     """Otherwise the cases below would prove little: on no ground, with no noise, level or on a slope."""
     recording = simulate(scenario, terrain=terrain, slope_deg=6.0 * (seed % 2), seed=seed)
-    assert examine(recording, rig) == []
-    assert examine(recording) == []
+    assert run_checks(recording, rig) == []
+    assert run_checks(recording) == []
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_corruption_is_named_and_mended(name: str, good: Recording, rig: Rig) -> None:
-    """By its finding, and no other error; mended, or left and still told."""
+    """By its finding, and no other error; repaired, or left and still told."""
     case = CASES[name]
-    spoilt = case.spoil(good)
-    findings = examine(spoilt, rig)
+    corrupted = case.corrupt(good)
+    findings = run_checks(corrupted, rig)
     assert (case.code, case.channel) in {(f.code, f.channel) for f in findings}, findings
     assert {f.code for f in findings if f.severity == "error"} <= {case.code}, findings
-    mended, done = treat(spoilt, rig)
-    left = {finding.code for finding in examine(mended, rig)}
-    if not case.mended:
+    repaired, done = repair(corrupted, rig)
+    left = {finding.code for finding in run_checks(repaired, rig)}
+    if not case.repaired:
         assert case.code in left
         return
     assert left <= set(case.left)
-    assert sum(note.startswith("mended: ") for note in mended.notes) == len(done)
+    assert sum(note.startswith("repaired: ") for note in repaired.notes) == len(done)
     truly = case.good(good)
     for channel in truly.channels():
-        own = case if channel == case.channel else Case(case.spoil, "", "")
-        assert_like(getattr(mended, channel), getattr(truly, channel), own)
+        own = case if channel == case.channel else Case(case.corrupt, "", "")
+        assert_like(getattr(repaired, channel), getattr(truly, channel), own)
 
 
-def assert_like(mended: Channel, good: Channel, case: Case) -> None:
-    """The mended channel is the good one, as far as the case allows."""
-    assert case.kept * len(good) <= len(mended) <= len(good)
+def assert_like(repaired: Channel, good: Channel, case: Case) -> None:
+    """The repaired channel is the good one, as far as the case allows."""
+    assert case.kept * len(good) <= len(repaired) <= len(good)
     index = np.arange(len(good))
-    if len(mended) < len(good):
-        after = np.clip(np.searchsorted(good.t_ns, mended.t_ns), 1, len(good) - 1)
-        index = after - (mended.t_ns - good.t_ns[after - 1] < good.t_ns[after] - mended.t_ns)
-    assert np.abs(mended.t_ns - good.t_ns[index]).max() <= case.time_s * 1e9
-    columns = mended.columns()
+    if len(repaired) < len(good):
+        after = np.clip(np.searchsorted(good.t_ns, repaired.t_ns), 1, len(good) - 1)
+        index = after - (repaired.t_ns - good.t_ns[after - 1] < good.t_ns[after] - repaired.t_ns)
+    assert np.abs(repaired.t_ns - good.t_ns[index]).max() <= case.time_s * 1e9
+    columns = repaired.columns()
     for name, values in good.columns().items():
         if name in case.lost:
             assert name not in columns
@@ -415,9 +415,9 @@ def test_clock_set_back_is_named_and_mended(good: Recording, rig: Rig, tmp_path:
     with pytest.raises(DataError, match=r"time runs backwards.*--repair-clock"):
         open_recording(tmp_path / "log")
     read = open_recording(tmp_path / "log", repair_clock=True)
-    assert [(f.code, f.channel) for f in examine(read, rig)] == [("clock-jump", "imu")]
-    mended, _ = treat(read, rig)
-    assert examine(mended, rig) == []
+    assert [(f.code, f.channel) for f in run_checks(read, rig)] == [("clock-jump", "imu")]
+    repaired, _ = repair(read, rig)
+    assert run_checks(repaired, rig) == []
     assert good.imu is not None
-    assert mended.imu is not None
-    assert_like(mended.imu, good.imu, Case(lambda r: r, "", "", time_s=1e-6))
+    assert repaired.imu is not None
+    assert_like(repaired.imu, good.imu, Case(lambda r: r, "", "", time_s=1e-6))

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine, treat
+from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.recording import Fix, Recording
-from tests.datasets.checks.test_doctor_physics import lively_drive
+from tests.datasets.checks.test_physical_faults import lively_drive
 
 RNG = np.random.default_rng(5)
 TENTHS = RNG.integers(7, 15, 300) / 10
@@ -23,7 +23,7 @@ def with_sigma(drive: Recording, flat: np.ndarray, fix: Fix, north: float = 1.0)
 
 
 def codes(recording: Recording) -> set[str]:
-    return {finding.code for finding in examine(recording)}
+    return {finding.code for finding in run_checks(recording)}
 
 
 @pytest.mark.parametrize("fix", [Fix.SINGLE, Fix.DGPS, Fix.FLOAT, Fix.FIXED])
@@ -53,16 +53,16 @@ def test_sigmas_are_left_alone(drive: Recording, flat: np.ndarray, north: float)
 
 
 def test_the_repair_takes_the_class_for_its_worth(drive: Recording) -> None:
-    mended, done = treat(with_sigma(drive, TENTHS, Fix.SINGLE))
+    repaired, done = repair(with_sigma(drive, TENTHS, Fix.SINGLE))
     assert [finding.code for finding in done] == ["sigma-dilution"]
-    assert mended.gnss is not None
-    np.testing.assert_allclose(mended.gnss.sigma_enu_m[:, 0], 3.0 * TENTHS)
-    np.testing.assert_allclose(mended.gnss.sigma_enu_m[:, 2], 6.0 * TENTHS)
-    assert treat(mended) == (mended, [])
+    assert repaired.gnss is not None
+    np.testing.assert_allclose(repaired.gnss.sigma_enu_m[:, 0], 3.0 * TENTHS)
+    np.testing.assert_allclose(repaired.gnss.sigma_enu_m[:, 2], 6.0 * TENTHS)
+    assert repair(repaired) == (repaired, [])
 
 
 def test_what_would_change_nothing_is_no_repair(drive: Recording) -> None:
-    (found,) = examine(with_sigma(drive, TENTHS, Fix.DGPS))
+    (found,) = run_checks(with_sigma(drive, TENTHS, Fix.DGPS))
     assert found.repair is None
 
 

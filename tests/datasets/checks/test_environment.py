@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine, treat
+from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.checks.environment import circle
 from terrafusion.datasets.checks.summary import summarise
 from terrafusion.datasets.core.errors import DataError
@@ -35,7 +35,7 @@ def turning(offset_t: tuple[float, float] = (0.0, 0.0), turns: float = 2.0) -> R
 
 
 def codes(recording: Recording) -> list[str]:
-    return [finding.code for finding in examine(recording)]
+    return [finding.code for finding in run_checks(recording)]
 
 
 def test_the_log_folder_has_a_file_for_each(tmp_path: Path) -> None:
@@ -124,37 +124,37 @@ def test_a_sound_log_has_no_finding() -> None:
 def test_pressure_units_are_named_and_mended(name: str, factor: float) -> None:
     good = turning()
     assert good.barometer is not None
-    spoilt = dataclasses.replace(
+    corrupted = dataclasses.replace(
         good, barometer=Barometer(good.barometer.t_ns, good.barometer.pressure_pa * factor)
     )
-    [finding] = examine(spoilt)
+    [finding] = run_checks(corrupted)
     assert (finding.code, finding.severity) == ("pressure-unit", "warning")
     assert finding.what == f"the pressure looks like {name}, not Pa"
-    mended, _ = treat(spoilt)
-    assert mended.barometer is not None
-    np.testing.assert_allclose(mended.barometer.pressure_pa, good.barometer.pressure_pa, rtol=1e-12)
-    assert codes(mended) == []
+    repaired, _ = repair(corrupted)
+    assert repaired.barometer is not None
+    np.testing.assert_allclose(repaired.barometer.pressure_pa, good.barometer.pressure_pa, rtol=1e-12)
+    assert codes(repaired) == []
 
 
 @pytest.mark.parametrize(
     ("name", "factor"), [("uT", 1e6), ("gauss", 1e4), ("milligauss", 1e7), ("nT", 1e9), ("", 1.0 / 49.5e-6)]
 )
 def test_field_units_are_named_and_mended(name: str, factor: float) -> None:
-    """A field divided by its own size (Xsens) cannot be mended: only its direction is left."""
+    """A field divided by its own size (Xsens) cannot be repaired: only its direction is left."""
     good = turning()
     assert good.magnetometer is not None
     own = good.magnetometer
-    spoilt = dataclasses.replace(good, magnetometer=Magnetometer(own.t_ns, own.field_t * factor))
-    [finding] = examine(spoilt)
+    corrupted = dataclasses.replace(good, magnetometer=Magnetometer(own.t_ns, own.field_t * factor))
+    [finding] = run_checks(corrupted)
     assert (finding.code, finding.severity) == ("field-unit", "warning")
     if not name:
         assert finding.repair is None
         assert "only its direction" in finding.fix
         return
     assert finding.what == f"the field looks like {name}, not T"
-    mended, _ = treat(spoilt)
-    assert mended.magnetometer is not None
-    np.testing.assert_allclose(mended.magnetometer.field_t, own.field_t, rtol=1e-12)
+    repaired, _ = repair(corrupted)
+    assert repaired.magnetometer is not None
+    np.testing.assert_allclose(repaired.magnetometer.field_t, own.field_t, rtol=1e-12)
 
 
 def test_single_pressures_are_left_out() -> None:
@@ -162,23 +162,23 @@ def test_single_pressures_are_left_out() -> None:
     assert good.barometer is not None
     p = good.barometer.pressure_pa.copy()
     p[7] = 0.0
-    spoilt = dataclasses.replace(good, barometer=Barometer(good.barometer.t_ns, p))
-    assert codes(spoilt) == ["pressure-range"]
-    mended, _ = treat(spoilt)
-    assert mended.barometer is not None
-    assert len(mended.barometer) == 399
+    corrupted = dataclasses.replace(good, barometer=Barometer(good.barometer.t_ns, p))
+    assert codes(corrupted) == ["pressure-range"]
+    repaired, _ = repair(corrupted)
+    assert repaired.barometer is not None
+    assert len(repaired.barometer) == 399
 
 
 def test_hard_iron_is_found_and_taken_off() -> None:
-    spoilt = turning(offset_t=(6e-6, -3e-6))
-    [finding] = examine(spoilt)
+    corrupted = turning(offset_t=(6e-6, -3e-6))
+    [finding] = run_checks(corrupted)
     assert finding.code == "hard-iron"
     assert "up to 21 deg" in finding.what  # asin(6.71 / 19.1) = 20.6 deg
-    mended, _ = treat(spoilt)
-    assert mended.magnetometer is not None
+    repaired, _ = repair(corrupted)
+    assert repaired.magnetometer is not None
     good = turning().magnetometer
     assert good is not None
-    np.testing.assert_allclose(mended.magnetometer.field_t, good.field_t, atol=2e-8)
+    np.testing.assert_allclose(repaired.magnetometer.field_t, good.field_t, atol=2e-8)
 
 
 def test_without_a_full_turn_an_offset_is_not_told() -> None:

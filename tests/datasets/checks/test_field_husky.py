@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Fix, Imu, Overrides, Recording, differences
@@ -143,7 +143,7 @@ def test_a_healthy_husky_has_no_errors(field_logs: Path, husky_rig: Rig) -> None
         open_recording(field_logs / "test1.bag", rig=husky_rig),
         open_recording(field_logs / "test1.bag"),
     ):
-        assert [f for f in examine(recording, husky_rig) if f.severity == "error"] == []
+        assert [f for f in run_checks(recording, husky_rig) if f.severity == "error"] == []
 
 
 def test_a_flipped_husky_gyro_is_found(field_logs: Path, husky_rig: Rig) -> None:
@@ -151,7 +151,7 @@ def test_a_flipped_husky_gyro_is_found(field_logs: Path, husky_rig: Rig) -> None
     rig = dataclasses.replace(husky_rig, sensors=dataclasses.replace(husky_rig.sensors, imu=flipped))
     recording = open_recording(field_logs / "test1.bag", rig=rig)
     assert fits(recording)["yaw"] < -0.8
-    errors = {f.code for f in examine(recording, rig) if f.severity == "error"}
+    errors = {f.code for f in run_checks(recording, rig) if f.severity == "error"}
     assert errors
 
 
@@ -159,7 +159,7 @@ def test_an_unknown_husky_without_vehicle_is_diagnosed(field_logs: Path, tmp_pat
     recording = open_recording(unknown_copy(field_logs / "test1.bag", tmp_path))
     assert recording.vehicle is None
     assert recording.overrides.track_m == 1.0
-    assert any(f.severity == "error" and f.channel == "imu" for f in examine(recording))
+    assert any(f.severity == "error" and f.channel == "imu" for f in run_checks(recording))
 
 
 def test_jackal(field_logs: Path, husky_rig: Rig) -> None:

@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.checks.summary import summarise, summarise_all
 from terrafusion.datasets.core.recording import Recording
@@ -65,7 +65,7 @@ def lines_of(page: dict) -> str:
 def polluted(value: float) -> Callable[[Recording], Recording]:
     """Every number of every channel is this one in some rows."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         for name, channel in r.channels().items():
             changed = {}
             for spec in dataclasses.fields(channel):
@@ -76,7 +76,7 @@ def polluted(value: float) -> Callable[[Recording], Recording]:
             r = dataclasses.replace(r, **{name: dataclasses.replace(channel, **changed)})
         return r
 
-    return spoil
+    return corrupt
 
 
 def many_labels(r: Recording) -> Recording:
@@ -124,7 +124,7 @@ HOSTILE: dict[str, Callable[[Recording], Recording]] = {
 @pytest.mark.parametrize("name", HOSTILE)
 def test_any_recording_has_a_page(name: str, drive: Recording) -> None:
     recording = HOSTILE[name](drive)
-    findings = examine(recording)
+    findings = run_checks(recording)
     assert recording.name[:50] in lines_of(summarise(recording, measure([recording]), findings))
     both = [recording, drive]
     page = summarise_all("both", both, measure(both), [findings, []])

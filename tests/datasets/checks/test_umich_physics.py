@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.catalog.catalog import load_catalog
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.checks.mounting import heading
 from terrafusion.datasets.core.conventions import Conventions, apply
@@ -115,7 +115,7 @@ def physics(recording: Recording) -> dict[str, bool]:
     if recording.wheels is not None:
         t = recording.truth.t_ns[9:-9]
         rolled = np.interp(t, recording.wheels.t_ns, recording.wheels.speed[:, 0])
-        told = heading(Patient(recording, None))
+        told = heading(CheckContext(recording, None))
         angle = told.angle if told is not None and told.angle is not None else np.pi
         checks["imu forward"] = abs(angle) < np.radians(15.0)
         checks["wheel sign"] = bool(np.corrcoef(rolled, ahead)[0, 1] > 0.5)

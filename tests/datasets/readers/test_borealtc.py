@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.checks.mounting import heading
 from terrafusion.datasets.core.conventions import Conventions, apply
@@ -76,7 +76,7 @@ def physics(recording: Recording) -> dict[str, bool]:
     assert recording.motor is not None
     assert measures.yaw is not None
     track = measures.yaw.effective_track_m
-    told = heading(Patient(recording, None))
+    told = heading(CheckContext(recording, None))
     return {
         "gravity": measures.gravity is not None and measures.gravity.axis == "+z",
         "forward": told is None or told.angle is None or abs(told.angle) < np.radians(15.0),
@@ -137,7 +137,7 @@ def test_a_flipped_convention_breaks_physics(run: Path, name: str) -> None:
 @pytest.mark.parametrize("axes", [("-x", "-y", "+z"), ("-y", "+x", "+z"), ("+y", "-x", "+z")])
 def test_x_is_forward_where_the_run_tells(boreal_logs: Path, name: str, axes: tuple[str, ...]) -> None:
     recording = open_recording(f"borealtc/{name}")
-    assert heading(Patient(recording, None)) is not None
+    assert heading(CheckContext(recording, None)) is not None
     assert physics(recording)["forward"]
     assert not physics(apply(recording, Conventions(imu_axes=axes)))["forward"]
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.lag import lag_between
 from terrafusion.datasets.core.recording import Fix, Recording
 from terrafusion.datasets.readers import open_recording
@@ -105,7 +105,7 @@ def chord_over_wheels(recording: Recording) -> float:
 
 
 def codes(recording: Recording) -> set[str]:
-    return {finding.code for finding in examine(recording)}
+    return {finding.code for finding in run_checks(recording)}
 
 
 # --- the published files -----------------------------------------------------------------------------------

@@ -18,11 +18,11 @@ ACCEL = ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2")
 
 @pytest.fixture
 def log(good_log: Path, tmp_path: Path) -> Path:
-    """A copy of the good log, to be spoilt."""
+    """A copy of the good log, to be corrupted."""
     return shutil.copytree(good_log, tmp_path / "log")
 
 
-def spoil(log: Path, channel: str, columns: tuple[str, ...], factor: float) -> None:
+def corrupt(log: Path, channel: str, columns: tuple[str, ...], factor: float) -> None:
     """Multiply columns of a channel."""
     table = pd.read_csv(log / f"{channel}.csv")
     table[list(columns)] *= factor
@@ -37,25 +37,25 @@ def set_back(log: Path, channel: str, after_s: float, by_s: float) -> None:
 
 
 def test_repairs_are_told_and_kept(log: Path, good_log: Path, terrafusion) -> None:
-    spoil(log, "imu", ACCEL, 1 / 9.80665)
+    corrupt(log, "imu", ACCEL, 1 / 9.80665)
     outcome = terrafusion("convert", "log", "out", "--apply-fixes")
     assert (outcome.status, outcome.err) == (0, "")
-    told = [line for line in outcome.out.splitlines() if line.startswith("mended: ")]
+    told = [line for line in outcome.out.splitlines() if line.startswith("repaired: ")]
     assert len(told) == 1
-    assert told[0].startswith("mended: accel-in-g, imu: ")
+    assert told[0].startswith("repaired: accel-in-g, imu: ")
     assert "9.80665" in told[0]
     assert "error" not in outcome.out
-    mended, good = open_recording("out"), open_recording(good_log)
-    assert mended.imu is not None
+    repaired, good = open_recording("out"), open_recording(good_log)
+    assert repaired.imu is not None
     assert good.imu is not None
-    np.testing.assert_allclose(mended.imu.accel_mps2, good.imu.accel_mps2, rtol=1e-9)
-    assert any("mended" in note and "accel" in note for note in mended.notes)
+    np.testing.assert_allclose(repaired.imu.accel_mps2, good.imu.accel_mps2, rtol=1e-9)
+    assert any("repaired" in note and "accel" in note for note in repaired.notes)
     assert "no findings" in terrafusion("inspect", "out").out
     assert terrafusion("replay", "out", "--out", "results").status == 0
 
 
 def test_nothing_is_changed_unasked(log: Path, terrafusion) -> None:
-    spoil(log, "imu", ACCEL, 1 / 9.80665)
+    corrupt(log, "imu", ACCEL, 1 / 9.80665)
     outcome = terrafusion("convert", "log", "copy")
     assert (outcome.status, outcome.err) == (0, "")
     assert "error: accel-in-g, imu: " in outcome.out
@@ -72,14 +72,14 @@ def test_what_is_left_is_told(log: Path, terrafusion) -> None:
     table.to_csv(log / "imu.csv", index=False)
     outcome = terrafusion("convert", "log", "out", "--apply-fixes")
     assert outcome.status == 0
-    assert "mended: " not in outcome.out
+    assert "repaired: " not in outcome.out
     left = next(line for line in outcome.out.splitlines() if line.startswith("error: accel-magnitude, imu"))
     assert left.endswith("[left: no repair can know the true numbers]")
     terrafusion("replay", "out", "--out", "results").refused("gravity has been removed")
 
 
 def test_a_refused_replay_names_the_remedy(log: Path, terrafusion) -> None:
-    spoil(log, "imu", ACCEL, 1 / 9.80665)
+    corrupt(log, "imu", ACCEL, 1 / 9.80665)
     refusal = terrafusion("replay", "log", "--out", "results")
     refusal.refused("imu", "`terrafusion convert log OUT --apply-fixes`")
     words = refusal.err.split("`terrafusion ")[1].split("`")[0].split()
@@ -90,7 +90,7 @@ def test_a_refused_replay_names_the_remedy(log: Path, terrafusion) -> None:
 def test_mending_a_good_log_changes_nothing(good_log: Path, terrafusion) -> None:
     outcome = terrafusion("convert", good_log, "same", "--apply-fixes")
     assert (outcome.status, outcome.err) == (0, "")
-    assert "mended" not in outcome.out
+    assert "repaired" not in outcome.out
     for path in good_log.glob("*.csv"):
         assert (Path("same") / path.name).read_bytes() == path.read_bytes()
 
@@ -104,8 +104,8 @@ def test_a_clock_set_back(log: Path, terrafusion) -> None:
     for option in ("--repair-clock", "--apply-fixes"):
         outcome = terrafusion("convert", "log", f"with{option}", option)
         assert (outcome.status, outcome.err) == (0, ""), outcome
-        mended = open_recording(f"with{option}")
-        assert mended.imu is not None
-        assert (np.diff(mended.imu.t_ns) > 0).all()
-        assert any("imu" in note and "3" in note for note in mended.notes)
+        repaired = open_recording(f"with{option}")
+        assert repaired.imu is not None
+        assert (np.diff(repaired.imu.t_ns) > 0).all()
+        assert any("imu" in note and "3" in note for note in repaired.notes)
     assert terrafusion("replay", "log", "--out", "results", "--repair-clock").status == 0

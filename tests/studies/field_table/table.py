@@ -27,7 +27,7 @@ from urllib.parse import quote
 import numpy as np
 
 from terrafusion.datasets.catalog.catalog import CatalogFile, at_hand, data_folders, load_catalog
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors_of
 from terrafusion.datasets.core.files import check_folder
 from terrafusion.datasets.core.recording import Recording
@@ -289,7 +289,7 @@ def check_log(recording: Recording) -> None:
     if recording.wheels is None or recording.imu is None:
         raise DataError("has no wheels or no IMU", remedy="nothing to estimate from: the table leaves it out")
     params, _ = choose_vehicle(recording, None)
-    errors = [found for found in examine(recording, params.rig()) if found.severity == "error"]
+    errors = [found for found in run_checks(recording, params.rig()) if found.severity == "error"]
     if errors:
         raise DataError(
             f"{errors[0].what} ({errors[0].evidence})", channel=errors[0].channel, remedy=errors[0].fix

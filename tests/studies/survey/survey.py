@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import DATA_VARIABLE, CatalogFile, data_folders, load_catalog
-from terrafusion.datasets.checks.finding import Patient
+from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.measures import Measures, measure
 from terrafusion.datasets.checks.mounting import heading
 from terrafusion.datasets.checks.path import dead_reckoned
@@ -233,7 +233,7 @@ def _turn_r(one: str, other: str, *, logged: bool = False) -> Callable[[Drives],
 def _rates_in_common(recordings: Sequence[Recording], one: str, other: str) -> tuple[Array, Array]:
     pairs = []
     for recording in recordings:
-        known = accounts(Patient(recording, None))
+        known = accounts(CheckContext(recording, None))
         if one in known and other in known:
             a, b = known[one], known[other]
             grid = np.arange(max(a.t_s[0], b.t_s[0]), min(a.t_s[-1], b.t_s[-1]), TURN_S)
@@ -256,7 +256,7 @@ def _gravity_size(drives: Drives) -> float | None:
 
 def _off_forward(drives: Drives) -> float | None:
     """Degrees by which the IMU's x lies left of forward, told by changes of speed and by the turns."""
-    found = heading(Patient(drives.opened[0], None))
+    found = heading(CheckContext(drives.opened[0], None))
     return float(np.degrees(found.angle)) if found is not None and found.angle is not None else None
 
 
@@ -288,7 +288,7 @@ def _reckoned_rms(*, gyro: bool) -> Callable[[Drives], float | None]:
     def rms(drives: Drives) -> float | None:
         recording = drives.opened[0]
         gnss, track = recording.gnss, recording.overrides.track_m
-        known = accounts(Patient(recording, None))
+        known = accounts(CheckContext(recording, None))
         if gnss is None or track is None or "wheels" not in known:
             return None
         if not gyro and recording.imu is not None:
@@ -298,7 +298,7 @@ def _reckoned_rms(*, gyro: bool) -> Callable[[Drives], float | None]:
             turned[:, 2] = np.interp((recording.imu.t_ns - recording.start_ns) * 1e-9, wheels.t_s, rate)
             recording = _with_gyro(recording, turned)
         antenna = complex(*recording.overrides.antenna_m[:2]) if recording.overrides.antenna_m else 0j
-        reckoned = dead_reckoned(Patient(recording, None), antenna)
+        reckoned = dead_reckoned(CheckContext(recording, None), antenna)
         if reckoned is None:
             return None
         t, _, path = reckoned

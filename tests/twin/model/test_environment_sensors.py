@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import terrafusion.twin.params
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa, pressure_at
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
@@ -140,7 +140,7 @@ def test_iron_is_as_stated() -> None:
     ]
     middle = [0.5 * (m.min(axis=0) + m.max(axis=0))[:2] for m in (d.magnetometer.field_t for d in hard)]
     assert 1.5e-6 < np.std(middle) < 4.5e-6
-    assert any("hard-iron" in [f.code for f in examine(d)] for d in hard)
+    assert any("hard-iron" in [f.code for f in run_checks(d)] for d in hard)
 
 
 def test_disturbances_belong_to_the_place() -> None:

@@ -1,4 +1,4 @@
-"""Axes, signs, units, scales and frames: each fault is found by its physics, and mended where it can be."""
+"""Axes, signs, units, scales and frames: each fault is found by its physics, and repaired where it can be."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine, treat
+from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.recording import Command, Fix, Gnss, Imu, Overrides, Recording, Wheels
 from terrafusion.datasets.core.sensors import Rig, axes_matrix
@@ -92,29 +92,29 @@ def without(r: Recording, *channels: str) -> Recording:
 def imu_with(**change: Callable[[np.ndarray], np.ndarray]) -> Fault:
     """Another reading of the IMU's arrays."""
 
-    def spoilt(r: Recording) -> Recording:
+    def corrupted(r: Recording) -> Recording:
         assert r.imu is not None
         fields = {name: f(getattr(r.imu, name)) for name, f in change.items()}
         return dataclasses.replace(r, imu=dataclasses.replace(r.imu, **fields))
 
-    return spoilt
+    return corrupted
 
 
 def wheels_with(change: Callable[[np.ndarray], np.ndarray]) -> Fault:
-    def spoilt(r: Recording) -> Recording:
+    def corrupted(r: Recording) -> Recording:
         assert r.wheels is not None
         return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, speed=change(r.wheels.speed)))
 
-    return spoilt
+    return corrupted
 
 
 def gnss_with(**change: Callable[[np.ndarray], np.ndarray]) -> Fault:
-    def spoilt(r: Recording) -> Recording:
+    def corrupted(r: Recording) -> Recording:
         assert r.gnss is not None
         fields = {name: f(getattr(r.gnss, name).copy()) for name, f in change.items()}
         return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, **fields))
 
-    return spoilt
+    return corrupted
 
 
 def mounted(*axes: str) -> Fault:
@@ -124,12 +124,12 @@ def mounted(*axes: str) -> Fault:
 
 
 def after(*steps: Fault) -> Fault:
-    def spoilt(r: Recording) -> Recording:
+    def corrupted(r: Recording) -> Recording:
         for step in steps:
             r = step(r)
         return r
 
-    return spoilt
+    return corrupted
 
 
 def rad_for_metres(r: Recording) -> Recording:
@@ -151,13 +151,13 @@ def radius(value: float) -> Fault:
 
 
 def latitude_longitude(order: list[int], scale: float = 1.0) -> Fault:
-    def spoilt(r: Recording) -> Recording:
+    def corrupted(r: Recording) -> Recording:
         assert r.gnss is not None
         place = enu_to_geodetic(r.gnss.enu_m, DATUM)
         place = np.column_stack([place[:, order] * scale, place[:, 2]])
         return dataclasses.replace(r, gnss=dataclasses.replace(r.gnss, enu_m=place), datum=None)
 
-    return spoilt
+    return corrupted
 
 
 def truth_yawed(r: Recording, degrees: float) -> Recording:
@@ -308,44 +308,44 @@ MENDED: dict[str, tuple[Fault, str, str]] = {
 
 @pytest.mark.parametrize("name", MENDED)
 def test_fault_is_found_and_mended(name: str) -> None:
-    spoil, code, severity = MENDED[name]
+    corrupt, code, severity = MENDED[name]
     good = lively_drive()
-    spoilt = spoil(good)
-    found = {finding.code: finding for finding in examine(spoilt)}
+    corrupted = corrupt(good)
+    found = {finding.code: finding for finding in run_checks(corrupted)}
     assert code in found, sorted(found)
     assert found[code].severity == severity
     assert found[code].evidence
     assert found[code].fix
-    mended, done = treat(spoilt)
+    repaired, done = repair(corrupted)
     assert code in [finding.code for finding in done]
-    assert {finding.code for finding in examine(mended)} <= {"gaps"}  # where fixes were dropped
-    assert_same(mended, good)
+    assert {finding.code for finding in run_checks(repaired)} <= {"gaps"}  # where fixes were dropped
+    assert_same(repaired, good)
 
 
-def assert_same(mended: Recording, good: Recording) -> None:
+def assert_same(repaired: Recording, good: Recording) -> None:
     """The numbers of the channels that are left are near those of the good drive."""
-    if mended.imu is not None:
-        np.testing.assert_allclose(mended.imu.gyro_radps, good.imu.gyro_radps, atol=0.005)
-        np.testing.assert_allclose(mended.imu.accel_mps2, good.imu.accel_mps2, atol=0.02)
-    if mended.wheels is not None:
-        found = mended.wheels.side_speeds_mps(mended.overrides.wheel_radius_m or RADIUS_M)
+    if repaired.imu is not None:
+        np.testing.assert_allclose(repaired.imu.gyro_radps, good.imu.gyro_radps, atol=0.005)
+        np.testing.assert_allclose(repaired.imu.accel_mps2, good.imu.accel_mps2, atol=0.02)
+    if repaired.wheels is not None:
+        found = repaired.wheels.side_speeds_mps(repaired.overrides.wheel_radius_m or RADIUS_M)
         np.testing.assert_allclose(found, good.wheels.side_speeds_mps(RADIUS_M), rtol=0.01, atol=0.01)
-    if mended.gnss is not None:
-        same = good.gnss.select(np.isin(good.gnss.t_ns, mended.gnss.t_ns))
-        assert len(mended.gnss) > 0.9 * len(good.gnss)
+    if repaired.gnss is not None:
+        same = good.gnss.select(np.isin(good.gnss.t_ns, repaired.gnss.t_ns))
+        assert len(repaired.gnss) > 0.9 * len(good.gnss)
         away = same.enu_m - same.enu_m[0]
-        np.testing.assert_allclose(mended.gnss.enu_m - mended.gnss.enu_m[0], away, atol=0.01)
-        kept = np.isfinite(mended.gnss.velocity_enu_mps)
-        found, expected = mended.gnss.velocity_enu_mps[kept], same.velocity_enu_mps[kept]
+        np.testing.assert_allclose(repaired.gnss.enu_m - repaired.gnss.enu_m[0], away, atol=0.01)
+        kept = np.isfinite(repaired.gnss.velocity_enu_mps)
+        found, expected = repaired.gnss.velocity_enu_mps[kept], same.velocity_enu_mps[kept]
         np.testing.assert_allclose(found, expected, rtol=0.05, atol=0.02)
-        assert (mended.gnss.sigma_enu_m > 0.03).all()
-        assert (mended.gnss.sigma_enu_m < 0.25).all()
-    if mended.truth is not None:
-        np.testing.assert_allclose(mended.truth.position_m, good.truth.position_m, atol=1e-6)
-        off = np.angle(np.exp(1j * (mended.truth.yaw_rad() - good.truth.yaw_rad())))
+        assert (repaired.gnss.sigma_enu_m > 0.03).all()
+        assert (repaired.gnss.sigma_enu_m < 0.25).all()
+    if repaired.truth is not None:
+        np.testing.assert_allclose(repaired.truth.position_m, good.truth.position_m, atol=1e-6)
+        off = np.angle(np.exp(1j * (repaired.truth.yaw_rad() - good.truth.yaw_rad())))
         np.testing.assert_allclose(off, 0.0, atol=0.05)
-    if mended.command is not None:
-        np.testing.assert_array_equal(mended.command.yaw_rate_radps, good.command.yaw_rate_radps)
+    if repaired.command is not None:
+        np.testing.assert_array_equal(repaired.command.yaw_rate_radps, good.command.yaw_rate_radps)
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 1.0, 2.0])
@@ -353,9 +353,10 @@ def assert_same(mended: Recording, good: Recording) -> None:
 def test_lively_drive_has_no_finding(seed: int, speed_mps: float, husky_rig: Rig) -> None:
     good = lively_drive(seed, speed_mps)
     for drive in (good, four_wheels(good), in_mps(good)):
-        assert examine(drive) == []
+        assert run_checks(drive) == []
     assert (
-        examine(good, dataclasses.replace(husky_rig, wheel_radius_m=RADIUS_M, sensors=level(husky_rig))) == []
+        run_checks(good, dataclasses.replace(husky_rig, wheel_radius_m=RADIUS_M, sensors=level(husky_rig)))
+        == []
     )
 
 
@@ -380,19 +381,19 @@ FOUND: dict[str, tuple[Fault, str, str]] = {
 
 @pytest.mark.parametrize("name", FOUND)
 def test_what_the_data_leave_open_is_found_and_left(name: str) -> None:
-    spoil, code, severity = FOUND[name]
-    spoilt = spoil(lively_drive())
-    found = {finding.code: finding for finding in examine(spoilt)}
+    corrupt, code, severity = FOUND[name]
+    corrupted = corrupt(lively_drive())
+    found = {finding.code: finding for finding in run_checks(corrupted)}
     assert code in found, sorted(found)
     assert found[code].severity == severity
     assert found[code].repair is None
-    _, done = treat(spoilt)
+    _, done = repair(corrupted)
     assert code not in [finding.code for finding in done]
 
 
 def test_slip_on_soft_ground_is_no_finding() -> None:
     slipping = dataclasses.replace(radius(1.5 * RADIUS_M)(lively_drive()), terrain_name="mud")
-    assert examine(slipping) == []
+    assert run_checks(slipping) == []
 
 
 def test_the_gyro_is_assumed_where_nothing_tells() -> None:
@@ -401,11 +402,11 @@ def test_the_gyro_is_assumed_where_nothing_tells() -> None:
     gyro_only = imu_with(
         gyro_radps=times(np.nan, np.nan, -1.0), accel_mps2=lambda a: np.full_like(a, np.nan)
     )(bare)
-    found = examine(gyro_only)
+    found = run_checks(gyro_only)
     assert [finding.code for finding in found] == ["yaw-sign"]
     assert "assumed" in found[0].fix
-    mended, _ = treat(gyro_only)
-    assert any("assumed" in note for note in mended.notes)
+    repaired, _ = repair(gyro_only)
+    assert any("assumed" in note for note in repaired.notes)
 
 
 def test_two_faults_of_one_kind_are_both_mended() -> None:
@@ -413,22 +414,22 @@ def test_two_faults_of_one_kind_are_both_mended() -> None:
     good = four_wheels(lively_drive())
     assert good.wheels is not None
     dead = good.wheels.speed * [0.0, 0.0, 1.0, 1.0]
-    spoilt = dataclasses.replace(good, wheels=dataclasses.replace(good.wheels, speed=dead))
-    mended, done = treat(spoilt)
+    corrupted = dataclasses.replace(good, wheels=dataclasses.replace(good.wheels, speed=dead))
+    repaired, done = repair(corrupted)
     assert [finding.code for finding in done].count("wheel-odd") == 2
-    assert mended.overrides.wheel_radius_m == good.overrides.wheel_radius_m
-    assert "wheel-odd" not in {finding.code for finding in examine(mended)}
+    assert repaired.overrides.wheel_radius_m == good.overrides.wheel_radius_m
+    assert "wheel-odd" not in {finding.code for finding in run_checks(repaired)}
 
 
 def test_one_reversed_speed_is_the_wheels_own() -> None:
     good = body_speed(lively_drive())
     assert good.wheels is not None
-    spoilt = dataclasses.replace(good, wheels=dataclasses.replace(good.wheels, speed=-good.wheels.speed))
-    mended, done = treat(spoilt)
+    corrupted = dataclasses.replace(good, wheels=dataclasses.replace(good.wheels, speed=-good.wheels.speed))
+    repaired, done = repair(corrupted)
     assert [finding.code for finding in done] == ["wheel-reversed"]
-    assert examine(mended) == []
-    assert mended.wheels is not None
-    np.testing.assert_allclose(mended.wheels.speed, good.wheels.speed)
+    assert run_checks(repaired) == []
+    assert repaired.wheels is not None
+    np.testing.assert_allclose(repaired.wheels.speed, good.wheels.speed)
 
 
 def body_speed(r: Recording) -> Recording:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine, treat
+from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.readers import open as opening
 
@@ -51,12 +51,12 @@ def joined(recordings: list[Recording]) -> Recording:
 
 def test_husky_mounting_is_found(unread: Path) -> None:
     bag = opening.open_recording(log(unread / "husky_parkinglot" / "test1.bag"))
-    mended, done = treat(bag)
+    repaired, done = repair(bag)
     assert [finding.code for finding in done] == ["imu-axes"]
     assert "-z, -x, +y point forward, left, up" in done[0].fix
     assert "acceleration follows the wheels along -z" in done[0].evidence
     # Its covariances are the HDOP squared: 9 values of sigma from 0.8 to 1.7, up twice that.
-    assert [(finding.code, finding.severity) for finding in examine(mended)] == [
+    assert [(finding.code, finding.severity) for finding in run_checks(repaired)] == [
         ("sigma-dilution", "warning")
     ]
 
@@ -64,19 +64,19 @@ def test_husky_mounting_is_found(unread: Path) -> None:
 @pytest.mark.parametrize("name", ["s5t1", "test17run"])
 def test_pathfinder_signs_are_found(unread: Path, name: str) -> None:
     rover = opening.open_recording(log(unread / "wvu_pathfinder" / f"{name}.mat"))
-    mended, done = treat(rover)
+    repaired, done = repair(rover)
     found = {finding.code: finding for finding in done}
     assert "left side" in found["wheel-sign"].fix
     assert "+x, -y, -z point forward, left, up" in found["imu-axes"].fix
     assert "acceleration follows the wheels along +x" in found["imu-axes"].evidence
-    assert not {"wheel-sign", "imu-axes", "yaw-sign"} & {finding.code for finding in examine(mended)}
+    assert not {"wheel-sign", "imu-axes", "yaw-sign"} & {finding.code for finding in run_checks(repaired)}
 
 
 def test_pathfinder_radius_is_found(unread: Path) -> None:
     rover = opening.open_recording(log(unread / "wvu_pathfinder" / "test17run.mat"))
-    mended, done = treat(dataclasses.replace(rover, overrides=Overrides(wheel_radius_m=0.110)))
+    repaired, done = repair(dataclasses.replace(rover, overrides=Overrides(wheel_radius_m=0.110)))
     assert "wheel-radius" in [finding.code for finding in done]
-    assert 0.114 < mended.overrides.wheel_radius_m < 0.119
+    assert 0.114 < repaired.overrides.wheel_radius_m < 0.119
 
 
 @pytest.mark.parametrize(
@@ -89,5 +89,5 @@ def test_pathfinder_radius_is_found(unread: Path) -> None:
 )
 def test_norlab_yaw_sign_is_found_in_joined_windows(unread: Path, folder: str, flipped: bool) -> None:
     windows = opening.open_recordings(log(unread / "norlab_drive" / folder / "slip_dataset_all.pkl"))
-    codes = [finding.code for finding in examine(joined(windows[:120]))]
+    codes = [finding.code for finding in run_checks(joined(windows[:120]))]
     assert ("yaw-sign" in codes) == flipped

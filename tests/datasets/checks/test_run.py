@@ -8,14 +8,14 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
 
 def test_clean_drive_has_no_finding(drive: Recording, husky_rig: Rig) -> None:
-    assert examine(drive) == []
-    assert examine(drive, husky_rig) == []
+    assert run_checks(drive) == []
+    assert run_checks(drive, husky_rig) == []
 
 
 def imu_gap(r: Recording) -> Recording:
@@ -117,8 +117,8 @@ FAULTS: list[tuple[Callable[[Recording], Recording], str, str, str]] = [
 
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault[0].__name__)
 def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Recording], str, str, str]) -> None:
-    spoil, severity, channel, what = fault
-    findings = examine(spoil(drive))
+    corrupt, severity, channel, what = fault
+    findings = run_checks(corrupt(drive))
     assert (severity, channel) in [(f.severity, f.channel) for f in findings]
     found = next(f for f in findings if f.channel == channel and what in f.what)
     assert found.evidence
@@ -127,12 +127,12 @@ def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Record
 
 
 def test_held_value_count_is_told(drive: Recording) -> None:
-    found = next(f for f in examine(held_wheels(drive)) if f.what == "values are held")
+    found = next(f for f in run_checks(held_wheels(drive)) if f.what == "values are held")
     assert "every 4" in found.evidence
 
 
 def test_errors_come_first(drive: Recording) -> None:
-    severities = [f.severity for f in examine(gyro_flipped(imu_gap(drive)))]
+    severities = [f.severity for f in run_checks(gyro_flipped(imu_gap(drive)))]
     assert severities == sorted(severities, key=lambda s: s != "error")
 
 
@@ -140,5 +140,5 @@ def test_sparse_logs_do_not_trip_it(drive: Recording) -> None:
     for name, channel in drive.channels().items():
         for n in (1, 2, 5):
             alone = Recording("x", drive.start_ns, **{name: channel.select(slice(0, n))})
-            assert examine(alone) == [], (name, n)
-    assert examine(Recording("x", 0)) == []
+            assert run_checks(alone) == [], (name, n)
+    assert run_checks(Recording("x", 0)) == []

@@ -7,9 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import examine
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.recording import Imu, Recording
-from tests.datasets.checks.test_doctor_physics import (
+from tests.datasets.checks.test_physical_faults import (
     EFFECTIVE_TRACK_M,
     RADIUS_M,
     START_NS,
@@ -29,9 +29,9 @@ from tests.datasets.checks.test_doctor_physics import (
 def test_short_recordings_are_taken(rows_kept: int) -> None:
     good = lively_drive()
     for name in ("wheels", "imu", "gnss", "command"):
-        examine(dataclasses.replace(good, **{name: getattr(good, name).select(slice(0, rows_kept))}))
+        run_checks(dataclasses.replace(good, **{name: getattr(good, name).select(slice(0, rows_kept))}))
     assert good.truth is not None
-    examine(dataclasses.replace(good, truth=good.truth.select(slice(0, rows_kept))))
+    run_checks(dataclasses.replace(good, truth=good.truth.select(slice(0, rows_kept))))
 
 
 BARE: dict[str, Fault] = {
@@ -58,7 +58,7 @@ BARE: dict[str, Fault] = {
 
 @pytest.mark.parametrize("name", BARE)
 def test_a_log_with_less_is_clean_too(name: str) -> None:
-    found = {finding.code for finding in examine(BARE[name](lively_drive()))}
+    found = {finding.code for finding in run_checks(BARE[name](lively_drive()))}
     assert found <= {"dead", "missing-values"}  # true of two of them
 
 
@@ -75,10 +75,10 @@ def test_a_robot_that_spins_on_the_spot_is_clean() -> None:
     imu = Imu(good.imu.t_ns, gyro, good.imu.accel_mps2 * [0.01, 0.01, 1.0])
     spinning = without(good, "gnss", "truth", "command")
     spinning = dataclasses.replace(spinning, imu=imu, wheels=dataclasses.replace(good.wheels, speed=sides))
-    assert examine(spinning) == []
+    assert run_checks(spinning) == []
     stuck = dataclasses.replace(spinning, imu=None)
-    assert [(f.code, f.severity, f.repair) for f in examine(stuck)] == [("wheel-sign", "warning", None)]
-    assert examine(dataclasses.replace(stuck, terrain_name="snow")) == []
+    assert [(f.code, f.severity, f.repair) for f in run_checks(stuck)] == [("wheel-sign", "warning", None)]
+    assert run_checks(dataclasses.replace(stuck, terrain_name="snow")) == []
 
 
 def motion_rate(r: Recording, t_s: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""`docs/doctor.md` lists every code that a check can give, and quotes the thresholds of the code."""
+"""`docs/log-checks.md` lists every code that a check can give, and quotes the thresholds of the code."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from terrafusion.datasets import checks as doctor
+from terrafusion.datasets import checks
 
-TEXT = (Path(__file__).parents[3] / "docs" / "doctor.md").read_text(encoding="utf-8")
-MODULES = [f"{doctor.__name__}.{module.name}" for module in pkgutil.iter_modules(doctor.__path__)]
+TEXT = (Path(__file__).parents[3] / "docs" / "log-checks.md").read_text(encoding="utf-8")
+MODULES = [f"{checks.__name__}.{module.name}" for module in pkgutil.iter_modules(checks.__path__)]
 
 
 def codes_of(module_name: str) -> Iterator[tuple[str, int]]:
@@ -46,6 +46,6 @@ QUOTED = re.findall(r"`(\w+)\.([A-Z][A-Z0-9_]*)`(?: (-?[\d.]+(?:e-?\d+)?))?", TE
 
 @pytest.mark.parametrize(("module", "name", "value"), QUOTED)
 def test_thresholds_are_those_of_the_code(module: str, name: str, value: str) -> None:
-    found = getattr(importlib.import_module(f"{doctor.__name__}.{module}"), name)
+    found = getattr(importlib.import_module(f"{checks.__name__}.{module}"), name)
     if value:
         assert float(value) == pytest.approx(float(found))

@@ -1,4 +1,4 @@
-"""The input doctor on clocks and signals: clean drives are silent, each fault is named and mended."""
+"""The input doctor on clocks and signals: clean drives are silent, each fault is named and repaired."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from terrafusion.datasets.checks import Finding, Patient, examine, treat
+from terrafusion.datasets.checks import CheckContext, Finding, repair, run_checks
 from terrafusion.datasets.checks.delays import _finding
 from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
 from terrafusion.datasets.core.lag import Lag
@@ -30,7 +30,7 @@ CODES = {
 
 def found_in(recording: Recording, rig: Rig | None = None) -> list[Finding]:
     """The findings on clocks and signals; the others have tests of their own."""
-    return [finding for finding in examine(recording, rig) if finding.code in CODES]
+    return [finding for finding in run_checks(recording, rig) if finding.code in CODES]
 
 
 def seconds(t_ns: np.ndarray) -> np.ndarray:
@@ -40,12 +40,12 @@ def seconds(t_ns: np.ndarray) -> np.ndarray:
 def retimed(name: str, new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
     """A channel with other times."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         channel = getattr(r, name)
         t_ns = np.asarray(new(channel.t_ns)).astype(np.int64)
         return dataclasses.replace(r, **{name: dataclasses.replace(channel, t_ns=t_ns)})
 
-    return spoil
+    return corrupt
 
 
 def late(name: str, by_s: float, from_s: float = 0.0) -> Spoil:
@@ -59,23 +59,23 @@ def drifting(name: str, rate: float) -> Spoil:
 def rows(name: str, choose: Callable[[np.ndarray], np.ndarray]) -> Spoil:
     """A channel with some of its rows, by seconds from its start."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         channel = getattr(r, name)
         return dataclasses.replace(r, **{name: channel.select(choose(seconds(channel.t_ns)))})
 
-    return spoil
+    return corrupt
 
 
 def with_field(name: str, field: str, new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
     """A channel with other values in one field."""
 
-    def spoil(r: Recording) -> Recording:
+    def corrupt(r: Recording) -> Recording:
         channel = getattr(r, name)
         return dataclasses.replace(
             r, **{name: dataclasses.replace(channel, **{field: new(getattr(channel, field).copy())})}
         )
 
-    return spoil
+    return corrupt
 
 
 def to(value: float, *cells: object) -> Callable[[np.ndarray], np.ndarray]:
@@ -133,7 +133,7 @@ def arrival(t_ns: np.ndarray) -> np.ndarray:
     return np.sort(t_ns + np.random.default_rng(1).integers(0, 2 * period, len(t_ns)))
 
 
-# code, channel, spoil, largest error of the mended times in seconds
+# code, channel, corrupt, largest error of the repaired times in seconds
 CLOCK_FAULTS: dict[str, tuple[str, str, Spoil, float]] = {
     "imu is 0.4 s late": ("clock-offset", "imu", late("imu", 0.4), 0.05),
     "wheels are 0.8 s early": ("clock-offset", "wheels", late("wheels", -0.8), 0.03),
@@ -155,16 +155,16 @@ CLOCK_FAULTS: dict[str, tuple[str, str, Spoil, float]] = {
 
 @pytest.mark.parametrize("name", CLOCK_FAULTS)
 def test_clock_faults_are_named_and_mended(drive: Recording, name: str) -> None:
-    code, channel, spoil, tolerance_s = CLOCK_FAULTS[name]
-    spoilt = spoil(drive)
-    assert [(f.code, f.channel) for f in found_in(spoilt)] == [(code, channel)]
-    mended, done = treat(spoilt)
+    code, channel, corrupt, tolerance_s = CLOCK_FAULTS[name]
+    corrupted = corrupt(drive)
+    assert [(f.code, f.channel) for f in found_in(corrupted)] == [(code, channel)]
+    repaired, done = repair(corrupted)
     assert (code, channel) in [(f.code, f.channel) for f in done]
-    assert found_in(mended) == []
-    assert any(f"mended: {channel}" in note for note in mended.notes)
-    good, now = getattr(drive, channel).t_ns, getattr(mended, channel).t_ns
+    assert found_in(repaired) == []
+    assert any(f"repaired: {channel}" in note for note in repaired.notes)
+    good, now = getattr(drive, channel).t_ns, getattr(repaired, channel).t_ns
     assert np.abs(now - good).max() * 1e-9 < tolerance_s
-    assert mended.start_ns <= now[0]
+    assert repaired.start_ns <= now[0]
 
 
 @pytest.mark.parametrize(
@@ -208,15 +208,15 @@ VALUE_FAULTS: dict[str, tuple[str, str, Spoil]] = {
 
 @pytest.mark.parametrize("name", VALUE_FAULTS)
 def test_value_faults_are_named_and_mended(drive: Recording, name: str) -> None:
-    code, channel, spoil = VALUE_FAULTS[name]
-    spoilt = spoil(drive)
-    assert [(f.code, f.channel) for f in found_in(spoilt)] == [(code, channel)]
-    mended, _ = treat(spoilt)
-    left = found_in(mended)
+    code, channel, corrupt = VALUE_FAULTS[name]
+    corrupted = corrupt(drive)
+    assert [(f.code, f.channel) for f in found_in(corrupted)] == [(code, channel)]
+    repaired, _ = repair(corrupted)
+    left = found_in(repaired)
     assert code not in [f.code for f in left]
     assert {f.code for f in left} <= {"missing-values", "gaps"}  # what is gone stays gone, and is told
     assert all(f.repair is None for f in left)
-    after = getattr(mended, channel)
+    after = getattr(repaired, channel)
     if after is None:  # dead wheels are left out
         assert name == "wheels are dead"
         return
@@ -234,7 +234,7 @@ def test_value_faults_are_named_and_mended(drive: Recording, name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("corrupt", "words"),
     [
         (rows("imu", lambda t: (t < 20.0) | (t > 25.0)), "1 gap"),
         (
@@ -244,14 +244,14 @@ def test_value_faults_are_named_and_mended(drive: Recording, name: str) -> None:
     ],
     ids=["a gap", "dropped messages"],
 )
-def test_what_is_missing_stays_missing(drive: Recording, spoil: Spoil, words: str) -> None:
-    spoilt = spoil(drive)
-    (finding,) = found_in(spoilt)
+def test_what_is_missing_stays_missing(drive: Recording, corrupt: Spoil, words: str) -> None:
+    corrupted = corrupt(drive)
+    (finding,) = found_in(corrupted)
     assert finding.code == "gaps"
     assert words in finding.what
     assert finding.repair is None
     assert "nobody knows" in finding.fix
-    assert treat(spoilt) == (spoilt, [])
+    assert repair(corrupted) == (corrupted, [])
 
 
 def test_a_channel_that_ends_early_has_no_drift_and_no_jump(drive: Recording) -> None:
@@ -264,46 +264,46 @@ def test_irregular_times_without_a_clock_are_not_mended(drive: Recording) -> Non
     t_ns = START_NS + np.cumsum(np.random.default_rng(0).exponential(0.05, len(drive.motor)) * 1e9).astype(
         int
     )
-    spoilt = dataclasses.replace(drive, motor=dataclasses.replace(drive.motor, t_ns=t_ns))
-    finding = next(f for f in found_in(spoilt) if f.code == "uneven-sampling")
+    corrupted = dataclasses.replace(drive, motor=dataclasses.replace(drive.motor, t_ns=t_ns))
+    finding = next(f for f in found_in(corrupted) if f.code == "uneven-sampling")
     assert finding.repair is None
 
 
 def test_other_clocks_of_other_lengths_are_not_mended(drive: Recording) -> None:
     assert drive.gnss is not None
-    spoilt = late("gnss", 1000.0)(rows("gnss", lambda t: t < 40.0)(drive))
-    (finding,) = found_in(spoilt)
+    corrupted = late("gnss", 1000.0)(rows("gnss", lambda t: t < 40.0)(drive))
+    (finding,) = found_in(corrupted)
     assert (finding.code, finding.repair) == ("no-common-time", None)
 
 
 def test_repeated_times_keep_their_first_row(drive: Recording) -> None:
     assert drive.gnss is not None
     index = np.sort(np.r_[np.arange(len(drive.gnss)), 10, 20, 20])
-    spoilt = dataclasses.replace(drive, gnss=drive.gnss.select(index))
-    (finding,) = found_in(spoilt)
+    corrupted = dataclasses.replace(drive, gnss=drive.gnss.select(index))
+    (finding,) = found_in(corrupted)
     assert (finding.code, finding.what) == ("repeated-times", "3 repeated times")
-    mended, _ = treat(spoilt)
-    assert mended.gnss is not None
-    np.testing.assert_array_equal(mended.gnss.t_ns, drive.gnss.t_ns)
-    np.testing.assert_array_equal(mended.gnss.enu_m, drive.gnss.enu_m)
+    repaired, _ = repair(corrupted)
+    assert repaired.gnss is not None
+    np.testing.assert_array_equal(repaired.gnss.t_ns, drive.gnss.t_ns)
+    np.testing.assert_array_equal(repaired.gnss.enu_m, drive.gnss.enu_m)
 
 
 def test_steps_taken_out_on_reading_are_told_once(drive: Recording) -> None:
     jumps = (ClockJump("imu", START_NS + 10**10, -2.5), ClockJump("imu", START_NS + 2 * 10**10, 0.5))
-    spoilt = dataclasses.replace(drive, clock_jumps=jumps)
-    (finding,) = found_in(spoilt)
+    corrupted = dataclasses.replace(drive, clock_jumps=jumps)
+    (finding,) = found_in(corrupted)
     assert (finding.code, finding.severity, finding.channel) == ("clock-jump", "error", "imu")
     assert "-2.500 s at t = 10.00 s" in finding.evidence
-    mended, done = treat(spoilt)
+    repaired, done = repair(corrupted)
     assert [f.code for f in done] == ["clock-jump"]
-    assert mended.clock_jumps == ()
-    assert "clock was set 2 times" in mended.notes[-1]
-    assert mended.imu is drive.imu
+    assert repaired.clock_jumps == ()
+    assert "clock was set 2 times" in repaired.notes[-1]
+    assert repaired.imu is drive.imu
 
 
 def lags(recording: Recording) -> dict[str, Lag]:
     """The lags that the check of clocks starts from, by pair."""
-    found = {pair: far_lag(*signals) for pair, signals in signal_pairs(Patient(recording, None)).items()}
+    found = {pair: far_lag(*signals) for pair, signals in signal_pairs(CheckContext(recording, None)).items()}
     return {f"{other} after {one}": lag for (one, other), lag in found.items() if lag is not None}
 
 
@@ -388,7 +388,7 @@ def test_four_hundred_seconds_are_examined_quickly() -> None:
     sides = np.stack([1.0 - 0.25 * rate, 1.0 + 0.25 * rate], axis=1) + rng.normal(0.0, 0.01, (len(t_ns), 2))
     wheels = Wheels(t_ns, sides, ("left", "right"), "mps")
     r = Recording("x", START_NS, wheels=wheels, imu=Imu(t_ns, gyro, accel))
-    examine(r)
+    run_checks(r)
     took = []
     for _ in range(3):
         start = time.process_time()
