@@ -22,9 +22,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
-from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import complete_rows, imu_kind, inputs_of
 from terrafusion.fusion.estimate.estimate import State

@@ -13,9 +13,10 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
-from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import Inputs, complete_rows, inputs_of
 from terrafusion.fusion.estimate.estimate import Estimate, State

@@ -11,9 +11,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Command, Fix, Terrain
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import matrix_to_quaternion
-from terrafusion.datasets.core.recording import Command, Fix, Recording, Terrain
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
 from terrafusion.twin.effects.catalogue import checked

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.gnss import scatter_m
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording
+from terrafusion.datasets.core.channels import Fix, Gnss
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 
 LEAST_FIXES, LEAST_VALUES, SHARE = 20, 3, 0.99

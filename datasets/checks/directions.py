@@ -9,7 +9,7 @@ from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.mounting import gravity, heading, wheels_turn_backwards
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, places, wheel_speed
 from terrafusion.datasets.checks.yaw_signals import SURE_R, Account, account, agreement, seconds
-from terrafusion.datasets.core.recording import Imu
+from terrafusion.datasets.core.channels import Imu
 
 Array = NDArray[np.float64]
 

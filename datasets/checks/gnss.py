@@ -13,7 +13,8 @@ from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, compare, places, wheel_speed
 from terrafusion.datasets.checks.timing import GAP_PERIODS
 from terrafusion.datasets.checks.yaw_signals import seconds, typical_sigma
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording
+from terrafusion.datasets.core.channels import Fix, Gnss
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 
 Array = NDArray[np.float64]

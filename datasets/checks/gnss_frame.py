@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import compare, places
 from terrafusion.datasets.checks.yaw_signals import account, course_agreement, seconds, typical_sigma
+from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.frames import geodetic_to_enu
-from terrafusion.datasets.core.recording import Gnss, Recording
+from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import ANY_RADIUS_M, wheel_speed
 from terrafusion.datasets.checks.yaw_signals import Account, account, accounts, agreement
+from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.datasets.core.recording import Imu, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import AXES, axes_matrix
 
 Array = NDArray[np.float64]

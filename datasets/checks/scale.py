@@ -11,8 +11,9 @@ import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.path import Scale, scales, wheel_speed
+from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.recording import TERRAINS, Recording
+from terrafusion.datasets.core.recording import Recording
 
 MOST_SLIP_FREE, SURELY_MORE = 1.04, 1.02
 """Driven wheels never go slower than the ground: a ratio above the first whose interval excludes the

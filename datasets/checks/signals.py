@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.yaw_sources import yaw_rates
+from terrafusion.datasets.core.channels import Channel, Imu, Wheels
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
-from terrafusion.datasets.core.recording import Channel, Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

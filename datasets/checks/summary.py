@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.finding import Finding
 from terrafusion.datasets.checks.measures import Measures
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
-from terrafusion.datasets.core.recording import Channel, Recording
+from terrafusion.datasets.core.channels import Channel
+from terrafusion.datasets.core.recording import Recording
 
 TimesNs = NDArray[np.int64]
 

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.sensor_pairs import clocks_of, period_s, retimed
-from terrafusion.datasets.core.recording import Channel, Recording
+from terrafusion.datasets.core.channels import Channel
+from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]

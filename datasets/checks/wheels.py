@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.directions import runs_backwards, sides_opposed
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
 from terrafusion.datasets.checks.scale import is_firm
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.recording import Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext
-from terrafusion.datasets.core.recording import Gnss
+from terrafusion.datasets.core.channels import Gnss
 
 Array = NDArray[np.float64]
 

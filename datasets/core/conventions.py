@@ -14,8 +14,9 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Channel, Imu, Terrain
 from terrafusion.datasets.core.config import Position, Quantity
-from terrafusion.datasets.core.recording import Channel, Imu, Recording, Terrain
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 

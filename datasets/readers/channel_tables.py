@@ -12,8 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import (
+from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
     Fix,
@@ -24,6 +23,7 @@ from terrafusion.datasets.core.recording import (
     Terrain,
     Wheels,
 )
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.log_meta import Meta

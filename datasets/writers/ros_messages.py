@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
-from terrafusion.datasets.core.recording import (
+from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
     Fix,
@@ -22,6 +21,7 @@ from terrafusion.datasets.core.recording import (
     Terrain,
     Wheels,
 )
+from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
 from terrafusion.datasets.writers.cdr import Layout, split

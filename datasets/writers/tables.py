@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Imu, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,

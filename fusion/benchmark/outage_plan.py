@@ -10,8 +10,9 @@ import dataclasses
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.metrics.metrics import Outage
 
 Array = NDArray[np.float64]

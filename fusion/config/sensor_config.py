@@ -13,8 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafusion.datasets.core.channels import Gnss, Imu
 from terrafusion.datasets.core.errors import ConfigError, DataError
-from terrafusion.datasets.core.recording import Gnss, Imu, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, planar_spec
 from terrafusion.fusion.graph.preintegration import Preintegrator

@@ -17,9 +17,10 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
-from terrafusion.datasets.core.recording import Fix
+from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
@@ -35,6 +36,7 @@ from terrafusion.fusion.estimator.alignment import (
 from terrafusion.fusion.estimator.friction import grip_of
 from terrafusion.fusion.estimator.gates import WheelGate
 from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
+from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.skid import Slide
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
@@ -107,6 +109,10 @@ class Estimator:
         from terrafusion.twin.model.vehicle import load_vehicle
 
         return cls(EstimatorConfig(load_vehicle(name).rig(), name, mode))
+
+    def add(self, message: Message) -> None:
+        """One message of `Recording.messages()` or of a driver; see `messages.add_message`."""
+        add_message(self, message)
 
     def add_imu(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike = UNKNOWN) -> None:
         """Angular rate (3,) rad/s and specific force (3,) m/s2, body axes, mean since the last sample.

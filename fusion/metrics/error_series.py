@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle, yaw_of
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.estimate import Estimate
 

@@ -30,8 +30,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.recording import Gnss, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.consistency import (
     Consistency,

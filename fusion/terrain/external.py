@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from terrafusion.datasets.core.recording import Terrain
+from terrafusion.datasets.core.channels import Terrain
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 TRUE_SOURCES = ("annotation", "simulation")
@@ -22,11 +24,21 @@ def external_probabilities(
     if terrain is None or terrain.probabilities is None or terrain.source in TRUE_SOURCES:
         return []
     rows = []
-    for t_ns, p in zip(terrain.t_ns.tolist(), terrain.probabilities, strict=True):
-        if not np.isfinite(p).all() or (p < 0.0).any() or not p.sum() > 0.0:
-            continue
-        named = dict.fromkeys(known, 0.0)
-        for name, value in zip(terrain.classes, p.tolist(), strict=True):
-            named[name if name in named else UNKNOWN] += value
-        rows.append((int(t_ns), named))
+    for t_ns, p in zip(terrain.t_ns.tolist(), terrain.probabilities.tolist(), strict=True):
+        named = known_probabilities(dict(zip(terrain.classes, p, strict=True)), known)
+        if named is not None:
+            rows.append((int(t_ns), named))
     return rows
+
+
+def known_probabilities(
+    probabilities: Mapping[str, float], known: tuple[str, ...]
+) -> dict[str, float] | None:
+    """Probabilities of the classes `known`, all others as `unknown`; None where they are no probabilities."""
+    p = np.fromiter(probabilities.values(), dtype=float)
+    if not np.isfinite(p).all() or (p < 0.0).any() or not p.sum() > 0.0:
+        return None
+    named = dict.fromkeys(known, 0.0)
+    for name, value in probabilities.items():
+        named[name if name in named else UNKNOWN] += value
+    return named

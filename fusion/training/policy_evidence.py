@@ -40,8 +40,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.training.drives import seconds, wheel_samples
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle

@@ -36,17 +36,9 @@ def _sides(v: np.ndarray, rate: np.ndarray) -> np.ndarray:
 
 
 def _recording() -> Any:
+    from terrafusion.datasets.core.channels import Command, Gnss, Imu, Motor, Terrain, Wheels
     from terrafusion.datasets.core.frames import rpy_to_quaternion
-    from terrafusion.datasets.core.recording import (
-        Command,
-        Gnss,
-        Imu,
-        Motor,
-        Overrides,
-        Recording,
-        Terrain,
-        Wheels,
-    )
+    from terrafusion.datasets.core.recording import Overrides, Recording
     from terrafusion.datasets.core.trajectory import Trajectory
 
     t_imu, gyro, accel = _inertial(50)

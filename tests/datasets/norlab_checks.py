@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from terrafusion.datasets.checks import run_checks
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.lag import Lag, lag_between
-from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 
 RADIUS_M, TRACK_M = 0.3, 1.08
 START_NS = 1_722_278_749_529_941_023

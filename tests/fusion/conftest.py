@@ -8,8 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix, Gnss, Wheels
 from terrafusion.datasets.core.frames import rpy_to_quaternion
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.estimate import Estimate, Innovation, WeightChange
 

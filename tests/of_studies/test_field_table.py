@@ -16,8 +16,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Imu, Terrain, Wheels
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Imu, Recording, Terrain, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark import parts
 from terrafusion.fusion.benchmark.outage_plan import (
     AID_HZ,

@@ -12,8 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Gnss, Imu, Terrain, Wheels
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Terrain, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.model.vehicle import load_vehicle

@@ -29,7 +29,8 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.drives import (
     FAMILIES,
     LEAD_S,

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.recording import Gnss, Imu, Recording
+from terrafusion.datasets.core.channels import Gnss, Imu
+from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
 

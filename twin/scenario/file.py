@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.config import Quantity, checked_number, shown
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.recording import Fix
 from terrafusion.twin.model.ground import SoilPatches, Variation
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.scenario.scenario import (

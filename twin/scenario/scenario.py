@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.config import Quantity, checked_number
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.recording import Fix
 from terrafusion.twin.model.ground import SoilPatches, Variation
 
 Array = NDArray[np.float64]

@@ -14,7 +14,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import moves
 from terrafusion.twin.model.ground import under_wheels
 from terrafusion.twin.model.measurement import corrections, measured

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.recording import Wheels
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import WHEELS, state_slice

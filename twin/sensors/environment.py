@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.atmosphere import pressure_at
-from terrafusion.datasets.core.recording import Barometer, Magnetometer
+from terrafusion.datasets.core.channels import Barometer, Magnetometer
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz

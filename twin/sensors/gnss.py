@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.recording import Fix, Gnss
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.sensors import GnssSpec
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.sensor_realism import GnssRealism

@@ -7,8 +7,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.datasets.core.recording import Imu
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams

@@ -15,8 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import enu_to_geodetic
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.speeds import CUTOFF_HZ, imu_speed, low_pass
 from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

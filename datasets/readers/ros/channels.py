@@ -9,10 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
-from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.frames import geodetic_to_enu
-from terrafusion.datasets.core.recording import (
+from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
     Fix,
@@ -22,6 +19,9 @@ from terrafusion.datasets.core.recording import (
     Terrain,
     Wheels,
 )
+from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros import topics

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import ChannelReader, Layouts
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of

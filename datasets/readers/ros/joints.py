@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.recording import Wheels
+from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.readers.ros.messages import Stream
 
 Array = NDArray[np.float64]

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, sha256_of
+from terrafusion.datasets.core.channels import Command, Imu, Motor, Terrain, Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.frames import rpy_to_quaternion
-from terrafusion.datasets.core.recording import Command, Imu, Motor, Recording, Terrain, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.sets.safe_pickle import MAX_BYTES, numbers, read_table

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.gnss_time import GPS_EPOCH_S, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.core.lag import lag_between
-from terrafusion.datasets.core.recording import Fix
 from terrafusion.datasets.readers.sets.matlab_hdf5 import MatlabFile
 
 Array = NDArray[np.float64]

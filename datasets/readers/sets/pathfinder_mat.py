@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.frames import geodetic_to_enu
-from terrafusion.datasets.core.recording import Gnss, Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.sets.matlab_hdf5 import MatlabFile, is_hdf5, opened, variables
 from terrafusion.datasets.readers.sets.pathfinder_fixes import (

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import wrap_angle, yaw_of
-from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
-from terrafusion.datasets.core.recording import Fix, Gnss
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.datasets.readers.formats import Request
 

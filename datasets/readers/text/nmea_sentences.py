@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Fix
 
 Array = NDArray[np.float64]
 

@@ -11,12 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.csv_table import Table
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request

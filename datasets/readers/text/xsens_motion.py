@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
-from terrafusion.datasets.core.recording import Imu
 from terrafusion.datasets.readers.text.delimited import Columns
 
 Array = NDArray[np.float64]

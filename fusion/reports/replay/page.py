@@ -12,7 +12,8 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.recording import Gnss, Recording
+from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, Scores
 from terrafusion.fusion.reports import style

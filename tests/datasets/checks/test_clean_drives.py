@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import run_checks
-from terrafusion.datasets.core.recording import Imu, Recording
+from terrafusion.datasets.core.channels import Imu
+from terrafusion.datasets.core.recording import Recording
 from tests.datasets.checks.test_physical_faults import (
     EFFECTIVE_TRACK_M,
     RADIUS_M,

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.core.channels import Channel, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic
-from terrafusion.datasets.core.recording import Channel, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.recording import Recording
 from tests.datasets.checks.test_physical_faults import lively_drive
 
 RNG = np.random.default_rng(5)

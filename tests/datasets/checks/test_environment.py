@@ -11,8 +11,10 @@ import pytest
 from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.checks.environment import circle
 from terrafusion.datasets.checks.summary import summarise
+from terrafusion.datasets.core.channels import Barometer, Imu, Magnetometer
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import Barometer, Imu, Magnetometer, Recording, differences
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap

@@ -12,8 +12,10 @@ import pytest
 
 from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.checks.measures import measure
+from terrafusion.datasets.core.channels import Fix, Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
-from terrafusion.datasets.core.recording import Fix, Imu, Overrides, Recording, differences
+from terrafusion.datasets.core.differences import differences
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import AXES, Rig, axes_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder

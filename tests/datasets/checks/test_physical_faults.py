@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.core.channels import Command, Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
-from terrafusion.datasets.core.recording import Command, Fix, Gnss, Imu, Overrides, Recording, Wheels
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 

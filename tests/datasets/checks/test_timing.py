@@ -13,8 +13,9 @@ import pytest
 from terrafusion.datasets.checks import CheckContext, Finding, repair, run_checks
 from terrafusion.datasets.checks.delays import _finding
 from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.lag import Lag
-from terrafusion.datasets.core.recording import ClockJump, Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 

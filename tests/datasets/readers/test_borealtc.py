@@ -13,9 +13,11 @@ import pytest
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.measures import measure
 from terrafusion.datasets.checks.mounting import heading
+from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import TERRAINS, Recording, differences
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import borealtc_csv
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import run_checks
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.lag import lag_between
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 from tests.datasets.conftest import CatalogWith
 from tests.datasets.pathfinder_files import (

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.ros.joints import wheel_of_joint

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
 from terrafusion.datasets.core.gnss_time import LEAP_SECONDS, gps_to_unix_ns
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recording
 
 COLUMNS = "latitude(deg) longitude(deg)  height(m)   Q  ns   sdn(m)   sde(m)   sdu(m)  sdne(m)  sdeu(m)  sdun(m) age(s)  ratio"  # fmt: skip  # noqa: E501

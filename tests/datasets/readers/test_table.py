@@ -13,9 +13,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.text.column_map import FIELDS, starter_map
 from terrafusion.datasets.readers.text.units import UNITS, units_of

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.recording import differences
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import umich_text
 from terrafusion.datasets.readers.text import number_rows

@@ -11,9 +11,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic, geodetic_to_enu, rpy_to_quaternion
-from terrafusion.datasets.core.recording import Fix
 from terrafusion.datasets.readers import open_recording
 
 N = 200

@@ -12,17 +12,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
+from terrafusion.datasets.core.channels import Command, Fix, Gnss, Imu, Terrain, Wheels
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.recording import (
-    Command,
-    Fix,
-    Gnss,
-    Imu,
-    Recording,
-    Terrain,
-    Wheels,
-    differences,
-)
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import csv_table, open_recording
 from terrafusion.datasets.writers import log_folder, write_log_folder

@@ -20,8 +20,10 @@ from rosbags.rosbag2 import Writer as RosbagWriter
 from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_typestore
 
+from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.recording import Imu, Overrides, Recording, Wheels, differences
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.datasets.readers import open_recording

@@ -13,20 +13,18 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from terrafusion.datasets.core.recording import (
+from terrafusion.datasets.core.channels import (
     Barometer,
-    ClockJump,
     Command,
     Gnss,
     Imu,
     Magnetometer,
     Motor,
-    Overrides,
-    Recording,
     Terrain,
     Wheels,
-    differences,
 )
+from terrafusion.datasets.core.differences import differences
+from terrafusion.datasets.core.recording import ClockJump, Overrides, Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap

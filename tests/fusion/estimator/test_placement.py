@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import wrap_angle
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator

@@ -10,9 +10,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, wrap_angle
-from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.config.estimator_config import EstimatorConfig

@@ -8,7 +8,8 @@ import gtsam
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.recording import Imu, Recording
+from terrafusion.datasets.core.channels import Imu
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.preintegration import HELD_INFLATION, Preintegrator

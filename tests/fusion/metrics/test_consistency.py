@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Terrain
 from terrafusion.datasets.core.errors import ConfigError, DataError
-from terrafusion.datasets.core.recording import Terrain
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics import consistency as c
 from terrafusion.fusion.metrics.metrics import score

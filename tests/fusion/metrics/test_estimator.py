@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate

@@ -11,7 +11,8 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.recording import Fix, Gnss, Recording, Terrain
+from terrafusion.datasets.core.channels import Fix, Gnss, Terrain
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, score
 from terrafusion.fusion.reports.replay import plots, plots_filter, plots_map

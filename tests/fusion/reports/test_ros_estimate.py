@@ -12,8 +12,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.frames import quaternion_to_matrix
-from terrafusion.datasets.core.recording import differences
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level

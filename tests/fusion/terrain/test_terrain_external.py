@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.recording import Terrain
+from terrafusion.datasets.core.channels import Terrain
 from terrafusion.fusion.replay import replay
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.twin.simulate import simulate

@@ -12,9 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
 
+from terrafusion.datasets.core.channels import Terrain, Wheels
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
-from terrafusion.datasets.core.recording import Recording, Terrain, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.noise.policy import load_policy

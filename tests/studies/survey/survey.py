@@ -25,8 +25,9 @@ from terrafusion.datasets.checks.measures import Measures, measure
 from terrafusion.datasets.checks.mounting import heading
 from terrafusion.datasets.checks.path import dead_reckoned
 from terrafusion.datasets.checks.yaw_signals import accounts
+from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.lag import lag_between
-from terrafusion.datasets.core.recording import Channel, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.datasets.readers.formats import Request, format_of

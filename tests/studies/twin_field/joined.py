@@ -16,7 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.recording import Imu, Recording, Wheels
+from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from tests.studies.twin_field.runs import DT_S, FieldRun, chain_starts, chains_of, field_run
 from tests.studies.twin_field.truth import heading

@@ -13,8 +13,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis.strategies import floats, sampled_from
 
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.recording import differences
 from terrafusion.twin.gap.blind.plant import contact
 from terrafusion.twin.gap.blind.plant.field import Patches
 from terrafusion.twin.gap.blind.plant.machine import Machine, motor_current

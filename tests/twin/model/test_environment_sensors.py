@@ -13,9 +13,10 @@ from hypothesis import strategies as st
 import terrafusion.twin.params
 from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa, pressure_at
+from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
-from terrafusion.datasets.core.recording import Recording, differences
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
 from terrafusion.twin.model.sensor_realism import BarometerRealism, MagnetometerRealism
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle

@@ -7,9 +7,10 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
-from terrafusion.datasets.core.recording import TERRAINS, Recording
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX

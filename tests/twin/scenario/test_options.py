@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
-from terrafusion.datasets.core.recording import Fix
 from terrafusion.twin.model.dynamics import wheel_loads
 from terrafusion.twin.model.motion import wheel_shares
 from terrafusion.twin.model.vectors import vehicle_vector

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
-from terrafusion.datasets.core.recording import Fix
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.recording import Fix, Recording
+from terrafusion.datasets.core.channels import Fix
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.sensor_realism import GnssRealism
 from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle

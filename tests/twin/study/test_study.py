@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.recording import Imu
+from terrafusion.datasets.core.channels import Imu
 from terrafusion.twin.analysis import speeds as processing
 from terrafusion.twin.analysis.speeds import Profiles, differenced_speed, imu_speed, low_pass, match
 from terrafusion.twin.simulate import simulate

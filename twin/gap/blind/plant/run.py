@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Command, Terrain
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.recording import Command, Recording, Terrain
+from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.gap.blind.plant import sensors
 from terrafusion.twin.gap.blind.plant.commands import side_commands, wanted_twist
 from terrafusion.twin.gap.blind.plant.field import Patches

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Motor, Wheels
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.datasets.core.recording import Fix, Gnss, Imu, Motor, Wheels
 from terrafusion.twin.gap.blind.plant.machine import motor_current
 from terrafusion.twin.gap.blind.plant.spec import RunSpec
 

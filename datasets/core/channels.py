@@ -1,0 +1,338 @@
+"""The channels of a recording: numpy arrays whose first axis is time, each channel on its own clock.
+
+`t_ns` is int64 nanoseconds (Unix epoch for real logs) and never decreases. Unknown numbers are NaN.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import TYPE_CHECKING, Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.messages import (
+    BarometerSample,
+    CommandSample,
+    GnssSample,
+    ImuSample,
+    MagnetometerSample,
+    Message,
+    MotorSample,
+    TerrainSample,
+    WheelSample,
+    sides,
+)
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+
+TERRAINS = ("asphalt", "gravel", "grass", "medium_sand", "loose_sand", "ploughed_soil", "mud", "snow")
+"""Terrain classes by name; `unknown` stands for none of them."""
+
+
+class Fix(IntEnum):
+    """GNSS fix classes, in rising quality."""
+
+    NONE = 0
+    SINGLE = 1
+    DGPS = 2
+    FLOAT = 3
+    FIXED = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Channel:
+    """What all channels share: a clock and rows."""
+
+    name: ClassVar[str] = ""
+    t_ns: TimesNs
+
+    def __post_init__(self) -> None:
+        t = np.asarray(self.t_ns)
+        if t.ndim != 1 or t.dtype != np.int64:
+            raise TypeError(f"{self.name}: t_ns must be a 1-D int64 array, not {t.dtype} {t.shape}")
+        for spec in dataclasses.fields(self):
+            value = getattr(self, spec.name)
+            if isinstance(value, np.ndarray) and len(value) != len(t):
+                raise ValueError(f"{self.name}.{spec.name} has {len(value)} rows for {len(t)} times")
+        back = np.flatnonzero(t[1:] < t[:-1])  # a difference could overflow
+        if back.size:
+            i = int(back[0])
+            raise DataError(
+                f"time runs backwards by {(int(t[i]) - int(t[i + 1])) * 1e-9:.6f} s after row {i}",
+                channel=self.name,
+                time_s=(int(t[i]) - int(t[0])) * 1e-9,
+                remedy="sort the rows or split the log at the clock jump",
+            )
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+    def select(self, rows: Any) -> Self:
+        """The same channel with the rows of a boolean mask, slice or index array."""
+        changed = {
+            spec.name: getattr(self, spec.name)[rows]
+            for spec in dataclasses.fields(self)
+            if isinstance(getattr(self, spec.name), np.ndarray)
+        }
+        return dataclasses.replace(self, **changed)
+
+    def between(self, start_ns: int, end_ns: int) -> Self:
+        """Rows with start_ns <= t < end_ns."""
+        first, last = np.searchsorted(self.t_ns, [start_ns, end_ns], side="left")
+        return self.select(slice(int(first), int(last)))
+
+    def samples(self) -> Iterator[Message]:
+        """One message a row, in order of time."""
+        raise TypeError(f"{type(self).__name__} has no messages")
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """Columns of the log folder (see docs/conventions.md) without `t_s`; absent ones left out."""
+        raise TypeError(f"{type(self).__name__} has no table form")
+
+    def to_pandas(self) -> pd.DataFrame:
+        """The columns of the log folder, indexed by `t_ns`."""
+        import pandas as pd
+
+        return pd.DataFrame(self.columns(), index=pd.Index(self.t_ns, name="t_ns"))
+
+
+def _named(values: Array, names: tuple[str, ...]) -> dict[str, NDArray[Any]]:
+    return {name: values[:, i] for i, name in enumerate(names) if not np.isnan(values[:, i]).all()}
+
+
+@dataclass(frozen=True, eq=False)
+class Command(Channel):
+    """Commanded body twist: `v_mps` (N,), `yaw_rate_radps` (N,)."""
+
+    name: ClassVar[str] = "command"
+    v_mps: Array
+    yaw_rate_radps: Array
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return {"v_mps": self.v_mps, "yaw_rate_radps": self.yaw_rate_radps}
+
+    def samples(self) -> Iterator[CommandSample]:
+        """One message a row."""
+        return map(CommandSample, self.t_ns.tolist(), self.v_mps.tolist(), self.yaw_rate_radps.tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Wheels(Channel):
+    """Wheel speeds `speed` (N, k) of the wheels or sides `names` in `unit` "radps" or "mps".
+
+    `names` is one of the tuples of `LAYOUTS`; ("speed",) is the mean of both
+    sides and says nothing about yaw. `angle_rad` (N, k) is the accumulated
+    wheel angle where the log has it.
+    """
+
+    name: ClassVar[str] = "wheels"
+    LAYOUTS: ClassVar[tuple[tuple[str, ...], ...]] = (
+        ("left", "right"),
+        ("front_left", "front_right", "rear_left", "rear_right"),
+        ("speed",),
+    )
+    speed: Array
+    names: tuple[str, ...]
+    unit: str
+    angle_rad: Array | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.names not in self.LAYOUTS or self.unit not in ("radps", "mps"):
+            raise ValueError(f"wheels: unknown layout {self.names} in {self.unit}")
+        if self.speed.shape != (len(self), len(self.names)):
+            raise ValueError(f"wheels: speed has shape {self.speed.shape} for {len(self.names)} wheels")
+        if self.angle_rad is not None and self.angle_rad.shape != self.speed.shape:
+            raise ValueError(f"wheels: angle_rad has shape {self.angle_rad.shape}, speed {self.speed.shape}")
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        table: dict[str, NDArray[Any]] = {
+            f"{n}_{self.unit}": self.speed[:, i] for i, n in enumerate(self.names)
+        }
+        if self.angle_rad is not None:
+            table |= {f"{n}_rad": self.angle_rad[:, i] for i, n in enumerate(self.names)}
+        return table
+
+    def has_sides(self) -> bool:
+        """Whether left and right are told apart."""
+        return len(self.names) > 1
+
+    def side_speeds_mps(self, wheel_radius_m: float) -> Array:
+        """Circumferential speed (N, 2) of left and right, m/s; both equal where sides are unknown."""
+        return sides(self.speed * (wheel_radius_m if self.unit == "radps" else 1.0), self.names)
+
+    def samples(self) -> Iterator[WheelSample]:
+        """One message a row."""
+        angle = [None] * len(self) if self.angle_rad is None else list(self.angle_rad)
+        for t_ns, row, turned in zip(self.t_ns.tolist(), self.speed, angle, strict=True):
+            yield WheelSample(t_ns, row, self.names, self.unit, turned)
+
+
+@dataclass(frozen=True, eq=False)
+class Imu(Channel):
+    """Angular rate `gyro_radps` (N, 3) and specific force `accel_mps2` (N, 3), body axes.
+
+    At rest on level ground the specific force is (0, 0, +g). Axes the log does
+    not have are NaN throughout.
+    """
+
+    name: ClassVar[str] = "imu"
+    gyro_radps: Array
+    accel_mps2: Array
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        gyro = _named(self.gyro_radps, ("gyro_x_radps", "gyro_y_radps", "gyro_z_radps"))
+        return gyro | _named(self.accel_mps2, ("accel_x_mps2", "accel_y_mps2", "accel_z_mps2"))
+
+    def has_gyro(self) -> bool:
+        return not np.isnan(self.gyro_radps).all(axis=0).any()
+
+    def has_accel(self) -> bool:
+        return not np.isnan(self.accel_mps2).all(axis=0).any()
+
+    def samples(self) -> Iterator[ImuSample]:
+        """One message a row."""
+        return map(ImuSample, self.t_ns.tolist(), self.gyro_radps, self.accel_mps2)
+
+
+@dataclass(frozen=True, eq=False)
+class Gnss(Channel):
+    """Antenna position `enu_m` (N, 3) about the recording's datum with 1-sigma `sigma_enu_m` (N, 3).
+
+    `velocity_enu_mps` (N, 3) and `sigma_v_mps` (N,) where the receiver reports
+    them; `fix` (N,) holds `Fix` values.
+    """
+
+    name: ClassVar[str] = "gnss"
+    enu_m: Array
+    sigma_enu_m: Array
+    fix: NDArray[np.uint8]
+    velocity_enu_mps: Array | None = None
+    sigma_v_mps: Array | None = None
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        table: dict[str, NDArray[Any]] = {
+            "east_m": self.enu_m[:, 0],
+            "north_m": self.enu_m[:, 1],
+            "sigma_e_m": self.sigma_enu_m[:, 0],
+            "sigma_n_m": self.sigma_enu_m[:, 1],
+        }
+        if not (np.isnan(self.enu_m[:, 2]).all() and np.isnan(self.sigma_enu_m[:, 2]).all()):
+            table |= {"up_m": self.enu_m[:, 2], "sigma_u_m": self.sigma_enu_m[:, 2]}
+        if self.velocity_enu_mps is not None:
+            table |= {f"v_{axis}_mps": self.velocity_enu_mps[:, i] for i, axis in enumerate("enu")}
+        if self.sigma_v_mps is not None:
+            table["sigma_v_mps"] = self.sigma_v_mps
+        table["fix"] = np.array([Fix(f).name.lower() for f in self.fix], dtype=object)
+        return table
+
+    def samples(self) -> Iterator[GnssSample]:
+        """One message a row."""
+        n = len(self)
+        velocity = [None] * n if self.velocity_enu_mps is None else list(self.velocity_enu_mps)
+        sigma_v = np.full(n, np.nan) if self.sigma_v_mps is None else self.sigma_v_mps
+        return map(
+            GnssSample,
+            self.t_ns.tolist(), self.enu_m, self.sigma_enu_m, self.fix.tolist(), velocity, sigma_v.tolist(),
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class Motor(Channel):
+    """Motor currents `current_a` (N, 2) left and right, and voltages `voltage_v` (N, 2) where known."""
+
+    name: ClassVar[str] = "motor"
+    current_a: Array
+    voltage_v: Array | None = None
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        table: dict[str, NDArray[Any]] = {"left_a": self.current_a[:, 0], "right_a": self.current_a[:, 1]}
+        if self.voltage_v is not None:
+            table |= {"left_v": self.voltage_v[:, 0], "right_v": self.voltage_v[:, 1]}
+        return table
+
+    def samples(self) -> Iterator[MotorSample]:
+        """One message a row."""
+        voltage = [None] * len(self) if self.voltage_v is None else list(self.voltage_v)
+        return map(MotorSample, self.t_ns.tolist(), self.current_a, voltage)
+
+
+@dataclass(frozen=True, eq=False)
+class Barometer(Channel):
+    """Static pressure `pressure_pa` (N,), as measured.
+
+    A pressure and no altitude: an altitude needs a sea-level pressure, which logs do not hold.
+    """
+
+    name: ClassVar[str] = "barometer"
+    pressure_pa: Array
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return {"pressure_pa": self.pressure_pa}
+
+    def samples(self) -> Iterator[BarometerSample]:
+        """One message a row."""
+        return map(BarometerSample, self.t_ns.tolist(), self.pressure_pa.tolist())
+
+
+@dataclass(frozen=True, eq=False)
+class Magnetometer(Channel):
+    """Magnetic flux density `field_t` (N, 3), body axes, tesla; the field that the robot stands in."""
+
+    name: ClassVar[str] = "magnetometer"
+    field_t: Array
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.field_t.shape != (len(self), 3):
+            raise ValueError(f"magnetometer: field_t has shape {self.field_t.shape}, not ({len(self)}, 3)")
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return {f"field_{axis}_t": self.field_t[:, i] for i, axis in enumerate("xyz")}
+
+    def samples(self) -> Iterator[MagnetometerSample]:
+        """One message a row."""
+        return map(MagnetometerSample, self.t_ns.tolist(), self.field_t)
+
+
+@dataclass(frozen=True, eq=False)
+class Terrain(Channel):
+    """Terrain `label` (N,) of str, and `probabilities` (N, k) over `classes` where known.
+
+    `source` tells who says so: "annotation", "camera", "detector", "simulation".
+    A label holds from its time until the next.
+    """
+
+    name: ClassVar[str] = "terrain"
+    label: NDArray[Any]
+    source: str = "annotation"
+    classes: tuple[str, ...] = ()
+    probabilities: Array | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        wanted = (len(self), len(set(self.classes)))
+        if self.probabilities is not None and self.probabilities.shape != wanted:
+            raise ValueError(f"terrain: probabilities have shape {self.probabilities.shape}, not {wanted}")
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        table: dict[str, NDArray[Any]] = {"label": self.label}
+        if self.probabilities is not None:
+            table |= {f"p_{name}": self.probabilities[:, i] for i, name in enumerate(self.classes)}
+        return table
+
+    def samples(self) -> Iterator[TerrainSample]:
+        """One message a row."""
+        rows = [None] * len(self) if self.probabilities is None else self.probabilities.tolist()
+        for t_ns, label, row in zip(self.t_ns.tolist(), self.label, rows, strict=True):
+            named = None if row is None else dict(zip(self.classes, row, strict=True))
+            yield TerrainSample(t_ns, str(label), self.source, named)
