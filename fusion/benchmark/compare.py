@@ -122,6 +122,12 @@ def log_ratios(errors: dict[str, dict[str, dict[str, float]]], arm: str, base: s
     return out
 
 
+def known_median(values: Sequence[float | None]) -> float | None:
+    """Median of the known ones; None where there is none."""
+    known = [v for v in values if v is not None and np.isfinite(v)]
+    return float(np.median(known)) if known else None
+
+
 def resampled(values: Array) -> Array:
     """Medians (R, k) of columns of `values` (n, k) over bootstrap samples of its rows."""
     rng = np.random.default_rng(SEED)

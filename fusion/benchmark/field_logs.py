@@ -1,28 +1,62 @@
-"""The field logs as drives: the outages of the field table, with the true ground where a log tells it."""
+"""The field logs as runs: which are at hand, where each loses its fixes, and its true ground if labelled."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TypeVar
 
+import numpy as np
+
+from terrafusion.datasets.catalog.catalog import CatalogFile, at_hand, data_folders, load_catalog
+from terrafusion.datasets.checks import run_checks
+from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors_of
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.benchmark.arms import known_labels, true_labels
 from terrafusion.fusion.benchmark.drives import FIELD, Drive
-from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, until
-from tests.studies.field_table.table import (
-    Refusal,
-    catalogued,
-    check_log,
-    each_drive,
-    ground_of,
-    outages_of,
-    reference_of,
-)
+from terrafusion.fusion.benchmark.joined_windows import joined_drives
+from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, plan_outages, until
+from terrafusion.fusion.metrics.health import rolled_until_m
+from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.replay import choose_vehicle
 
 AID_SEED = 1
 """Of the noise on fixes that are made from truth."""
 NOT_LABELLED = "not labelled"
+WHOLE, CUT = "raw", "windows"
+"""Of a run that is catalogued whole, the windows cut from it are left out."""
+OUTAGES_S = (30.0, 60.0, 120.0)
+LEAST_DRIVE_S = 10.0
+"""Shorter recordings are windows cut from a drive: those that go on from each other are joined."""
+LEAST_JOINED_S = 25.0
+"""Shorter drives joined from windows hold no outage, and little driving after a start."""
+LEAD_ROLLED_M = 5.0
+"""The wheels must have rolled so far before an outage: fixes show no heading of a robot that stands."""
+LEAST_ROLLED_M = 3.0
+"""Outages in which the wheels roll less test nothing and are left out."""
+SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
+UNFORESEEN = (ArithmeticError, RuntimeError, ValueError)
+"""Errors of readers and solver that stop one replay, counted and not hidden, but not the whole table."""
+Result = TypeVar("Result")
+SET_GROUND = {"husky_parkinglot": "firm"}
+"""Ground of sets whose logs carry no label but whose title names it."""
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A log that was not run, and why."""
+
+    log: str
+    why: str
+
+    @property
+    def line(self) -> str:
+        """Both, as tables tell it."""
+        return f"{self.log}: {self.why}"
 
 
 @dataclass(frozen=True)
@@ -69,3 +103,112 @@ def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:
             recording=until(recording, outage.start_s + outage.seconds + 0.5),
             outage=outage,
         )
+
+
+def catalogued() -> list[str]:
+    """Names of the catalogue's recordings whose files are all at hand, but windows cut from one of them."""
+    folders = data_folders()
+
+    def complete(files: list[CatalogFile]) -> bool:
+        return all(at_hand(entry, folders) is not None for entry in files)
+
+    names = [name for name, files in load_catalog().recordings().items() if complete(files)]
+    cut = {f"{name.removesuffix(WHOLE)}{CUT}" for name in names if name.endswith(f"/{WHOLE}")}
+    return [name for name in names if name not in cut]
+
+
+def each_drive(
+    log: str, run: Callable[[str, int, Recording], Iterable[Result | Refusal]]
+) -> list[Result | Refusal]:
+    """What `run` gives for name, number and recording of every drive of a log; what stops it is a refusal."""
+    out: list[Result | Refusal] = []
+    try:
+        recordings, joined = read_runs(log)
+    except (TerrafusionError, *UNFORESEEN) as error:
+        return [refusal_of(log, error)]
+    for i, recording in enumerate(recordings):
+        name = log if joined or len(recordings) == 1 else f"{log}#{i}"
+        try:
+            with errors_of(name):
+                out += run(name, i, recording)
+        except (TerrafusionError, *UNFORESEEN) as error:
+            out.append(refusal_of(name, error))
+    return out
+
+
+def refusal_of(name: str, error: Exception) -> Refusal:
+    """Told of the log and its file, not of the folder where they lie: tables go into documents."""
+    if not isinstance(error, TerrafusionError):
+        return Refusal(name, f"FAILED, {type(error).__name__}: {error}")
+    file = None if error.file is None else Path(error.file).name
+    told = TerrafusionError(
+        error.what,
+        file=None if file == Path(name).name else file,
+        channel=error.channel,
+        time_s=error.time_s,
+        remedy=error.remedy,
+    )
+    return Refusal(name, str(told))
+
+
+@functools.lru_cache(maxsize=1)
+def read_runs(log: str) -> tuple[list[Recording], bool]:
+    """The drives of a log, read once for modes that follow each other, and whether they had to be joined."""
+    recordings = open_recordings(log)
+    if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= LEAST_DRIVE_S:
+        return recordings, False
+    drives = [d for d in joined_drives(log, recordings) if d.duration_s() >= LEAST_JOINED_S]
+    drives = [d for d in drives if d.truth is not None]
+    if not drives:
+        told = f"holds {len(recordings)} pieces that make no drive of {LEAST_JOINED_S:g} s with a truth"
+        raise DataError(told, remedy="give a log that is one drive")
+    return drives, True
+
+
+def check_log(recording: Recording) -> None:
+    """Refuse what `terrafusion replay` refuses."""
+    if recording.wheels is None or recording.imu is None:
+        raise DataError("has no wheels or no IMU", remedy="nothing to estimate from: the table leaves it out")
+    params, _ = choose_vehicle(recording, None)
+    errors = [found for found in run_checks(recording, params.rig()) if found.severity == "error"]
+    if errors:
+        raise DataError(
+            f"{errors[0].what} ({errors[0].evidence})", channel=errors[0].channel, remedy=errors[0].fix
+        )
+
+
+def reference_of(recording: Recording) -> str:
+    """ "truth", "fixes kept back", or "none"."""
+    listed = recording.truth_channels
+    if recording.truth is not None and len(recording.truth) and (not listed or "position" in listed):
+        return "truth"
+    return "fixes kept back" if recording.gnss is not None and len(recording.gnss) else "none"
+
+
+def ground_of(log: str, recording: Recording) -> str:
+    """ "firm" or "slipping" by the log's label, else by its set; "" where neither tells."""
+    labels = {recording.terrain_name} - {""}
+    if recording.terrain is not None:
+        labels |= set(recording.terrain.label.astype(str).tolist())
+    if labels - {"unknown", "mixed"}:
+        return "slipping" if labels & set(SLIPPING) else "firm"
+    return SET_GROUND.get(log.partition("/")[0], "")
+
+
+def outages_of(recording: Recording, most_starts: int) -> list[Outage]:
+    """Outages of all lengths where wheels, IMU and fixes are there and the wheels roll."""
+    wheels, imu, gnss = recording.wheels, recording.imu, recording.gnss
+    assert wheels is not None
+    assert imu is not None
+    assert gnss is not None
+    start_ns = recording.start_ns
+    first_s = (max(int(c.t_ns[0]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
+    last_s = (min(int(c.t_ns[-1]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
+    radius_m = choose_vehicle(recording, None)[0].rig().wheel_radius_m
+    rolled = rolled_until_m(wheels, radius_m)
+    if rolled[-1] < LEAD_ROLLED_M:
+        return []
+    moved_s = (int(wheels.t_ns[np.searchsorted(rolled, LEAD_ROLLED_M)]) - start_ns) * 1e-9
+    earliest = max(first_s + lead_s(first_s, last_s), moved_s)
+    planned = [o for s in OUTAGES_S for o in plan_outages(earliest, last_s, s, most_starts)]
+    return [o for o in planned if np.ptp(rolled[o.covers(wheels.t_ns, start_ns)]) >= LEAST_ROLLED_M]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.benchmark.arms import Arm, replay_options
 from terrafusion.fusion.benchmark.drives import Drive
+from terrafusion.fusion.benchmark.field_logs import UNFORESEEN
 from terrafusion.fusion.metrics.consistency import estimated_ground_at, position, summarise
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.health import examine_estimate
@@ -20,7 +21,6 @@ from terrafusion.fusion.metrics.metrics import OutageScore
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
 from terrafusion.fusion.terrain.classifier import UNKNOWN
-from tests.studies.field_table.table import UNFORESEEN
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]

@@ -12,12 +12,11 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import check_folder
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.drives import Case, drive_of
-from terrafusion.fusion.benchmark.field_logs import drives_of
+from terrafusion.fusion.benchmark.field_logs import Refusal, drives_of
 from terrafusion.fusion.benchmark.measure import Row, measure
 from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, write_part
 from terrafusion.fusion.benchmark.plan import Job, Plan
 from terrafusion.twin.executors import open_workers
-from tests.studies.field_table.table import Refusal
 
 
 @dataclass(frozen=True)

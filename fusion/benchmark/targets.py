@@ -12,7 +12,7 @@ from terrafusion.fusion.benchmark.compare import Contrast, Interval, Share, cont
 from terrafusion.fusion.benchmark.drives import FIELD
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.metrics.consistency import Consistency
-from tests.studies.twin_consistency import Cell, pool
+from terrafusion.fusion.metrics.pooled_consistency import Cell, pool
 
 REACHED, OPEN, MISSED = "reached", "open", "missed"
 """By the whole interval; by neither of its ends; by no part of it."""

@@ -14,8 +14,6 @@ independent ones (Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8(2), for 
 is close to chi-square with d N_eff degrees of freedom over that number: the same mean and variance. rho is
 estimated about zero (under the hypothesis the mean is known to be zero, so a constant error counts as
 one sample) and cut at its first value that is not positive (Geyer 1992, initial positive sequence).
-
-`python -m terrafusion.fusion.metrics.consistency` runs the check on twin drives (`twin_consistency`).
 """
 
 from __future__ import annotations
@@ -263,9 +261,3 @@ def _correlate(column: Array) -> Array:
     size = next_fast_len(2 * len(column), real=True)
     spectrum = rfft(column, size)
     return np.asarray(irfft(np.abs(spectrum) ** 2, size)[: len(column)])
-
-
-if __name__ == "__main__":
-    from tests.studies.twin_consistency import command
-
-    raise SystemExit(command())

@@ -14,12 +14,12 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.open import open_recordings
+from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun, field_runs
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.studies.twin_field import compare, summary
 from tests.studies.twin_field.forks import N_FUTURE, N_PAST, Forks, forks_of
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, Hold
-from tests.studies.twin_field.runs import DT_S, FieldRun, field_runs
 from tests.studies.twin_field.scores import METRICS, interval, medians, scores
 from tests.studies.twin_field.slip import MEASURED, slip_rows
 from tests.studies.twin_field.sources import read

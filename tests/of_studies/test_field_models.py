@@ -7,13 +7,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from terrafusion.fusion.benchmark.body_velocity import Poses, body_velocity, heading, speed_noise
+from terrafusion.fusion.benchmark.field_runs import DT_S
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.twin_field import kinematic
 from tests.studies.twin_field.fitting import residuals
 from tests.studies.twin_field.forks import BINS, N_FUTURE, N_PAST, Forks, half_second_means
-from tests.studies.twin_field.runs import DT_S
-from tests.studies.twin_field.truth import Poses, body_velocity, heading, speed_noise
 from tests.studies.twin_field.twin_model import ACTUATION, GROUND, TwinModel, calibrated, changed
 
 SAMPLES = N_PAST + N_FUTURE + 1

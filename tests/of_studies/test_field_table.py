@@ -19,7 +19,8 @@ from hypothesis import strategies as st
 from terrafusion.datasets.core.channels import Imu, Terrain, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark import parts
+from terrafusion.fusion.benchmark import field_logs, parts
+from terrafusion.fusion.benchmark.field_logs import Refusal, ground_of, outages_of, reference_of
 from terrafusion.fusion.benchmark.outage_plan import (
     AID_HZ,
     AID_SIGMA_M,
@@ -40,18 +41,7 @@ from tests.studies.field_table.summary import (
     ratio_of,
     verdicts,
 )
-from tests.studies.field_table.table import (
-    Refusal,
-    Run,
-    Task,
-    collect,
-    ground_of,
-    outages_of,
-    reference_of,
-    run_task,
-    run_tasks,
-    tasks_of,
-)
+from tests.studies.field_table.table import Run, Task, collect, run_task, run_tasks, tasks_of
 
 SECOND_NS = 1_000_000_000
 
@@ -363,7 +353,7 @@ def test_a_log_is_read_once_for_modes_that_follow_each_other(
         read.append(log)
         return [bare]
 
-    monkeypatch.setattr(field_table, "open_recordings", opened)
+    monkeypatch.setattr(field_logs, "open_recordings", opened)
     for log, mode in (("one", "fixed"), ("one", "robust"), ("two", "fixed")):
         task, (refusal,) = run_task(Task(log, mode, 1, 1))
         assert (task.mode, refusal.log) == (mode, log)
@@ -413,7 +403,7 @@ def test_a_refusal_does_not_tell_where_a_log_lies(
     def opened(log: str) -> list[Recording]:
         raise DataError("holds NaN", file=file, channel="speed", remedy="mend it")
 
-    monkeypatch.setattr(field_table, "open_recordings", opened)
+    monkeypatch.setattr(field_logs, "open_recordings", opened)
     _, (refusal,) = run_task(Task("set/one", "fixed", 1, 1))
     assert isinstance(refusal, Refusal)
     assert refusal.line == told

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.metrics.pooled_consistency import bootstrap
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
-from tests.studies.twin_consistency import bootstrap
 
 Array = NDArray[np.float64]
 Flags = NDArray[np.bool_]

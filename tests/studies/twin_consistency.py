@@ -1,6 +1,6 @@
 """NEES and NIS on twin drives, ground by ground, in the adaptive and the fixed mode.
 
-    python -m terrafusion.fusion.metrics.consistency --seeds 10
+    python -m tests.studies.twin_consistency --seeds 10
 
 Each seed is a drive of its own: heading, soil (scattered as for the policy) and all sensor noise are drawn
 from it. The seeds and the scenario are not those of the policy's training. Every drive has one outage; rows
@@ -18,20 +18,16 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.metrics.consistency import (
     CONFIDENCE,
     Consistency,
-    band,
     summarise,
-    verdict,
     whitened_series,
 )
-
-Array = NDArray[np.float64]
+from terrafusion.fusion.metrics.pooled_consistency import IN_OUTAGE, MARKS, Cell, pool
 
 MODES = ("adaptive", "fixed")
 SCENARIO = "waypoints"
@@ -39,40 +35,11 @@ FIRST_SEED = 1000
 """The policy is fitted to seeds from 0 on."""
 OUTAGE_S = (20.0, 30.0)
 """Start and length of the outage of each drive."""
-RESAMPLES = 4000
-IN_OUTAGE = ", outage"
-TWO_DIMENSIONAL = ("position", f"position{IN_OUTAGE}", "nis gnss")
 TABLES = (
     ("position", f"position{IN_OUTAGE}"),
     ("heading", f"heading{IN_OUTAGE}"),
     ("nis gnss", "nis wheels"),
 )
-MARKS = {"consistent": "=", "overconfident": "+", "cautious": "-"}
-
-
-@dataclass(frozen=True)
-class Cell:
-    """One quantity on one ground in one mode, over all drives.
-
-    Attributes:
-        drives, effective: number of drives, and of independent samples in all of them together.
-        mean: of the drives' mean NEES or NIS per dimension.
-        interval: of that mean, by bootstrap over drives.
-        band: in which it lies for a consistent estimator.
-    """
-
-    terrain: str
-    mode: str
-    quantity: str
-    drives: int
-    effective: float
-    mean: float
-    interval: tuple[float, float]
-    band: tuple[float, float]
-
-    def verdict(self) -> str:
-        """ "consistent", "overconfident" or "cautious", by the band."""
-        return verdict(self.mean, *self.band)
 
 
 @dataclass(frozen=True)
@@ -148,39 +115,6 @@ def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
     return tuple(row for row in rows if row is not None)
 
 
-def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> list[Cell]:
-    """The drives of one ground and mode together, every drive counting the same."""
-    cells = []
-    for quantity in dict.fromkeys(row.quantity for drive in drives for row in drive):
-        rows = [row for drive in drives for row in drive if row.quantity == quantity]
-        means = np.array([row.mean for row in rows])
-        # The mean of M means of which each is worth n_i samples: its variance is sum(1 / n_i) / M^2.
-        effective = len(rows) ** 2 / sum(1.0 / row.effective for row in rows)
-        degrees = effective * (2 if quantity in TWO_DIMENSIONAL else 1)
-        cells.append(
-            Cell(
-                terrain,
-                mode,
-                quantity,
-                len(rows),
-                effective,
-                float(means.mean()),
-                bootstrap(means),
-                band(degrees),
-            )
-        )
-    return cells
-
-
-def bootstrap(values: Array, seed: int = 0) -> tuple[float, float]:
-    """Percentile interval of the mean of independent `values` (M,); a point where there is one value."""
-    rng = np.random.default_rng(seed)
-    means = rng.choice(values, size=(RESAMPLES, len(values))).mean(axis=1)
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(means, [tail, 100.0 - tail])
-    return float(low), float(high)
-
-
 def table(cells: Sequence[Cell], quantities: Sequence[str]) -> list[str]:
     """Markdown: a row for each ground and mode, a column for each quantity that was found."""
     shown = [q for q in quantities if any(cell.quantity == q for cell in cells)]
@@ -198,16 +132,16 @@ def _text(cell: Cell) -> str:
 
 
 def command(arguments: list[str] | None = None) -> int:
-    """`python -m terrafusion.fusion.metrics.consistency`: 0 when done, 1 with one line for a known error."""
+    """`python -m tests.studies.twin_consistency`: 0 when done, 1 with one line for a known error."""
     import argparse
     import sys
 
     from terrafusion.fusion.cli.common import progress_bar
 
     parser = argparse.ArgumentParser(
-        prog="python -m terrafusion.fusion.metrics.consistency",
+        prog="python -m tests.studies.twin_consistency",
         description="NEES and NIS of the estimator on twin drives of each ground.",
-        epilog="example: python -m terrafusion.fusion.metrics.consistency --seeds 10",
+        epilog="example: python -m tests.studies.twin_consistency --seeds 10",
     )
     plan = Plan(seeds=0)
     parser.add_argument("--seeds", type=int, default=5, help="drives of each ground (default 5)")
@@ -239,3 +173,7 @@ def report(plan: Plan, found: Found) -> list[str]:
     for quantities in TABLES:
         lines += ["", *table(found.cells, quantities)]
     return [*lines, *(f"not estimated: {line}" for line in found.refused)]
+
+
+if __name__ == "__main__":
+    raise SystemExit(command())

@@ -26,12 +26,12 @@ from terrafusion.fusion.benchmark.plan import Plan
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run import Found
 from terrafusion.fusion.benchmark.targets import nees_cells, targets
+from terrafusion.fusion.metrics.pooled_consistency import Cell
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports import page
 from terrafusion.fusion.reports.benchmark.plots import plot_ratios
 from terrafusion.fusion.reports.benchmark.text import Table, markdown, tables
-from tests.studies.twin_consistency import Cell
 
 SCHEMA = "terrafusion.benchmark/1"
 MARK = "<!-- what follows is written by terrafusion benchmark --docs -->"

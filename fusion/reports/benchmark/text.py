@@ -8,13 +8,21 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
-from terrafusion.fusion.benchmark.compare import LEAST_UNITS, Contrast, Interval, contrasts, groups_of, shares
+from terrafusion.fusion.benchmark.compare import (
+    LEAST_UNITS,
+    Contrast,
+    Interval,
+    contrasts,
+    groups_of,
+    known_median,
+    shares,
+)
 from terrafusion.fusion.benchmark.drives import FAMILIES, FIELD, PLANTS
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
 from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, nees_cells, targets
+from terrafusion.fusion.metrics.pooled_consistency import MARKS, Cell
 from terrafusion.fusion.reports.replay.text import number
-from tests.studies.twin_consistency import MARKS, Cell
 
 Cells = list[str]
 
@@ -206,6 +214,4 @@ def _percent(share: float | None) -> str:
 
 
 def _median(values: Sequence[float | None]) -> str:
-    from tests.studies.field_table.summary import median
-
-    return "-" if not values else number(median(values))
+    return "-" if not values else number(known_median(values))

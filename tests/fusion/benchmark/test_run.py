@@ -10,18 +10,15 @@ from types import SimpleNamespace
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
-from terrafusion.fusion.benchmark import field_logs as field
-from terrafusion.fusion.benchmark import parts, plan, run
+from terrafusion.fusion.benchmark import field_logs, parts, plan, run
 from terrafusion.fusion.benchmark.arms import ARMS
 from terrafusion.fusion.benchmark.drives import FIRST_SEED, Case
-from terrafusion.fusion.benchmark.field_logs import Log
+from terrafusion.fusion.benchmark.field_logs import Log, Refusal
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
 from terrafusion.fusion.benchmark.run import Found, run_benchmark
 from terrafusion.fusion.reports.benchmark import outputs
 from terrafusion.fusion.reports.benchmark.outputs import MARK, write_benchmark, write_document
-from tests.studies.field_table import table as field_table
-from tests.studies.field_table.table import Refusal
 
 FEW = ("fixed", "adaptive", "oracle")
 JOB = Job(Case("outages", "twin", FIRST_SEED + 2), FEW)
@@ -112,19 +109,17 @@ def test_logs_are_run_again_once_their_files_differ_or_where_they_were_refused(t
     assert len(begun) == 4
 
 
-@pytest.mark.parametrize("place", [(field_table, "open_recordings"), (field, "check_log")])
+@pytest.mark.parametrize("place", [(field_logs, "open_recordings"), (field_logs, "check_log")])
 def test_an_unforeseen_error_in_a_log_becomes_a_refusal(place, monkeypatch) -> None:
     def fail(what: object) -> None:
         raise ValueError("from a reader or planner")
 
-    field_table._drives.cache_clear()
-    monkeypatch.setattr(
-        field_table, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)]
-    )
+    field_logs.read_runs.cache_clear()
+    monkeypatch.setattr(field_logs, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)])
     monkeypatch.setattr(*place, fail)
     _, found = run.run_job(Job(Log("one", 1), ("fixed",)))
     assert found == Found((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
-    field_table._drives.cache_clear()
+    field_logs.read_runs.cache_clear()
 
 
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(

@@ -13,6 +13,7 @@ from terrafusion.datasets.core.channels import Terrain
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics import consistency as c
+from terrafusion.fusion.metrics import pooled_consistency
 from terrafusion.fusion.metrics.metrics import score
 from tests.studies import twin_consistency as twin
 
@@ -197,12 +198,12 @@ def consistency(mean: float, effective: float = 10.0, quantity: str = "position"
 
 
 def test_drives_are_pooled_with_equal_weight():
-    (cell,) = twin.pool("mud", "fixed", [(consistency(0.5),), (consistency(1.5),)])
+    (cell,) = pooled_consistency.pool("mud", "fixed", [(consistency(0.5),), (consistency(1.5),)])
     assert (cell.mean, cell.drives, cell.effective) == (1.0, 2, 20.0)
     assert cell.band == pytest.approx(c.band(40.0))
     assert cell.interval == (0.5, 1.5)
     assert cell.verdict() == "consistent"
-    (uneven,) = twin.pool("mud", "fixed", [(consistency(0.5, 1.0),), (consistency(1.5, 1e9),)])
+    (uneven,) = pooled_consistency.pool("mud", "fixed", [(consistency(0.5, 1.0),), (consistency(1.5, 1e9),)])
     assert uneven.effective == pytest.approx(4.0)
 
 
@@ -211,14 +212,16 @@ def test_the_bootstrap_holds_the_mean_as_often_as_it_says():
     rng = np.random.default_rng(1)
     held = 0
     for _ in range(200):
-        low, high = twin.bootstrap(rng.normal(3.0, 1.0, size=10))
+        low, high = pooled_consistency.bootstrap(rng.normal(3.0, 1.0, size=10))
         held += low <= 3.0 <= high
     assert 0.82 <= held / 200 <= 0.98
-    assert twin.bootstrap(np.array([2.0])) == (2.0, 2.0)
+    assert pooled_consistency.bootstrap(np.array([2.0])) == (2.0, 2.0)
 
 
 def test_the_table_marks_what_is_not_consistent():
-    cells = twin.pool("mud", "fixed", [(consistency(3.0), consistency(0.1, quantity="heading"))])
+    cells = pooled_consistency.pool(
+        "mud", "fixed", [(consistency(3.0), consistency(0.1, quantity="heading"))]
+    )
     lines = twin.table(cells, ("position", "heading", "absent"))
     assert lines[0] == "| ground | mode | position | heading |"
     assert "3.00 [3.00, 3.00] + 0.48..1.71" in lines[2]

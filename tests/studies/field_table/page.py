@@ -25,7 +25,8 @@ from tests.studies.field_table.summary import (
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from tests.studies.field_table.table import Refusal, Run
+    from terrafusion.fusion.benchmark.field_logs import Refusal
+    from tests.studies.field_table.table import Run
 
 LEAST_SHOWN_M = 0.01
 

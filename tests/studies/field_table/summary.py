@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from terrafusion.fusion.benchmark.compare import known_median
+
 if TYPE_CHECKING:
     from tests.studies.field_table.table import Run
 
@@ -65,7 +67,7 @@ def ratio_of(own: Sequence[Run], other: Sequence[Run]) -> tuple[float | None, fl
     The interval is a bootstrap over what the two ran both: outages (or drives) are drawn anew, then the
     noise of each (Davison and Hinkley 1997, Bootstrap Methods, sec. 3.8). None where nothing can be drawn.
     """
-    top, below = median([r.error_m for r in own]), median([r.error_m for r in other])
+    top, below = known_median([r.error_m for r in own]), known_median([r.error_m for r in other])
     ratio = top / below if top is not None and below else None
     theirs = {(r.drive, r.start_s, r.seed): r.error_m for r in other}
     pairs: dict[tuple[int, float | None], list[tuple[float, float]]] = {}
@@ -99,7 +101,7 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
         row["surely_worse"] = sum((line.ratio_low or 0.0) > 1 + EVEN for line in found)
         row["mean_ratio"] = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
         row["worst"] = float(ratios.max())
-        row["percent"] = median([line.percent for line in found])
+        row["percent"] = known_median([line.percent for line in found])
         out.append(row)
     return out
 
@@ -142,12 +144,6 @@ def in_order(test: str) -> tuple[int, str]:
     return len(test), test
 
 
-def median(values: Sequence[float | None]) -> float | None:
-    """Median of the known ones; None where there is none."""
-    known = [v for v in values if v is not None and np.isfinite(v)]
-    return float(np.median(known)) if known else None
-
-
 def _rows(runs: Sequence[Run]) -> list[dict[str, list[Run]]]:
     """The runs of each log and test by mode."""
     groups: dict[tuple[str, str], dict[str, list[Run]]] = {}
@@ -157,13 +153,13 @@ def _rows(runs: Sequence[Run]) -> list[dict[str, list[Run]]]:
 
 
 def _best_baseline(by_mode: dict[str, list[Run]]) -> str:
-    errors = {mode: median([r.error_m for r in runs]) for mode, runs in by_mode.items() if mode != OWN}
+    errors = {mode: known_median([r.error_m for r in runs]) for mode, runs in by_mode.items() if mode != OWN}
     known = {mode: error for mode, error in errors.items() if error is not None}
     return min(known, key=lambda mode: known[mode], default="")
 
 
 def _line(mode: str, runs: list[Run], baseline: str, best: list[Run]) -> Line:
-    first, error = runs[0], median([r.error_m for r in runs])
+    first, error = runs[0], known_median([r.error_m for r in runs])
     ratio, low, high = ratio_of(runs, best) if mode != baseline else (1.0 if error else None, None, None)
     return Line(
         log=first.log,
@@ -174,15 +170,15 @@ def _line(mode: str, runs: list[Run], baseline: str, best: list[Run]) -> Line:
         runs=len(runs),
         distance_m=float(np.median([r.distance_m for r in runs])),
         error_m=error,
-        percent=median([r.percent for r in runs]),
-        nees=median([r.nees for r in runs]),
+        percent=known_median([r.percent for r in runs]),
+        nees=known_median([r.nees for r in runs]),
         ratio=ratio,
         ratio_low=low,
         ratio_high=high,
         baseline=baseline,
         diverged=sum(bool(r.diverged) for r in runs),
         top_speed_mps=float(np.max([r.top_speed_mps for r in runs])),
-        path_ratio=median([r.path_ratio for r in runs]),
+        path_ratio=known_median([r.path_ratio for r in runs]),
         realtime=float(np.median([r.realtime for r in runs])),
         latency_p99_ms=float(np.median([r.latency_p99_ms for r in runs])),
     )

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tests.studies.twin_field.runs import DT_S, FieldRun
+from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun
 
 Array = NDArray[np.float64]
 

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from terrafusion.fusion.benchmark.field_runs import DT_S
 from tests.studies.twin_field.compare import SAME, Result
 from tests.studies.twin_field.forks import N_PAST
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL
-from tests.studies.twin_field.runs import DT_S
 from tests.studies.twin_field.scores import METRICS
 from tests.studies.twin_field.slip import MEASURED, SlipRow
 from tests.studies.twin_field.summary import Line

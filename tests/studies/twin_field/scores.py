@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.fusion.benchmark.body_velocity import heading
+from terrafusion.fusion.benchmark.field_runs import DT_S
 from tests.studies.twin_field.bootstrap import resamples
 from tests.studies.twin_field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
-from tests.studies.twin_field.runs import DT_S
-from tests.studies.twin_field.truth import heading
 
 Array = NDArray[np.float64]
 

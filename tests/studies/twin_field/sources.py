@@ -12,12 +12,11 @@ from terrafusion.datasets.catalog.catalog import CatalogFile, load_catalog
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.open import open_recordings
-from tests.studies.twin_field.runs import FieldRun, field_runs
+from terrafusion.fusion.benchmark.field_logs import CUT, WHOLE
+from terrafusion.fusion.benchmark.field_runs import FieldRun, field_runs
 
 SETS = ("norlab_drive", "umich_husky", "wvu_pathfinder")
 """Sets with a reference for the motion; of the others of the catalogue only the wheels are known."""
-WHOLE, CUT = "raw", "windows"
-"""Of a drive that is there whole, the windows that were cut from it are left out."""
 
 
 @dataclass

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.benchmark.field_runs import DT_S
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.soil import SoilParams
@@ -20,7 +21,6 @@ from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, STATES, VEHI
 from terrafusion.twin.scenario.commands import delayed_inputs
 from tests.studies.twin_field.fitting import Bounded, fit
 from tests.studies.twin_field.forks import N_PAST, Forks
-from tests.studies.twin_field.runs import DT_S
 
 Array = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.body_velocity import CHUNK_S, Poses, body_velocity, speed_noise
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
-from tests.studies.twin_field.truth import CHUNK_S, Poses, body_velocity, speed_noise
 
 Array = NDArray[np.float64]
 

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from tests.studies.twin_field.runs import DT_S, FieldRun, chain_starts, chains_of, field_run
-from tests.studies.twin_field.truth import heading
+from terrafusion.fusion.benchmark.body_velocity import heading
+from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun, chain_starts, chains_of, field_run
 
 Array = NDArray[np.float64]
 

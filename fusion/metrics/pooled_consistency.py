@@ -1,0 +1,80 @@
+"""NEES and NIS pooled over independent runs.
+
+The band is where the mean of a consistent estimator falls, given the effective samples of all runs together.
+The interval is the percentile bootstrap's over runs (Efron 1979, Ann. Statist. 7(1)).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.fusion.metrics.consistency import CONFIDENCE, Consistency, band, verdict
+
+Array = NDArray[np.float64]
+
+RESAMPLES = 4000
+IN_OUTAGE = ", outage"
+TWO_DIMENSIONAL = ("position", f"position{IN_OUTAGE}", "nis gnss")
+MARKS = {"consistent": "=", "overconfident": "+", "cautious": "-"}
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One quantity on one ground in one mode, over all drives.
+
+    Attributes:
+        drives, effective: number of drives, and of independent samples in all of them together.
+        mean: of the drives' mean NEES or NIS per dimension.
+        interval: of that mean, by bootstrap over drives.
+        band: in which it lies for a consistent estimator.
+    """
+
+    terrain: str
+    mode: str
+    quantity: str
+    drives: int
+    effective: float
+    mean: float
+    interval: tuple[float, float]
+    band: tuple[float, float]
+
+    def verdict(self) -> str:
+        """ "consistent", "overconfident" or "cautious", by the band."""
+        return verdict(self.mean, *self.band)
+
+
+def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> list[Cell]:
+    """The drives of one ground and mode together, every drive counting the same."""
+    cells = []
+    for quantity in dict.fromkeys(row.quantity for drive in drives for row in drive):
+        rows = [row for drive in drives for row in drive if row.quantity == quantity]
+        means = np.array([row.mean for row in rows])
+        # The mean of M means of which each is worth n_i samples: its variance is sum(1 / n_i) / M^2.
+        effective = len(rows) ** 2 / sum(1.0 / row.effective for row in rows)
+        degrees = effective * (2 if quantity in TWO_DIMENSIONAL else 1)
+        cells.append(
+            Cell(
+                terrain,
+                mode,
+                quantity,
+                len(rows),
+                effective,
+                float(means.mean()),
+                bootstrap(means),
+                band(degrees),
+            )
+        )
+    return cells
+
+
+def bootstrap(values: Array, seed: int = 0) -> tuple[float, float]:
+    """Percentile interval of the mean of independent `values` (M,); a point where there is one value."""
+    rng = np.random.default_rng(seed)
+    means = rng.choice(values, size=(RESAMPLES, len(values))).mean(axis=1)
+    tail = 50.0 * (1.0 - CONFIDENCE)
+    low, high = np.percentile(means, [tail, 100.0 - tail])
+    return float(low), float(high)
