@@ -149,7 +149,7 @@ def simulate_run(
     )  # fmt: skip
     driven = drive_through(setup, backend)
     motion = setup.motion(driven.states, driven.inputs)
-    recording = _record(setup, driven, motion, sensors.Noise(seed, noiseless))
+    recording = _record(setup, driven, motion, sensors.NoiseStreams(seed, noiseless))
     if setup.effects:
         late_s = 0.0 if noiseless else setup.vehicle.realism.gnss_latency_s
         recording = sensed(
@@ -243,7 +243,9 @@ def _check_stands(scenario: Scenario, vehicle: VehicleParams) -> None:
         )
 
 
-def _record(setup: RunSetup, driven: DrivenStates, motion: BodyMotion, noise: sensors.Noise) -> Recording:
+def _record(
+    setup: RunSetup, driven: DrivenStates, motion: BodyMotion, noise: sensors.NoiseStreams
+) -> Recording:
     """The channels at their own rates, all on the clock of the IMU."""
     scenario, vehicle, route = setup.scenario, setup.vehicle, setup.route
     states, rate = driven.states, vehicle.sensors.imu.rate_hz
