@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 Array = NDArray[np.float64]
 
@@ -90,12 +94,12 @@ class Innovation:
     accepted: bool
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
     """A whole drive as estimated.
 
     `trajectory` has the twist (body) and the covariance of every keyframe; the
-    other arrays run along it. `classes` names the columns of `terrain`, `key_state.LINEAR` those of `linear`.
+    other arrays run along it. `classes` names the columns of `terrain`, `linear_names` those of `linear`.
     """
 
     trajectory: Trajectory
@@ -118,6 +122,54 @@ class Estimate:
     bias_sigma: Array | None = None
     linear: Array | None = None
     linear_sigma: Array | None = None
+    linear_names: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        t_ns = self.trajectory.t_ns
+        seconds = (int(t_ns[-1]) - int(t_ns[0])) * 1e-9 if len(t_ns) else 0.0
+        names, counts = np.unique(self.status.astype(str), return_counts=True)
+        status = ", ".join(f"{name} {n / len(t_ns):.0%}" for name, n in zip(names, counts, strict=True))
+        return "\n".join(
+            [
+                f"Estimate: {len(t_ns)} keyframes over {seconds:.1f} s, "
+                f"path {self.trajectory.path_length_m():.1f} m",
+                f"  status: {status}",
+                f"  slip: median {np.median(self.slip):.3f}, 1 sigma {np.median(self.slip_sigma):.3f}"
+                if len(t_ns)
+                else "  slip: none",
+                f"  {len(self.changes)} changes of weights, {len(self.innovations)} innovations, "
+                f"{len(self.notes)} notes",
+            ]
+        )
+
+    def _repr_html_(self) -> str:
+        return text_html(repr(self))
+
+    def to_pandas(self) -> pd.DataFrame:
+        """One row a keyframe, indexed by `t_ns`: pose, twist, biases, slip, terrain posterior and status.
+
+        Columns carry their units; `p_<class>` are probabilities, `sigma_<name>` is 1 sigma of a column, and
+        the linear states have the names of `linear_names`.
+        """
+        table = self.trajectory.to_pandas()
+        if self.trajectory.covariance is not None:
+            for i, name in enumerate(("x_m", "y_m", "z_m", "roll_rad", "pitch_rad", "yaw_rad")):
+                table[f"sigma_{name}"] = np.sqrt(self.trajectory.covariance[:, i, i])
+        for i, axis in enumerate("enu"):
+            table[f"v_{axis}_mps"] = self.velocity_mps[:, i]
+        for i, axis in enumerate("xyz"):
+            table[f"gyro_bias_{axis}_radps"] = self.gyro_bias_radps[:, i]
+            table[f"accel_bias_{axis}_mps2"] = self.accel_bias_mps2[:, i]
+        table["slip"], table["sigma_slip"] = self.slip, self.slip_sigma
+        for i, name in enumerate(self.linear_names):
+            if name != "slip" and self.linear is not None and self.linear_sigma is not None:
+                table[name], table[f"sigma_{name}"] = self.linear[:, i], self.linear_sigma[:, i]
+        for i, name in enumerate(self.classes):
+            table[f"p_{name}"] = self.terrain[:, i]
+        table["terrain"], table["status"] = self.dominant_terrain(), self.status
+        if self.slipping is not None and self.immobilised is not None:
+            table["slipping"], table["immobilised"] = self.slipping, self.immobilised
+        return table
 
     def dominant_terrain(self) -> NDArray[Any]:
         """The most probable class (N,) at each keyframe."""

@@ -72,4 +72,5 @@ class History:
             bias_sigma=stack("bias_sigma", (6,)),
             linear=stack("linear", (len(LINEAR),)),
             linear_sigma=stack("linear_sigma", (len(LINEAR),)),
+            linear_names=LINEAR,
         )

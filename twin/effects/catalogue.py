@@ -72,14 +72,22 @@ def lookup(key: str) -> tuple[Form, Parameter]:
     raise ConfigError(f"unknown effect '{key}'", remedy=remedy)
 
 
+def parameter_key(name: str) -> str:
+    """The key that a name stands for: a bare effect, such as "slope", means its first form."""
+    forms = [form for form in catalogue().values() if form.effect == name]
+    if forms and len(forms[0].parameters) == 1:
+        return forms[0].parameter_key(forms[0].parameters[0])
+    return name
+
+
 def checked(values: Mapping[str, float]) -> dict[str, float]:
-    """The values as floats, sorted by key, those of zero left out.
+    """The values as floats, sorted by key, those of zero left out; a bare effect means its first form.
 
     Raises:
         ConfigError: an unknown key, or a value that is no number or out of its range.
     """
     out = {}
-    for key, value in sorted(values.items()):
+    for key, value in sorted((parameter_key(name), value) for name, value in values.items()):
         _, parameter = lookup(key)
         if not (math.isfinite(value) and parameter.low <= value <= parameter.high):
             raise ConfigError(

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Annotated
 
 from terrafusion.datasets.core.config import Quantity, structure
+from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig, SensorSuite
@@ -104,7 +105,7 @@ class Odometry:
     track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class VehicleParams:
     """A four-wheel differential-drive robot: body, drive, odometry and sensors.
 
@@ -126,6 +127,28 @@ class VehicleParams:
     topics: dict[str, str] = field(default_factory=dict)
     effects: dict[str, Annotated[float, Quantity("")]] = field(default_factory=dict)
     measured: tuple[str, ...] = ()
+
+    @classmethod
+    def load(cls, name_or_path: str | Path) -> VehicleParams:
+        """A vehicle by its name in the library, or from a YAML file; see `load_vehicle`."""
+        return load_vehicle(name_or_path)
+
+    def __repr__(self) -> str:
+        body, odometry, gnss = self.body, self.odometry, self.sensors.gnss
+        lines = [
+            f"Vehicle '{self.name}': {self.description}",
+            f"  body: {body.mass_kg:g} kg, track {body.track_m:g} m, wheelbase {body.wheelbase_m:g} m",
+            f"  odometry: wheel radius {odometry.wheel_radius_m:g} m, track {odometry.track_m:g} m",
+            f"  sensors: antenna at {gnss.antenna_m} m, IMU at {self.sensors.imu.position_m} m",
+        ]
+        if self.effects:
+            lines.append(f"  effects: {', '.join(sorted(self.effects))}")
+        if self.measured:
+            lines.append(f"  measured on this robot: {', '.join(self.measured)}")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return text_html(repr(self))
 
     def rig(self) -> Rig:
         """What a reader or an estimator needs: odometry geometry, sensors and topic names."""
