@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.compare import (
     LEAST_UNITS,
@@ -22,7 +23,6 @@ from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
 from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, nees_cells, targets
 from terrafusion.fusion.metrics.pooled_consistency import MARKS, Cell
-from terrafusion.fusion.reports.replay.text import number
 
 Cells = list[str]
 

@@ -235,14 +235,14 @@ def _reasons(shown: ReportRun, recording: Recording, marked: Sequence[WeightChan
     rows = []
     numbers, told = plots.moments(marked), 0
     for change in marked:
-        number = numbers[change.t_ns]
+        order = numbers[change.t_ns]
         t_s = (change.t_ns - recording.start_ns) * 1e-9
-        when = (f"{number}", f"{t_s:.1f}") if number != told else ("", "")
-        told = number
+        when = (f"{order}", f"{t_s:.1f}") if order != told else ("", "")
+        told = order
         name, _, why = change.reason.partition(": ")
         if name not in shown.estimate.weights:
             name, why = change.sensor, change.reason
-        before, after = (words.number(float(value)) for value in (change.before, change.after))
+        before, after = (number(float(value)) for value in (change.before, change.after))
         rows.append(
             f'<tr><td class="n">{when[0]}</td><td class="n">{when[1]}</td><td>{escape(name)}</td>'
             f'<td class="n">{before} → {after} {escape(change.unit)}</td><td>{escape(why)}</td></tr>'

@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from terrafusion.datasets.core.tables import number
+
 Metrics = Mapping[str, Any]
 
 REFERENCE = {"truth": "the ground truth", "gnss_held_out": "GNSS fixes kept from the estimator"}
@@ -72,18 +74,6 @@ class Row:
 
     def _same(self, i: int, j: int) -> bool:
         return self.text(i) == self.text(j)
-
-
-def number(value: float | None, digits: int = 3) -> str:
-    """`value` with so many significant digits and no exponent where it can be avoided; a dash for None."""
-    if value is None:
-        return "–"
-    if isinstance(value, int) or value == 0.0:
-        return f"{value:,.0f}".replace(",", "\u202f")
-    if not 1e-5 <= abs(value) < 1e7:
-        return f"{value:.{digits - 1}e}"
-    decimals = max(0, digits - 1 - math.floor(math.log10(abs(value))))
-    return f"{value:,.{decimals}f}".replace(",", "\u202f")
 
 
 def table_rows(runs: Sequence[Metrics]) -> list[Row]:

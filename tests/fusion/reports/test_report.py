@@ -13,6 +13,7 @@ import pytest
 
 from terrafusion.datasets.core.channels import Fix, Gnss, Terrain
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, score
 from terrafusion.fusion.reports.replay import plots, plots_filter, plots_map
@@ -23,7 +24,7 @@ from terrafusion.fusion.reports.replay.outputs import (
     terrain_shares,
 )
 from terrafusion.fusion.reports.replay.page import ReportRun, write_report
-from terrafusion.fusion.reports.replay.text import Row, head_of_many, number, pick_pair, table_rows
+from terrafusion.fusion.reports.replay.text import Row, head_of_many, pick_pair, table_rows
 from terrafusion.fusion.reports.style import colour_of, plain, thin
 
 HOSTILE = '<script>alert("x")</script>&_$\\frac{'
