@@ -14,6 +14,7 @@ from typing import Any
 
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, Scores
 from terrafusion.fusion.reports import style
