@@ -27,7 +27,7 @@ from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import complete_rows, imu_kind, inputs_of
+from terrafusion.fusion.config.sensor_config import complete_samples, imu_kind, sensor_config_of
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 
@@ -70,7 +70,7 @@ def messages(recording: Recording, wheel_radius_m: float) -> Iterator[Message]:
         raise DataError(
             "the log lacks IMU or wheels", remedy="live use needs both; see `terrafusion inspect`"
         )
-    imu = recording.imu.select(complete_rows(recording.imu, kind))
+    imu = recording.imu.select(complete_samples(recording.imu, kind))
     streams = [
         _wheels(recording.wheels, wheel_radius_m), _gnss(recording), _commands(recording),
         _pressures(recording), _imu(imu),
@@ -248,7 +248,7 @@ def _live(log: str, vehicle: str | None, realtime: bool) -> None:
 
     recording = open_recording(log)
     robot, _ = choose_vehicle(recording, vehicle)
-    inputs = inputs_of(recording, recording.gnss)
+    inputs = sensor_config_of(recording, recording.gnss)
     estimator = Estimator(EstimatorConfig(robot.rig(), robot.name, inputs=inputs))
     newest: list[State | None] = [None]
 

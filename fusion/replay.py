@@ -18,12 +18,12 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples, sensor_config_of
 from terrafusion.fusion.estimate.estimate import Estimate, State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.history import History
-from terrafusion.fusion.estimator.map_alignment import Placement
-from terrafusion.fusion.graph.batch import Batch
+from terrafusion.fusion.estimator.map_alignment import MapAlignment
+from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import (
@@ -155,14 +155,14 @@ def replay(
             )
     used, held_out = split_fixes(recording, outages)
     rows = policy if isinstance(policy, Policy) else load_policy(policy)
-    inputs = inputs_of(recording, used)
+    inputs = sensor_config_of(recording, used)
     imu, wheels = _usable(recording, inputs)
     config = EstimatorConfig(params.rig(), params.name, mode, rows, inputs=inputs, **(settings or {}))
     archive = Chain(calibrate=config.calibrate) if batch else None
     history = History()
     estimator = Estimator(
         config,
-        on_state=lambda state: history.add(state, estimator.weights.row, estimator.weights.take_changes()),
+        on_state=lambda state: history.add(state, estimator.weights.noise, estimator.weights.take_changes()),
         on_innovation=history.innovations.append,
         archive=archive,
     )
@@ -198,7 +198,7 @@ def replay(
     )  # fmt: skip
 
 
-def _usable(recording: Recording, inputs: Inputs) -> tuple[Imu | None, Wheels]:
+def _usable(recording: Recording, inputs: SensorConfig) -> tuple[Imu | None, Wheels]:
     """IMU, where one is used, and wheels, without rows that lack a value the graph needs."""
     imu, wheels = recording.imu, recording.wheels
     if wheels is None or not len(wheels):
@@ -215,7 +215,7 @@ def _usable(recording: Recording, inputs: Inputs) -> tuple[Imu | None, Wheels]:
             raise DataError("the log is too short to start from", remedy="give at least two seconds")
         return None, wheels
     assert imu is not None
-    imu = imu.select(complete_rows(imu, inputs.imu))
+    imu = imu.select(complete_samples(imu, inputs.imu))
     overlap = (min(imu.t_ns[-1], wheels.t_ns[-1]) - max(imu.t_ns[0], wheels.t_ns[0])) * 1e-9
     if overlap < 2.0:
         raise DataError(
@@ -313,14 +313,14 @@ def _smooth(chain: Chain, history: History, config: EstimatorConfig, placed: boo
 
     Where fixes have `placed` the path, no state of it is local any more.
     """
-    batch = Batch(chain, [key_state_of(state) for state in history.states])
+    batch = BatchSmoother(chain, [key_state_of(state) for state in history.states])
     batch.optimise()
     keys, covariances = batch.states(), batch.covariances()
     offset = len(keys) - len(history.states)
     history.states[:] = [
-        _smoothed(state, key, P, gyro_sigma_radps(config.rig.sensors.imu, config.keyframe_s, row))
-        for state, key, P, row in zip(
-            history.states, keys[offset:], covariances[offset:], history.rows, strict=True
+        _smoothed(state, key, P, gyro_sigma_radps(config.rig.sensors.imu, config.keyframe_s, noise))
+        for state, key, P, noise in zip(
+            history.states, keys[offset:], covariances[offset:], history.noises, strict=True
         )
     ]
     if placed:
@@ -359,7 +359,7 @@ def _smoothed(live: State, key: KeyState, P: Array, gyro_sigma: Array) -> State:
     )
 
 
-def _laid_onto_the_map(history: History, placed: Placement, batch: bool) -> tuple[str, ...]:
+def _laid_onto_the_map(history: History, placed: MapAlignment, batch: bool) -> tuple[str, ...]:
     """Put the local states before the first fixes where these show them to have been."""
     local = [i for i, state in enumerate(history.states) if state.status == "no_gnss"]
     for i in local:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.fusion.config.sensor_config import Inputs
+from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.noise.policy import Policy, load_policy
@@ -55,7 +55,7 @@ class EstimatorConfig:
     wheel_gate_sigma: float = 6.0
     yaw_sigma_start_rad: float = 0.12
     start_without_gnss_s: float = 30.0
-    inputs: Inputs = field(default_factory=Inputs)
+    inputs: SensorConfig = field(default_factory=SensorConfig)
     calibrate: bool = False
     declination_rad: float | None = None
     labels: GroundLabels | None = None

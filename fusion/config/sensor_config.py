@@ -28,7 +28,7 @@ COMPLETE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class Inputs:
+class SensorConfig:
     """What an estimator is given; declared, never guessed from single samples.
 
     Attributes:
@@ -99,7 +99,7 @@ class Inputs:
         return tuple(notes)
 
 
-def inputs_of(recording: Recording, gnss: Gnss | None) -> Inputs:
+def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
     """What `recording` holds, with the fixes `gnss` that the estimator is to be given.
 
     Raises:
@@ -107,10 +107,10 @@ def inputs_of(recording: Recording, gnss: Gnss | None) -> Inputs:
     """
     wheels = recording.wheels
     fixes = gnss is not None and bool(((gnss.fix > 0) & np.isfinite(gnss.enu_m[:, :2].sum(axis=1))).any())
-    return Inputs(imu_kind(recording.imu), wheels is None or wheels.has_sides(), fixes)
+    return SensorConfig(imu_kind(recording.imu), wheels is None or wheels.has_sides(), fixes)
 
 
-def complete_rows(imu: Imu, kind: str) -> np.ndarray:
+def complete_samples(imu: Imu, kind: str) -> np.ndarray:
     """Which rows (N,) of the IMU hold all that its kind asks for."""
     z = np.isfinite(imu.gyro_radps[:, 2])
     if kind == "six_axis":
@@ -120,9 +120,9 @@ def complete_rows(imu: Imu, kind: str) -> np.ndarray:
 
 def imu_kind(imu: Imu | None) -> str:
     """Which of `IMU_KINDS` the IMU of a log is."""
-    if imu is None or not complete_rows(imu, "gyro_z").any():
+    if imu is None or not complete_samples(imu, "gyro_z").any():
         return "none"
-    six, z = int(complete_rows(imu, "six_axis").sum()), int(complete_rows(imu, "gyro_z").sum())
+    six, z = int(complete_samples(imu, "six_axis").sum()), int(complete_samples(imu, "gyro_z").sum())
     return "six_axis" if six >= COMPLETE_SHARE * z else "gyro_z"
 
 

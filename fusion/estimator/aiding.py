@@ -11,17 +11,17 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.estimate.estimate import Innovation
-from terrafusion.fusion.estimator.alignment import LEVEL_SIGMA_STILL_RAD, WINDOW_NS, GivenStart, Start
-from terrafusion.fusion.estimator.barometer import HeightAid
+from terrafusion.fusion.estimator.alignment import LEVEL_SIGMA_STILL_RAD, WINDOW_NS, KnownStart, Start
+from terrafusion.fusion.estimator.barometer import BarometerAiding
 from terrafusion.fusion.estimator.gnss import GnssUpdater
-from terrafusion.fusion.estimator.magnetometer import HeadingAid
+from terrafusion.fusion.estimator.magnetometer import MagnetometerAiding
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream
 
 Array = NDArray[np.float64]
 
 
-class Aids:
+class AidingSensors:
     """Both sensors.
 
     Args:
@@ -31,10 +31,10 @@ class Aids:
     """
 
     def __init__(self, rig: Rig, declination_rad: float | None, report: Callable[[Innovation], None]) -> None:
-        self.height = HeightAid(rig.sensors.barometer, report)
+        self.height = BarometerAiding(rig.sensors.barometer, report)
         self._accel_tilt_rad = rig.sensors.imu.accel_bias_sigma_mps2 / GRAVITY_MPS2
         tilt = float(np.hypot(LEVEL_SIGMA_STILL_RAD, self._accel_tilt_rad))
-        self.heading = HeadingAid(rig.sensors.magnetometer, declination_rad, report, tilt)
+        self.heading = MagnetometerAiding(rig.sensors.magnetometer, declination_rad, report, tilt)
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
     def update(self, chain: Chain, newest_ns: int, before: Array, after: Array, gnss: GnssUpdater) -> bool:
@@ -52,7 +52,7 @@ class Aids:
         heading = self.heading.active and self.heading.update(chain, t_ns, newest_ns, before, after, turned)
         return height or heading
 
-    def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> GivenStart | None:
+    def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> KnownStart | None:
         """Where a robot at rest stands and where it heads, once a fix and the field have told it."""
         self.height.forget(imu.t_ns[0])
         self.heading.forget(imu.t_ns[0])
@@ -60,14 +60,14 @@ class Aids:
         if not early or not self.heading.ready:
             return None
         tilt = float(np.hypot(level.level_sigma_rad, self._accel_tilt_rad))
-        told = self.heading.heading_at_rest(level, tilt)
+        told = self.heading.stationary_heading(level, tilt)
         if told is None:
             return None
         yaw, sigma = told
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, yaw).matrix()
         best = min(early, key=lambda fix: float(fix.sigma_m[0]))
         position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
-        return GivenStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
+        return KnownStart(position, yaw, float(np.nanmax(best.sigma_m)) + 0.05, sigma)
 
     def notes(self) -> tuple[str, ...]:
         """What was made of the samples, in sentences."""

@@ -89,7 +89,7 @@ def _mean_speed_mps(wheels: WheelStream, start_ns: int, end_ns: int) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class GivenStart:
+class KnownStart:
     """A position (3,) and heading, ENU, that are known beforehand, with their 1 sigmas."""
 
     position_m: Array
@@ -102,9 +102,9 @@ class GivenStart:
         return dataclasses.replace(level, **vars(self))
 
 
-def checked_given(
+def checked_start(
     position_m: ArrayLike, yaw_rad: float, position_sigma_m: float, yaw_sigma_rad: float
-) -> GivenStart:
+) -> KnownStart:
     """A given start.
 
     Raises:
@@ -120,10 +120,10 @@ def checked_given(
             f"sigmas {position_sigma_m} m, {yaw_sigma_rad} rad of the start are not positive",
             remedy="give 1 sigma",
         )
-    return GivenStart(position, float(yaw_rad), position_sigma_m, yaw_sigma_rad)
+    return KnownStart(position, float(yaw_rad), position_sigma_m, yaw_sigma_rad)
 
 
-def turn_between(
+def rotation_between(
     z: NDArray[np.complex128], g: NDArray[np.complex128], weight: Array
 ) -> tuple[complex, float]:
     """The turn that lays points z onto points g, as a complex number, and its information.
@@ -143,7 +143,7 @@ def heading_from_motion(
 ) -> Start | None:
     """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
 
-    Positions and velocities show the same turn, so their sums add up (see `turn_between`). None while
+    Positions and velocities show the same turn, so their sums add up (see `rotation_between`). None while
     fewer than three fixes are inside, or while the fixes hardly move though the wheels do.
     """
     times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
@@ -157,7 +157,7 @@ def heading_from_motion(
     z = path_at(t_fix) + lever * heading
     g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
     weight = np.array([1.0 / (f.sigma_m[0] * f.sigma_m[1]) for f in inside])
-    turn, information = turn_between(z, g, weight)
+    turn, information = rotation_between(z, g, weight)
     half = 0.1
     z_dot = (path_at(t_fix + half) - path_at(t_fix - half)) / (2.0 * half)
     z_dot = z_dot + lever * (np.exp(1j * yaw_at(t_fix + half)) - np.exp(1j * yaw_at(t_fix - half))) / 0.2

@@ -52,7 +52,7 @@ def height_factor(k: int, height_m: float, sigma_m: float, sensor_m: Array) -> g
     return gtsam.GPSFactorArm(X(k), np.array([0.0, 0.0, height_m]), sensor_m, noise)
 
 
-class HeightAid:
+class BarometerAiding:
     """Turns pressures into factors of the newest keyframe; `report` gets every innovation (m)."""
 
     def __init__(self, spec: BarometerSpec | None, report: Callable[[Innovation], None]) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.estimator.alignment import turn_between
+from terrafusion.fusion.estimator.alignment import rotation_between
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.streams import GnssFix
 
@@ -46,7 +46,7 @@ CONFIRMED = 3
 
 
 @dataclass(frozen=True)
-class Fit:
+class PathFit:
     """How the dead-reckoned path lies among the fixes.
 
     Attributes:
@@ -68,7 +68,7 @@ class Fit:
 
 
 @dataclass(frozen=True, eq=False)
-class Pair:
+class FixPair:
     """A fix (east + i north, m) with its claimed sigma, and the dead-reckoned antenna `z` (m) at its time."""
 
     t_ns: int
@@ -77,7 +77,7 @@ class Pair:
     sigma_m: float
 
 
-class MotionTrack:
+class DeadReckoning:
     """The dead-reckoned path of the antenna and the fixes along it, for the last `KEPT_S`."""
 
     def __init__(self, antenna_m: Array) -> None:
@@ -85,7 +85,7 @@ class MotionTrack:
         self._t_ns: list[int] = []
         self._z: list[complex] = []
         self._yaw: list[float] = []
-        self.pairs: list[Pair] = []
+        self.pairs: list[FixPair] = []
         self._yaw_chain = 0.0
         self._turned = 0
         self._told = np.zeros(2)
@@ -130,7 +130,7 @@ class MotionTrack:
         z = self._z[i - 1] + share * (self._z[i] - self._z[i - 1])
         yaw = self._yaw[i - 1] + share * (self._yaw[i] - self._yaw[i - 1])
         at = z + self._lever * complex(np.cos(yaw), np.sin(yaw))
-        pair = Pair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
+        pair = FixPair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
         bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
 
     def scatter(self) -> float:
@@ -158,7 +158,7 @@ class MotionTrack:
         total, counted = self._told + self._tell(self.pairs)
         return float(total / counted) if counted >= LEAST_NEWS else math.nan
 
-    def _tell(self, pairs: list[Pair]) -> Array:
+    def _tell(self, pairs: list[FixPair]) -> Array:
         """Sum and number (2,) of second differences over the claims, for `news`."""
         if len(pairs) < 3:
             return np.zeros(2)
@@ -166,7 +166,7 @@ class MotionTrack:
         share = (seen / claimed)[bend < claimed]
         return np.array([np.minimum(share, WILD).sum(), np.count_nonzero(share < WILD)])
 
-    def _second_differences(self, pairs: list[Pair]) -> tuple[Array, Array, Array]:
+    def _second_differences(self, pairs: list[FixPair]) -> tuple[Array, Array, Array]:
         """Squares (m2, each axis) of second differences of fix minus path where fixes come evenly, what slip
         may add to them, and what the claims would."""
         z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
@@ -220,7 +220,7 @@ class MotionTrack:
         limit = max(LEAST_TURN_RAD, 4.0 * math.hypot(fit.sigma_rad, min(yaw_sigma_rad, 0.3)))
         return error if abs(error) > limit else None
 
-    def error_of(self, fit: Fit) -> float:
+    def error_of(self, fit: PathFit) -> float:
         """Angle, rad, by which the chain's heading must turn to agree with the fit."""
         return cmath.phase(fit.turn * cmath.exp(-1j * (self._yaw_chain - self._yaw[-1])))
 
@@ -228,7 +228,7 @@ class MotionTrack:
         """The dead-reckoned antenna at the newest keyframe, m."""
         return self._z[-1] + self._lever * cmath.exp(1j * self._yaw[-1])
 
-    def fit(self, scale: float, yaw_sigma_rad: float) -> Fit | None:
+    def fit(self, scale: float, yaw_sigma_rad: float) -> PathFit | None:
         """The path laid onto the fixes, whose claims count `scale` times; None until its turn is known to
         `yaw_sigma_rad`."""
         if len(self.pairs) < 5:
@@ -237,7 +237,7 @@ class MotionTrack:
         weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in self.pairs])
         keep = np.ones(len(z), dtype=bool)
         for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
-            turn, information = turn_between(z[keep], fix[keep], weight[keep])
+            turn, information = rotation_between(z[keep], fix[keep], weight[keep])
             if information <= 0.0:
                 return None
             ratio = abs(turn) / information
@@ -254,7 +254,7 @@ class MotionTrack:
         sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * left / extent
         if sigma > yaw_sigma_rad or not LEAST_RATIO < ratio < MOST_RATIO:
             return None
-        return Fit(turn / information, sigma, complex(middle), complex(fix_middle), left)
+        return PathFit(turn / information, sigma, complex(middle), complex(fix_middle), left)
 
 
 def _median(values: Array) -> float:

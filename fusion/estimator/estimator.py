@@ -24,33 +24,33 @@ from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
-from terrafusion.fusion.estimator.aiding import Aids
+from terrafusion.fusion.estimator.aiding import AidingSensors
 from terrafusion.fusion.estimator.alignment import (
     WINDOW_NS,
-    GivenStart,
+    KnownStart,
     Start,
-    checked_given,
+    checked_start,
     heading_from_motion,
     level_start,
 )
-from terrafusion.fusion.estimator.friction import grip_of
+from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate
 from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
-from terrafusion.fusion.estimator.skid import Slide
+from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
-from terrafusion.fusion.estimator.stationarity import RestDetector, forget_waiting, hold
+from terrafusion.fusion.estimator.stationarity import StationarityDetector, drop_before_start, hold
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, wheel_increment
 from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
-from terrafusion.fusion.graph.planar import held_level, in_a_turn, yaw_of_wheels
+from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
-from terrafusion.fusion.weighting.adaptive import TerrainWeights
+from terrafusion.fusion.weighting.adaptive import TerrainNoise
 
 Array = NDArray[np.float64]
 
@@ -82,24 +82,24 @@ class Estimator:
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.wheels = WheelStream()
-        self.weights = TerrainWeights(config)
+        self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
-        self._slide = Slide(grip_of(config, self._preintegrator, self.weights.note))
+        self._slide = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.note))
         self.gnss = GnssUpdater(config, self._report, self.weights.single, self._slide)
-        self.aids = Aids(config.rig, config.declination_rad, self._report)
+        self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._step_ns = round(config.keyframe_s * 1e9)
         self._keep = round(config.lag_s / config.keyframe_s) + LAG_MARGIN
         self._start: Start | None = None
-        self._given: GivenStart | None = None
+        self._given: KnownStart | None = None
         self._level: Start | None = None
         self._state: State | None = None
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._silent = False
-        self._rest = RestDetector(config.rig)
+        self._rest = StationarityDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
         self._propagator = Propagator(self._preintegrator)
 
@@ -166,7 +166,7 @@ class Estimator:
 
         A heading that proves wrong is set right from the motion. Must come before the start.
         """
-        self._given = checked_given(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
+        self._given = checked_start(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
 
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with the own detector's."""
@@ -192,7 +192,7 @@ class Estimator:
         """The newest state carried to the newest IMU sample; None before the start."""
         if self._state is None:
             return None
-        return self._propagator.carry(self._state, self._covariance, self.imu, self.weights.row)
+        return self._propagator.carry(self._state, self._covariance, self.imu, self.weights.noise)
 
     def dump(self) -> bytes:
         """The state of a running estimator, for `restore`; see `snapshot`."""
@@ -252,7 +252,7 @@ class Estimator:
             start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
             if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
                 self._begin(start)
-            elif forget_waiting(self.imu, self.wheels, self.gnss.waiting):
+            elif drop_before_start(self.imu, self.wheels, self.gnss.waiting):
                 self._level = None
         elif not self.gnss.waiting and (last or elapsed > self.config.longest_wait_s):
             self.gnss.local = True
@@ -265,7 +265,7 @@ class Estimator:
         spec = self.config.rig.sensors.imu
         gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
         grade = float(rotation.matrix()[2, 0])
-        linear, sigma = slow_states.prior(self.weights.row, grade, self.gnss.drift_sigma_m)
+        linear, sigma = slow_states.prior(self.weights.noise, grade, self.gnss.drift_sigma_m)
         point = KeyState(
             gtsam.Pose3(rotation, start.position_m),
             rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
@@ -305,12 +305,12 @@ class Estimator:
         switch = self.weights.take_switch()
         before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
         before = self.chain.state(self.chain.last)
-        row, drift = self.weights.row, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
+        noise, drift = self.weights.noise, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
         if switch > SWITCHED:
-            slow_states.open_slip(self.chain, t_ns - SEEN_LATE_NS, dt, row, *drift, switch)
+            slow_states.inflate_slip_covariance(self.chain, t_ns - SEEN_LATE_NS, dt, noise, *drift, switch)
         segments = self.imu.segments(before_ns, t_ns)
         if self.config.inputs.planar:
-            segments = in_a_turn(segments, before)
+            segments = with_centripetal_force(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         segments, wheels = self._slide.dragged(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
@@ -320,7 +320,7 @@ class Estimator:
             point = carried(before, wheels, dt)
             link = bridge(k, before, point, dt)
         else:
-            measured = self._preintegrator.integrate(segments, before.bias, row)
+            measured = self._preintegrator.integrate(segments, before.bias, noise)
             seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
@@ -329,11 +329,11 @@ class Estimator:
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, switch)
         up = before.pose.rotation().matrix()[2]
-        markov = slow_states.step(dt, row, up, *drift, switch, wheels)
+        markov = slow_states.step(dt, noise, up, *drift, switch, wheels)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)
         if self.config.inputs.planar:
-            self.chain.add(k, held_level(k), "X")
+            self.chain.add(k, level_factor(k), "X")
         self._zero_velocity(k, t_ns, before, link)
         self._finish_keyframe(t_ns, gyro, rolled.distance_m if rolled else None)
 
@@ -341,7 +341,7 @@ class Estimator:
         chain = self.chain
         chain.solve(SMOOTH_WINDOW)
         before = self._covariance = chain.covariance()
-        if self.gnss.update(chain, self._covariance, self.weights.row):
+        if self.gnss.update(chain, self._covariance, self.weights.noise):
             chain.solve(SMOOTH_WINDOW)
             self._covariance = chain.covariance()
         if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
@@ -361,7 +361,7 @@ class Estimator:
         state, self._fresh = self._fresh, None
         if state is None:
             return
-        turned = self.gnss.set_heading_right(self.chain, self.weights.row)
+        turned = self.gnss.correct_heading(self.chain, self.weights.noise)
         if turned or self.chain.last % SMOOTH_EVERY == 0:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()
@@ -377,9 +377,11 @@ class Estimator:
         quantum_m = rig.sensors.wheels.quantum_rad * rig.wheel_radius_m
         bias_z = float(before.bias.gyroscope()[2])
         change = self.wheels.speed_change_mps(before_ns, t_ns)
-        row, surging = self.weights.row, self.config.calibrate
-        increment = wheel_increment(travelled, segments, bias_z, rig.track_m, quantum_m, row, change, surging)
-        increment = self._slide.loosened(increment, before, (t_ns - before_ns) * 1e-9)
+        noise, surging = self.weights.noise, self.config.calibrate
+        increment = wheel_increment(
+            travelled, segments, bias_z, rig.track_m, quantum_m, noise, change, surging
+        )
+        increment = self._slide.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
@@ -392,11 +394,11 @@ class Estimator:
         moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
         d = wheels.displacement_m
         innovation = float(moved[0] - before.rolling * d[0])
-        P, row = self._covariance, self.weights.row
+        P, noise = self._covariance, self.weights.noise
         forward = before.pose.rotation().matrix()[:, 0]
         variance = (
             wheels.sigma[0] ** 2
-            + d[0] ** 2 * (P[SLIP, SLIP] + row.slip_sigma**2 * (2.0 * dt / row.slip_time_s + switch))
+            + d[0] ** 2 * (P[SLIP, SLIP] + noise.slip_sigma**2 * (2.0 * dt / noise.slip_time_s + switch))
             + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
             + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
         )
@@ -442,7 +444,7 @@ class Estimator:
                 P,
                 R,
                 key.velocity,
-                gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, self.weights.row),
+                gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, self.weights.noise),
             ),
             bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),

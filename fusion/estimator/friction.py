@@ -1,7 +1,7 @@
-"""Grip of the ground, heard from fixes: a robot's way is told for many grips at once, and fixes choose.
+"""FrictionEstimator of the ground, heard from fixes: a robot's way is told for many grips at once, and fixes choose.
 
 Without an accelerometer nothing but the wheels tells the speed, and on ice they tell it wrong: the robot
-follows them no faster than friction drags it. `Grip` carries a velocity along for each of `GRIPS_MPS2` by the
+follows them no faster than friction drags it. `FrictionEstimator` carries a velocity along for each of `FRICTION_MPS2` by the
 wheels and the gyro alone (`graph.friction`), compares the ways with those between fixes a second apart, and
 weighs the grips by how well they tell them (multiple models: Bar-Shalom, Li and Kirubarajan 2001, sec. 11.6).
 The planar graph then takes the way and the change of speed that the grip allows in place of the wheels'.
@@ -22,7 +22,7 @@ from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.coulomb import slid
+from terrafusion.fusion.graph.coulomb import skid_motion
 from terrafusion.fusion.graph.key_state import ICR_X, SIDE_SLIP, VELOCITY, KeyState
 from terrafusion.fusion.graph.link import imu_factor
 from terrafusion.fusion.graph.planar import ACCEL_DENSITY_MPS2
@@ -33,16 +33,16 @@ from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
-GRIPS_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
+FRICTION_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
 """Grips that are told apart: mu g from ice to dry ground."""
 SLIPPERY_MPS2 = 2.0
 """Up to this grip, of ice and wet or snowy ground, friction leads; with more, wheels lead nearly as well."""
-SLIPPERY = GRIPS_MPS2[GRIPS_MPS2 <= SLIPPERY_MPS2]
+SLIPPERY = FRICTION_MPS2[FRICTION_MPS2 <= SLIPPERY_MPS2]
 SURE = 0.9999
 """Probability of friction, whatever the grip, from which it leads on dry ground, too: what else bends a way
 (soft ground, a hill, a jump of fixes) passes for friction sooner than for rolling. Chosen on field logs."""
 USUAL_MPS2, USUAL_SPREAD = 1.0, 0.7
-"""Grip of a robot that slides, before any fix, and standard deviation of its logarithm (assumed)."""
+"""FrictionEstimator of a robot that slides, before any fix, and standard deviation of its logarithm (assumed)."""
 HOLDS = 0.9
 """Probability, before any fix, that the wheels hold: half of it that the robot goes as they roll, half that
 it does as friction has it on ground that is not slippery (assumed)."""
@@ -66,7 +66,7 @@ TELL_STEP = 0.2
 _STEP_MPS = 0.01
 
 
-class Grip:
+class FrictionEstimator:
     """Which grip the ground has, and what a robot does by it.
 
     Args:
@@ -83,7 +83,7 @@ class Grip:
         self._told_mps2 = math.inf
         self._linked: deque[tuple[int, list[ImuSegment]]] = deque()
         usual = np.exp(-0.5 * (np.log(SLIPPERY / USUAL_MPS2) / USUAL_SPREAD) ** 2)
-        dry = np.full(len(GRIPS_MPS2) - len(SLIPPERY), 0.5 * HOLDS / (len(GRIPS_MPS2) - len(SLIPPERY)))
+        dry = np.full(len(FRICTION_MPS2) - len(SLIPPERY), 0.5 * HOLDS / (len(FRICTION_MPS2) - len(SLIPPERY)))
         self._prior = np.log([*(1.0 - HOLDS) * usual / usual.sum(), *dry, 0.5 * HOLDS])
         self._score = np.zeros(len(self._prior))
         self._velocity: Array | None = None
@@ -100,7 +100,7 @@ class Grip:
         weight = self._weights()
         if float(weight[: len(SLIPPERY)].sum()) > 0.5:
             return slice(len(SLIPPERY))
-        return slice(len(GRIPS_MPS2)) if float(weight[:-1].sum()) > SURE else None
+        return slice(len(FRICTION_MPS2)) if float(weight[:-1].sum()) > SURE else None
 
     @property
     def mps2(self) -> float:
@@ -116,7 +116,7 @@ class Grip:
     def _known(self) -> tuple[float, float]:
         """Mean and standard deviation of the grip, m/s2."""
         leading = self._leading() or slice(len(SLIPPERY))
-        weight, grips = self._weights()[leading], GRIPS_MPS2[leading]
+        weight, grips = self._weights()[leading], FRICTION_MPS2[leading]
         mean = float(weight @ grips / weight.sum())
         return mean, math.sqrt(float(weight @ (grips - mean) ** 2 / weight.sum()))
 
@@ -212,10 +212,10 @@ class Grip:
         """Carry the ways on to `t_ns`."""
         R = before.pose.rotation().matrix()
         if self._velocity is None:
-            self._velocity = np.tile((R.T @ before.velocity)[:2], (len(GRIPS_MPS2), 1))
+            self._velocity = np.tile((R.T @ before.velocity)[:2], (len(FRICTION_MPS2), 1))
             here = np.tile((R @ self.antenna_m)[:2], (len(self._prior), 1))
             self._paths.append((t_ns - round(dt_s * 1e9), here))
-        self._velocity, way = slid(self._velocity, *motion, GRIPS_MPS2, self.track_m, dt_s)
+        self._velocity, way = skid_motion(self._velocity, *motion, FRICTION_MPS2, self.track_m, dt_s)
         rolled = before.rolling * wheels.displacement_m[:2] + [0.0, _across_m(wheels, before)]
         way = np.vstack([way, rolled])
         turned = R @ (gtsam.Rot3.Rz(wheels.yaw_rad).matrix() - np.eye(3)) @ self.antenna_m
@@ -258,7 +258,7 @@ class Grip:
         start = (R.T @ before.velocity)[:2]
         starts = start + np.array([[0.0, 0.0], [_STEP_MPS, 0.0], [0.0, _STEP_MPS]])
         grip, spread = self._known()
-        ends, ways = slid(starts, *motion, np.full(3, grip), self.track_m, dt_s)
+        ends, ways = skid_motion(starts, *motion, np.full(3, grip), self.track_m, dt_s)
         kept = (ends[1:] - ends[0]).T / _STEP_MPS
         carried_s = (ways[1:] - ways[0]).T / _STEP_MPS
         variance = np.diag(carried_s @ (R.T @ covariance[VELOCITY, VELOCITY] @ R)[:2, :2] @ carried_s.T)
@@ -279,11 +279,11 @@ class Grip:
         sigma[:2] = np.sqrt(sigma[:2] ** 2 + variance)
         # The factor will slip it, and carry it to the side, as it does with wheels that roll.
         way = np.append((ways[0] - [0.0, _across_m(wheels, before)]) / before.rolling, 0.0)
-        slid_m = wheels.displacement_m[0] - way[0]
-        return segments, dataclasses.replace(wheels, displacement_m=way, sigma=sigma, slid_m=float(slid_m))
+        skid_m = wheels.displacement_m[0] - way[0]
+        return segments, dataclasses.replace(wheels, displacement_m=way, sigma=sigma, skid_m=float(skid_m))
 
     def loose_link(
-        self, chain: Chain, k: int, more_m2ps: float, row: SensorNoise
+        self, chain: Chain, k: int, more_m2ps: float, noise: SensorNoise
     ) -> gtsam.NonlinearFactorGraph | None:
         """The link into keyframe k with an acceleration less sure, so that the way is by `more_m2ps`."""
         node, before = chain.nodes[k - chain.first], chain.nodes[k - 1 - chain.first]
@@ -295,20 +295,20 @@ class Grip:
         loose = math.sqrt(x * x + more), math.sqrt(y * y + more)
         segments = [dataclasses.replace(piece, accel_density_mps2=loose) for piece in made]
         link = gtsam.NonlinearFactorGraph()
-        link.add(imu_factor(k, self._preintegrator.integrate(segments, before.point.bias, row)))
+        link.add(imu_factor(k, self._preintegrator.integrate(segments, before.point.bias, noise)))
         return link
 
 
-def grip_of(
+def friction_estimator(
     config: EstimatorConfig, preintegrator: Preintegrator, tell: Callable[[WeightChange], None]
-) -> Grip | None:
-    """The `Grip` of an estimator; None where weights are fixed, or where IMU or wheels do not allow it.
+) -> FrictionEstimator | None:
+    """The `FrictionEstimator` of an estimator; None where weights are fixed, or where IMU or wheels do not allow it.
 
     A calibration asks what the wheels tell, and leaves friction out.
     """
     inputs = config.inputs
     heard = inputs.planar and inputs.sides and inputs.yaw == "gyro" and not config.calibrate
-    return Grip(config.rig, preintegrator, tell) if heard and config.mode == "adaptive" else None
+    return FrictionEstimator(config.rig, preintegrator, tell) if heard and config.mode == "adaptive" else None
 
 
 def _density2(rate_m2ps: float) -> float:

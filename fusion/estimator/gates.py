@@ -23,7 +23,7 @@ JUMP_LASTS = 2
 longer have it."""
 
 
-class Verdict(Enum):
+class GateDecision(Enum):
     """What a gate says of a fix."""
 
     ACCEPT = "accept"
@@ -53,7 +53,7 @@ class GnssGate:
     limit: int = 30
     rejected: list[tuple[Array, float]] = field(default_factory=list)
 
-    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[Verdict, float]:
+    def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[GateDecision, float]:
         """What to do with the fix, and the normalised innovation squared.
 
         `innovation_m` (d,) is fix minus prediction, `covariance_m2` (d, d) of it.
@@ -61,12 +61,12 @@ class GnssGate:
         nis = float(innovation_m @ np.linalg.solve(covariance_m2, innovation_m))
         if nis <= self.threshold:
             self.rejected.clear()
-            return Verdict.ACCEPT, nis
+            return GateDecision.ACCEPT, nis
         self.rejected.append((innovation_m[:2].copy(), float(np.sqrt(covariance_m2[0, 0]))))
         if len(self.rejected) > self.limit or (len(self.rejected) >= self.patience and self._agree()):
             self.rejected.clear()
-            return Verdict.REACQUIRE, nis
-        return Verdict.REJECT, nis
+            return GateDecision.REACQUIRE, nis
+        return GateDecision.REJECT, nis
 
     def _agree(self) -> bool:
         recent = self.rejected[-self.patience :]

@@ -16,18 +16,18 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
-from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
-from terrafusion.fusion.estimator.gates import GnssGate, Verdict
-from terrafusion.fusion.estimator.map_alignment import Placement, place
-from terrafusion.fusion.estimator.skid import Slide
+from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
+from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
+from terrafusion.fusion.estimator.map_alignment import MapAlignment, place
+from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
-from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
-from terrafusion.fusion.weighting.weighting import Surprise, Weighting
+from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
 from terrafusion.twin.sensors.gnss import best_fix
 
 Array = NDArray[np.float64]
@@ -74,16 +74,16 @@ class GnssUpdater:
         config: EstimatorConfig,
         report: Callable[[Innovation], None],
         weighting: Weighting | None = None,
-        slide: Slide | None = None,
+        slide: SkidDetector | None = None,
     ) -> None:
         self.weighting = weighting or Weighting()
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         spec = config.rig.sensors.gnss
-        self.track = MotionTrack(self.antenna_m)
+        self.track = DeadReckoning(self.antenna_m)
         self.turned = 0
-        self.slide = slide or Slide()
+        self.slide = slide or SkidDetector()
         self.scale, self.white = 1.0, WHITE_SHARE
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._best = best_fix(spec)
@@ -98,7 +98,7 @@ class GnssUpdater:
         self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
         self.local = False
-        self.placed: Placement | None = None
+        self.placed: MapAlignment | None = None
         self.unplaced = 0
         self.rejected = 0
         self.too_late = 0
@@ -120,7 +120,7 @@ class GnssUpdater:
         self._seen = len(self.waiting)
         return changed
 
-    def update(self, chain: Chain, covariance: Array, row: SensorNoise) -> bool:
+    def update(self, chain: Chain, covariance: Array, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
         A fix belongs to the first keyframe after it. `covariance` (dim, dim) is
@@ -146,7 +146,7 @@ class GnssUpdater:
                 if renewed or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
                     covariance = chain.covariance_at(k)
-                used |= self._add(chain, k, fix, covariance, row)
+                used |= self._add(chain, k, fix, covariance, noise)
                 self._unchecked = fix
         if used:
             self.weighting.revisit(chain)
@@ -185,7 +185,7 @@ class GnssUpdater:
         chain.revise(k, step.renewed(slice(1, 3)))
         return True
 
-    def set_heading_right(self, chain: Chain, row: SensorNoise) -> bool:
+    def correct_heading(self, chain: Chain, noise: SensorNoise) -> bool:
         """Turn the whole window where motion and fixes agree on another heading than the filter's.
 
         Looks only where fixes have been taken since the last call; True when it turned.
@@ -209,7 +209,7 @@ class GnssUpdater:
         doubt[2] = DOUBTFUL_YAW_SIGMA_RAD**2
         doubt[3:6] = off**2 + float(np.max(fix.sigma_m[:2]) * self.scale) ** 2
         doubt[VELOCITY], doubt[BIAS] = 1.0, self._bias_sigma**2
-        doubt[SLIP], doubt[DRIFT] = row.slip_sigma**2, self.drift_sigma_m**2
+        doubt[SLIP], doubt[DRIFT] = noise.slip_sigma**2, self.drift_sigma_m**2
         chain.restart(doubt, chain.first)
         chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
         chain.smooth(len(chain.nodes))
@@ -220,7 +220,7 @@ class GnssUpdater:
         return True
 
     def _add(
-        self, chain: Chain, k: int, fix: GnssFix, covariance: Array, row: SensorNoise, again: bool = False
+        self, chain: Chain, k: int, fix: GnssFix, covariance: Array, noise: SensorNoise, again: bool = False
     ) -> bool:
         node, state = chain.nodes[k - chain.first], chain.state(k)
         delay_s = float(state.of(GNSS_DELAY))
@@ -231,7 +231,7 @@ class GnssUpdater:
         antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
         lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
         velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
-        inflation = row.gnss_inflation * self.scale
+        inflation = noise.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
         sigma = self._white_sigma(fix, inflation, share)
         position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
@@ -243,15 +243,15 @@ class GnssUpdater:
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
         P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
-        if verdict is Verdict.REJECT and nis <= self.weighting.passed_nis:
-            verdict = Verdict.ACCEPT
-        if verdict is Verdict.REJECT and not again and self._slid(chain, k, fix, row):
-            return self._add(chain, k, fix, chain.covariance_at(k), row, again=True)
+        if verdict is GateDecision.REJECT and nis <= self.weighting.passed_nis:
+            verdict = GateDecision.ACCEPT
+        if verdict is GateDecision.REJECT and not again and self._slid(chain, k, fix, noise):
+            return self._add(chain, k, fix, chain.covariance_at(k), noise, again=True)
         scale, weight = 1.0, 1.0
-        if verdict is not Verdict.REACQUIRE:
+        if verdict is not GateDecision.REACQUIRE:
             drift_m2 = (share * self.drift_sigma_m) ** 2
             scale, weight = self.weighting.gnss(
-                Surprise(
+                InnovationTest(
                     fix.t_ns,
                     innovation[:2],
                     predicted_m2,
@@ -261,8 +261,8 @@ class GnssUpdater:
                     self.white,
                 )
             )
-        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not Verdict.REJECT))
-        if verdict is Verdict.REJECT:
+        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not GateDecision.REJECT))
+        if verdict is GateDecision.REJECT:
             if again:
                 self.slide.put_back(chain)
             self.rejected += 1
@@ -272,17 +272,20 @@ class GnssUpdater:
         sigma[:2] *= scale
         cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
-        if not known or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is Verdict.REJECT:
+        if (
+            not known
+            or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is GateDecision.REJECT
+        ):
             height = (np.asarray(state.pose.translation()) + R @ lever)[2]
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
         if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
-            sigma_v = round(max(fix.sigma_v_mps * row.gnss_inflation, 1e-3), 4)
+            sigma_v = round(max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), 4)
             if chain.dim > GNSS_DELAY:
                 doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
                 at_keyframe = fix.velocity_mps - accel_world * offset_s
-                sigma_v, turned = math.hypot(sigma_v, doubt), swing(rate, offset_s)
+                sigma_v, turned = math.hypot(sigma_v, doubt), lever_arm_velocity(rate, offset_s)
                 chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
             else:
                 body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
@@ -294,13 +297,13 @@ class GnssUpdater:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
 
-    def _slid(self, chain: Chain, k: int, fix: GnssFix, row: SensorNoise) -> bool:
+    def _slid(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just refused show that the wheels did not roll where the robot went."""
         refused = [off for off, _ in self.gate.rejected]
         sigma_m = float(np.max(fix.sigma_m[:2]))
         if not self.track.smooth_at(fix.t_ns):
             return False
-        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m, row):
+        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m, noise):
             return False
         self.gate.rejected.pop()  # it is tested again
         return True
@@ -327,7 +330,7 @@ class GnssUpdater:
         innovation_m: Array,
         S: Array,
         jacobian: Array,
-        verdict: Verdict,
+        verdict: GateDecision,
     ) -> bool:
         """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
 
@@ -337,7 +340,7 @@ class GnssUpdater:
         """
         gain = covariance @ jacobian.T @ np.linalg.inv(S)
         doubt = np.zeros(chain.dim)
-        if verdict is Verdict.REACQUIRE:
+        if verdict is GateDecision.REACQUIRE:
             doubt[3:6] = float(innovation_m @ innovation_m)
         elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
             return False

@@ -19,14 +19,14 @@ class History:
 
     def __init__(self) -> None:
         self.states: list[State] = []
-        self.rows: list[SensorNoise] = []
+        self.noises: list[SensorNoise] = []
         self.innovations: list[Innovation] = []
         self.changes: list[WeightChange] = []
 
-    def add(self, state: State, row: SensorNoise, changes: Iterable[WeightChange] = ()) -> None:
-        """One more keyframe, the noise row it was made with, and the changes of weights before it."""
+    def add(self, state: State, noise: SensorNoise, changes: Iterable[WeightChange] = ()) -> None:
+        """One more keyframe, the noise noise it was made with, and the changes of weights before it."""
         self.states.append(state)
-        self.rows.append(row)
+        self.noises.append(noise)
         self.changes.extend(changes)
 
     def estimate(
@@ -61,7 +61,7 @@ class History:
                 len(states), len(classes)
             ),
             classes=classes,
-            weights={name: np.array([getattr(row, name) for row in self.rows]) for name in fields},
+            weights={name: np.array([getattr(noise, name) for noise in self.noises]) for name in fields},
             changes=tuple(changes),
             innovations=tuple(self.innovations),
             status=np.array([s.status for s in states], dtype=object),

@@ -126,7 +126,7 @@ class Reference:
         self.size_t = 0.0
 
 
-class HeadingAid:
+class MagnetometerAiding:
     """Turns fields into factors of the newest keyframe; `report` gets every innovation (rad).
 
     Args:
@@ -190,7 +190,7 @@ class HeadingAid:
             self.given_rad = None
             self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
 
-    def heading_at_rest(self, level: Start, tilt_rad: float) -> tuple[float, float] | None:
+    def stationary_heading(self, level: Start, tilt_rad: float) -> tuple[float, float] | None:
         """Heading and its 1 sigma, rad, of a robot at rest whose roll and pitch are known to `tilt_rad`.
 
         None without a declination, with few samples, or with a field that is not Earth's. From here on the

@@ -1,7 +1,7 @@
 """A path that was begun without GNSS, laid onto the map by the fixes that come later.
 
 Until then the path is local: its start and heading are arbitrary. Wheels and gyro trace its shape (see
-`MotionTrack`), and once the fixes of the last half minute tell how that shape lies on the map, the window
+`DeadReckoning`), and once the fixes of the last half minute tell how that shape lies on the map, the window
 is turned and shifted there as a whole. What was told before stays as it was told.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
+from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import DRIFT, quaternion_of
 from terrafusion.fusion.graph.node import Node
@@ -34,7 +34,7 @@ OPEN_YAW_RAD, OPEN_M = np.pi, 1e4
 
 
 @dataclass(frozen=True, eq=False)
-class Placement:
+class MapAlignment:
     """The turn `yaw_rad` about the vertical and the shift that brings `from_m` (3,) to `to_m` (3,), ENU.
 
     `t_ns` is when it became known.
@@ -63,11 +63,11 @@ class Placement:
 
 def place(
     chain: Chain,
-    track: MotionTrack,
+    track: DeadReckoning,
     fix: GnssFix,
     antenna_m: Array,
     drift_sigma_m: float,
-) -> Placement | None:
+) -> MapAlignment | None:
     """Lay the window onto the map, once the heading on it is known to `YAW_SIGMA_RAD`; else None."""
     fit = track.fit(1.0, YAW_SIGMA_RAD)
     if fit is None:
@@ -85,13 +85,13 @@ def place(
     doubt[3:5] = claimed_m**2 + fit.rest_m**2 + (fit.sigma_rad * away_m) ** 2
     doubt[5] = float(fix.sigma_m[2]) ** 2 if known else OPEN_M**2
     doubt[DRIFT] = drift_sigma_m**2
-    told = Placement(fix.t_ns, track.error_of(fit), antenna, to_m)
-    leave_frame(chain.nodes)
+    told = MapAlignment(fix.t_ns, track.error_of(fit), antenna, to_m)
+    drop_local_factors(chain.nodes)
     chain.restart(doubt, chain.first, PLACE)
     chain.turn(told.yaw_rad, told.from_m, told.to_m)
     chain.smooth(len(chain.nodes))
     if chain.archive is not None:
-        leave_frame(chain.archive.nodes)
+        drop_local_factors(chain.archive.nodes)
         chain.archive.turn(told.yaw_rad, told.from_m, told.to_m)
         prior = chain.archive.nodes[0].prior
         prior[PLACE, :] = 0.0
@@ -100,7 +100,7 @@ def place(
     return told
 
 
-def leave_frame(nodes: list[Node]) -> None:
+def drop_local_factors(nodes: list[Node]) -> None:
     """Drop the headings and heights that barometer and magnetometer have told in a frame that is no more.
 
     They are as sure as the start was, which was arbitrary: turned along they would make the map's as sure.

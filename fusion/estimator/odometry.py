@@ -46,7 +46,7 @@ class Propagator:
         self._count = 0
         self._measured: gtsam.PreintegratedCombinedMeasurements
 
-    def carry(self, state: State, covariance: Array, imu: ImuStream, row: SensorNoise) -> State:
+    def carry(self, state: State, covariance: Array, imu: ImuStream, noise: SensorNoise) -> State:
         """The state at the newest IMU sample, with `covariance` (dim, dim) of the keyframe carried along.
 
         Slip, terrain, status and biases stay those of the keyframe, the
@@ -57,13 +57,13 @@ class Propagator:
         if newest_ns <= state.t_ns:
             return state
         if self._state is not state or self._taken(imu) != self._count:
-            self._begin(state, covariance, row)
+            self._begin(state, covariance, noise)
         for piece in imu.segments(self._until_ns, newest_ns):
             self._measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
             self._readings += piece.dt_s * np.array([piece.gyro_radps, piece.accel_mps2])
         self._until_ns = newest_ns
         self._count = self._taken(imu)
-        density = np.array(row.gyro_axes()) * self._preintegrator.spec.gyro_noise_radps_sqrthz
+        density = np.array(noise.gyro_axes()) * self._preintegrator.spec.gyro_noise_radps_sqrthz
         interval_s = max(newest_ns - imu.t_ns[-2], 1) * 1e-9 if len(imu.t_ns) > 1 else 1.0
         gyro = np.where(np.isfinite(imu.gyro[-1]), imu.gyro[-1], state.gyro_bias_radps)  # none: no rate
         return self._carried(state, gyro, density / math.sqrt(interval_s))
@@ -73,7 +73,7 @@ class Propagator:
         assert self._state is not None
         return bisect.bisect_right(imu.t_ns, self._until_ns) - bisect.bisect_right(imu.t_ns, self._state.t_ns)
 
-    def _begin(self, state: State, covariance: Array, row: SensorNoise) -> None:
+    def _begin(self, state: State, covariance: Array, noise: SensorNoise) -> None:
         x, y, z, w = state.quaternion
         pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
         self._state, self._until_ns = state, state.t_ns
@@ -82,7 +82,7 @@ class Propagator:
         self._bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
         self._key = KeyState(pose, state.velocity_mps, self._bias, state.linear)
         self._covariance, self._count, self._readings = covariance, 0, np.zeros((2, 3))
-        self._measured = self._preintegrator.integrate([], self._bias, row)
+        self._measured = self._preintegrator.integrate([], self._bias, noise)
 
     def _carried(self, state: State, gyro_radps: Array, gyro_sigma_radps: Array) -> State:
         measured = self._measured

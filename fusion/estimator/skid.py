@@ -1,6 +1,6 @@
 """Wheels that fixes refute: a robot that slides goes where its wheels do not roll.
 
-On ice, or in a skid, slip and side-slip leave what the ground's row allows within a second. The wheels
+On ice, or in a skid, slip and side-slip leave what the ground's noise allows within a second. The wheels
 then keep good fixes out, and after each that is let in lead the estimate astray again. But how far a robot
 can have slid is known: no further than its wheels rolled and its speed carried it since the last fix that
 was used. Fixes that are refused, lie on one side of the estimate and no further off than that, refute
@@ -18,7 +18,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.estimator.friction import Grip
+from terrafusion.fusion.estimator.friction import FrictionEstimator
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
@@ -43,7 +43,7 @@ DRIVING_MPS = 0.3
 _Passed = tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]
 
 
-class Slide:
+class SkidDetector:
     """How wrong the wheels are beyond their noise.
 
     Attributes:
@@ -52,7 +52,7 @@ class Slide:
         refutations: how often fixes refuted the wheels.
     """
 
-    def __init__(self, grip: Grip | None = None) -> None:
+    def __init__(self, grip: FrictionEstimator | None = None) -> None:
         self.grip = grip
         self.rate_m2ps = 0.0
         self.refutations = 0
@@ -68,19 +68,19 @@ class Slide:
         since_ns: int | None,
         refused: list[Array],
         sigma_m: float,
-        row: SensorNoise,
+        noise: SensorNoise,
     ) -> bool:
         """Whether refused fixes, the last at keyframe k, refute the wheels; loosens them if so.
 
         It takes two refused fixes in a row, in a slide one.
 
         Args:
-            chain: as it is; its wheels from `since_ns` to k are loosened.
+            chain: as it is; its wheels from `since_ns` to k are with_extra_variance.
             k: keyframe of the newest refused fix.
             since_ns: time of the last fix used.
             refused: offsets (2,), m, of the fixes refused in a row from the estimate.
             sigma_m: 1 sigma of the newest fix.
-            row: noise of the ground.
+            noise: noise of the ground.
         """
         if since_ns is None or len(refused) < (1 if self.rate_m2ps else 2) or not _on_one_side(refused[-2:]):
             return False
@@ -108,8 +108,8 @@ class Slide:
         self.refutations += 1
         for i, node, driven in zip(passed, nodes, driven_s, strict=True):
             if node.wheels is not None:
-                loose = self.grip.loose_link(chain, i, more_m2ps, row) if self.grip else None
-                chain.revise(i, wheels=node.wheels.loosened(more_m2ps * driven), link=loose)
+                loose = self.grip.loose_link(chain, i, more_m2ps, noise) if self.grip else None
+                chain.revise(i, wheels=node.wheels.with_extra_variance(more_m2ps * driven), link=loose)
         chain.smooth(chain.last - begin + 1)
         return True
 
@@ -120,14 +120,14 @@ class Slide:
         for i, wheels, link in passed:
             chain.revise(i, wheels=wheels, link=link)
 
-    def loosened(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
+    def with_extra_variance(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
         """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
         driven_s = dt_s * driving(before, wheels, dt_s)
         self._driven_s += driven_s
         if not self.rate_m2ps:
             return wheels
         self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
-        return wheels.loosened(self.rate_m2ps * driven_s)
+        return wheels.with_extra_variance(self.rate_m2ps * driven_s)
 
     def dragged(
         self,
@@ -138,7 +138,7 @@ class Slide:
         before: KeyState,
         covariance: Array,
     ) -> tuple[list[ImuSegment], WheelIncrement | None]:
-        """What links a keyframe, as friction has it where fixes have shown that; see `Grip.step`."""
+        """What links a keyframe, as friction has it where fixes have shown that; see `FrictionEstimator.step`."""
         if self.grip is None:
             return segments, wheels
         return self.grip.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)

@@ -106,7 +106,7 @@ def restore(fresh: R, data: bytes) -> R:
         _Reader(arrays).read(tree.get("state"), fresh, "estimator")
         fresh.chain.rebuild()
     except (ConfigError, DataError) as error:
-        raise _spoilt(error.what) from None
+        raise _corrupt(error.what) from None
     except (
         ArithmeticError,
         AttributeError,
@@ -116,7 +116,7 @@ def restore(fresh: R, data: bytes) -> R:
         TypeError,
         ValueError,
     ):
-        raise _spoilt("its parts do not fit together") from None
+        raise _corrupt("its parts do not fit together") from None
     return fresh
 
 
@@ -131,7 +131,7 @@ def _versions() -> dict[str, str]:
     return {"terrafusion": metadata.version("terrafusion"), "gtsam": metadata.version("gtsam")}
 
 
-def _spoilt(why: str) -> ConfigError:
+def _corrupt(why: str) -> ConfigError:
     return ConfigError(f"the snapshot cannot be restored: {why}", remedy="start anew")
 
 
@@ -146,9 +146,9 @@ def _opened(data: bytes) -> tuple[dict[str, Any], memoryview]:
     try:
         tree = json.loads(data[_HEAD : _HEAD + length])
     except (ValueError, RecursionError):
-        raise _spoilt("its tree is no JSON") from None
+        raise _corrupt("its tree is no JSON") from None
     if not isinstance(tree, dict):
-        raise _spoilt("its tree is no object")
+        raise _corrupt("its tree is no object")
     return tree, memoryview(data)[_HEAD + length :]
 
 

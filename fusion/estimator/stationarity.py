@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import at_rest
+from terrafusion.fusion.graph.factors import no_motion_factor
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 
 Array = NDArray[np.float64]
@@ -80,7 +80,7 @@ def likelihood_ratio(
     return total / max(dof, 1)
 
 
-class RestDetector:
+class StationarityDetector:
     """Tells rest from motion at each keyframe.
 
     Attributes:
@@ -113,7 +113,7 @@ class RestDetector:
         if speed_mps > MOVING_MPS + 4.0 * speed_sigma_mps:
             return False
         start_ns = t_ns - round(self.window_s * 1e9)
-        turned = wheels_turned(wheels, start_ns, t_ns)
+        turned = wheel_motion(wheels, start_ns, t_ns)
         if turned is None or turned > self.still_m:
             return False
         t_s, gyro, accel = imu.window(start_ns, t_ns + 1)
@@ -125,7 +125,7 @@ class RestDetector:
         return statistic < LIMIT
 
 
-def forget_waiting(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) -> bool:
+def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) -> bool:
     """Before the start: drop samples and fixes that no start can use; True when some were dropped.
 
     A robot that stands learns no heading from it, and needs only the last seconds to level itself. One
@@ -137,7 +137,7 @@ def forget_waiting(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) ->
         cut = newest - round(0.5e9 * LONGEST_WAIT_S)
     elif waited_s > 2.0 * KEPT_AT_REST_S:
         cut = newest - round(1e9 * KEPT_AT_REST_S)
-        turned = wheels_turned(wheels, imu.t_ns[0], newest)
+        turned = wheel_motion(wheels, imu.t_ns[0], newest)
         if turned is None or turned > AT_REST_M:
             return False
     else:
@@ -150,7 +150,7 @@ def forget_waiting(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) ->
 
 def hold(chain: Chain, k: int, link: gtsam.NonlinearFactorGraph) -> None:
     """Zero velocity at keyframe k, and in its `link` no motion since the one before."""
-    link.add(at_rest(k))
+    link.add(no_motion_factor(k))
     chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _STOPPED), "V")
 
 
@@ -163,7 +163,7 @@ def noise_at_rest(spec: ImuSpec, rate_hz: float, gyro: Array, accel: Array) -> t
     return sigma_gyro, min(math.hypot(accel_white, slow), CEILING_MPS2)
 
 
-def wheels_turned(wheels: WheelStream, start_ns: int, end_ns: int) -> float | None:
+def wheel_motion(wheels: WheelStream, start_ns: int, end_ns: int) -> float | None:
     """Most that a side moved within the window, m, to and fro included; None where samples are missing."""
     i = bisect.bisect_right(wheels.t_ns, start_ns) - 1
     j = bisect.bisect_right(wheels.t_ns, end_ns)

@@ -17,7 +17,7 @@ from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from terrafusion.fusion.graph.batch_rows import Block
+from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain, carried_prior
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
@@ -28,7 +28,7 @@ BLOCK = 500
 """Keyframes whose rows are held at a time."""
 
 
-class Batch:
+class BatchSmoother:
     """The keyframes of a chain and their factors, solved together.
 
     Attributes:
@@ -51,7 +51,7 @@ class Batch:
         self.linear = np.array([point.linear for point in points])
         self.iterations = 0
         self._blocks = [
-            Block(nodes, self.first, k, min(k + BLOCK, self.first + self.size))
+            RowBlock(nodes, self.first, k, min(k + BLOCK, self.first + self.size))
             for k in range(self.first, self.first + self.size, BLOCK)
         ]
         self._made_at, self._prior = nodes[0].point, nodes[0].prior

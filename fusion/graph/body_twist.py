@@ -53,10 +53,10 @@ def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: 
     return np.asarray(0.5 * (Q + Q.T))
 
 
-def gyro_sigma_radps(imu: ImuSpec, keyframe_s: float, row: SensorNoise) -> Array:
+def gyro_sigma_radps(imu: ImuSpec, keyframe_s: float, noise: SensorNoise) -> Array:
     """White noise (3,) of the gyro's mean over a keyframe's interval: density / sqrt(interval), inflated."""
     density = imu.gyro_noise_radps_sqrthz
-    return np.array(row.gyro_axes()) * density / math.sqrt(keyframe_s)
+    return np.array(noise.gyro_axes()) * density / math.sqrt(keyframe_s)
 
 
 def bias_sigma(P: Array) -> Array:

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.linalg import lapack
 
 from terrafusion.fusion.graph import gnss_factor, velocity_factor
-from terrafusion.fusion.graph.batch_rows import Block
+from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
@@ -61,7 +61,7 @@ class Chain:
     unary factors may be added to any keyframe still held. `solve` brings the
     newest keyframe up to date, `smooth` the newest few.
     `archive` is a second chain that is given the same factors and keeps them
-    all, for a `Batch` solution afterwards. Only with `calibrate` are the last linear
+    all, for a `BatchSmoother` solution afterwards. Only with `calibrate` are the last linear
     states, those of a calibration, estimated; without, tangents end before them.
     """
 
@@ -325,7 +325,7 @@ class Chain:
             linear[: self.dim - NAV.stop] += node.delta[NAV.stop :]
             node.point = KeyState(now.atPose3(X(k)), now.atVector(V(k)), now.atConstantBias(B(k)), linear)
             node.delta = np.zeros(self.dim)
-        block = Block(self.nodes, self.first, self.first, self.last + 1)
+        block = RowBlock(self.nodes, self.first, self.first, self.last + 1)
         rows, counts = block.rows(now, np.array([node.point.linear for node in self.nodes]))
         for node, after, own, count in zip(self.nodes, self.nodes[1:], rows, counts, strict=False):
             node.conditional, after.prior = eliminated(own[:count], node.prior)

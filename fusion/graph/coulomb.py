@@ -25,7 +25,7 @@ SUBSTEPS = 2
 """Steps a keyframe is taken in."""
 
 
-def slid(
+def skid_motion(
     velocity_mps: Array,
     left_mps: float,
     right_mps: float,

@@ -18,7 +18,7 @@ from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
-REST_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
+NO_MOTION_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
 """Motion of a robot at rest between two keyframes: rotation (rad), then translation (m)."""
 UP_SIDE_RATIO = 0.05
 """Vertical over forward displacement in the body frame (1 sigma): wheels follow the ground."""
@@ -71,10 +71,10 @@ def wheel_increment(
     return WheelIncrement(np.array([x, y, 0.0]), sigma, distance, turn, yaw, speed_change_mps, surge_m)
 
 
-def at_rest(k: int) -> gtsam.NonlinearFactor:
+def no_motion_factor(k: int) -> gtsam.NonlinearFactor:
     """Zero velocity and zero rotation between two keyframes."""
     return gtsam.BetweenFactorPose3(
-        X(k - 1), X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(REST_SIGMAS)
+        X(k - 1), X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(NO_MOTION_SIGMAS)
     )
 
 

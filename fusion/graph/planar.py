@@ -50,12 +50,12 @@ _TILT_NOISE = gtsam.noiseModel.Isotropic.Sigma(2, TILT_SIGMA_RAD)
 _BIAS_WALK = 1e-6
 
 
-def held_level(k: int) -> gtsam.NonlinearFactor:
+def level_factor(k: int) -> gtsam.NonlinearFactor:
     """Body z of keyframe k points up, but for the tilt of the ground."""
     return gtsam.AttitudeFactorPose3(X(k), _LEVEL, _TILT_NOISE, _LEVEL)
 
 
-def in_a_turn(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
+def with_centripetal_force(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
     """The segments of a level robot that keeps its forward speed: centripetal force v omega is added."""
     speed = float(before.pose.rotation().matrix()[:, 0] @ before.velocity)
     bias = float(before.bias.gyroscope()[2])
@@ -94,12 +94,12 @@ class PlanarPreintegrator(Preintegrator):
         self,
         segments: list[ImuSegment],
         bias: gtsam.imuBias.ConstantBias,
-        row: SensorNoise,
+        noise: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; of the row only the inflation about yaw acts."""
+        """Preintegrate the segments about `bias`; of the noise only the inflation about yaw acts."""
         turned = sum(float(piece.gyro_radps[2]) * piece.dt_s for piece in segments)
         total = sum(piece.dt_s for piece in segments)
-        density = self.yaw_density(turned / total if total > 0.0 else 0.0, row.gyro_yaw_inflation)
+        density = self.yaw_density(turned / total if total > 0.0 else 0.0, noise.gyro_yaw_inflation)
         forces = segments[0].accel_density_mps2 if segments else None
         params = self._planar(density, forces or (ACCEL_DENSITY_MPS2, ACCEL_DENSITY_MPS2))
         measured = gtsam.PreintegratedCombinedMeasurements(params, bias)

@@ -34,22 +34,22 @@ class Preintegrator:
         self,
         segments: list[ImuSegment],
         bias: gtsam.imuBias.ConstantBias,
-        row: SensorNoise,
+        noise: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; the row's inflations multiply the data sheet's noise.
+        """Preintegrate the segments about `bias`; the noise's inflations multiply the data sheet's noise.
 
         With a spike that another sample stands for, what its sensor tells in the whole is `HELD_INFLATION`
         times less certain.
         """
-        row = _less_sure(row, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
-        measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(row), bias)
+        noise = _less_sure(noise, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
+        measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(noise), bias)
         for piece in segments:
             measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
         return measured
 
-    def _scaled(self, row: SensorNoise) -> gtsam.PreintegrationCombinedParams:
+    def _scaled(self, noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:
         # Steps of 5 % keep the number of parameter sets small.
-        inflations = *row.gyro_axes(), row.accel_inflation
+        inflations = *noise.gyro_axes(), noise.accel_inflation
         key = tuple(round(math.log(inflation) / STEP) for inflation in inflations)
         if key not in self._params:
             spec, eye = self.spec, np.eye(3)
@@ -66,6 +66,6 @@ class Preintegrator:
         return self._params[key]
 
 
-def _less_sure(row: SensorNoise, gyro: bool, accel: bool) -> SensorNoise:
+def _less_sure(noise: SensorNoise, gyro: bool, accel: bool) -> SensorNoise:
     names = ("gyro_inflation", "gyro_yaw_inflation") * gyro + ("accel_inflation",) * accel
-    return dataclasses.replace(row, **{name: HELD_INFLATION * getattr(row, name) for name in names})
+    return dataclasses.replace(noise, **{name: HELD_INFLATION * getattr(noise, name) for name in names})

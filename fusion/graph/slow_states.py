@@ -25,7 +25,7 @@ SLIP_RENEWAL = 1.1
 """Slip is what traction asks for, and traction changes with speed: where the wheels change theirs by a
 share x, `SLIP_RENEWAL x^2` of the slip is new. Tuned likewise,
 as 2 of an x that was seen a quarter too small."""
-OF_THE_GROUND = np.array([SLIP, YAW_SCALE, SIDE_SLIP, SURGE_SLIP]) - NAV.stop
+GROUND_STATES = np.array([SLIP, YAW_SCALE, SIDE_SLIP, SURGE_SLIP]) - NAV.stop
 """What another ground changes; the receiver's drift and the calibration stay."""
 CRAWL_MPS = 0.1
 """Below this wheel speed any change of it is a start or a stop."""
@@ -61,19 +61,19 @@ _WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
 """Walk of the calibration, per sqrt(s): hardly any, but what is certain for ever cannot be whitened."""
 
 
-def prior(row: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
-    """Mean and 1 sigma (15,) of the linear states before any data, on the ground of `row`."""
+def prior(noise: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
+    """Mean and 1 sigma (15,) of the linear states before any data, on the ground of `noise`."""
     mean, sigma = np.zeros(len(LINEAR)), np.empty(len(LINEAR))
-    mean[0], mean[3] = row.slip_at(grade), row.yaw_scale_mean
-    sigma[:6] = _stationary(row, drift_sigma_m)
+    mean[0], mean[3] = noise.slip_at(grade), noise.yaw_scale_mean
+    sigma[:6] = _stationary(noise, drift_sigma_m)
     sigma[6:-1] = list(CALIBRATION_SIGMA.values())
-    mean[-1], sigma[-1] = row.slip_per_grade, _surge_sigma(row)
+    mean[-1], sigma[-1] = noise.slip_per_grade, _surge_sigma(noise)
     return mean, sigma
 
 
 def step(
     dt_s: float,
-    row: SensorNoise,
+    noise: SensorNoise,
     up: Array,
     drift_sigma_m: float,
     drift_time_s: float,
@@ -85,16 +85,16 @@ def step(
     `up` (3,) is the world's up in body axes, `switch` the share of the ground that just changed.
     """
     backwards = wheels is not None and wheels.distance_m < 0.0
-    downhill = -SIDE_SLIP_PER_GRADE * row.slip_per_grade * float(up[1]) * (-1.0 if backwards else 1.0)
-    sigma = _stationary(row, drift_sigma_m)
+    downhill = -SIDE_SLIP_PER_GRADE * noise.slip_per_grade * float(up[1]) * (-1.0 if backwards else 1.0)
+    sigma = _stationary(noise, drift_sigma_m)
     sigma[-1] = float(np.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill))
     renewed = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     wandering = markov_step(
         dt_s,
-        mean=[row.slip_at(float(up[0])), 0.0, 0.0, row.yaw_scale_mean, 0.0, downhill],
+        mean=[noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill],
         sigma=sigma,
         time_s=[
-            SLIP_STEADY * row.slip_time_s,
+            SLIP_STEADY * noise.slip_time_s,
             drift_time_s,
             drift_time_s,
             YAW_SCALE_TIME_S,
@@ -104,7 +104,7 @@ def step(
         forget=[renewed, 0.0, 0.0, switch, 0.0, switch],
     )
     walk = np.array(list(_WALK.values())) * np.sqrt(dt_s)
-    surge = markov_step(dt_s, [row.slip_per_grade], [_surge_sigma(row)], [SURGE_TIME_S], [switch])
+    surge = markov_step(dt_s, [noise.slip_per_grade], [_surge_sigma(noise)], [SURGE_TIME_S], [switch])
     return MarkovStep(
         np.concatenate([wandering.decay, np.ones(len(walk)), surge.decay]),
         np.concatenate([wandering.mean, np.zeros(len(walk)), surge.mean]),
@@ -112,11 +112,11 @@ def step(
     )
 
 
-def open_slip(
+def inflate_slip_covariance(
     chain: Chain,
     t_ns: int,
     dt_s: float,
-    row: SensorNoise,
+    noise: SensorNoise,
     drift_sigma_m: float,
     drift_time_s: float,
     switch: float,
@@ -131,8 +131,8 @@ def open_slip(
     if k <= chain.last:
         node = chain.nodes[k - chain.first]
         up = node.point.pose.rotation().matrix()[2]
-        anew = step(dt_s, row, up, drift_sigma_m, drift_time_s, switch, node.wheels)
-        chain.revise(k, anew if node.markov is None else node.markov.opened(anew, OF_THE_GROUND))
+        anew = step(dt_s, noise, up, drift_sigma_m, drift_time_s, switch, node.wheels)
+        chain.revise(k, anew if node.markov is None else node.markov.opened(anew, GROUND_STATES))
 
 
 def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:
@@ -143,12 +143,12 @@ def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:
     return min(1.0, SLIP_RENEWAL * (wheels.speed_change_mps / speed_mps) ** 2)
 
 
-def _surge_sigma(row: SensorNoise) -> float:
-    return SURGE_DOUBT * abs(row.slip_per_grade) + 1e-3
+def _surge_sigma(noise: SensorNoise) -> float:
+    return SURGE_DOUBT * abs(noise.slip_per_grade) + 1e-3
 
 
-def _stationary(row: SensorNoise, drift_sigma_m: float) -> list[float]:
-    slow_side_slip = SIDE_SLIP_SHARE * row.side_slip_sigma
+def _stationary(noise: SensorNoise, drift_sigma_m: float) -> list[float]:
+    slow_side_slip = SIDE_SLIP_SHARE * noise.side_slip_sigma
     drift = [drift_sigma_m, drift_sigma_m]
-    yaw_scale = float(np.hypot(row.yaw_scale_sigma, YAW_SCALE_ROBOT))
-    return [row.slip_sigma, *drift, yaw_scale, ICR_SIGMA_M, slow_side_slip]
+    yaw_scale = float(np.hypot(noise.yaw_scale_sigma, YAW_SCALE_ROBOT))
+    return [noise.slip_sigma, *drift, yaw_scale, ICR_SIGMA_M, slow_side_slip]

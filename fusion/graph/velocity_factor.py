@@ -2,9 +2,9 @@
 
 Residual (3,), world frame, m/s::
 
-    r = v + R swing (lever + antenna) - measured
+    r = v + R lever_arm_velocity (lever + antenna) - measured
 
-`v` and R are those of the keyframe, `swing` is what the turning body makes of a place on it. Without a
+`v` and R are those of the keyframe, `lever_arm_velocity` is what the turning body makes of a place on it. Without a
 calibration the antenna is where the vehicle file says, and the velocity of the body origin is a prior
 (`factors.gnss_velocity`). With one, such priors would hold the velocity to where the antenna was thought to
 be when they came: hundreds would confirm one and the same error, and the antenna never reach its place.
@@ -34,16 +34,16 @@ class GnssVelocity:
         velocity_mps: (3,) of the antenna, world.
         sigma_mps: 1 sigma of each axis, white.
         lever_m: (3,) the antenna's place in the vehicle file, body.
-        swing_radps: (3, 3), see `swing`.
+        lever_rate_radps: (3, 3), see `lever_arm_velocity`.
     """
 
     velocity_mps: Array
     sigma_mps: float
     lever_m: Array
-    swing_radps: Array
+    lever_rate_radps: Array
 
 
-def swing(rate_radps: Array, offset_s: float) -> Array:
+def lever_arm_velocity(rate_radps: Array, offset_s: float) -> Array:
     """(3, 3) from a place on a body that turns with `rate_radps` (3,) to its velocity about the origin.
 
     Both in the axes that the body has at the keyframe; the velocity is that of `offset_s` later (to second
@@ -56,8 +56,8 @@ def swing(rate_radps: Array, offset_s: float) -> Array:
 def residual(told: GnssVelocity, pose: Any, velocity_mps: Array, linear: Array) -> Array:
     """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
     lever = told.lever_m + np.append(linear[_ANTENNA], 0.0)
-    swung = pose.rotation().matrix() @ told.swing_radps @ lever
-    return np.asarray(velocity_mps + swung - told.velocity_mps)
+    lever_velocity = pose.rotation().matrix() @ told.lever_rate_radps @ lever
+    return np.asarray(velocity_mps + lever_velocity - told.velocity_mps)
 
 
 def jacobians(told: GnssVelocity, pose: Any, linear: Array) -> tuple[Array, Array, Array]:
@@ -65,8 +65,8 @@ def jacobians(told: GnssVelocity, pose: Any, linear: Array) -> tuple[Array, Arra
     R = pose.rotation().matrix()
     lever = told.lever_m + np.append(linear[_ANTENNA], 0.0)
     H_pose, H = np.zeros((3, 6)), np.zeros((3, MARKOV.stop - MARKOV.start))
-    H_pose[:, :3] = -R @ skew(told.swing_radps @ lever)
-    H[:, _ANTENNA] = (R @ told.swing_radps)[:, :2]
+    H_pose[:, :3] = -R @ skew(told.lever_rate_radps @ lever)
+    H[:, _ANTENNA] = (R @ told.lever_rate_radps)[:, :2]
     return H_pose, np.eye(3), H
 
 

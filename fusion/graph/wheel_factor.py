@@ -61,7 +61,7 @@ class WheelIncrement:
         yaw_rad: turn by the gyro, bias removed.
         speed_change_mps: wheel speed at the end less that at the start.
         surge_m: a / g (|distance| + v0 dt) of wheels that accelerate by a; 0 unless calibrated.
-        slid_m: way along body x that the wheels rolled and the robot, by friction, did not go.
+        skid_m: way along body x that the wheels rolled and the robot, by friction, did not go.
     """
 
     displacement_m: Array
@@ -71,7 +71,7 @@ class WheelIncrement:
     yaw_rad: float = 0.0
     speed_change_mps: float = 0.0
     surge_m: float = 0.0
-    slid_m: float = 0.0
+    skid_m: float = 0.0
 
     def without_turn(self) -> WheelIncrement:
         """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
@@ -85,7 +85,7 @@ class WheelIncrement:
         sigma = self.sigma * np.array([scale, 1.0, 1.0, scale])
         return dataclasses.replace(self, sigma=sigma, speed_change_mps=change)
 
-    def loosened(self, variance_m2: float) -> WheelIncrement:
+    def with_extra_variance(self, variance_m2: float) -> WheelIncrement:
         """The same, less sure of the way along body x and y by `variance_m2` each."""
         sigma = self.sigma.copy()
         sigma[:2] = np.sqrt(sigma[:2] ** 2 + variance_m2)
@@ -94,7 +94,7 @@ class WheelIncrement:
 
 def slip_of(linear: Array, wheels: WheelIncrement) -> float:
     """Slip over the interval of `wheels`, what their acceleration asks for and a slide included."""
-    asked_m = float(linear[_A]) * wheels.surge_m + (1.0 - float(linear[_S])) * wheels.slid_m
+    asked_m = float(linear[_A]) * wheels.surge_m + (1.0 - float(linear[_S])) * wheels.skid_m
     return float(linear[_S]) + (asked_m / wheels.distance_m if abs(wheels.distance_m) > MOVED_M else 0.0)
 
 

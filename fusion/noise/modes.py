@@ -19,26 +19,26 @@ INNOVATION_METHODS = ("sage_husa", "variational")
 
 
 @dataclass(frozen=True)
-class RowTuning:
-    """Factors on three standard deviations of a policy's row; 1 leaves it as it was fitted."""
+class NoiseTuning:
+    """Factors on three standard deviations of a policy's noise; 1 leaves them as fitted."""
 
     wheel_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
     slip_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
     gnss_factor: Annotated[float, Quantity("", 0.01, 100.0)] = 1.0
 
-    def of(self, row: SensorNoise) -> SensorNoise:
-        """`row` with the factors on it."""
+    def applied(self, noise: SensorNoise) -> SensorNoise:
+        """`noise` with the factors applied."""
         return dataclasses.replace(
-            row,
-            wheel_sigma_mps=row.wheel_sigma_mps * self.wheel_factor,
-            slip_sigma=row.slip_sigma * self.slip_factor,
-            gnss_inflation=row.gnss_inflation * self.gnss_factor,
+            noise,
+            wheel_sigma_mps=noise.wheel_sigma_mps * self.wheel_factor,
+            slip_sigma=noise.slip_sigma * self.slip_factor,
+            gnss_inflation=noise.gnss_inflation * self.gnss_factor,
         )
 
-    def of_all(self, policy: Policy) -> Policy:
-        """`policy` with the factors on every row."""
-        classes = {name: self.of(row) for name, row in policy.classes.items()}
-        return dataclasses.replace(policy, classes=classes, fixed=self.of(policy.fixed))
+    def applied_to_policy(self, policy: Policy) -> Policy:
+        """`policy` with the factors applied to every class."""
+        classes = {name: self.applied(noise) for name, noise in policy.classes.items()}
+        return dataclasses.replace(policy, classes=classes, fixed=self.applied(policy.fixed))
 
 
 @dataclass(frozen=True)
@@ -67,8 +67,8 @@ class ModeTuning:
     that the terrain model does not know, until its slip tells the ground.
     """
 
-    fixed: RowTuning = RowTuning()
-    adaptive: RowTuning = RowTuning()
+    fixed: NoiseTuning = NoiseTuning()
+    adaptive: NoiseTuning = NoiseTuning()
     cauchy: RobustTuning = RobustTuning()
     gnc: RobustTuning = RobustTuning()
     sage_husa: InnovationTuning = InnovationTuning()
@@ -77,8 +77,8 @@ class ModeTuning:
 
 
 SECTIONS: dict[str, type] = {
-    "fixed": RowTuning,
-    "adaptive": RowTuning,
+    "fixed": NoiseTuning,
+    "adaptive": NoiseTuning,
     "cauchy": RobustTuning,
     "gnc": RobustTuning,
     "sage_husa": InnovationTuning,

@@ -72,9 +72,9 @@ _HINTS = get_type_hints(SensorNoise, include_extras=True)
 _RANGES: dict[str, Quantity] = {name: _HINTS[name].__metadata__[0] for name in _FIELDS}
 
 
-def within_ranges(row: SensorNoise) -> SensorNoise:
-    """The row with every number inside the range that a policy file may hold."""
-    return SensorNoise(**{n: min(max(getattr(row, n), q.low), q.high) for n, q in _RANGES.items()})
+def within_ranges(noise: SensorNoise) -> SensorNoise:
+    """The noise with every number clipped to the range that a policy file allows."""
+    return SensorNoise(**{n: min(max(getattr(noise, n), q.low), q.high) for n, q in _RANGES.items()})
 
 
 @dataclass(frozen=True)

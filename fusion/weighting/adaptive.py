@@ -40,7 +40,7 @@ _RECORDED = {
 }
 
 
-class TerrainWeights:
+class TerrainNoise:
     """Runs the detector along the drive and blends the policy by its posterior.
 
     In the other modes the terrain is still detected and reported, but the row
@@ -53,19 +53,19 @@ class TerrainWeights:
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
-        self.policy = config.tuning.adaptive.of_all(config.policy)
+        self.policy = config.tuning.adaptive.applied_to_policy(config.policy)
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._told: Array | None = None
-        fixed = config.tuning.fixed.of(config.policy.fixed)
+        fixed = config.tuning.fixed.applied(config.policy.fixed)
         self._pooled = model.slip_only
         if self._pooled:
             # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
-        self.row = self.policy.blend(self._shares) if self.adaptive else fixed
+        self.noise = self.policy.blend(self._shares) if self.adaptive else fixed
         self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
         self._noted: SensorNoise | None = None
         self._rig = config.rig
@@ -154,7 +154,7 @@ class TerrainWeights:
         speed = 0.5 * (left + right) / (WINDOW_NS * 1e-9)
         rate = (speed - self._last_speed) / (UPDATE_NS * 1e-9)
         self._last_speed = 0.0 if np.isnan(speed) else speed
-        prior = self.row.slip_at(self._grade), self.row.slip_sigma
+        prior = self.noise.slip_at(self._grade), self.noise.slip_sigma
         observed = state.status == "running"  # without fixes the slip is what its prior says
         measured = slip_without_prior(state.slip, state.slip_sigma, *prior) if observed else None
         slip, slip_sigma = measured if measured is not None else (None, None)
@@ -193,10 +193,10 @@ class TerrainWeights:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.row = self.policy.blend(self._shares, self._grade)
+        self.noise = self.policy.blend(self._shares, self._grade)
         if self._noted is None:  # not started yet: nothing to change from
             return
-        before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.row)
+        before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.noise)
         best = int(p.argmax())
         why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
         for name, (sensor, unit) in _RECORDED.items():

@@ -30,10 +30,10 @@ from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.modes import InnovationTuning
 from terrafusion.fusion.weighting.weighting import (
     NOTEWORTHY,
+    InnovationTest,
     NoiseInForce,
-    Surprise,
     Weighting,
-    tested_wheels,
+    wheel_innovation_test,
     widened,
 )
 
@@ -47,7 +47,7 @@ MOVING_MPS = 0.05
 
 
 class SageHusa:
-    """Noise variance `value` of one sensor, in units of `Surprise.unit_m` squared."""
+    """Noise variance `value` of one sensor, in units of `InnovationTest.unit_m` squared."""
 
     def __init__(self, value: float, memory: float, low: float, high: float) -> None:
         self.gain, self.low, self.high = 1.0 / memory, low, high
@@ -57,7 +57,7 @@ class SageHusa:
         """Begin anew at a first guess."""
         self.value = value
 
-    def update(self, tested: Surprise) -> None:
+    def update(self, tested: InnovationTest) -> None:
         """Take one measurement in."""
         seen = float(np.mean((tested.innovation_m**2 - tested.predicted_m2) / tested.unit_m**2))
         self.value += self.gain * (seen - self.value)
@@ -76,7 +76,7 @@ class Variational:
         self.value, self._alpha = value, 0.5 * self.memory
         self._beta = self._alpha * value
 
-    def update(self, tested: Surprise) -> None:
+    def update(self, tested: InnovationTest) -> None:
         """Take one measurement in."""
         nu2, P, unit2 = tested.innovation_m**2, np.maximum(tested.predicted_m2, 0.0), tested.unit_m**2
         keep = 1.0 - 1.0 / self.memory
@@ -98,7 +98,7 @@ class InnovationWeighting(Weighting):
         self.method = config.innovation_method
         tuning: InnovationTuning = getattr(config.tuning, config.innovation_method)
         kind = SageHusa if self.method == "sage_husa" else Variational
-        self._noise, row, span2 = noise, noise.row, tuning.wheel_span**2
+        self._noise, row, span2 = noise, noise.noise, tuning.wheel_span**2
         start = row.wheel_sigma_mps**2
         self._wheels = kind(start, tuning.wheel_memory, start / span2, start * span2)
         self._gnss = kind(1.0, tuning.gnss_memory, 0.0, math.inf)
@@ -112,17 +112,17 @@ class InnovationWeighting(Weighting):
         """Learn from an increment of a moving robot, and weigh it by what was learnt."""
         if abs(wheels.distance_m) < MOVING_MPS * dt_s:
             return wheels
-        tested = tested_wheels(t_ns, wheels, innovation_m, variance_m2, dt_s)
-        own_m2, before = float(tested.noise_m2[0]), self._noise.row.wheel_sigma_mps
+        tested = wheel_innovation_test(t_ns, wheels, innovation_m, variance_m2, dt_s)
+        own_m2, before = float(tested.noise_m2[0]), self._noise.noise.wheel_sigma_mps
         quantum_m2 = own_m2 - (before * dt_s) ** 2
         predicted = tested.predicted_m2 + quantum_m2
         self._wheels.update(dataclasses.replace(tested, predicted_m2=predicted))
         self._set(t_ns, "wheels", "wheel_sigma_mps", math.sqrt(self._wheels.value), "m/s")
         return widened(wheels, math.sqrt((quantum_m2 + self._wheels.value * dt_s**2) / own_m2))
 
-    def gnss(self, tested: Surprise) -> tuple[float, float]:
+    def gnss(self, tested: InnovationTest) -> tuple[float, float]:
         """Learn from a fix, and weigh it by what was learnt."""
-        before, unit2 = self._noise.row.gnss_inflation, float(np.mean(tested.unit_m**2))
+        before, unit2 = self._noise.noise.gnss_inflation, float(np.mean(tested.unit_m**2))
         white = float(np.mean(tested.noise_m2)) / unit2
         drift = tested.drift_m2 / unit2
         least = tested.white_share
@@ -134,11 +134,11 @@ class InnovationWeighting(Weighting):
         self._gnss.update(tested)
         inflation = math.sqrt(min(self._gnss.value + drift, self._gnss.value / least))
         self._set(tested.t_ns, "gnss", "gnss_inflation", min(max(inflation, self._low), self._high), "")
-        now = self._noise.row.gnss_inflation
+        now = self._noise.noise.gnss_inflation
         return math.sqrt(_white(now**2, drift, least) / _white(before**2, drift, least)), 1.0
 
     def _set(self, t_ns: int, sensor: str, name: str, value: float, unit: str) -> None:
-        self._noise.row = dataclasses.replace(self._noise.row, **{name: value})
+        self._noise.noise = dataclasses.replace(self._noise.noise, **{name: value})
         before = self._noted[name]
         if abs(value - before) > NOTEWORTHY * before:
             why = f"{name}: innovations ({self.method})"

@@ -31,7 +31,13 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.modes import RobustTuning
-from terrafusion.fusion.weighting.weighting import NoiseInForce, Surprise, Weighting, tested_wheels, widened
+from terrafusion.fusion.weighting.weighting import (
+    InnovationTest,
+    NoiseInForce,
+    Weighting,
+    wheel_innovation_test,
+    widened,
+)
 
 Array = NDArray[np.float64]
 
@@ -58,7 +64,7 @@ class RobustWeighting(Weighting):
         self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
     ) -> WheelIncrement:
         """By the Cauchy loss."""
-        tested = tested_wheels(t_ns, wheels, innovation_m, variance_m2, dt_s)
+        tested = wheel_innovation_test(t_ns, wheels, innovation_m, variance_m2, dt_s)
         w = cauchy_weight(tested, self.tuning.wheel_c)
         if (w < DOUBTED) != self._wheels_doubted:
             self._wheels_doubted = not self._wheels_doubted
@@ -68,7 +74,7 @@ class RobustWeighting(Weighting):
             self._noise.note(WeightChange(tested.t_ns, "wheels", before, after, "", why))
         return widened(wheels, float(w**-0.5))
 
-    def gnss(self, tested: Surprise) -> tuple[float, float]:
+    def gnss(self, tested: InnovationTest) -> tuple[float, float]:
         """By the Cauchy loss, or by the first step of GNC: all or nothing, against the prediction."""
         if self.loss == "cauchy":
             w = cauchy_weight(tested, self.tuning.gnss_c)
@@ -122,7 +128,7 @@ class RobustWeighting(Weighting):
         self._noise.note(WeightChange(t_ns, "gnss", before, after, "", why))
 
 
-def cauchy_weight(tested: Surprise, c: float) -> float:
+def cauchy_weight(tested: InnovationTest, c: float) -> float:
     """Weight of one measurement whose update settles at the Cauchy loss's minimum, by reweighting."""
     w = 1.0
     for _ in range(IRLS_STEPS):

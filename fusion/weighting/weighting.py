@@ -23,14 +23,14 @@ NOTEWORTHY = 0.1
 class NoiseInForce(Protocol):
     """The sensor noise that a mode may change, and where it records what it changed."""
 
-    row: SensorNoise
+    noise: SensorNoise
 
     def note(self, change: WeightChange) -> None:
         """Record a change."""
 
 
 @dataclass(frozen=True, eq=False)
-class Surprise:
+class InnovationTest:
     """A measurement against its prediction, its `dof` components d taken to be independent.
 
     Attributes:
@@ -67,7 +67,7 @@ class Weighting:
         """The increment with the sigma it is to have; `variance_m2` is that of the innovation."""
         return wheels
 
-    def gnss(self, tested: Surprise) -> tuple[float, float]:
+    def gnss(self, tested: InnovationTest) -> tuple[float, float]:
         """Factor on the horizontal sigma of a fix, and its weight by a robust loss (0 to 1)."""
         return 1.0, 1.0
 
@@ -75,13 +75,13 @@ class Weighting:
         """Weigh the fixes still held in the window again, after new ones came."""
 
 
-def tested_wheels(
+def wheel_innovation_test(
     t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
-) -> Surprise:
+) -> InnovationTest:
     """A wheel increment against its prediction, along body x."""
     own = wheels.sigma[0] ** 2
     rest = max(variance_m2 - own, 0.0)
-    return Surprise(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
+    return InnovationTest(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
 
 
 def widened(wheels: WheelIncrement, scale: float) -> WheelIncrement:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.graph.batch import Batch
+from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.studies.speed import gtsam_graph as speed_gtsam
@@ -36,7 +36,7 @@ def test_the_batch_beats_the_live_pass_and_gtsam_on_the_same_graph(taken: Live) 
     assert ours < 0.5 * taken.cpu_s
     seconds, error = speed_gtsam.batch(taken.archive, start, Graph.FULL, "GaussNewton")
     assert ours < 0.5 * seconds
-    batch = Batch(taken.archive, start)
+    batch = BatchSmoother(taken.archive, start)
     batch.optimise()
     # GTSAM's error is half the sum of squares, and its prior is carried along with the first keyframe.
     assert np.isfinite(error)

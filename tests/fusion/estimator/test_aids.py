@@ -16,11 +16,11 @@ from terrafusion.datasets.core.atmosphere import pressure_at
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.alignment import Start
-from terrafusion.fusion.estimator.barometer import HeightAid, height_factor, height_jacobian
+from terrafusion.fusion.estimator.barometer import BarometerAiding, height_factor, height_jacobian
 from terrafusion.fusion.estimator.magnetometer import (
     CHANCES,
     PATIENCE,
-    HeadingAid,
+    MagnetometerAiding,
     Reference,
     levelled,
     wrapped,
@@ -172,7 +172,7 @@ def test_a_field_tells_the_heading_at_any_tilt_and_iron_is_linear(
     declination, world = 0.2, np.array([0.0, 0.0, -45e-6])
     world[:2] = 19e-6 * math.sin(declination), 19e-6 * math.cos(declination)
     R = rotation(roll, pitch, yaw)
-    aid = HeadingAid(None, declination, lambda _: None)
+    aid = MagnetometerAiding(None, declination, lambda _: None)
     told, H = aid._told(R, R.T @ world)
     assert wrapped(told - yaw) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(levelled(R) @ R.T @ world, rotation(0.0, 0.0, yaw).T @ world, atol=1e-18)
@@ -191,25 +191,25 @@ def test_a_start_at_rest_and_its_sigma() -> None:
     level = Start(0, np.zeros(3), 1e-3, 0.0, 1e-3, 0.05, -0.1, 0.01, 0.0, np.zeros(3))
     R = rotation(0.05, -0.1, 2.0)
     field = R.T @ np.array([19e-6 * math.sin(0.1), 19e-6 * math.cos(0.1), -45e-6])
-    aid = HeadingAid(None, 0.1, lambda _: None)
-    assert aid.heading_at_rest(level, 0.01) is None, "no sample yet"
+    aid = MagnetometerAiding(None, 0.1, lambda _: None)
+    assert aid.stationary_heading(level, 0.01) is None, "no sample yet"
     for i in range(20):
         aid.add(i * 50_000_000, field)
-    told = aid.heading_at_rest(level, 0.01)
+    told = aid.stationary_heading(level, 0.01)
     assert told is not None
     assert told[0] == pytest.approx(2.0, abs=1e-6)
     assert told[1] == pytest.approx(math.hypot(0.03, 3e-6 / 19e-6, 0.05, 0.01 * 45 / 19), rel=0.02)
     for i in range(21, 100):  # it has begun to turn
         aid.add(i * 50_000_000, rotation(0.0, 0.0, -0.02 * i) @ field)
-    assert aid.heading_at_rest(level, 0.01)[0] == pytest.approx(2.0, abs=1e-6)
+    assert aid.stationary_heading(level, 0.01)[0] == pytest.approx(2.0, abs=1e-6)
     late = dataclasses.replace(level, t_ns=-1_000_000_000)
-    assert aid.heading_at_rest(late, 0.01) is None, "a sample of the second of rest, and no other"
+    assert aid.stationary_heading(late, 0.01) is None, "a sample of the second of rest, and no other"
     moving = dataclasses.replace(level, gyro_bias_radps=None)
-    assert aid.heading_at_rest(moving, 0.01) is None
-    unknown = HeadingAid(None, None, lambda _: None)
+    assert aid.stationary_heading(moving, 0.01) is None
+    unknown = MagnetometerAiding(None, None, lambda _: None)
     for i in range(20):
         unknown.add(i * 50_000_000, field)
-    assert unknown.heading_at_rest(level, 0.01) is None, "magnetic north is not north"
+    assert unknown.stationary_heading(level, 0.01) is None, "magnetic north is not north"
 
 
 def test_a_disturbed_field_is_not_like_the_drives() -> None:
@@ -224,7 +224,7 @@ def test_a_disturbed_field_is_not_like_the_drives() -> None:
     assert all(slow), "a field that changes slowly, from place to place, is followed"
 
 
-def stand(aid: HeightAid, heights: list[float], placed_from: int | None = None) -> None:
+def stand(aid: BarometerAiding, heights: list[float], placed_from: int | None = None) -> None:
     """Pressures of a robot that stands, one a second, through the aid's own test; its path is laid onto the
     map before that of number `placed_from`."""
     from terrafusion.fusion.graph.chain import Chain
@@ -247,7 +247,7 @@ def stand(aid: HeightAid, heights: list[float], placed_from: int | None = None) 
 
 def test_a_pressure_that_jumps_is_refused_then_taken_for_a_new_reference() -> None:
     seen: list[Innovation] = []
-    aid = HeightAid(None, seen.append)
+    aid = BarometerAiding(None, seen.append)
     stand(aid, [100.0] * 10 + [130.0] * 15)
     assert aid.jumps == 1
     assert aid.refused == 10
@@ -261,7 +261,7 @@ def test_a_pressure_that_jumps_is_refused_then_taken_for_a_new_reference() -> No
 def test_a_path_laid_onto_the_map_takes_the_barometer_along() -> None:
     """Heights shift by 30 m beside the pressures, once: nothing is refused, and the new reference holds."""
     seen: list[Innovation] = []
-    aid = HeightAid(None, seen.append)
+    aid = BarometerAiding(None, seen.append)
     stand(aid, [100.0] * 10 + [130.0] * 15, placed_from=11)
     assert aid.refused == aid.jumps == 0
     assert all(i.accepted for i in seen)
@@ -269,7 +269,7 @@ def test_a_path_laid_onto_the_map_takes_the_barometer_along() -> None:
 
 
 def test_pressures_that_are_none_are_refused() -> None:
-    aid = HeightAid(None, lambda _: None)
+    aid = BarometerAiding(None, lambda _: None)
     for pressure in (0.0, 1013.25, math.nan, -5.0, 2e5):
         aid.add(0, pressure)
     assert aid.refused == 5
@@ -277,7 +277,7 @@ def test_pressures_that_are_none_are_refused() -> None:
 
 
 def test_a_magnetometer_that_does_not_turn_with_the_robot_is_left_out() -> None:
-    aid = HeadingAid(None, None, lambda _: None)
+    aid = MagnetometerAiding(None, None, lambda _: None)
     for _ in range((CHANCES + 1) * PATIENCE):
         aid._refuse()
     assert aid.off
@@ -314,4 +314,4 @@ def test_a_climb_in_warm_air_is_within_the_sigma_told() -> None:
 
 def test_a_field_of_two_axes_is_refused() -> None:
     with pytest.raises(DataError, match="magnetometer"):
-        HeadingAid(None, 0.0, lambda _: None).add(0, [1e-5, 2e-5])
+        MagnetometerAiding(None, 0.0, lambda _: None).add(0, [1e-5, 2e-5])

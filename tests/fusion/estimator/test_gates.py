@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from terrafusion.fusion.estimator.gates import GnssGate, Verdict, WheelGate
+from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, WheelGate
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 GATE = float(chi2.ppf(0.999, 2))
@@ -17,7 +17,7 @@ def test_a_consistent_sensor_is_refused_as_often_as_the_gate_says() -> None:
     P = np.array([[2.0, 0.6], [0.6, 1.0]])
     draws = rng.multivariate_normal(np.zeros(2), P, 20_000)
     gate = GnssGate(GATE, patience=10**9)
-    refused = sum(gate.test(d, P)[0] is Verdict.REJECT for d in draws)
+    refused = sum(gate.test(d, P)[0] is GateDecision.REJECT for d in draws)
     assert 8 <= refused <= 35  # 20 expected; the bounds are beyond its 99.9 % interval
 
 
@@ -25,14 +25,14 @@ def test_lone_spikes_never_reacquire() -> None:
     gate = GnssGate(GATE)
     rng = np.random.default_rng(1)
     for _ in range(20):
-        assert gate.test(rng.normal(0, 500.0, 2), np.eye(2))[0] in (Verdict.REJECT, Verdict.ACCEPT)
-    assert gate.test(np.zeros(2), np.eye(2))[0] is Verdict.ACCEPT
+        assert gate.test(rng.normal(0, 500.0, 2), np.eye(2))[0] in (GateDecision.REJECT, GateDecision.ACCEPT)
+    assert gate.test(np.zeros(2), np.eye(2))[0] is GateDecision.ACCEPT
 
 
 def test_fixes_that_agree_are_let_in() -> None:
     gate = GnssGate(GATE)
     verdicts = [gate.test(np.array([40.0, 0.1 * i]), np.eye(2))[0] for i in range(5)]
-    assert verdicts == [Verdict.REJECT] * 4 + [Verdict.REACQUIRE]
+    assert verdicts == [GateDecision.REJECT] * 4 + [GateDecision.REACQUIRE]
 
 
 def test_one_good_fix_clears_the_count() -> None:
@@ -40,7 +40,7 @@ def test_one_good_fix_clears_the_count() -> None:
     for _ in range(4):
         gate.test(np.array([40.0, 0.0]), np.eye(2))
     gate.test(np.zeros(2), np.eye(2))
-    assert gate.test(np.array([40.0, 0.0]), np.eye(2))[0] is Verdict.REJECT
+    assert gate.test(np.array([40.0, 0.0]), np.eye(2))[0] is GateDecision.REJECT
 
 
 DT_S = 0.1

@@ -17,9 +17,9 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
-from terrafusion.fusion.estimator.dead_reckoning import MotionTrack, Pair
+from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.gates import GnssGate, Verdict
+from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, checked_fix
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -226,14 +226,14 @@ def test_good_fixes_are_never_locked_out(
     sigma = 0.02
     good = [np.array(offset) + i * np.array(drift) + rng.normal(0.0, sigma, 2) for i in range(10)]
     verdicts = [gate.test(fix, np.eye(2) * sigma**2)[0] for fix in good]
-    assert any(v is not Verdict.REJECT for v in verdicts)
+    assert any(v is not GateDecision.REJECT for v in verdicts)
 
 
 def test_whatever_comes_the_gate_opens_in_the_end() -> None:
     gate = GnssGate(GATE)
     rng = np.random.default_rng(1)
     verdicts = [gate.test(rng.normal(0, 500.0, 2), np.eye(2))[0] for _ in range(40)]
-    assert Verdict.REACQUIRE in verdicts[30:]
+    assert GateDecision.REACQUIRE in verdicts[30:]
 
 
 # --- receivers that lie --------------------------------------------------------------------------------
@@ -276,7 +276,7 @@ def test_noise_that_is_new_at_every_fix_is_told_from_a_drift(drive: Recording) -
     white = with_fixes(drive, antenna + noise, np.full((len(antenna), 1), 0.1))
     fed = feed(white, messages(white))
     assert fed.estimator.gnss.white > 0.5
-    late = nis_after(fed, drive.start_ns, 15.0) * fed.estimator.weights.row.gnss_inflation**2
+    late = nis_after(fed, drive.start_ns, 15.0) * fed.estimator.weights.noise.gnss_inflation**2
     assert 0.6 < late.mean() / 2.0 < 1.5
     slow = with_fixes(drive, antenna + np.array([0.1, -0.07, 0.0]), np.full((len(antenna), 1), 0.1))
     assert feed(slow, messages(slow)).estimator.gnss.white == WHITE_SHARE
@@ -368,8 +368,8 @@ def test_fixes_of_a_robot_that_stood_show_no_heading_whatever_else_was_seen() ->
     # Three fixes far off take each other's part until only those at rest are left: one place, no direction.
     rest = [(0j, 0.1 * complex(np.cos(k), np.sin(k))) for k in range(9)]
     wild = [(1 + 0j, -2 + 31j), (2 + 0j, -18 - 22j), (3 + 0j, -24 - 38j)]
-    track = MotionTrack(np.zeros(3))
-    track.pairs = [Pair(i, z, fix, 1.0) for i, (z, fix) in enumerate([*rest, *wild])]
+    track = DeadReckoning(np.zeros(3))
+    track.pairs = [FixPair(i, z, fix, 1.0) for i, (z, fix) in enumerate([*rest, *wild])]
     assert track.wrong_by(0.1, 1.0) is None
 
 

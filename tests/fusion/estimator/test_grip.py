@@ -1,4 +1,4 @@
-"""Grip of the ground, heard from fixes, on a twin whose laws are not those of `graph.friction`."""
+"""FrictionEstimator of the ground, heard from fixes, on a twin whose laws are not those of `graph.friction`."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ import pytest
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import Inputs, inputs_of
+from terrafusion.fusion.config.sensor_config import SensorConfig, sensor_config_of
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.estimator import friction as grips
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.friction import Grip, grip_of
+from terrafusion.fusion.estimator.friction import FrictionEstimator, friction_estimator
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
@@ -88,11 +88,11 @@ def rms_m(found: Replay) -> float:
 
 def config_of(recording: Recording) -> EstimatorConfig:
     robot, _ = choose_vehicle(recording, None)
-    return EstimatorConfig(robot.rig(), robot.name, inputs=inputs_of(recording, recording.gnss))
+    return EstimatorConfig(robot.rig(), robot.name, inputs=sensor_config_of(recording, recording.gnss))
 
 
 def followed(recording: Recording, until_s: float = np.inf) -> tuple[list[float], list[bool], Estimator]:
-    """Grip and whether the robot slides after every fix, of a live estimator."""
+    """FrictionEstimator and whether the robot slides after every fix, of a live estimator."""
     estimator = Estimator(config_of(recording))
     grip = estimator.gnss.slide.grip
     assert grip is not None
@@ -138,7 +138,7 @@ def test_ground_that_holds_costs_nothing(asphalt: Recording, monkeypatch: pytest
     _, slides, _ = followed(asphalt)
     assert not any(slides)
     heard = replay(asphalt)
-    monkeypatch.setattr("terrafusion.fusion.estimator.estimator.grip_of", lambda *_: None)
+    monkeypatch.setattr("terrafusion.fusion.estimator.estimator.friction_estimator", lambda *_: None)
     assert places(heard) == places(replay(asphalt))
 
 
@@ -187,31 +187,36 @@ def test_a_dump_in_a_slide_goes_on_with_the_same_bits(ice: Recording) -> None:
 
 def test_who_hears_the_grip() -> None:
     """A planar graph with two wheels and a gyro, whose weights follow the ground; no calibration."""
-    base = dataclasses.replace(Estimator.for_vehicle("warthog").config, inputs=Inputs(imu="gyro_z"))
+    base = dataclasses.replace(Estimator.for_vehicle("warthog").config, inputs=SensorConfig(imu="gyro_z"))
 
     def hears(**changes: object) -> bool:
         config: EstimatorConfig = dataclasses.replace(base, **changes)  # type: ignore[arg-type]
         return (
-            grip_of(config, config.inputs.preintegrator(config.rig.sensors.imu), lambda _: None) is not None
+            friction_estimator(config, config.inputs.preintegrator(config.rig.sensors.imu), lambda _: None)
+            is not None
         )
 
     assert hears()
     assert not hears(mode="fixed")
     assert not hears(calibrate=True)
-    assert not hears(inputs=Inputs())
-    assert not hears(inputs=Inputs(imu="none"))
-    assert not hears(inputs=Inputs(imu="gyro_z", sides=False))
+    assert not hears(inputs=SensorConfig())
+    assert not hears(inputs=SensorConfig(imu="none"))
+    assert not hears(inputs=SensorConfig(imu="gyro_z", sides=False))
 
 
 class Straight:
     """A robot whose wheels roll at 3 m/s along a heading, while it goes as told; a fix every half second."""
 
     def __init__(self, heading_rad: float = 0.0, origin_m: tuple[float, float] = (0.0, 0.0)) -> None:
-        config = dataclasses.replace(Estimator.for_vehicle("warthog").config, inputs=Inputs(imu="gyro_z"))
+        config = dataclasses.replace(
+            Estimator.for_vehicle("warthog").config, inputs=SensorConfig(imu="gyro_z")
+        )
         self.told: list[WeightChange] = []
-        grip = grip_of(config, config.inputs.preintegrator(config.rig.sensors.imu), self.told.append)
+        grip = friction_estimator(
+            config, config.inputs.preintegrator(config.rig.sensors.imu), self.told.append
+        )
         assert grip is not None
-        self.grip: Grip = grip
+        self.grip: FrictionEstimator = grip
         self.heading = gtsam.Rot3.Rz(heading_rad)
         self.at = np.array([*origin_m, 0.0]) + self.heading.matrix() @ grip.antenna_m
         self.k = 0
@@ -293,7 +298,7 @@ def test_a_refuted_slide_loosens_its_links_and_has_them_back(ice: Recording) -> 
     nodes = chain.nodes[-8:]
     links, sure = [node.link for node in nodes], chain.covariance()
     since, ahead = nodes[0].t_ns, [np.array([0.5, 0.0]), np.array([0.6, 0.0])]
-    assert slide.refuted(chain, chain.last, since, ahead, 0.1, estimator.weights.row)
+    assert slide.refuted(chain, chain.last, since, ahead, 0.1, estimator.weights.noise)
     assert all(node.link is not link for node, link in zip(nodes[1:], links[1:], strict=True))
     assert (np.diag(chain.covariance())[3:8] > 1.2 * np.diag(sure)[3:8]).any()
     slide.put_back(chain)
@@ -326,7 +331,7 @@ def test_on_dry_ground_friction_leads_only_where_it_is_sure(
 ) -> None:
     """`lead` is the logarithm of how much better one grip, or rolling, told the way than all others."""
     grip = Straight().grip
-    i = -1 if best_mps2 is None else int(np.flatnonzero(best_mps2 == grips.GRIPS_MPS2)[0])
+    i = -1 if best_mps2 is None else int(np.flatnonzero(best_mps2 == grips.FRICTION_MPS2)[0])
     grip._score[i] += lead
     assert grip.slides == leads
     if leads:

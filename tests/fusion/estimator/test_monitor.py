@@ -13,7 +13,12 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.estimator.slip_monitor import SPINNING, STALLED, MotionMonitor
-from terrafusion.fusion.estimator.stationarity import CREEP_MPS, RestDetector, likelihood_ratio, shaking
+from terrafusion.fusion.estimator.stationarity import (
+    CREEP_MPS,
+    StationarityDetector,
+    likelihood_ratio,
+    shaking,
+)
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.slip_trials import alarms, poisson_interval, spinning_hill, stuck_trial
@@ -106,7 +111,7 @@ def streams(quantum_rad: float, wheel_mps: float, gyro=None, accel=None, seed: i
 
 
 def rests(imu: ImuStream, wheels: WheelStream, quantum_rad: float, **speed: float) -> bool:
-    detector = RestDetector(rig(quantum_rad, 10.0))
+    detector = StationarityDetector(rig(quantum_rad, 10.0))
     return detector.stands(2_000_000_000, imu, wheels, np.zeros(3), np.zeros(3), **speed)
 
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.fusion.estimator.dead_reckoning import LEAST_NEWS, MOST_NEWS, MotionTrack
+from terrafusion.fusion.estimator.dead_reckoning import LEAST_NEWS, MOST_NEWS, DeadReckoning
 from terrafusion.fusion.estimator.gnss import ALL_NEW
 from terrafusion.fusion.inputs.streams import GnssFix
 
@@ -22,9 +22,9 @@ def tracked(
     heading_rad: float = 0.0,
     origin_m: complex = 0j,
     order: np.ndarray | None = None,
-) -> MotionTrack:
+) -> DeadReckoning:
     """A robot straight on; fix i, twice a second, is `noise_m` (n, 2) off. `order` is that of arrival."""
-    track, n = MotionTrack(np.zeros(3)), len(noise_m)
+    track, n = DeadReckoning(np.zeros(3)), len(noise_m)
     turn = np.exp(1j * heading_rad)
 
     def fix(i: int) -> GnssFix:

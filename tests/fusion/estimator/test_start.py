@@ -13,9 +13,9 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import Inputs
+from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.alignment import turn_between
+from terrafusion.fusion.estimator.alignment import rotation_between
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -198,7 +198,9 @@ def test_a_start_that_is_none_is_refused(bad: dict[str, float]) -> None:
 
 def test_turn_between_is_exact_for_a_turned_and_scaled_path() -> None:
     z = np.array([0.0, 1.0 + 0.2j, 2.0 - 0.1j, 2.5 + 1.0j])
-    turn, information = turn_between(z, 5.0 - 3.0j + 0.8 * np.exp(2.1j) * z, np.array([1.0, 2.0, 1.0, 3.0]))
+    turn, information = rotation_between(
+        z, 5.0 - 3.0j + 0.8 * np.exp(2.1j) * z, np.array([1.0, 2.0, 1.0, 3.0])
+    )
     assert turn / information == pytest.approx(0.8 * np.exp(2.1j))
 
 
@@ -224,7 +226,7 @@ def test_a_rest_of_just_a_second_is_seen_whichever_channel_comes_first_and_howev
 ) -> None:
     """The rest ends with the first sample of the wheels that is a second old, or sooner."""
     states: list[State] = []
-    config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=Inputs(gnss=False))
+    config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=SensorConfig(gnss=False))
     estimator = Estimator(config, on_state=states.append)
     for t_ns, name, speed in samples(rest_s, wheel_period_s, wheels_first):
         if name == "wheels":
@@ -238,7 +240,7 @@ def test_a_rest_of_just_a_second_is_seen_whichever_channel_comes_first_and_howev
 
 def test_wheels_that_fall_silent_do_not_hold_up_the_start() -> None:
     states: list[State] = []
-    config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=Inputs(gnss=False))
+    config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=SensorConfig(gnss=False))
     estimator = Estimator(config, on_state=states.append)
     estimator.add_wheels(0, 0.0, 0.0)
     for i in range(300):

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import V, X
 
-from terrafusion.fusion.graph.batch import Batch
-from terrafusion.fusion.graph.batch_rows import Block
+from terrafusion.fusion.graph.batch import BatchSmoother
+from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import ANTENNA, IMU_ROTATION, LINEAR, KeyState
-from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from tests.fusion.graph.test_chain import SIGMAS, STEP, drive, iso
 
 NS = 100_000_000
@@ -43,7 +43,7 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
             fix = GnssPosition(fixes[k], lever, np.array([0.3, 0.4, 1.0]), 0.7, velocity, delay_s=0.02)
             chain.add_fix(k, fix)
             if calibrate:
-                turned = swing(np.array([0.1, -0.2, 0.3 * k]), -0.05)
+                turned = lever_arm_velocity(np.array([0.1, -0.2, 0.3 * k]), -0.05)
                 chain.add_velocity(k, GnssVelocity(velocity, 0.1, lever, turned))
     return chain
 
@@ -52,7 +52,7 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
 def test_rows_are_those_of_the_chain(calibrate: bool) -> None:
     """Rows may come in another order, so that their information matrices are compared."""
     chain = varied(calibrate)
-    block = Block(chain.nodes, 0, 0, 12)
+    block = RowBlock(chain.nodes, 0, 0, 12)
     linear = np.array([node.point.linear for node in chain.nodes])
     rows, counts = block.rows(chain.values, linear)
     for k in range(11):
@@ -72,10 +72,10 @@ def test_rows_are_those_of_the_chain(calibrate: bool) -> None:
 
 def test_blocks_hand_on_what_they_know(monkeypatch: pytest.MonkeyPatch) -> None:
     """Where the chain is cut into blocks changes nothing."""
-    whole = Batch(varied(calibrate=False))
+    whole = BatchSmoother(varied(calibrate=False))
     whole.optimise()
     monkeypatch.setattr("terrafusion.fusion.graph.batch.BLOCK", 5)
-    cut = Batch(varied(calibrate=False))
+    cut = BatchSmoother(varied(calibrate=False))
     cut.optimise()
     for a, b in zip(whole.states(), cut.states(), strict=True):
         np.testing.assert_allclose(a.local(b), 0.0, atol=1e-12)
@@ -85,14 +85,14 @@ def test_blocks_hand_on_what_they_know(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_step_halving_ends_where_plain_steps_end() -> None:
     """From a start that is metres and half a radian off the same minimum is found."""
     chain = varied(calibrate=False)
-    near = Batch(chain)
+    near = BatchSmoother(chain)
     near.optimise(tolerance=1e-5)
     far = []
     for k, state in enumerate(near.states()):
         off = np.zeros(21)
         off[:6] = 0.4 * np.sin(k), -0.2, 0.5, 2.0, np.cos(k), 1.0
         far.append(state.retract(off))
-    away = Batch(chain, far)
+    away = BatchSmoother(chain, far)
     away.optimise(tolerance=1e-5)
     sigma = np.sqrt(np.array([np.diag(P) for P in near.covariances()]))
     for a, b, s in zip(near.states(), away.states(), sigma, strict=True):
@@ -104,4 +104,4 @@ def test_a_keyframe_that_nothing_ties_down_is_refused() -> None:
     for k, point in enumerate(drive(3, seed=2)[0]):
         chain.append(k * NS, point)
     with pytest.raises(ArithmeticError, match="not determined"):
-        Batch(chain).optimise()
+        BatchSmoother(chain).optimise()

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from terrafusion.fusion.graph import gauss_markov as markov
 from terrafusion.fusion.graph import gnss_factor, velocity_factor, wheel_factor
-from terrafusion.fusion.graph.batch import Batch
+from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gauss_markov import markov_step
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
-from terrafusion.fusion.graph.velocity_factor import GnssVelocity, swing
+from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
 Array = NDArray[np.float64]
@@ -97,7 +97,9 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
             )
             chain.add_fix(k, fix)
             graph.add(gnss_factor.as_gtsam_factor(fix, X(k), M(k)))
-            told = GnssVelocity(points[k].velocity, 0.1, np.array([0.2, 0.0, 0.3]), swing(RATE, -0.05))
+            told = GnssVelocity(
+                points[k].velocity, 0.1, np.array([0.2, 0.0, 0.3]), lever_arm_velocity(RATE, -0.05)
+            )
             chain.add_velocity(k, told)
             graph.add(velocity_factor.as_gtsam_factor(told, X(k), V(k), M(k)))
     return graph
@@ -124,7 +126,7 @@ def test_batch_solution_is_that_of_gtsam() -> None:
     params.setAbsoluteErrorTol(1e-14)
     params.setLinearSolverType("MULTIFRONTAL_QR")
     solution = gtsam.GaussNewtonOptimizer(graph, values, params).optimize()
-    batch = Batch(chain)
+    batch = BatchSmoother(chain)
     batch.optimise(tolerance=1e-6)
     states = batch.states()
     for k in (0, 17, 39):
@@ -160,7 +162,7 @@ def test_filter_ends_where_the_batch_ends() -> None:
             if chain is live:
                 chain.solve(window=40)
     live.smooth(40, iterations=10)
-    whole = Batch(batch)
+    whole = BatchSmoother(batch)
     whole.optimise()
     a, b = live.state(39), whole.states()[39]
     # Live keyframes are linearised again only beyond 0.02 rad: a tenth of a sigma is left.
@@ -265,7 +267,9 @@ def test_gnss_jacobians_match_finite_differences(seed: int) -> None:
 def test_velocity_jacobians_match_finite_differences(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pose, linear, v = gtsam.Pose3.Expmap(rng.normal(0, 1, 6)), rng.normal(0, 1, N), rng.normal(0, 1, 3)
-    told = GnssVelocity(rng.normal(0, 1, 3), 0.1, rng.normal(0, 0.5, 3), swing(rng.normal(0, 1, 3), -0.1))
+    told = GnssVelocity(
+        rng.normal(0, 1, 3), 0.1, rng.normal(0, 0.5, 3), lever_arm_velocity(rng.normal(0, 1, 3), -0.1)
+    )
     H_pose, H_velocity, H_linear = velocity_factor.jacobians(told, pose, linear)
     for H, function, n in (
         (H_pose, lambda s: velocity_factor.residual(told, pose.retract(s), v, linear), 6),
@@ -279,8 +283,8 @@ def test_an_antenna_swings_as_a_point_of_the_body_does() -> None:
     """Its velocity some time before the keyframe, from its places then, in the axes of the keyframe."""
     rate, lever, offset, h = np.array([0.2, -0.3, 0.9]), np.array([0.4, 0.1, 0.6]), -0.1, 1e-5
     ahead, behind = (gtsam.Rot3.Expmap(rate * (offset + s)).matrix() @ lever for s in (h, -h))
-    assert swing(rate, offset) @ lever == pytest.approx((ahead - behind) / (2 * h), abs=5e-3)
-    assert swing(rate, 0.0) @ lever == pytest.approx(np.cross(rate, lever))
+    assert lever_arm_velocity(rate, offset) @ lever == pytest.approx((ahead - behind) / (2 * h), abs=5e-3)
+    assert lever_arm_velocity(rate, 0.0) @ lever == pytest.approx(np.cross(rate, lever))
 
 
 def test_a_turned_imu_acts_as_its_rows_say() -> None:

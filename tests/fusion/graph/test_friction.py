@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from terrafusion.fusion.graph.coulomb import SLIP_SPEED_MPS, slid
+from terrafusion.fusion.graph.coulomb import SLIP_SPEED_MPS, skid_motion
 
 Array = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ grips = st.floats(0.3, 8.0)
 def one(
     velocity: tuple[float, float], left: float, right: float, rate: float, grip: float, dt_s: float = 0.1
 ) -> tuple[Array, Array]:
-    ends, ways = slid(np.array([velocity]), left, right, rate, np.array([grip]), TRACK_M, dt_s)
+    ends, ways = skid_motion(np.array([velocity]), left, right, rate, np.array([grip]), TRACK_M, dt_s)
     return ends[0], ways[0]
 
 
@@ -105,5 +105,5 @@ def test_wheels_that_turn_the_robot_hold_less_against_a_slide_outwards() -> None
 def test_with_good_grip_the_robot_soon_goes_as_its_wheels() -> None:
     velocity = np.array([[0.0, 1.0]])
     for _ in range(10):
-        velocity, _ = slid(velocity, 1.0, 1.0, 0.0, np.array([6.0]), TRACK_M, 0.1)
+        velocity, _ = skid_motion(velocity, 1.0, 1.0, 0.0, np.array([6.0]), TRACK_M, 0.1)
     assert velocity[0] == pytest.approx([1.0, 0.0], abs=1e-3)

@@ -17,10 +17,10 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import Inputs, complete_rows, inputs_of
+from terrafusion.fusion.config.sensor_config import SensorConfig, complete_samples, sensor_config_of
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
-from terrafusion.fusion.graph.planar import PlanarPreintegrator, in_a_turn, yaw_of_wheels
+from terrafusion.fusion.graph.planar import PlanarPreintegrator, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
@@ -151,13 +151,13 @@ def test_same_input_gives_the_same_bits(exact: Recording, what: str) -> None:
 )
 def test_what_is_assumed_is_said(exact: Recording, what: str, said: tuple[str, ...]) -> None:
     log = reduced(exact, what)
-    notes = "; ".join(inputs_of(log, log.gnss).notes(log))
+    notes = "; ".join(sensor_config_of(log, log.gnss).notes(log))
     assert all(words in notes for words in said), notes
 
 
 def test_a_full_log_has_nothing_to_say(exact: Recording) -> None:
-    assert inputs_of(exact, exact.gnss) == Inputs()
-    assert inputs_of(exact, exact.gnss).notes(exact) == ()
+    assert sensor_config_of(exact, exact.gnss) == SensorConfig()
+    assert sensor_config_of(exact, exact.gnss).notes(exact) == ()
 
 
 def test_roll_pitch_and_height_stay_level_without_gnss(noisy: Recording) -> None:
@@ -196,25 +196,25 @@ def test_an_accelerometer_with_few_rows_is_not_relied_on(exact: Recording) -> No
     accel = exact.imu.accel_mps2.copy()
     accel[np.arange(len(accel)) % 10 != 0] = np.nan
     log = dataclasses.replace(exact, imu=dataclasses.replace(exact.imu, accel_mps2=accel))
-    inputs = inputs_of(log, log.gnss)
+    inputs = sensor_config_of(log, log.gnss)
     assert inputs.imu == "gyro_z"
     assert "few rows" in inputs.notes(log)[0]
     assert log.imu is not None
-    assert complete_rows(log.imu, "six_axis").sum() < complete_rows(log.imu, "gyro_z").sum()
+    assert complete_samples(log.imu, "six_axis").sum() < complete_samples(log.imu, "gyro_z").sum()
 
 
 def test_nothing_that_tells_the_heading_is_refused(exact: Recording) -> None:
     with pytest.raises(DataError, match="nothing tells the heading"):
         replay(reduced(exact, "body speed", gnss=False))
     with pytest.raises(ConfigError, match="unknown kind of IMU"):
-        Inputs(imu="magic")
+        SensorConfig(imu="magic")
 
 
 def test_fixes_of_class_none_are_no_gnss(exact: Recording) -> None:
     log = reduced(exact, "no imu")
     assert log.gnss is not None
     blind = dataclasses.replace(log.gnss, fix=np.zeros_like(log.gnss.fix))
-    assert not inputs_of(log, blind).gnss
+    assert not sensor_config_of(log, blind).gnss
 
 
 def test_a_stream_admits_only_what_was_declared() -> None:
@@ -232,7 +232,7 @@ def test_a_stream_admits_only_what_was_declared() -> None:
 
 
 def test_an_estimator_told_of_no_imu_refuses_one() -> None:
-    config = EstimatorConfig(load_vehicle("husky").rig(), inputs=Inputs(imu="none"))
+    config = EstimatorConfig(load_vehicle("husky").rig(), inputs=SensorConfig(imu="none"))
     with pytest.raises(DataError, match="no IMU"):
         Estimator(config).add_imu(0, [0.0, 0.0, 0.0])
 
@@ -253,7 +253,7 @@ def test_a_turn_adds_the_centripetal_force() -> None:
     bias = gtsam.imuBias.ConstantBias(np.zeros(3), np.array([0.0, 0.0, 0.1]))
     before = KeyState(gtsam.Pose3(heading, np.zeros(3)), velocity, bias, np.zeros(len(LINEAR)))
     segment = ImuSegment(0.1, np.array([0.0, 0.0, 0.4]), np.array([0.0, 0.0, GRAVITY_MPS2]))
-    force = in_a_turn([segment], before)[0].accel_mps2
+    force = with_centripetal_force([segment], before)[0].accel_mps2
     np.testing.assert_allclose(force, [0.0, 2.0 * 0.3, GRAVITY_MPS2])
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import Inputs
+from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.odometry import Propagator
@@ -50,7 +50,7 @@ def test_a_mounting_that_is_known_moves_nothing(estimator: Estimator) -> None:
     for i in range(21):
         imu.add(state.t_ns + i * 10**7, gyro, accel)
     covariance = 1e-4 * np.eye(estimator.chain.dim)
-    found = Propagator(estimator._preintegrator).carry(state, covariance, imu, estimator.weights.row)
+    found = Propagator(estimator._preintegrator).carry(state, covariance, imu, estimator.weights.noise)
     assert np.linalg.norm(found.velocity_mps) < 0.2 * GRAVITY_MPS2 * 2.0 * np.sum(ROTATION**2)
     assert found.angular_velocity_radps == pytest.approx(body[0], abs=2.0 * 0.3 * np.sum(ROTATION**2))
 
@@ -69,7 +69,7 @@ def test_rates_and_readings_are_inverse_to_first_order() -> None:
 
 
 def test_a_gyro_of_one_axis_tells_no_other_rate() -> None:
-    inputs = Inputs(imu="gyro_z")
+    inputs = SensorConfig(imu="gyro_z")
     made = Estimator(EstimatorConfig(load_vehicle("elevate").rig(), "elevate", inputs=inputs))
     made.set_start([0.0, 0.0, 0.0], 0.0)
     for i in range(205):

@@ -12,9 +12,9 @@ from hypothesis import given as drawn
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.estimator.dead_reckoning import MotionTrack
+from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.estimator.skid import Slide
+from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix
@@ -110,10 +110,10 @@ def test_loosened_wheels_know_less_of_the_way_and_as_much_of_the_turn(
     variance: float, sigma: float, distance: float
 ) -> None:
     wheels = WheelIncrement(np.array([distance, 0.0, 0.0]), np.full(4, sigma), distance, 0.1)
-    loose = wheels.loosened(variance)
+    loose = wheels.with_extra_variance(variance)
     assert np.allclose(loose.sigma[:2] ** 2, sigma**2 + variance)
     assert (loose.sigma[2:] == sigma).all()
-    twice = wheels.loosened(0.5 * variance).loosened(0.5 * variance)
+    twice = wheels.with_extra_variance(0.5 * variance).with_extra_variance(0.5 * variance)
     assert np.allclose(twice.sigma, loose.sigma)
 
 
@@ -124,23 +124,28 @@ def moving(speed_mps: float) -> KeyState:
 
 
 def test_a_robot_at_rest_does_not_slide() -> None:
-    slide = Slide()
+    slide = SkidDetector()
     slide.rate_m2ps = 0.5
     still = WheelIncrement(np.zeros(3), np.full(4, 0.01), 0.0, 0.0)
-    assert (slide.loosened(still, moving(0.0), 0.1).sigma == still.sigma).all()
-    sliding, spinning = slide.loosened(still, moving(3.0), 0.1), dataclasses.replace(still, distance_m=0.3)
+    assert (slide.with_extra_variance(still, moving(0.0), 0.1).sigma == still.sigma).all()
+    sliding, spinning = (
+        slide.with_extra_variance(still, moving(3.0), 0.1),
+        dataclasses.replace(still, distance_m=0.3),
+    )
     assert sliding.sigma[0] == pytest.approx(np.hypot(0.01, np.sqrt(0.05)), rel=0.02)
-    assert slide.loosened(spinning, moving(0.0), 0.1).sigma[0] == pytest.approx(sliding.sigma[0], rel=0.02)
+    assert slide.with_extra_variance(spinning, moving(0.0), 0.1).sigma[0] == pytest.approx(
+        sliding.sigma[0], rel=0.02
+    )
 
 
 def test_a_slide_is_forgotten_when_fixes_agree_with_the_wheels_and_only_then() -> None:
-    slide = Slide()
+    slide = SkidDetector()
     slide.rate_m2ps = 0.5
     state = moving(3.0)
     wheels = WheelIncrement(np.array([3.0, 0.0, 0.0]), np.full(4, 0.01), 3.0, 0.0)
 
     def told(k: int, innovation_m: float) -> float:
-        slide.loosened(wheels, state, 1.0)
+        slide.with_extra_variance(wheels, state, 1.0)
         slide.accepted(k * 10**9, np.full(2, innovation_m), np.full(2, 0.02 + slide.rate_m2ps))
         return slide.rate_m2ps
 
@@ -151,8 +156,8 @@ def test_a_slide_is_forgotten_when_fixes_agree_with_the_wheels_and_only_then() -
     assert told(200, 5.0) == 0.0  # a fix that the gate lets in refutes nothing
 
 
-def track_of(points_m: np.ndarray, sigma_m: float, step_s: float = 0.2) -> MotionTrack:
-    track = MotionTrack(np.zeros(3))
+def track_of(points_m: np.ndarray, sigma_m: float, step_s: float = 0.2) -> DeadReckoning:
+    track = DeadReckoning(np.zeros(3))
     for k in range(-1, len(points_m)):
         track._append(round(k * step_s * 1e9), 0j, 0.0)
     for k, (x, y) in enumerate(points_m):

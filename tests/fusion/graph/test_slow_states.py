@@ -106,7 +106,7 @@ def test_a_slip_opened_later_keeps_what_else_began_at_that_keyframe() -> None:
     chain.revise(2, chain.nodes[2].markov.renewed(drift))  # another class of fix
 
     def open_at_2(switch: float) -> np.ndarray:
-        slow_states.open_slip(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, switch)
+        slow_states.inflate_slip_covariance(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, switch)
         return chain.nodes[2].markov.decay
 
     assert open_at_2(0.9)[drift].tolist() == [0.0, 0.0]
@@ -121,6 +121,6 @@ def test_what_was_seen_late_is_opened_at_the_oldest_keyframe_that_still_can() ->
     point = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
     for k in range(3):
         chain.append((5 + k) * 10**8, point, markov=step(rolling(1.0)) if k else None)
-    slow_states.open_slip(chain, 0, 0.1, SAND, 0.02, 100.0, 1.0)
+    slow_states.inflate_slip_covariance(chain, 0, 0.1, SAND, 0.02, 100.0, 1.0)
     assert chain.nodes[1].markov.decay[SLIP] == 0.0
     assert chain.nodes[2].markov.decay[SLIP] > 0.9

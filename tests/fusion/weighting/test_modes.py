@@ -17,13 +17,13 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.noise.labels import GroundLabels
-from terrafusion.fusion.noise.modes import ModeTuning, RowTuning, load_modes, write_modes
+from terrafusion.fusion.noise.modes import ModeTuning, NoiseTuning, load_modes, write_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.weighting.adaptive import TerrainWeights
+from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.fusion.weighting.innovation import SageHusa, Variational
 from terrafusion.fusion.weighting.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
-from terrafusion.fusion.weighting.weighting import Surprise
+from terrafusion.fusion.weighting.weighting import InnovationTest
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.studies.mode_tuning import DRIVES, MIXED, MODE_OF, Training, fingerprint, loss, tune
@@ -41,8 +41,10 @@ def run(recording: Recording, method: str, **options: object) -> Replay:
     return replay(recording, mode=mode, settings=variant, **options)  # type: ignore[arg-type]
 
 
-def surprise(innovation: float, predicted: float, noise: float) -> Surprise:
-    return Surprise(0, np.array([innovation]), np.array([predicted]), np.array([noise]), np.array([1.0]))
+def surprise(innovation: float, predicted: float, noise: float) -> InnovationTest:
+    return InnovationTest(
+        0, np.array([innovation]), np.array([predicted]), np.array([noise]), np.array([1.0])
+    )
 
 
 def with_fixes(recording: Recording, error_m: np.ndarray, claimed_m: float | None = None) -> Recording:
@@ -175,27 +177,33 @@ def test_unknown_modes_and_variants_are_refused() -> None:
             EstimatorConfig(rig, **settings)  # type: ignore[arg-type]
 
 
-def test_untuned_fixed_mode_is_the_policy_row_itself(sand: Recording) -> None:
+def test_untuned_fixed_mode_is_the_fixed_noise_of_the_policy(sand: Recording) -> None:
     row = load_policy().fixed
-    assert RowTuning().of(row) == row
+    assert NoiseTuning().applied(row) == row
     untuned = replay(sand, mode="fixed", settings={"tuning": ModeTuning()}).estimate
     assert all(series[0] == getattr(row, name) for name, series in untuned.weights.items())
 
 
-def test_adaptive_has_factors_of_its_own_on_all_rows(sand: Recording) -> None:
-    own, others = ModeTuning(adaptive=RowTuning(2.0, 1.5, 3.0)), ModeTuning(fixed=RowTuning(3.0, 3.0, 3.0))
+def test_adaptive_applies_its_factors_to_all_classes(sand: Recording) -> None:
+    own, others = (
+        ModeTuning(adaptive=NoiseTuning(2.0, 1.5, 3.0)),
+        ModeTuning(fixed=NoiseTuning(3.0, 3.0, 3.0)),
+    )
     plain, moved, same = (replay(sand, settings={"tuning": t}).estimate for t in (ModeTuning(), own, others))
     assert plain.trajectory.position_m.tobytes() == same.trajectory.position_m.tobytes()
     np.testing.assert_allclose(moved.weights["gnss_inflation"], 3.0 * plain.weights["gnss_inflation"])
-    row, tuned = load_policy().blend([0.2] * 5), own.adaptive.of_all(load_policy()).blend([0.2] * 5)
+    row, tuned = (
+        load_policy().blend([0.2] * 5),
+        own.adaptive.applied_to_policy(load_policy()).blend([0.2] * 5),
+    )
     assert tuned.wheel_sigma_mps == pytest.approx(2.0 * row.wheel_sigma_mps)
     assert row.slip_sigma < tuned.slip_sigma < 1.5 * row.slip_sigma  # the spread of the means has no factor
 
 
-def test_a_robot_unknown_to_the_terrain_model_begins_with_the_row_of_fixed() -> None:
+def test_a_robot_unknown_to_the_terrain_model_begins_with_the_noise_of_fixed() -> None:
     config = EstimatorConfig(load_vehicle("husky").rig(), "husky")
-    fixed, adaptive = TerrainWeights(dataclasses.replace(config, mode="fixed")), TerrainWeights(config)
-    assert adaptive.policy.classes["unknown"] == fixed.row
+    fixed, adaptive = TerrainNoise(dataclasses.replace(config, mode="fixed")), TerrainNoise(config)
+    assert adaptive.policy.classes["unknown"] == fixed.noise
     assert max(adaptive.posterior(), key=adaptive.posterior().__getitem__) == "unknown"
 
 
@@ -233,20 +241,23 @@ def test_tuning_never_makes_the_training_loss_worse() -> None:
     assert loss(drives, "fixed", tuned) <= loss(drives, "fixed", ModeTuning())
 
 
-def test_a_robot_the_model_does_not_know_has_the_pooled_row_until_evidence_comes() -> None:
+def test_a_robot_the_model_does_not_know_has_the_pooled_noise_until_evidence_comes() -> None:
     """That row was fitted to all grounds, and has the doubt between them in it: it holds to the last bit
     until one is more likely than not."""
-    weights, pooled = Estimator.for_vehicle("warthog").weights, load_modes().fixed.of(load_policy().fixed)
-    assert weights.row == pooled
+    weights, pooled = (
+        Estimator.for_vehicle("warthog").weights,
+        load_modes().fixed.applied(load_policy().fixed),
+    )
+    assert weights.noise == pooled
     classes = weights.detector.classes
     sigmas = []
     for _ in range(40):
         weights.external(0, {name: float(name == "mud") for name in classes})
-        assert (weights.row == pooled) == (weights.posterior()["mud"] <= 0.5)
-        sigmas.append(weights.row.slip_sigma)
+        assert (weights.noise == pooled) == (weights.posterior()["mud"] <= 0.5)
+        sigmas.append(weights.noise.slip_sigma)
     assert sigmas == sorted(sigmas)
     assert weights.posterior()["mud"] > 0.99
-    assert weights.row.slip_sigma == pytest.approx(weights.policy.classes["mud"].slip_sigma, rel=0.02)
+    assert weights.noise.slip_sigma == pytest.approx(weights.policy.classes["mud"].slip_sigma, rel=0.02)
 
 
 def test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot() -> None:
@@ -254,7 +265,7 @@ def test_a_label_of_a_ground_is_taken_as_it_is_on_any_robot() -> None:
     told = dataclasses.replace(config, labels=GroundLabels((0,), ("mud",)))
     weights = Estimator(told).weights
     weights.begin(0)
-    assert weights.row == weights.policy.classes["mud"]
+    assert weights.noise == weights.policy.classes["mud"]
 
 
 def test_without_such_evidence_adaptive_is_fixed_to_the_last_bit() -> None:

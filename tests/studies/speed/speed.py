@@ -22,7 +22,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.graph.batch import Batch
+from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.live import messages
@@ -116,8 +116,8 @@ def initial(taken: Live) -> list[KeyState]:
 
 def batch_parts(chain: Chain, start: list[KeyState]) -> dict[str, tuple[float, float]]:
     """Wall and CPU seconds of the parts of a batch solution."""
-    made: list[Batch] = []
-    parts = {"set-up": timed(lambda: made.append(Batch(chain, start)))}
+    made: list[BatchSmoother] = []
+    parts = {"set-up": timed(lambda: made.append(BatchSmoother(chain, start)))}
     parts["Gauss-Newton"] = timed(made[0].optimise)
     parts[f"  of which one of {made[0].iterations} linearisations with elimination"] = timed(
         made[0].linearise
