@@ -142,10 +142,10 @@ def _immobilised(
 ) -> tuple[float, float, float, str] | tuple[None, None, None, None]:
     """When, where (x, y) and why the robot came to rest for good, or nothing."""
     moving = np.hypot(motion.velocity_body_mps[:, 0], motion.velocity_body_mps[:, 1]) > STOPPED_MPS
-    told = driven.wanted[:, 0] != 0.0
+    commanded = driven.commanded[:, 0] != 0.0
     # A robot that never moved is stuck from its first command on.
-    last = int(np.flatnonzero(moving)[-1]) if moving.any() else int(np.argmax(told))
-    missing = float(np.sum(np.abs(driven.wanted[last:, 0]))) * float(t_s[1] - t_s[0])
+    last = int(np.flatnonzero(moving)[-1]) if moving.any() else int(np.argmax(commanded))
+    missing = float(np.sum(np.abs(driven.commanded[last:, 0]))) * float(t_s[1] - t_s[0])
     if missing <= LOST_TRAVEL_M:
         return None, None, None, None
     rims = np.abs(driven.states[last:, state_slice("wheel_speed")]) * vehicle.wheel.radius_m

@@ -2,7 +2,7 @@
 
 y = h(x, u, vehicle, soil, effects, mounting): the instant values of `OUTPUTS`, without noise. The
 accelerations come from the right-hand side itself, so h and its derivatives by states, parameters and
-effects are exact. A sensor of `sensors.py` that reports means over an interval differs from these by what
+effects are exact. A sensor model that reports means over an interval differs from these by what
 changes within the interval.
 """
 

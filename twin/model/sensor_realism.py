@@ -51,7 +51,7 @@ class EncoderRealism:
 
 @dataclass(frozen=True)
 class GnssRealism:
-    """How a receiver fares where it does not see the whole sky; see `sensing.gnss`.
+    """How a receiver fares where it does not see the whole sky; see `sensors.gnss`.
 
     `reported_share` is the sigma the receiver reports over the true one of its
     random errors. A receiver that lost its signals finds a stand-alone fix again

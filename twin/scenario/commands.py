@@ -1,24 +1,23 @@
-"""From a scenario to driven states: command limits, side speeds, steering by waypoints."""
+"""From a scenario to driven states: command limits, side speeds, dead time, steering by waypoints."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.twin.engine.integrate import integrate
+from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import ENERGIES, INDEX, INPUTS, STATES, state_slice
 from terrafusion.twin.scenario.scenario import Scenario
 
 Array = NDArray[np.float64]
-Integrator = Callable[[Array, Array, float], Array]
-"""(state (X,), inputs (N + 1, U), start time s) -> states (N + 1, X)."""
 
 SETTLE_S = 10.0
-"""The robot stands this long before the run starts, so that it starts from rest in equilibrium."""
+"""The robot stands this long before the run starts: it starts in equilibrium."""
 STEERING_PERIOD_S = 0.1
 WAYPOINT_REACHED_M = 0.5
 LOOK_AHEAD_M = 1.5
@@ -28,20 +27,22 @@ MAX_STEERING_RADPS = 0.8
 
 @dataclass(frozen=True, eq=False)
 class DrivenStates:
-    """What was wanted, told and driven: twist (N, 2) before limits, inputs (N, U), states (N, X)."""
+    """Commanded twist (N, 2) before limits, inputs of the model (N, U), integrated states (N, X)."""
 
-    wanted: Array
+    commanded: Array
     inputs: Array
     states: Array
 
 
-def limit_slew(wanted: Array, dt_s: float, vehicle: VehicleParams, scenario: Scenario, start: Array) -> Array:
-    """Twist (N, 2) that follows `wanted` within the limits of speed and acceleration, from `start` (2,)."""
+def limit_slew(
+    commanded: Array, dt_s: float, vehicle: VehicleParams, scenario: Scenario, start: Array
+) -> Array:
+    """Twist (N, 2) that follows `commanded` within limits of speed and acceleration, from `start` (2,)."""
     drive = vehicle.drive
     accel = min(drive.max_accel_mps2, scenario.max_accel_mps2)
     steps = (accel * dt_s, drive.max_yaw_accel_radps2 * dt_s)
-    goal_v = np.clip(wanted[:, 0], -drive.max_speed_mps, drive.max_speed_mps)
-    goals = zip((goal_v, wanted[:, 1]), steps, start.tolist(), strict=True)
+    goal_v = np.clip(commanded[:, 0], -drive.max_speed_mps, drive.max_speed_mps)
+    goals = zip((goal_v, commanded[:, 1]), steps, start.tolist(), strict=True)
     return np.stack([follow(goal, step, first) for goal, step, first in goals], axis=1)
 
 
@@ -71,11 +72,10 @@ def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
 
 
 def delayed_inputs(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
-    """Inputs (N, 4), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, that arrive late.
+    """Inputs (N, 4), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, after a dead time.
 
-    Linear between samples; before the first sample the first one held. The
-    rates are those of the interval that ends at the delayed time: the late
-    command's derivative by the dead time is minus the rate.
+    Linear between samples; the first sample holds before it. The rates are those of the interval that
+    ends at the delayed time: the derivative of the input by the dead time is minus the rate.
     """
     steps = np.diff(sides, axis=0, prepend=sides[:1]) / dt_s
     if dead_time_s == 0.0:
@@ -85,12 +85,6 @@ def delayed_inputs(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array
     whole = np.clip(np.ceil(at).astype(int), 0, count - 1)
     late = np.stack([np.interp(at, np.arange(count), side) for side in sides.T], axis=1)
     return np.hstack([late, np.where(at[:, None] > 0.0, steps[whole], 0.0)])
-
-
-def at_rest(scenario: Scenario, dt_s: float, integrate: Integrator) -> Array:
-    """Initial state (X,): standing at the origin with the scenario's heading, settled on the slope."""
-    start, inputs = settling(scenario, dt_s)
-    return settled(scenario, integrate(start, inputs, -SETTLE_S)[-1])
 
 
 def settling(scenario: Scenario, dt_s: float) -> tuple[Array, Array]:
@@ -111,31 +105,35 @@ def settled(scenario: Scenario, state: Array) -> Array:
 
 
 def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[Array, Array]:
-    """Wanted twist (N, 2) and inputs (N, U) of a scenario that steers by no waypoints."""
+    """Commanded twist (N, 2) and inputs (N, U) of a scenario without waypoints."""
     dt = float(t_s[-1]) / (len(t_s) - 1)
-    wanted = scenario.commanded(t_s)
-    twist = limit_slew(wanted, dt, vehicle, scenario, np.zeros(2))
-    return wanted, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
+    commanded = scenario.commanded(t_s)
+    twist = limit_slew(commanded, dt, vehicle, scenario, np.zeros(2))
+    return commanded, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
 
 
-def drive(scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator) -> DrivenStates:
-    """Drive the scenario at the samples t_s (N,), uniformly spaced from 0."""
-    start = at_rest(scenario, float(t_s[-1]) / (len(t_s) - 1), integrate)
+def drive(
+    scenario: Scenario, t_s: Array, vehicle: VehicleParams, plant: Plant, backend: str = "auto"
+) -> DrivenStates:
+    """Settle at the start, then drive the scenario at the samples t_s (N,), uniformly spaced from 0."""
+    dt_s = 1.0 / vehicle.sensors.imu.rate_hz
+    x0, rest = settling(scenario, float(t_s[-1]) / (len(t_s) - 1))
+    start = settled(scenario, integrate(x0, rest, dt_s, plant, t0_s=-SETTLE_S, backend=backend)[-1])
     if scenario.waypoints:
-        return _steer(scenario, t_s, vehicle, integrate, start)
-    wanted, inputs = open_loop(scenario, t_s, vehicle)
-    return DrivenStates(wanted, inputs, integrate(start, inputs, 0.0))
+        return _steer(scenario, t_s, vehicle, plant, backend, start)
+    commanded, inputs = open_loop(scenario, t_s, vehicle)
+    return DrivenStates(commanded, inputs, integrate(start, inputs, dt_s, plant, backend=backend))
 
 
 def _steer(
-    scenario: Scenario, t_s: Array, vehicle: VehicleParams, integrate: Integrator, start: Array
+    scenario: Scenario, t_s: Array, vehicle: VehicleParams, plant: Plant, backend: str, start: Array
 ) -> DrivenStates:
     """Steer along the waypoints by the true pose, renewed every `STEERING_PERIOD_S`."""
-    dt = float(t_s[-1]) / (len(t_s) - 1)
+    dt, dt_s = float(t_s[-1]) / (len(t_s) - 1), 1.0 / vehicle.sensors.imu.rate_hz
     period, reach = max(1, round(STEERING_PERIOD_S / dt)), math.ceil(vehicle.drive.dead_time_s / dt) + 2
     points = np.array([(0.0, 0.0), *scenario.waypoints])
-    states, wanted = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
-    states[0], wanted[0] = start, 0.0
+    states, commanded = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
+    states[0], commanded[0] = start, 0.0
     twists = np.zeros((len(t_s), 2))
     goal, first = 1, 0
     while first < len(t_s) - 1:
@@ -143,17 +141,19 @@ def _steer(
         pose = states[first, :3]
         while goal < len(points) and np.hypot(*(points[goal] - pose[:2])) < WAYPOINT_REACHED_M:
             goal += 1
-        wish = _towards(points, goal, pose, scenario.waypoint_speed_mps)
-        block = np.tile(wish, (last - first, 1))
+        twist = _towards(points, goal, pose, scenario.waypoint_speed_mps)
+        block = np.tile(twist, (last - first, 1))
         twists[first + 1 : last + 1] = limit_slew(block, dt, vehicle, scenario, twists[first])
         known = max(0, first - reach)
         inputs = delayed_inputs(side_speeds(twists[known : last + 1], vehicle), dt, vehicle.drive.dead_time_s)
-        states[first : last + 1] = integrate(states[first], inputs[first - known :], float(t_s[first]))
-        wanted[first + 1 : last + 1] = wish
+        t0_s = float(t_s[first])
+        states[first : last + 1] = integrate(
+            states[first], inputs[first - known :], dt_s, plant, t0_s=t0_s, backend=backend
+        )
+        commanded[first + 1 : last + 1] = twist
         first = last
-    return DrivenStates(
-        wanted, delayed_inputs(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s), states
-    )
+    inputs = delayed_inputs(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s)
+    return DrivenStates(commanded, inputs, states)
 
 
 def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:

@@ -1,8 +1,7 @@
-"""A simulated drive with optional effects: what they make of the plant, of its motion and of each channel.
+"""Optional effects in a simulated drive: on the plant, on its motion and on each channel.
 
-Effects of the motion are in the plant. What effects add to the readings of a motion
-(`measurement.correction`) is added to the channels of `sensors.py`, whose noise stays as it was. A delay of a
-whole sensor is exact: it shifts the stamps.
+Effects on the motion are part of the plant. What effects add to the readings (`measurement.correction`) is
+added to the channels, whose noise stays the same. A delay of a whole sensor shifts its stamps.
 """
 
 from __future__ import annotations
@@ -23,7 +22,8 @@ from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import INPUTS, OUTPUTS, VEHICLE_PARAMETERS
+from terrafusion.twin.physics.layout import OUTPUTS, VEHICLE_PARAMETERS
+from terrafusion.twin.scenario.commands import DrivenStates
 from terrafusion.twin.sensors.noise import rows_at_rate, sample_rate_hz
 
 Array = NDArray[np.float64]
@@ -35,7 +35,7 @@ STAMPED_LATE = {"imu": "imu_time_offset/shift", "gnss": "gnss_latency/both"}
 
 
 def with_effects(plant: Plant, effects: Mapping[str, float]) -> Plant:
-    """The plant with the effects that change its motion; its dead time counts as applied by the driver."""
+    """The plant with the effects that change its motion; the dead time is applied to the inputs."""
     vehicle = plant.vehicle.copy()
     vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] += effects.get(DEAD_TIME, 0.0)
     moving = {key: value for key, value in effects.items() if moves(key)}
@@ -43,53 +43,51 @@ def with_effects(plant: Plant, effects: Mapping[str, float]) -> Plant:
 
 
 def as_driven(vehicle: VehicleParams, effects: Mapping[str, float]) -> VehicleParams:
-    """The vehicle as its driver has it: commands arrive later by the dead time among the effects."""
+    """The vehicle with the dead time among the effects added to its own."""
     late = vehicle.drive.dead_time_s + effects.get(DEAD_TIME, 0.0)
     return dataclasses.replace(vehicle, drive=dataclasses.replace(vehicle.drive, dead_time_s=late))
 
 
-def true_motion(
-    motion: BodyMotion, states: Array, inputs: Array | None, plant: Plant, vehicle: VehicleParams
-) -> BodyMotion:
-    """The motion with the body origin's velocity as effects have it that move the centre of gravity."""
-    told = np.zeros((len(states), len(INPUTS))) if inputs is None else inputs
+def true_motion(motion: BodyMotion, driven: DrivenStates, plant: Plant, vehicle: VehicleParams) -> BodyMotion:
+    """The motion with the velocity of the body origin under effects that move the centre of gravity."""
     ground = np.tile(plant.route.soil[0], 4)  # the origin's velocity does not depend on it
-    y = measured(states, told, plant.vehicle, ground, mounting_vector(vehicle), plant.effects)
+    mounting = mounting_vector(vehicle)
+    y = measured(driven.states, driven.inputs, plant.vehicle, ground, mounting, plant.effects)
     velocity = motion.velocity_body_mps.copy()
     velocity[:, :2] = y[:, [OUTPUTS.index("speed_mps"), OUTPUTS.index("side_speed_mps")]]
     return dataclasses.replace(motion, velocity_body_mps=velocity)
 
 
-def sensed(
+def with_sensor_effects(
     recording: Recording,
     motion: BodyMotion,
-    states: Array,
-    inputs: Array,
+    driven: DrivenStates,
     plant: Plant,
     vehicle: VehicleParams,
     effects: Mapping[str, float],
     gnss_latency_s: float = 0.0,
 ) -> Recording:
-    """A simulated recording with what the effects add to its channels, as late as they make them.
+    """A simulated recording with what the effects add to its channels and the delays they cause.
 
     Args:
         recording: as the sensors without effects report the motion.
         motion: of the body (see `true_motion`), at the samples (N,).
-        states, inputs: (N, X) and (N, U) at the samples.
+        driven: inputs and states at the samples.
         plant: that was driven.
         vehicle: with the nominal sensors.
         effects: all of them, by name.
-        gnss_latency_s: how late the recording's fixes are stamped.
+        gnss_latency_s: stamp less time of validity of the recording's fixes.
     """
     wheels, imu, gnss, motor = recording.wheels, recording.imu, recording.gnss, recording.motor
     if wheels is None or imu is None or gnss is None or motor is None:
         raise ValueError("a simulated recording has all channels")
     late = {name: effects.get(key, 0.0) for name, key in STAMPED_LATE.items()}
     rest = {key: value for key, value in effects.items() if key not in STAMPED_LATE.values()}
-    ground = under_wheels(plant.route, plant.vehicle, motion.t_s, states)
-    added = corrections(states, inputs, plant.vehicle, ground, mounting_vector(vehicle), rest)
+    ground = under_wheels(plant.route, plant.vehicle, motion.t_s, driven.states)
+    mounting = mounting_vector(vehicle)
+    added = corrections(driven.states, driven.inputs, plant.vehicle, ground, mounting, rest)
     columns = dict(zip(OUTPUTS, added.T, strict=True))
-    rows = rows_at_rate(len(states), sample_rate_hz(motion.t_s), vehicle.sensors.wheels.rate_hz)
+    rows = rows_at_rate(len(motion.t_s), sample_rate_hz(motion.t_s), vehicle.sensors.wheels.rate_hz)
     epochs_s = (gnss.t_ns - recording.start_ns) * 1e-9 - gnss_latency_s
     seen = {name: np.interp(epochs_s, motion.t_s, column) for name, column in columns.items()}
     return dataclasses.replace(

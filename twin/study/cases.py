@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.analysis.speeds import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
+from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.simulate import RunSummary, simulate_run
+from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.study.published import Case
 
 Array = NDArray[np.float64]

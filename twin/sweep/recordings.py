@@ -51,8 +51,8 @@ def write_recordings(
     if form not in FORMATS:
         raise ConfigError(f"unknown format '{form}'", remedy=f"known are {', '.join(FORMATS)}")
     check_runs(sweep, runs)
-    wanted = set(runs)
-    work = [(sweep, case, Path(folder), form) for case in sweep.cases() if case.run in wanted]
+    chosen = set(runs)
+    work = [(sweep, case, Path(folder), form) for case in sweep.cases() if case.run in chosen]
     failures = []
     with open_workers("loky", min(jobs, len(work)) or 1) as pool:
         for number, failure in enumerate(pool.results(_write, work), 1):

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
+from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import INDEX, state_slice
+from terrafusion.twin.run_setup import RunSetup, set_up
 from terrafusion.twin.scenario.commands import DrivenStates
-from terrafusion.twin.scenario.validity import check_slip
-from terrafusion.twin.simulate import RunSetup, set_up, simulate_run
+from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.sweep.batch import TOGETHER, attempt, drive_many
 from terrafusion.twin.sweep.plan import Sweep, SweepPoint, at_speed, top_speed_mps
 
@@ -126,7 +126,7 @@ def _capped(soil: SoilParams, friction: float) -> SoilParams:
 def _with_sensors(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row | Exception]:
     def sensed(case: SweepPoint) -> Row:
         run = simulate_run(**arguments(sweep, case))
-        row = _results(run.t_s, run.wanted, run.states, run.summary, sweep.vehicle)
+        row = _results(run.t_s, run.commanded, run.states, run.summary, sweep.vehicle)
         return row | _sensor_errors(run.recording, sweep.vehicle)
 
     return [attempt(sensed, case) for case in cases]
@@ -166,17 +166,14 @@ def _axes(sweep: Sweep, case: SweepPoint) -> Row:
 
 
 def results(setup: RunSetup, driven: DrivenStates) -> Row:
-    """What comes of a run without sensors; the same checks as in `simulate_run`."""
-    motion = setup.motion(driven.states, driven.inputs)
-    slip = slip_ratios(driven.states, motion, setup.vehicle)
-    check_slip(setup.route, setup.plant.route.field, setup.t_s, driven.states, slip)
-    summary = summarise(driven, motion, setup.vehicle, slip)
-    return _results(setup.t_s, driven.wanted, driven.states, summary, setup.vehicle)
+    """Results of a run without sensors."""
+    _, summary = setup.summarise(driven, setup.motion(driven))
+    return _results(setup.t_s, driven.commanded, driven.states, summary, setup.vehicle)
 
 
-def _results(t_s: Array, wanted: Array, states: Array, summary: RunSummary, vehicle: VehicleParams) -> Row:
+def _results(t_s: Array, twist: Array, states: Array, summary: RunSummary, vehicle: VehicleParams) -> Row:
     travel = float(states[-1, INDEX["travel"]])
-    commanded = float(np.sum(wanted[:, 0])) * float(t_s[1] - t_s[0])
+    commanded = float(np.sum(twist[:, 0])) * float(t_s[1] - t_s[0])
     ratio = travel / commanded if abs(commanded) >= MIN_COMMANDED_M else None
     status = DONE
     if summary.immobilised_at_s is not None:

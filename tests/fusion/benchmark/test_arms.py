@@ -18,8 +18,9 @@ from terrafusion.fusion.benchmark.arms import (
 )
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.policy import load_policy
+from terrafusion.twin.run_recording import START_NS
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.simulate import START_NS, simulate
+from terrafusion.twin.simulate import simulate
 
 POLICY = load_policy()
 LABELS = GroundLabels((START_NS, START_NS + 10**10), ("asphalt", "lava"))

@@ -22,7 +22,8 @@ from terrafusion.fusion.estimator.odometry import transition
 from terrafusion.fusion.live import main, messages, repeated, run
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.simulate import DATUM, simulate
+from terrafusion.twin.run_recording import DATUM
+from terrafusion.twin.simulate import simulate
 
 PAGE = Path(__file__).parents[3] / "docs" / "integration.md"
 

@@ -12,7 +12,8 @@ from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import load_vehicle
-from terrafusion.twin.simulate import START_NS, simulate
+from terrafusion.twin.run_recording import START_NS
+from terrafusion.twin.simulate import simulate
 
 CLASSES = load_policy().names()
 SWITCH_NS = START_NS + 15 * 10**9

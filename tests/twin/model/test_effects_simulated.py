@@ -22,8 +22,9 @@ from terrafusion.twin.model.ground import Variation, under_wheels
 from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.physics.layout import OUTPUTS
+from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.simulate import drive_through, set_up, simulate, simulate_run
+from terrafusion.twin.simulate import simulate, simulate_run
 
 DOCS = Path(__file__).parents[3] / "docs" / "effects.md"
 SHORT = dataclasses.replace(load_scenario("figure_eight"), duration_s=20.0)
@@ -131,7 +132,7 @@ def test_ground_under_the_wheels_is_that_of_the_integrator() -> None:
         load_scenario("mixed_terrain"), duration_s=40.0, variation=Variation(0.4, 1.0)
     )
     setup = set_up(varied, seed=2)
-    driven = drive_through(setup)
+    driven = setup.drive()
     ground = under_wheels(setup.plant.route, setup.plant.vehicle, setup.t_s, driven.states)
     assert np.ptp(ground, axis=0).max() > 0.0
     mounting = mounting_vector(setup.vehicle)

@@ -20,9 +20,10 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
 from terrafusion.twin.model.sensor_realism import BarometerRealism, MagnetometerRealism
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+from terrafusion.twin.run_recording import DATUM
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.sensors.environment import DECLINATION_RAD, FIELD_SIZE_T, earth_field_t
-from terrafusion.twin.simulate import DATUM, simulate
+from terrafusion.twin.simulate import simulate
 
 CIRCLE = Scenario("circle", 60.0, drive=(DriveSegment(60.0, 1.0, 0.2),), route=(RouteLeg("asphalt"),))
 

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.twin import simulate
 from terrafusion.twin.engine import codegen, compiler, integrate, native
 from terrafusion.twin.engine.codegen import SINGLE, Variant
 from terrafusion.twin.model.dynamics import rhs
@@ -16,6 +15,7 @@ from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import INDEX, INPUTS
+from terrafusion.twin.scenario import commands
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 
@@ -35,7 +35,7 @@ def test_halving_the_step_changes_almost_nothing(monkeypatch, terrain, slope) ->
     whole = integrate.integrate
 
     def states(substeps: int) -> np.ndarray:
-        monkeypatch.setattr(simulate, "integrate", lambda *a, **k: whole(*a, **k, substeps=substeps))
+        monkeypatch.setattr(commands, "integrate", lambda *a, **k: whole(*a, **k, substeps=substeps))
         scenario = dataclasses.replace(load_scenario("figure_eight"), duration_s=40.0)
         return simulate_run(scenario, terrain=terrain, slope_deg=slope).states
 

@@ -26,10 +26,11 @@ from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import Battery, VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import battery, gear_loss, motor_current, motor_torque
+from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import DrivenStates, delayed_inputs
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
-from terrafusion.twin.simulate import drive_through, set_up, simulate_run
+from terrafusion.twin.simulate import simulate_run
 
 ELEVATE = load_vehicle("elevate")
 P = dict(zip(VEHICLE_PARAMETERS, vehicle_vector(ELEVATE).tolist(), strict=True))
@@ -51,7 +52,7 @@ def fed_by(battery: Battery | None) -> VehicleParams:
 
 def energy(scenario: str | Scenario, vehicle: VehicleParams | str = ELEVATE, **kw) -> Energy:
     setup = set_up(scenario, vehicle=vehicle, **kw)
-    return energy_of(setup.t_s, drive_through(setup).states, setup.plant.vehicle)
+    return energy_of(setup.t_s, setup.drive().states, setup.plant.vehicle)
 
 
 @QUICK
@@ -228,7 +229,7 @@ def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps,
     states = np.zeros((len(setup.t_s), len(STATES)))
     states[:, state_slice("wheel_speed")] = wheel_radps
     driven = DrivenStates(setup.scenario.commanded(setup.t_s), np.zeros((len(states), 4)), states)
-    motion = setup.motion(states)
+    motion = setup.motion(driven)
     summary = summarise(driven, motion, setup.vehicle, slip_ratios(states, motion, setup.vehicle))
     assert summary.immobilised_cause == cause
     assert summary.immobilised_at_s == pytest.approx(3.0)  # from its first command on

@@ -19,6 +19,7 @@ from terrafusion.twin.model.motion import wheel_shares
 from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle, with_payload
 from terrafusion.twin.physics.layout import VEHICLE_PARAMETERS
+from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import (
     Canopy,
@@ -29,7 +30,7 @@ from terrafusion.twin.scenario.scenario import (
     Stretch,
     inside,
 )
-from terrafusion.twin.simulate import set_up, simulate, simulate_run
+from terrafusion.twin.simulate import simulate, simulate_run
 
 ELEVATE = load_vehicle("elevate")
 PARKED = Scenario("parked", 20.0, drive=(DriveSegment(20.0),), route=(RouteLeg("asphalt"),))

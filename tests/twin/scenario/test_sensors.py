@@ -13,7 +13,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment, Interval, RouteLeg, Scenario
-from terrafusion.twin.sensors import suite as sensors
+from terrafusion.twin.sensors.noise import rows_at_rate
 from terrafusion.twin.simulate import simulate
 
 PARKED = Scenario("parked", 400.0, drive=(DriveSegment(400.0),), route=(RouteLeg("asphalt"),))
@@ -169,7 +169,7 @@ def test_an_outage_that_covers_the_run_leaves_an_empty_channel() -> None:
     ("count", "rate", "last"), [(101, 50.0, 100), (101, 30.0, 100), (101, 200.0, 100), (2, 1.0, 0)]
 )
 def test_sensor_ticks_lie_on_the_grid(count, rate, last) -> None:
-    rows = sensors.rows_at_rate(count, 100.0, rate)
+    rows = rows_at_rate(count, 100.0, rate)
     assert rows[0] == 0
     assert rows[-1] == last
     assert (np.diff(rows) > 0).all()

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import DrivenStates
-from terrafusion.twin.simulate import drive_through, set_up, simulate_run
+from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.sweep import batch
 from terrafusion.twin.sweep import rows as rows_module
 from terrafusion.twin.sweep.rows import DONE, FAILED, IMMOBILISED, Row, arguments, columns, run_chunk
@@ -164,6 +165,6 @@ def test_runs_side_by_side_are_the_runs_one_by_one(scenario: str, tmp_path: Path
     setups = [set_up(**arguments(sweep, case)) for case in sweep.cases()]
     for setup, found in zip(setups, batch.drive_many(setups), strict=True):
         assert isinstance(found, DrivenStates)
-        alone = drive_through(setup)
-        np.testing.assert_array_equal(found.wanted, alone.wanted)
+        alone = setup.drive()
+        np.testing.assert_array_equal(found.commanded, alone.commanded)
         np.testing.assert_allclose(found.states, alone.states, rtol=1e-9, atol=1e-12)
