@@ -46,7 +46,7 @@ def run_python(document: Path, line: int, code: str, session: dict[str, Any]) ->
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder to work in. Reports have tests of their own and cost a third of the time: left out."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("terrafusion.fusion.reports.replay.results.write_report", lambda *_, **__: None)
+    monkeypatch.setattr("terrafusion.fusion.reports.replay.write_report", lambda *_, **__: None)
     return tmp_path
 
 

@@ -43,14 +43,14 @@ def benchmark(
 
     from terrafusion.fusion.benchmark.plan import Plan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
-    from terrafusion.fusion.reports.benchmark.outputs import (
+    from terrafusion.fusion.reports.benchmark import (
         at_the_end,
         document_head,
         origin_of,
         write_benchmark,
         write_document,
     )
-    from terrafusion.fusion.reports.benchmark.text import markdown
+    from terrafusion.fusion.reports.benchmark_tables import markdown
 
     plan = Plan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]

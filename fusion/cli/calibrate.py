@@ -80,7 +80,7 @@ def calibrate(
 
     Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
     """
-    from terrafusion.fusion.reports.calibration.page import write_calibration
+    from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
     from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG

@@ -10,7 +10,7 @@ from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.reports.replay.results import write_comparison, write_replay
+from terrafusion.fusion.reports.replay import write_comparison, write_replay
 from terrafusion.twin.simulate import simulate
 
 OUTAGE = Outage(75.0, 60.0)

@@ -79,8 +79,8 @@ def gap(
     Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
     """
     from terrafusion.datasets.core.files import check_folder
-    from terrafusion.fusion.reports.gap.page import write_diagnosis
-    from terrafusion.fusion.reports.gap.words import sentences
+    from terrafusion.fusion.reports.gap import write_diagnosis
+    from terrafusion.fusion.reports.gap_text import sentences
     from terrafusion.twin.gap.diagnose import diagnose
     from terrafusion.twin.model.vehicle import load_vehicle
 

@@ -36,7 +36,7 @@ def gap_blind(
       terrafusion gap-blind --share 0.2 --jobs 2 --out blind
     """
     from terrafusion.datasets.core.files import check_folder
-    from terrafusion.fusion.reports.blind.page import summary, write_blind
+    from terrafusion.fusion.reports.blind import summary, write_blind
     from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.check import run_blind_check
     from terrafusion.twin.gap.blind.plan import FULL

@@ -111,8 +111,8 @@ def replay(
     from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.metrics.metrics import parse_outage
     from terrafusion.fusion.replay import replay as run
-    from terrafusion.fusion.reports.replay.rerun_log import require_rerun, write_rerun
-    from terrafusion.fusion.reports.replay.results import write_replay
+    from terrafusion.fusion.reports.replay import write_replay
+    from terrafusion.fusion.reports.rerun_log import require_rerun, write_rerun
 
     if mode not in MODES:
         raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
@@ -151,7 +151,7 @@ def replay(
 def _write_bag(result: Replay, path: Path) -> None:
     """The log and the estimate beside it; prints what is not in standard messages."""
     from terrafusion.datasets.writers.mcap import write_mcap
-    from terrafusion.fusion.reports.replay.ros_estimate import written_estimate
+    from terrafusion.fusion.outputs.ros_estimate import written_estimate
 
     written = written_estimate(result.estimate)
     for part in write_mcap(result.recording, path, written, rig=result.vehicle.rig(), overwrite=True):
@@ -160,8 +160,8 @@ def _write_bag(result: Replay, path: Path) -> None:
 
 def summary(result: Replay) -> list[str]:
     """The result in a few lines of text."""
-    from terrafusion.fusion.reports.replay.linear_states import calibration, cells
-    from terrafusion.fusion.reports.replay.outputs import final_status
+    from terrafusion.fusion.outputs.linear_states import calibration, cells
+    from terrafusion.fusion.outputs.replay_files import final_status
 
     scores = result.scores
     status = final_status(result.estimate)

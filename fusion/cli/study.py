@@ -32,7 +32,7 @@ def study(
     """
     import joblib
 
-    from terrafusion.fusion.reports.study.outputs import write_bags, write_plan, write_study
+    from terrafusion.fusion.reports.study import write_bags, write_plan, write_study
     from terrafusion.twin.study.study import StudyPlan, run_study
     from terrafusion.twin.study.text import study_lines
 

@@ -71,7 +71,7 @@ def sweep(
                 plan, chosen, out / "recordings", form=recordings_format, jobs=count, progress=progress
             )
     if plots:
-        from terrafusion.fusion.reports.sweep.page import write_sweep_report
+        from terrafusion.fusion.reports.sweep import write_sweep_report
 
         write_sweep_report(out, plan, table, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     statuses, errors = (table.column(name).to_pylist() for name in ("status", "error"))

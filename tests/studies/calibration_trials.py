@@ -19,8 +19,8 @@ from scipy.integrate import cumulative_trapezoid
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA, CRAWL_MPS
+from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.replay import Replay, replay
-from terrafusion.fusion.reports.replay.linear_states import series
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

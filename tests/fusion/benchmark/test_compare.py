@@ -13,8 +13,8 @@ from terrafusion.fusion.benchmark.compare import contrasts, median_interval, sha
 from terrafusion.fusion.benchmark.measure import GroundRow, Row, switch_delay_s
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, nees_cells, targets
-from terrafusion.fusion.reports.benchmark.plots import plot_ratios
-from terrafusion.fusion.reports.benchmark.text import markdown, tables
+from terrafusion.fusion.reports.benchmark_tables import markdown, tables
+from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 
 def rows(arm: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[Row]:

@@ -17,8 +17,8 @@ from terrafusion.fusion.benchmark.field_logs import Log, Refusal
 from terrafusion.fusion.benchmark.measure import Row
 from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
 from terrafusion.fusion.benchmark.run import Found, run_benchmark
-from terrafusion.fusion.reports.benchmark import outputs
-from terrafusion.fusion.reports.benchmark.outputs import MARK, write_benchmark, write_document
+from terrafusion.fusion.reports import benchmark as outputs
+from terrafusion.fusion.reports.benchmark import MARK, write_benchmark, write_document
 
 FEW = ("fixed", "adaptive", "oracle")
 JOB = Job(Case("outages", "twin", FIRST_SEED + 2), FEW)

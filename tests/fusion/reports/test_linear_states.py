@@ -20,11 +20,11 @@ from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.metrics.metrics import score
-from terrafusion.fusion.reports.replay.linear_states import QUANTITIES, calibration, cells, series
-from terrafusion.fusion.reports.replay.outputs import build_metrics, estimate_columns, final_status
-from terrafusion.fusion.reports.replay.page import ReportRun, write_report
-from terrafusion.fusion.reports.replay.plots_states import drawn, plot_skid_steering
-from terrafusion.fusion.reports.replay.ros_estimate import written_estimate
+from terrafusion.fusion.outputs.linear_states import QUANTITIES, calibration, cells, series
+from terrafusion.fusion.outputs.replay_files import build_metrics, estimate_columns, final_status
+from terrafusion.fusion.outputs.ros_estimate import written_estimate
+from terrafusion.fusion.reports.plots.replay_states import drawn, plot_skid_steering
+from terrafusion.fusion.reports.replay import ReportRun, write_report
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 

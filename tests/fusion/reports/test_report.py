@@ -16,16 +16,18 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, score
-from terrafusion.fusion.reports.replay import plots, plots_filter, plots_map
-from terrafusion.fusion.reports.replay.outputs import (
+from terrafusion.fusion.outputs.replay_files import (
     build_metrics,
     final_status,
     rejected_counts,
     terrain_shares,
 )
-from terrafusion.fusion.reports.replay.page import ReportRun, write_report
-from terrafusion.fusion.reports.replay.text import Row, head_of_many, pick_pair, table_rows
-from terrafusion.fusion.reports.style import colour_of, plain, thin
+from terrafusion.fusion.reports.plots import replay as plots
+from terrafusion.fusion.reports.plots import replay_filter as plots_filter
+from terrafusion.fusion.reports.plots import replay_map as plots_map
+from terrafusion.fusion.reports.plots.style import colour_of, plain, thin
+from terrafusion.fusion.reports.replay import ReportRun, write_report
+from terrafusion.fusion.reports.replay_text import Row, head_of_many, pick_pair, table_rows
 
 HOSTILE = '<script>alert("x")</script>&_$\\frac{'
 OUTAGES = (Outage(40.0, 30.0),)

@@ -12,7 +12,7 @@ import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.reports.replay.rerun_log import require_rerun, write_rerun
+from terrafusion.fusion.reports.rerun_log import require_rerun, write_rerun
 
 
 def test_without_the_package_the_extra_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

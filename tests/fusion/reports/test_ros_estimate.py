@@ -17,7 +17,7 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level
-from terrafusion.fusion.reports.replay.ros_estimate import told_rows, written_estimate
+from terrafusion.fusion.outputs.ros_estimate import told_rows, written_estimate
 
 
 def with_outage(d: Any, first: int = 405, last: int = 705) -> Any:

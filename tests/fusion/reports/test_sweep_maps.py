@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from terrafusion.fusion.reports.sweep.maps import CellAxis, in_cells, plane_of, share_mobile, varied
+from terrafusion.fusion.reports.plots.sweep_cells import CellAxis, in_cells, plane_of, share_mobile, varied
 
 
 def table(**columns: list[Any]) -> dict[str, np.ndarray]:

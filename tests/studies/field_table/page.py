@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from terrafusion.datasets.core.files import write_atomically
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 from tests.studies.field_table.summary import (
     OWN,
     Beside,

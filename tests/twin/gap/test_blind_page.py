@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
-from terrafusion.fusion.reports.blind import plots
-from terrafusion.fusion.reports.blind.page import summary, write_blind
+from terrafusion.fusion.reports.blind import summary, write_blind
+from terrafusion.fusion.reports.plots import blind as plots
 from terrafusion.twin.gap.blind.plan import FULL, Scale, plan
 from terrafusion.twin.gap.blind.score import score
 from tests.twin import blind_answers as fake

@@ -12,8 +12,8 @@ import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
-from terrafusion.fusion.reports.gap.plots import plot_shrink
-from terrafusion.fusion.reports.gap.words import sentences
+from terrafusion.fusion.reports.gap_text import sentences
+from terrafusion.fusion.reports.plots.gap import plot_shrink
 from terrafusion.twin.gap import Diagnosis, diagnose
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES

@@ -8,8 +8,8 @@ from html import escape
 from pathlib import Path
 
 from terrafusion.datasets.core.files import write_atomically
-from terrafusion.fusion.reports.calibration import plots
 from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
+from terrafusion.fusion.reports.plots import calibration as plots
 from terrafusion.twin.calibrate.files import write_files
 from terrafusion.twin.calibrate.result import Calibration
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate
 from terrafusion.fusion.graph.key_state import LINEAR
-from terrafusion.fusion.reports.replay.linear_states import Array, series
-from terrafusion.fusion.reports.replay.plots_map import is_local
+from terrafusion.fusion.outputs.linear_states import Array, series
+from terrafusion.fusion.outputs.replay_files import is_local
 
 EVERY_S = 1.0
 """Diagnostics come at least this often while there are keyframes, and at each change."""

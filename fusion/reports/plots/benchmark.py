@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from terrafusion.fusion.benchmark.arms import BASE, OWN
 from terrafusion.fusion.benchmark.compare import Contrast
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,11 +17,16 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, Scores
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.outputs.linear_states import cells
+from terrafusion.fusion.outputs.replay_files import metrics_of, write_outputs
+from terrafusion.fusion.replay import Replay
+from terrafusion.fusion.reports import replay_text as words
 from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
-from terrafusion.fusion.reports.replay import plots, plots_filter, plots_map, plots_states
-from terrafusion.fusion.reports.replay import text as words
-from terrafusion.fusion.reports.replay.linear_states import cells
+from terrafusion.fusion.reports.plots import replay as plots
+from terrafusion.fusion.reports.plots import replay_filter as plots_filter
+from terrafusion.fusion.reports.plots import replay_map as plots_map
+from terrafusion.fusion.reports.plots import replay_states as plots_states
+from terrafusion.fusion.reports.plots import style
 
 MOST_REASONS = 20
 """How many of the changes of weight the report lists; `weights.jsonl` has them all."""
@@ -83,6 +88,35 @@ def write_report(
         _provenance(recording, provenance or {}),
     ]
     return write_page(path, title, body)
+
+
+def write_replay(out: Path, result: Replay, provenance: Mapping[str, object] | None = None) -> None:
+    """All files of one replay in the folder `out`, numbers first, so that they stay if a plot fails.
+
+    Raises:
+        TerrafusionError: the folder cannot be written.
+    """
+    write_outputs(out, result.estimate, metrics_of(result), result.recording)
+    write_comparison(out / "report.html", f"Replay of {result.recording.name}", [result], provenance)
+
+
+def write_comparison(
+    path: Path, title: str, results: Sequence[Replay], provenance: Mapping[str, object] | None = None
+) -> None:
+    """One report over several replays of the same drive."""
+    first = results[0]
+    runs = [ReportRun(r.mode, metrics_of(r), r.estimate, r.scores) for r in results]
+    write_report(
+        path,
+        title,
+        runs,
+        first.recording,
+        held_out=first.held_out,
+        outages=first.outages,
+        wheel_radius_m=first.vehicle.odometry.wheel_radius_m,
+        provenance={"policy": first.policy.name, "policy inputs": first.policy.inputs_sha256}
+        | dict(provenance or {}),
+    )
 
 
 def _head(title: str, runs: Sequence[ReportRun], ours: int, theirs: int) -> str:

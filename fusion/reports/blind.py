@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.files import write_atomically
-from terrafusion.fusion.reports.blind import plots
 from terrafusion.fusion.reports.page import figure, table, where_from, write_page
+from terrafusion.fusion.reports.plots import blind as plots
 
 Scores = Mapping[str, Any]
 

@@ -13,8 +13,9 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.reports import style
-from terrafusion.fusion.reports.replay.plots import TIME, shade_outages
+from terrafusion.fusion.outputs.replay_files import is_local
+from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -134,11 +135,6 @@ def plot_error_runs(
     style.dress(ax, x=TIME, y="position error, m")
     style.legend_above(ax)
     return fig, ax
-
-
-def is_local(estimate: Estimate) -> bool:
-    """Whether start and heading of the path are arbitrary, because no fix ever came."""
-    return bool(len(estimate.status)) and bool((estimate.status == "no_gnss").all())
 
 
 def _draw_moved(ax: Axes, estimate: Estimate, errors: Errors | None) -> list[Any]:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES
 from terrafusion.twin.gap.rollout.nuisance import NAMES

@@ -18,7 +18,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

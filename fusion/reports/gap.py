@@ -11,9 +11,9 @@ from pathlib import Path
 
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.benchmark.estimator_gap import Compared
-from terrafusion.fusion.reports.gap import plots
-from terrafusion.fusion.reports.gap.words import sentences
+from terrafusion.fusion.reports.gap_text import sentences
 from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
+from terrafusion.fusion.reports.plots import gap as plots
 from terrafusion.twin.gap.answer.diagnosis import Diagnosis
 
 MOST_RUNS = 3

@@ -30,8 +30,8 @@ from terrafusion.fusion.metrics.pooled_consistency import Cell
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports import page
-from terrafusion.fusion.reports.benchmark.plots import plot_ratios
-from terrafusion.fusion.reports.benchmark.text import Table, markdown, tables
+from terrafusion.fusion.reports.benchmark_tables import Table, markdown, tables
+from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 SCHEMA = "terrafusion.benchmark/1"
 MARK = "<!-- what follows is written by terrafusion benchmark --docs -->"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.calibrate.result import Calibration
 
 if TYPE_CHECKING:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.study.batch import CellResult
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun

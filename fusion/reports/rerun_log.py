@@ -26,9 +26,10 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate
 from terrafusion.fusion.graph.key_state import LINEAR
-from terrafusion.fusion.reports import style
-from terrafusion.fusion.reports.replay.linear_states import series
-from terrafusion.fusion.reports.replay.plots_map import ellipse_rows, ellipses, is_local, refused_fixes
+from terrafusion.fusion.outputs.linear_states import series
+from terrafusion.fusion.outputs.replay_files import is_local
+from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.replay_map import ellipse_rows, ellipses, refused_fixes
 
 if TYPE_CHECKING:
     from terrafusion.fusion.replay import Replay

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.reports import style
-from terrafusion.fusion.reports.sweep.maps import (
+from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.sweep_cells import (
     CellAxis,
     Columns,
     in_cells,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

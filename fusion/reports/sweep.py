@@ -12,8 +12,8 @@ import numpy as np
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.reports.page import bullets, figure, where_from, write_page
 from terrafusion.fusion.reports.page import table as page_table
-from terrafusion.fusion.reports.sweep.maps import Columns, columns_of
-from terrafusion.fusion.reports.sweep.plots import figures
+from terrafusion.fusion.reports.plots.sweep import figures
+from terrafusion.fusion.reports.plots.sweep_cells import Columns, columns_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.reports import style
+from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.study.field_drive import FieldDrive
 
 if TYPE_CHECKING:

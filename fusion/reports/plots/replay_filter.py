@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics import consistency
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.reports import style
-from terrafusion.fusion.reports.replay.plots import TIME, shade_outages
+from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -28,7 +28,9 @@ from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
 from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.metrics.metrics import Scores
-from terrafusion.fusion.reports.replay.linear_states import series
+from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
+from terrafusion.fusion.outputs.linear_states import series
+from terrafusion.fusion.replay import Replay
 
 SCHEMA = "terrafusion.replay/1"
 MODES = ("adaptive", "fixed", "robust", "innovation")
@@ -131,6 +133,33 @@ def final_status(estimate: Estimate) -> dict[str, str]:
     """Status of the last keyframe and its sentence; `waiting` when there is no keyframe."""
     value = str(estimate.status[-1]) if len(estimate.status) else "waiting"
     return {"value": value, "message": STATUS.get(value, value)}
+
+
+def is_local(estimate: Estimate) -> bool:
+    """Whether start and heading of the path are arbitrary, because no fix ever came."""
+    return bool(len(estimate.status)) and bool((estimate.status == "no_gnss").all())
+
+
+def metrics_of(result: Replay) -> dict[str, Any]:
+    """The content of `metrics.json` (docs/schemas/metrics.schema.json) for one replay."""
+    estimate = result.estimate
+    return build_metrics(
+        log=result.recording.name,
+        vehicle=result.vehicle.name,
+        mode=result.mode,
+        duration_s=result.recording.duration_s(),
+        distance_m=estimate.trajectory.path_length_m(),
+        realtime_factor=result.realtime_factor(),
+        updates=len(estimate.trajectory),
+        latencies_ms=result.latencies_ms,
+        terrain=terrain_shares(estimate),
+        changes=len(estimate.changes),
+        rejected={"gnss": result.rejected_gnss, "wheels": result.rejected_wheels},
+        scores=result.scores,
+        status=final_status(estimate),
+        notes=estimate.notes,
+        calibration=calibration_of(estimate),
+    )
 
 
 def write_outputs(

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.reports import style
-from terrafusion.fusion.reports.replay.linear_states import series
-from terrafusion.fusion.reports.replay.plots import TIME, shade_outages
+from terrafusion.fusion.outputs.linear_states import series
+from terrafusion.fusion.reports.plots import style
+from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
