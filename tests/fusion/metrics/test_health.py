@@ -1,0 +1,44 @@
+"""Whether an estimate can be of its run at all."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.channels import Wheels
+from terrafusion.fusion.metrics.health import examine_estimate, rolled_m
+
+SECOND_NS = 1_000_000_000
+
+
+def test_a_sound_estimate_passes_and_each_way_to_diverge_is_named(drive: Callable[..., Any]) -> None:
+    made = drive(seconds=60.0)
+    wheels, estimate = made.recording.wheels, made.estimate
+    sound = examine_estimate(estimate, wheels, 0.3)
+    assert sound.why == ""
+    assert sound.rolled_m == pytest.approx(66.0, rel=0.01)
+    assert sound.path_ratio() == pytest.approx(1.0 / 1.1, rel=0.02)
+    path = estimate.trajectory
+
+    def why(**changes: Any) -> str:
+        moved = dataclasses.replace(path, **changes.pop("trajectory", {}))
+        return examine_estimate(dataclasses.replace(estimate, trajectory=moved, **changes), wheels, 0.3).why
+
+    assert "not finite" in why(trajectory={"position_m": path.position_m * np.nan})
+    assert "covariance" in why(trajectory={"covariance": -path.covariance})
+    assert "m/s with wheels" in why(velocity_mps=estimate.velocity_mps * 4.0)
+    assert "path of" in why(trajectory={"position_m": path.position_m * 3.0})
+    assert "path of" in why(trajectory={"position_m": path.position_m * 0.01})
+
+
+def test_rolled_path_counts_both_ways_and_units() -> None:
+    t_ns = np.arange(0, 11, dtype=np.int64) * SECOND_NS
+    ahead = np.full((11, 2), 2.0)
+    assert rolled_m(Wheels(t_ns, ahead, ("left", "right"), "mps"), 0.3) == pytest.approx(20.0)
+    assert rolled_m(Wheels(t_ns, -ahead, ("left", "right"), "radps"), 0.3) == pytest.approx(6.0)
+    assert rolled_m(Wheels(t_ns, ahead * [1, -1], ("left", "right"), "mps"), 0.3) == 0.0
+    assert rolled_m(Wheels(t_ns[:0], ahead[:0], ("left", "right"), "mps"), 0.3) == 0.0
