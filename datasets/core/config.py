@@ -1,51 +1,51 @@
-"""Strict loading of YAML parameter files into frozen dataclasses.
+"""Strict loading of parameter files into frozen dataclasses and typed dictionaries, by pydantic.
 
-A parameter is a dataclass field annotated with a `Quantity`: its unit and the
-range it must lie in. In the file it stands as a mapping with its source::
+A number is annotated with its unit and the closed range it must lie in: `Quantity("m", 0, 5)` where it stands
+plain in the file, `Sourced("m", 0, 5)` where it stands with its source::
 
     mass_kg: {value: 32.0, source: "source study, Tab. 1"}
 
-The unit is the suffix of the key, so that a number cannot be read without it.
-`valid: [low, high]` may stand beside it: the range its source covers, held against the value.
-An unknown key, a missing source, a value out of range or of the wrong type is
-a `ConfigError` that names the key, the value and what is allowed.
+The unit is the suffix of the key, so that a number cannot be read without it. `valid: [low, high]` may stand
+beside a sourced value: the range its source covers. All errors of a file (unknown or missing keys, wrong
+types, numbers out of range) are reported together, a line each: file, key, value and what is allowed.
+`schema` gives the JSON schema of a kind of file, for editors.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
+import functools
 import math
 import reprlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
-from typing import Annotated, Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    TypeVar,
+    Union,
+    cast,
+    get_args,
+    get_origin,
+    get_type_hints,
+    is_typeddict,
+)
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.yaml_file import MAX_BYTES, read_yaml
+
+__all__ = [
+    "MAX_BYTES", "OneOf", "Position", "Prepared", "Quantity", "RejectedError", "Sourced", "Switch", "Whole",
+    "checked_number", "read_yaml", "refuse", "schema", "shown", "structure",
+]  # fmt: skip
 
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """Unit and closed range of a parameter; `size` entries for a vector, one number when 0."""
-
-    unit: str
-    low: float = -math.inf
-    high: float = math.inf
-    size: int = 0
-
-    def allowed(self) -> str:
-        """The range in words, as error messages quote it."""
-        kind = f"{self.size} numbers" if self.size else "a number"
-        bounds = f" in [{self.low:g}, {self.high:g}]" if math.isfinite(self.low + self.high) else ""
-        return f"{kind}{bounds} {self.unit}".rstrip()
-
-
-MAX_BYTES = 256 * 1024
-"""A larger file is no parameter file: pure-Python YAML would take seconds over it."""
+MAX_ERRORS = 100
+"""Errors of a file that are written out."""
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 2
@@ -61,74 +61,204 @@ def shown(value: Any) -> str:
         return "a huge number"
 
 
-Position = Annotated[tuple[float, ...], Quantity("m", -20.0, 20.0, size=3)]
+class RejectedError(ValueError):
+    """A value that is not allowed; in `what`, `{key}` stands for its key."""
+
+    def __init__(self, what: str, remedy: str | None = None) -> None:
+        super().__init__(what)
+        self.what, self.remedy = what, remedy
+
+    def at(self, key: str, file: Path | str) -> ConfigError:
+        """The error as a user sees it."""
+        return ConfigError(self.what.replace("{key}", key), file=file, remedy=self.remedy)
+
+
+class _Parsed:
+    """Annotation of a field whose value `parse` checks and converts; `schema` is its JSON schema."""
+
+    def parse(self, raw: Any) -> Any:
+        raise NotImplementedError
+
+    def schema(self) -> dict[str, Any]:
+        raise NotImplementedError
+
+    def hint(self) -> str:
+        """What to write, for a key that is missing."""
+        return ""
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_plain_validator_function(self.parse)
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        return self.schema()
+
+
+@dataclass(frozen=True)
+class Quantity(_Parsed):
+    """Unit and closed range of a parameter; `size` entries for a vector, one number when 0."""
+
+    unit: str
+    low: float = -math.inf
+    high: float = math.inf
+    size: int = 0
+
+    def allowed(self) -> str:
+        """The range in words, as error messages quote it."""
+        kind = f"{self.size} numbers" if self.size else "a number"
+        bounds = f" in [{self.low:g}, {self.high:g}]" if math.isfinite(self.low + self.high) else ""
+        return f"{kind}{bounds} {self.unit}".rstrip()
+
+    def hint(self) -> str:
+        return self.allowed()
+
+    def parse(self, raw: Any) -> float | tuple[float, ...]:
+        """`raw` as float (or tuple of floats) when it has the type and the range.
+
+        Raises:
+            RejectedError: otherwise.
+        """
+        items = list(raw) if self.size and isinstance(raw, (list, tuple)) else [raw]
+        numeric = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in items)
+        if not numeric or len(items) != (self.size or 1):
+            raise RejectedError(f"'{{key}}' is '{shown(raw)}'", f"give {self.allowed()}")
+        numbers = tuple(float(x) if abs(x) < 1e300 else math.inf for x in items)
+        if not all(math.isfinite(x) and self.low <= x <= self.high for x in numbers):
+            remedy = f"give {self.allowed()}; is the unit right?"
+            raise RejectedError(f"'{{key}}' is {shown(raw)}, out of range", remedy)
+        return numbers if self.size else numbers[0]
+
+    def schema(self) -> dict[str, Any]:
+        bounds = {"minimum": self.low, "maximum": self.high}
+        number: dict[str, Any] = {"type": "number"} | {k: v for k, v in bounds.items() if math.isfinite(v)}
+        if self.size:
+            number = {"type": "array", "items": number, "minItems": self.size, "maxItems": self.size}
+        return number | {"description": self.allowed()}
+
+
+@dataclass(frozen=True)
+class Whole(Quantity):
+    """A whole number, as int; `meaning` is what to give, where the range does not say it."""
+
+    meaning: str = ""
+
+    def allowed(self) -> str:
+        return self.meaning or f"a whole number in [{self.low:g}, {self.high:g}] {self.unit}".rstrip()
+
+    def parse(self, raw: Any) -> int:
+        whole = isinstance(raw, int) and not isinstance(raw, bool)
+        if not whole and not (isinstance(raw, float) and raw.is_integer() and not self.meaning):
+            raise RejectedError(f"'{{key}}' is {shown(raw)}", f"give {self.allowed()}")
+        if not self.low <= raw <= self.high:
+            raise RejectedError(f"'{{key}}' is {shown(raw)}, out of range", f"give {self.allowed()}")
+        return int(raw)
+
+    def schema(self) -> dict[str, Any]:
+        return super().schema() | {"type": "integer"}
+
+
+@dataclass(frozen=True)
+class Sourced(Quantity):
+    """A quantity that stands in the file as `{value, source}`, optionally with `valid: [low, high]`."""
+
+    def hint(self) -> str:
+        return f"{{value: {self.allowed()}, source: where it comes from}}"
+
+    def parse(self, raw: Any) -> float | tuple[float, ...]:
+        if not isinstance(raw, Mapping):
+            raise RejectedError(f"'{{key}}' is '{shown(raw)}' without a source", f"write {self.hint()}")
+        for name in raw:
+            if name not in ("value", "source", "valid"):
+                why = " (the unit is the suffix of the key)" if name == "unit" else ""
+                what = f"'{{key}}' has the unknown entry '{shown(name)}'{why}"
+                raise RejectedError(what, "keep 'value', 'source' and 'valid' only")
+        if not isinstance(raw.get("source"), str) or not raw["source"].strip():
+            raise RejectedError("'{key}' has no source", "tell where the number comes from")
+        value = super().parse(raw.get("value"))
+        if "valid" in raw:
+            self._check_valid(value, raw["valid"])
+        return value
+
+    def _check_valid(self, value: float | tuple[float, ...], valid: Any) -> None:
+        try:
+            low, high = Quantity(self.unit, self.low, self.high, size=2).parse(valid)  # type: ignore[misc]
+        except RejectedError as error:
+            raise RejectedError(error.what.replace("{key}", "{key}.valid"), error.remedy) from None
+        if not all(low <= x <= high for x in (value if isinstance(value, tuple) else (value,))):
+            what = f"'{{key}}' is {shown(value)}, outside its validity range"
+            raise RejectedError(what, f"its source covers [{low:g}, {high:g}] {self.unit}".rstrip())
+
+    def schema(self) -> dict[str, Any]:
+        number = super().schema()
+        span = {"type": "array", "items": {"type": "number"}, "minItems": 2, "maxItems": 2}
+        return {
+            "type": "object",
+            "description": number.pop("description"),
+            "properties": {"value": number, "source": {"type": "string", "minLength": 1}, "valid": span},
+            "required": ["value", "source"],
+            "additionalProperties": False,
+        }
+
+
+Position = Annotated[tuple[float, ...], Sourced("m", -20.0, 20.0, size=3)]
 """A point in the body frame (x forward, y left, z up), metres."""
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
-    """The mapping at the top of a YAML 1.2 file; twice the same key is an error.
+class _Truth(_Parsed):
+    def parse(self, raw: Any) -> bool:
+        if not isinstance(raw, bool):
+            raise RejectedError(f"'{{key}}' is '{shown(raw)}'", "give true or false")
+        return raw
+
+    def schema(self) -> dict[str, Any]:
+        return {"type": "boolean"}
+
+
+Switch = Annotated[bool, _Truth()]
+"""`true` or `false`, and nothing that could stand for them."""
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """Annotation of a field whose raw value `prepare` brings into the form of its type."""
+
+    prepare: Callable[[Any], Any]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        return core_schema.no_info_before_validator_function(self.prepare, handler(source))
+
+
+@dataclass(frozen=True)
+class OneOf:
+    """Annotation of a field of several types: `pick` gives the index in `kinds` for a raw value."""
+
+    pick: Callable[[Any], int]
+    kinds: tuple[Any, ...]
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
+        from pydantic_core import core_schema
+
+        choices = {f"<{i}>": handler.generate_schema(kind) for i, kind in enumerate(self.kinds)}
+        return core_schema.tagged_union_schema(choices, lambda raw: f"<{self.pick(raw)}>")
+
+
+def structure(kind: type[T], raw: Any, *, file: Path | str, key: str = "") -> T:
+    """The dataclass, typed dictionary or other type `kind` from the content `raw` of a file, strictly.
+
+    Nested types are sections. `key` is the path of `raw` inside the file.
 
     Raises:
-        ConfigError: the file is missing, very large, not UTF-8, not YAML, or not a mapping.
+        ConfigError: unknown or missing keys, missing sources, wrong types, numbers out of range; all of them.
     """
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
+    from pydantic import ValidationError
 
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise ConfigError(
-                f"the file has more than {MAX_BYTES // 1024} KiB", file=path, remedy="give a parameter file"
-            )
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise ConfigError("no such file", file=path, remedy="check the path") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(f"cannot be read: {error}", file=path, remedy="give a UTF-8 text file") from None
-    try:
-        content = YAML(typ="safe", pure=True).load(text)
-    except (YAMLError, ValueError, RecursionError) as error:
-        problem = str(getattr(error, "problem", None) or error).split("\n")[0]
-        mark = getattr(error, "problem_mark", None)
-        line = f" at line {mark.line + 1}" if mark is not None else ""
-        raise ConfigError(f"not valid YAML{line}: {problem}", file=path, remedy="mend that line") from None
-    if content is None:
-        return {}
-    if not isinstance(content, dict) or not all(isinstance(key, str) for key in content):
-        raise ConfigError("the top level must be a mapping of names to values", file=path)
-    return content
-
-
-def structure(cls: type[T], raw: Any, *, file: Path | str, key: str = "") -> T:
-    """Build the frozen dataclass `cls` from the mapping `raw`, strictly.
-
-    Nested dataclasses are sections. `key` is the path of `raw` inside the file.
-
-    Raises:
-        ConfigError: unknown or missing key, missing source, wrong type, out of range.
-    """
-    if not isinstance(raw, Mapping):
-        raise ConfigError(
-            f"'{shown(raw)}' is not a section",
-            file=file,
-            channel=key or None,
-            remedy=f"give keys from {', '.join(_names(cls))}",
-        )
-    hints = get_type_hints(cls, include_extras=True)
-    fields = {f.name: f for f in dataclasses.fields(cls) if f.init}  # type: ignore[arg-type]
-    for name in raw:
-        if name not in fields:
-            raise _unknown_key(str(name), list(fields), file, key)
-    values: dict[str, Any] = {}
-    for name, field in fields.items():
-        here = f"{key}.{name}" if key else name
-        if name in raw:
-            values[name] = _value(hints[name], raw[name], file, here)
-        elif field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING:
-            raise ConfigError(f"'{here}' is missing", file=file, remedy=f"add it{_hint(hints[name])}")
-    try:
-        return cls(**values)
-    except ValueError as error:
-        raise ConfigError(str(error), file=file, channel=key or None) from None
+        return cast(T, _adapter(cast(Any, kind)).validate_python(raw))
+    except ValidationError as error:
+        raise ConfigError.joined(_errors(error.errors(include_url=False), kind, file, key)) from None
 
 
 def checked_number(
@@ -139,109 +269,147 @@ def checked_number(
     Raises:
         ConfigError: otherwise.
     """
-    items = list(value) if quantity.size and isinstance(value, (list, tuple)) else [value]
-    numeric = all(isinstance(x, (int, float)) and not isinstance(x, bool) for x in items)
-    if not numeric or len(items) != (quantity.size or 1):
-        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy=f"give {quantity.allowed()}")
-    numbers = tuple(float(x) if abs(x) < 1e300 else math.inf for x in items)
-    if not all(math.isfinite(x) and quantity.low <= x <= quantity.high for x in numbers):
-        raise ConfigError(
-            f"'{key}' is {shown(value)}, out of range",
-            file=file,
-            remedy=f"give {quantity.allowed()}; is the unit right?",
-        )
-    return numbers if quantity.size else numbers[0]
+    try:
+        return quantity.parse(value)
+    except RejectedError as error:
+        raise error.at(key, file) from None
 
 
-def _names(cls: type) -> list[str]:
-    return [f.name for f in dataclasses.fields(cls)]
+def refuse(problems: Iterable[tuple[str, str]], file: Path | str) -> None:
+    """Raises what is wrong with a file beyond its single values, as (what, remedy), if anything is.
+
+    Raises:
+        ConfigError: there is a problem.
+    """
+    errors = [ConfigError(what, file=file, remedy=remedy) for what, remedy in problems]
+    if errors:
+        raise ConfigError.joined(errors)
 
 
-def _quantity(hint: Any) -> Quantity | None:
-    if get_origin(hint) is Annotated:
-        return next((a for a in get_args(hint)[1:] if isinstance(a, Quantity)), None)
+def schema(kind: Any, title: str = "") -> dict[str, Any]:
+    """JSON schema (2020-12) of the files that `structure` loads as `kind`."""
+    content: dict[str, Any] = _adapter(kind).json_schema()
+    return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | content | {"title": title}
+
+
+@functools.cache
+def _adapter(kind: Any) -> Any:
+    from pydantic import TypeAdapter, with_config
+
+    if dataclasses.is_dataclass(kind) or is_typeddict(kind):
+        with_config({"extra": "forbid"})(kind)  # holds for the dataclasses and dictionaries inside, too
+    return TypeAdapter(kind)
+
+
+def _errors(found: Sequence[Any], kind: Any, file: Path | str, key: str) -> list[ConfigError]:
+    """One error for each of pydantic's; a missing key that was only misspelt is left out."""
+    unknown, others, misspelt = [], [], set()
+    for error in found:
+        if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            *parent, name = error["loc"]
+            refused, meant = _unknown_key(str(name), _names(_at(kind, parent)))
+            misspelt.add((*parent, meant))
+            unknown.append(refused.at(_dotted(error["loc"], key), file))
+    for error in found:
+        if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+            continue
+        if error["type"] == "missing" and tuple(error["loc"]) in misspelt:
+            continue
+        others.append(_told(error, kind, file, _dotted(error["loc"], key)))
+    return (unknown + others)[:MAX_ERRORS]
+
+
+def _told(error: Any, kind: Any, file: Path | str, key: str) -> ConfigError:
+    cause = error.get("ctx", {}).get("error")
+    if isinstance(cause, RejectedError):
+        return cause.at(key, file)
+    if cause is not None:  # of a dataclass's own check
+        return ConfigError(str(cause), file=file, channel=key or None)
+    hint = _at(kind, error["loc"])
+    if error["type"] == "missing":
+        what = _marker(hint)
+        remedy = f"add it: {what.hint()}" if what is not None and what.hint() else "add it"
+        return ConfigError(f"'{key}' is missing", file=file, remedy=remedy)
+    value = shown(error["input"])
+    if error["type"] in ("dataclass_type", "dict_type"):
+        names = _names(hint)
+        remedy = f"give keys from {', '.join(names)}" if names else "give a mapping"
+        return ConfigError(f"'{value}' is not a section", file=file, channel=key or None, remedy=remedy)
+    remedies = {
+        "string_type": "give a text",
+        "tuple_type": "give a list",
+        "literal_error": f"give one of {', '.join(map(str, get_args(_bare(hint))))}",
+        "missing_key": "add it",
+    }
+    return ConfigError(
+        f"'{key}' is '{value}'", file=file, remedy=remedies.get(error["type"], error["msg"].lower())
+    )
+
+
+def _unknown_key(name: str, known: Sequence[str]) -> tuple[RejectedError, str]:
+    """The error about a key, and the one that may be meant ("" for none)."""
+    stem = name.rsplit("_", 1)[0]
+    same = [k for k in known if k.rsplit("_", 1)[0] in (stem, name)]
+    close = same or difflib.get_close_matches(name, known, n=1)
+    remedy = f"known here: {', '.join(known)}"
+    if same:
+        remedy = f"write '{same[0]}' (the unit is part of the name)"
+    elif close:
+        remedy = f"did you mean '{close[0]}'? {remedy}"
+    return RejectedError("unknown key '{key}'", remedy), close[0] if close else ""
+
+
+def _dotted(place: Iterable[Any], key: str) -> str:
+    """Place of a value as users write it: `route[0].length_m`."""
+    for part in place:
+        if isinstance(part, int):
+            key += f"[{part}]"
+        elif not str(part).startswith("<"):  # a choice of `OneOf`
+            key += f".{shown(part)}" if key else shown(part)
+    return key
+
+
+def _at(hint: Any, place: Iterable[Any]) -> Any:
+    """The type of the value at a place of a file, None where it has none."""
+    for part in place:
+        marker = _marker(hint)
+        if isinstance(marker, OneOf):
+            hint = marker.kinds[int(str(part).strip("<>"))]
+            continue
+        kind = _bare(hint)
+        if get_origin(kind) in (dict, tuple):
+            hint = get_args(kind)[get_origin(kind) is dict]
+        else:
+            hint = _hints(kind).get(part)
+    return hint
+
+
+def _bare(hint: Any) -> Any:
+    """`X` of `X | None`, `Annotated[X, ...]` or `Required[X]`."""
+    origin = get_origin(hint)
+    if origin in (Union, UnionType):
+        return _bare(next(kind for kind in get_args(hint) if kind is not type(None)))
+    if origin is not None and origin not in (dict, tuple, Literal):
+        return _bare(get_args(hint)[0])
+    return hint
+
+
+def _marker(hint: Any) -> Any:
+    """What a type is annotated with here, None where it is not."""
+    while get_origin(hint) is not None and get_origin(hint) not in (dict, tuple, Literal):
+        marks = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, (_Parsed, OneOf))]
+        if marks:
+            return marks[0]
+        hint = next(kind for kind in get_args(hint) if kind is not type(None))
     return None
 
 
-def _present(hint: Any) -> Any:
-    """`X` of `X | None`: a key that is there has a value."""
-    if get_origin(hint) not in (Union, UnionType):
-        return hint
-    return next(kind for kind in get_args(hint) if kind is not type(None))
+def _hints(kind: Any) -> dict[str, Any]:
+    """Keys of a section and their types; none for a type that is no section."""
+    if dataclasses.is_dataclass(kind) or is_typeddict(kind):
+        return get_type_hints(kind, include_extras=True)
+    return {}
 
 
-def _hint(hint: Any) -> str:
-    quantity = _quantity(hint)
-    return f": {{value: {quantity.allowed()}, source: where it comes from}}" if quantity else ""
-
-
-def _value(hint: Any, raw: Any, file: Path | str, key: str) -> Any:
-    hint = _present(hint)
-    quantity = _quantity(hint)
-    if quantity is not None:
-        return _sourced(quantity, raw, file, key)
-    if dataclasses.is_dataclass(hint):
-        return structure(hint, raw, file=file, key=key)  # type: ignore[arg-type]
-    if get_origin(hint) is dict:
-        if not isinstance(raw, Mapping):
-            raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a mapping")
-        item = get_args(hint)[1]
-        return {str(name): _value(item, value, file, f"{key}.{name}") for name, value in raw.items()}
-    if get_origin(hint) is tuple:
-        if not isinstance(raw, list) or not all(isinstance(x, str) for x in raw):
-            raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a list of words")
-        return tuple(raw)
-    if hint is str:
-        if not isinstance(raw, str):
-            raise ConfigError(f"'{key}' is '{shown(raw)}'", file=file, remedy="give a text")
-        return raw
-    raise TypeError(
-        f"{key}: a field of type {hint} cannot be loaded"
-    )  # a defect of the dataclass, not of the file
-
-
-def _sourced(quantity: Quantity, raw: Any, file: Path | str, key: str) -> Any:
-    if not isinstance(raw, Mapping):
-        raise ConfigError(
-            f"'{key}' is '{shown(raw)}' without a source",
-            file=file,
-            remedy=f"write {{value: {quantity.allowed()}, source: where it comes from}}",
-        )
-    for name in raw:
-        if name not in ("value", "source", "valid"):
-            why = " (the unit is the suffix of the key)" if name == "unit" else ""
-            raise ConfigError(
-                f"'{key}' has the unknown entry '{shown(name)}'{why}",
-                file=file,
-                remedy="keep 'value', 'source' and 'valid' only",
-            )
-    if not isinstance(raw.get("source"), str) or not raw["source"].strip():
-        raise ConfigError(f"'{key}' has no source", file=file, remedy="tell where the number comes from")
-    value = checked_number(raw.get("value"), quantity, file=file, key=key)
-    if "valid" in raw:
-        _check_valid(value, raw["valid"], quantity, file, key)
-    return value
-
-
-def _check_valid(value: Any, valid: Any, quantity: Quantity, file: Path | str, key: str) -> None:
-    """Refuses a number outside the range its source covers, `valid: [low, high]`."""
-    both = dataclasses.replace(quantity, size=2)
-    low, high = checked_number(valid, both, file=file, key=f"{key}.valid")  # type: ignore[misc]
-    numbers = value if isinstance(value, tuple) else (value,)
-    if not all(low <= number <= high for number in numbers):
-        raise ConfigError(
-            f"'{key}' is {shown(value)}, outside its validity range",
-            file=file,
-            remedy=f"its source covers [{low:g}, {high:g}] {quantity.unit}".rstrip(),
-        )
-
-
-def _unknown_key(name: str, known: list[str], file: Path | str, key: str) -> ConfigError:
-    here = f"{key}.{name}" if key else name
-    stem = name.rsplit("_", 1)[0]
-    same = [k for k in known if k.rsplit("_", 1)[0] == stem]
-    close = same or difflib.get_close_matches(name, known, n=1)
-    remedy = f"did you mean '{close[0]}'?" if close else f"known here: {', '.join(known)}"
-    if same:
-        remedy = f"write '{same[0]}' (the unit is part of the name)"
-    return ConfigError(f"unknown key '{shown(here)}'", file=file, remedy=remedy)
+def _names(hint: Any) -> list[str]:
+    return list(_hints(_bare(hint)))

@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Channel, Imu, Terrain
-from terrafusion.datasets.core.config import Position, Quantity
+from terrafusion.datasets.core.config import Position, Sourced
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
-Sign = Annotated[float, Quantity("", -1.0, 1.0)]
+Sign = Annotated[float, Sourced("", -1.0, 1.0)]
 BODY_AXES = ("+x", "+y", "+z")
 
 
@@ -48,12 +48,12 @@ class Conventions:
     gyro_z_sign: Sign = 1.0
     left_wheels_sign: Sign = 1.0
     right_wheels_sign: Sign = 1.0
-    wheel_radius_m: Annotated[float, Quantity("m", 0.01, 2.0)] | None = None
-    track_m: Annotated[float, Quantity("m", 0.05, 10.0)] | None = None
+    wheel_radius_m: Annotated[float, Sourced("m", 0.01, 2.0)] | None = None
+    track_m: Annotated[float, Sourced("m", 0.05, 10.0)] | None = None
     antenna_m: Position | None = None
     imu_m: Position | None = None
-    held: dict[str, Annotated[float, Quantity("rows", 1.0, 1e4)]] = field(default_factory=dict)
-    lag_s: dict[str, Annotated[float, Quantity("s", -10.0, 10.0)]] = field(default_factory=dict)
+    held: dict[str, Annotated[float, Sourced("rows", 1.0, 1e4)]] = field(default_factory=dict)
+    lag_s: dict[str, Annotated[float, Sourced("s", -10.0, 10.0)]] = field(default_factory=dict)
     truth_channels: tuple[str, ...] = ()
     terrain: str = ""
 

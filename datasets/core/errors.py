@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -54,6 +54,14 @@ class ClockError(DataError):
 
 class ConfigError(TerrafusionError):
     """A parameter file with an unknown key, a wrong unit or a value out of range."""
+
+    @classmethod
+    def joined(cls, errors: Sequence[ConfigError]) -> ConfigError:
+        """One error of several (at least one), a line each."""
+        first = errors[0]
+        error = cls(first.what, file=first.file, channel=first.channel, remedy=first.remedy)
+        error.args = ("\n".join(str(one) for one in errors),)
+        return error
 
 
 @contextmanager

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.config import Position, Quantity
+from terrafusion.datasets.core.config import Position, Sourced
 
 AXES = {
     "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0),
@@ -55,13 +55,13 @@ class ImuSpec:
     to messages whose `frame_id` is the one given here.
     """
 
-    rate_hz: Annotated[float, Quantity("Hz", 1.0, 5000.0)]
-    gyro_noise_radps_sqrthz: Annotated[float, Quantity("rad/s/sqrt(Hz)", 1e-7, 1.0)]
-    gyro_bias_walk_radps2_sqrthz: Annotated[float, Quantity("rad/s2/sqrt(Hz)", 1e-9, 0.1)]
-    gyro_bias_sigma_radps: Annotated[float, Quantity("rad/s", 0.0, 1.0)]
-    accel_noise_mps2_sqrthz: Annotated[float, Quantity("m/s2/sqrt(Hz)", 1e-6, 10.0)]
-    accel_bias_walk_mps3_sqrthz: Annotated[float, Quantity("m/s3/sqrt(Hz)", 1e-8, 1.0)]
-    accel_bias_sigma_mps2: Annotated[float, Quantity("m/s2", 0.0, 5.0)]
+    rate_hz: Annotated[float, Sourced("Hz", 1.0, 5000.0)]
+    gyro_noise_radps_sqrthz: Annotated[float, Sourced("rad/s/sqrt(Hz)", 1e-7, 1.0)]
+    gyro_bias_walk_radps2_sqrthz: Annotated[float, Sourced("rad/s2/sqrt(Hz)", 1e-9, 0.1)]
+    gyro_bias_sigma_radps: Annotated[float, Sourced("rad/s", 0.0, 1.0)]
+    accel_noise_mps2_sqrthz: Annotated[float, Sourced("m/s2/sqrt(Hz)", 1e-6, 10.0)]
+    accel_bias_walk_mps3_sqrthz: Annotated[float, Sourced("m/s3/sqrt(Hz)", 1e-8, 1.0)]
+    accel_bias_sigma_mps2: Annotated[float, Sourced("m/s2", 0.0, 5.0)]
     position_m: Position
     axes: tuple[str, ...] = ("+x", "+y", "+z")
     frame_id: str = "imu_link"
@@ -78,20 +78,20 @@ class ImuSpec:
 class WheelSpec:
     """Wheel encoders as the log has them: rate and resolution at the wheel."""
 
-    rate_hz: Annotated[float, Quantity("Hz", 0.5, 5000.0)]
-    quantum_rad: Annotated[float, Quantity("rad", 0.0, 1.0)]
-    speed_sigma_mps: Annotated[float, Quantity("m/s", 0.0, 1.0)]
+    rate_hz: Annotated[float, Sourced("Hz", 0.5, 5000.0)]
+    quantum_rad: Annotated[float, Sourced("rad", 0.0, 1.0)]
+    speed_sigma_mps: Annotated[float, Sourced("m/s", 0.0, 1.0)]
 
 
 @dataclass(frozen=True)
 class GnssSpec:
     """GNSS receiver: antenna position and accuracy (1 sigma)."""
 
-    rate_hz: Annotated[float, Quantity("Hz", 0.05, 100.0)]
-    sigma_horizontal_m: Annotated[float, Quantity("m", 1e-3, 100.0)]
-    sigma_vertical_m: Annotated[float, Quantity("m", 1e-3, 200.0)]
-    sigma_velocity_mps: Annotated[float, Quantity("m/s", 1e-3, 10.0)]
-    correlation_time_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
+    rate_hz: Annotated[float, Sourced("Hz", 0.05, 100.0)]
+    sigma_horizontal_m: Annotated[float, Sourced("m", 1e-3, 100.0)]
+    sigma_vertical_m: Annotated[float, Sourced("m", 1e-3, 200.0)]
+    sigma_velocity_mps: Annotated[float, Sourced("m/s", 1e-3, 10.0)]
+    correlation_time_s: Annotated[float, Sourced("s", 0.0, 3600.0)]
     antenna_m: Position
 
 
@@ -99,9 +99,9 @@ class GnssSpec:
 class BarometerSpec:
     """Barometer: white noise of a sample (1 sigma), and the random walk of weather and wind on top."""
 
-    rate_hz: Annotated[float, Quantity("Hz", 0.05, 500.0)]
-    noise_pa: Annotated[float, Quantity("Pa", 0.0, 1000.0)]
-    walk_paps_sqrthz: Annotated[float, Quantity("Pa/s/sqrt(Hz)", 0.0, 100.0)]
+    rate_hz: Annotated[float, Sourced("Hz", 0.05, 500.0)]
+    noise_pa: Annotated[float, Sourced("Pa", 0.0, 1000.0)]
+    walk_paps_sqrthz: Annotated[float, Sourced("Pa/s/sqrt(Hz)", 0.0, 100.0)]
     position_m: Position
 
 
@@ -110,9 +110,9 @@ class MagnetometerSpec:
     """Magnetometer in body axes: white noise of a sample and axis, and the hard iron that its calibration
     leaves on each axis (1 sigma)."""
 
-    rate_hz: Annotated[float, Quantity("Hz", 0.05, 1000.0)]
-    noise_t: Annotated[float, Quantity("T", 0.0, 1e-4)]
-    hard_iron_sigma_t: Annotated[float, Quantity("T", 0.0, 1e-3)]
+    rate_hz: Annotated[float, Sourced("Hz", 0.05, 1000.0)]
+    noise_t: Annotated[float, Sourced("T", 0.0, 1e-4)]
+    hard_iron_sigma_t: Annotated[float, Sourced("T", 0.0, 1e-3)]
 
 
 @dataclass(frozen=True)

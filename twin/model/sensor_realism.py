@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Quantity
+from terrafusion.datasets.core.config import Sourced
 
 
 @dataclass(frozen=True)
@@ -23,15 +23,15 @@ class ImuRealism:
     the quantum.
     """
 
-    gyro_bias_instability_radps: Annotated[float, Quantity("rad/s", 0.0, 0.1)] = 0.0
-    accel_bias_instability_mps2: Annotated[float, Quantity("m/s2", 0.0, 1.0)] = 0.0
-    gyro_scale_sigma: Annotated[float, Quantity("", 0.0, 0.1)] = 0.0
-    accel_scale_sigma: Annotated[float, Quantity("", 0.0, 0.1)] = 0.0
-    misalignment_sigma_rad: Annotated[float, Quantity("rad", 0.0, 0.1)] = 0.0
-    gyro_range_radps: Annotated[float, Quantity("rad/s", 0.1, 1000.0)] = math.inf
-    accel_range_mps2: Annotated[float, Quantity("m/s2", 10.0, 10000.0)] = math.inf
-    gyro_quantum_radps: Annotated[float, Quantity("rad/s", 0.0, 0.1)] = 0.0
-    accel_quantum_mps2: Annotated[float, Quantity("m/s2", 0.0, 1.0)] = 0.0
+    gyro_bias_instability_radps: Annotated[float, Sourced("rad/s", 0.0, 0.1)] = 0.0
+    accel_bias_instability_mps2: Annotated[float, Sourced("m/s2", 0.0, 1.0)] = 0.0
+    gyro_scale_sigma: Annotated[float, Sourced("", 0.0, 0.1)] = 0.0
+    accel_scale_sigma: Annotated[float, Sourced("", 0.0, 0.1)] = 0.0
+    misalignment_sigma_rad: Annotated[float, Sourced("rad", 0.0, 0.1)] = 0.0
+    gyro_range_radps: Annotated[float, Sourced("rad/s", 0.1, 1000.0)] = math.inf
+    accel_range_mps2: Annotated[float, Sourced("m/s2", 10.0, 10000.0)] = math.inf
+    gyro_quantum_radps: Annotated[float, Sourced("rad/s", 0.0, 0.1)] = 0.0
+    accel_quantum_mps2: Annotated[float, Sourced("m/s2", 0.0, 1.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,9 @@ class EncoderRealism:
     `stamp_jitter_s` after the counter was read.
     """
 
-    position_error_rad: Annotated[float, Quantity("rad", 0.0, 1.0)] = 0.0
-    shaft_turns: Annotated[float, Quantity("", 0.01, 1000.0)] = 1.0
-    stamp_jitter_s: Annotated[float, Quantity("s", 0.0, 0.1)] = 0.0
+    position_error_rad: Annotated[float, Sourced("rad", 0.0, 1.0)] = 0.0
+    shaft_turns: Annotated[float, Sourced("", 0.01, 1000.0)] = 1.0
+    stamp_jitter_s: Annotated[float, Sourced("s", 0.0, 0.1)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,30 +63,30 @@ class GnssRealism:
     `multipath_length_m`.
     """
 
-    reported_share: Annotated[float, Quantity("", 0.05, 2.0)] = 1.0
-    reacquire_s: Annotated[float, Quantity("s", 0.0, 3600.0)] = 0.0
-    refix_s: Annotated[float, Quantity("s", 0.0, 3600.0)] = 0.0
-    canopy_attenuation_db: Annotated[float, Quantity("dB", 0.0, 40.0)] = 0.0
-    canopy_loss_per_s: Annotated[float, Quantity("1/s", 0.0, 100.0)] = 0.0
-    canopy_multipath_m: Annotated[float, Quantity("m", 0.0, 100.0)] = 0.0
-    multipath_length_m: Annotated[float, Quantity("m", 0.1, 100.0)] = 3.0
+    reported_share: Annotated[float, Sourced("", 0.05, 2.0)] = 1.0
+    reacquire_s: Annotated[float, Sourced("s", 0.0, 3600.0)] = 0.0
+    refix_s: Annotated[float, Sourced("s", 0.0, 3600.0)] = 0.0
+    canopy_attenuation_db: Annotated[float, Sourced("dB", 0.0, 40.0)] = 0.0
+    canopy_loss_per_s: Annotated[float, Sourced("1/s", 0.0, 100.0)] = 0.0
+    canopy_multipath_m: Annotated[float, Sourced("m", 0.0, 100.0)] = 0.0
+    multipath_length_m: Annotated[float, Sourced("m", 0.1, 100.0)] = 3.0
 
 
 @dataclass(frozen=True)
 class CurrentRealism:
     """Errors of a motor current sensor beyond white noise: gain and offset, drawn once a run, and steps."""
 
-    gain_sigma: Annotated[float, Quantity("", 0.0, 0.5)] = 0.0
-    offset_sigma_a: Annotated[float, Quantity("A", 0.0, 100.0)] = 0.0
-    quantum_a: Annotated[float, Quantity("A", 0.0, 100.0)] = 0.0
+    gain_sigma: Annotated[float, Sourced("", 0.0, 0.5)] = 0.0
+    offset_sigma_a: Annotated[float, Sourced("A", 0.0, 100.0)] = 0.0
+    quantum_a: Annotated[float, Sourced("A", 0.0, 100.0)] = 0.0
 
 
 @dataclass(frozen=True)
 class BarometerRealism:
     """What the weather adds to a standard pressure: an offset and a trend, drawn once a run."""
 
-    offset_sigma_pa: Annotated[float, Quantity("Pa", 0.0, 10000.0)] = 0.0
-    trend_sigma_paps: Annotated[float, Quantity("Pa/s", 0.0, 10.0)] = 0.0
+    offset_sigma_pa: Annotated[float, Sourced("Pa", 0.0, 10000.0)] = 0.0
+    trend_sigma_paps: Annotated[float, Sourced("Pa/s", 0.0, 10.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -97,9 +97,9 @@ class MagnetometerRealism:
     fixed field over `disturbance_length_m`.
     """
 
-    soft_iron_sigma: Annotated[float, Quantity("", 0.0, 0.5)] = 0.0
-    disturbance_t: Annotated[float, Quantity("T", 0.0, 1e-3)] = 0.0
-    disturbance_length_m: Annotated[float, Quantity("m", 0.1, 1000.0)] = 5.0
+    soft_iron_sigma: Annotated[float, Sourced("", 0.0, 0.5)] = 0.0
+    disturbance_t: Annotated[float, Sourced("T", 0.0, 1e-3)] = 0.0
+    disturbance_length_m: Annotated[float, Sourced("m", 0.1, 1000.0)] = 5.0
 
 
 @dataclass(frozen=True)
@@ -113,12 +113,12 @@ class SensorRealism:
     `GnssSpec` for the receiver's best mode.
     """
 
-    vibration_gain: Annotated[float, Quantity("", 0.0, 100.0)]
-    gnss_white_share: Annotated[float, Quantity("", 0.0, 1.0)]
-    gnss_single_sigma_m: Annotated[float, Quantity("m", 0.01, 100.0)]
-    gnss_single_correlation_s: Annotated[float, Quantity("s", 0.0, 3600.0)]
-    gnss_latency_s: Annotated[float, Quantity("s", 0.0, 10.0)]
-    current_noise_a: Annotated[float, Quantity("A", 0.0, 100.0)]
+    vibration_gain: Annotated[float, Sourced("", 0.0, 100.0)]
+    gnss_white_share: Annotated[float, Sourced("", 0.0, 1.0)]
+    gnss_single_sigma_m: Annotated[float, Sourced("m", 0.01, 100.0)]
+    gnss_single_correlation_s: Annotated[float, Sourced("s", 0.0, 3600.0)]
+    gnss_latency_s: Annotated[float, Sourced("s", 0.0, 10.0)]
+    current_noise_a: Annotated[float, Sourced("A", 0.0, 100.0)]
     imu: ImuRealism = field(default_factory=ImuRealism)
     encoder: EncoderRealism = field(default_factory=EncoderRealism)
     gnss: GnssRealism = field(default_factory=GnssRealism)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Quantity, structure
+from terrafusion.datasets.core.config import Sourced, structure
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.soil_table import is_published, published_soil
 
@@ -26,39 +26,39 @@ class PressureSinkage:
     `multipass` is the part of the sinkage that a wheel in the rut of the one before it does not make again.
     """
 
-    k_c_n_per_m_n1: Annotated[float, Quantity("N/m^(n+1)", 0.0, 1e7)]
-    k_phi_n_per_m_n2: Annotated[float, Quantity("N/m^(n+2)", 1e3, 1e12)]
-    exponent: Annotated[float, Quantity("", 0.1, 1.8)]
-    slip_sinkage: Annotated[float, Quantity("", 0.0, 10.0)]
-    contact_length_floor_m: Annotated[float, Quantity("m", 0.005, 0.5)]
-    multipass: Annotated[float, Quantity("", 0.0, 1.0)] = 0.0
-    skid_sinkage: Annotated[float, Quantity("", 0.0, 20.0)] = 0.0
+    k_c_n_per_m_n1: Annotated[float, Sourced("N/m^(n+1)", 0.0, 1e7)]
+    k_phi_n_per_m_n2: Annotated[float, Sourced("N/m^(n+2)", 1e3, 1e12)]
+    exponent: Annotated[float, Sourced("", 0.1, 1.8)]
+    slip_sinkage: Annotated[float, Sourced("", 0.0, 10.0)]
+    contact_length_floor_m: Annotated[float, Sourced("m", 0.005, 0.5)]
+    multipass: Annotated[float, Sourced("", 0.0, 1.0)] = 0.0
+    skid_sinkage: Annotated[float, Sourced("", 0.0, 20.0)] = 0.0
 
 
 @dataclass(frozen=True)
 class Shear:
     """Janosi-Hanamoto shear under a Mohr-Coulomb limit, capped by an effective friction coefficient."""
 
-    cohesion_pa: Annotated[float, Quantity("Pa", 0.0, 1e6)]
-    friction_angle_rad: Annotated[float, Quantity("rad", 0.0, 0.9)]
-    shear_modulus_m: Annotated[float, Quantity("m", 2e-4, 0.2)]
-    friction_cap: Annotated[float, Quantity("", 0.01, 2.0)]
+    cohesion_pa: Annotated[float, Sourced("Pa", 0.0, 1e6)]
+    friction_angle_rad: Annotated[float, Sourced("rad", 0.0, 0.9)]
+    shear_modulus_m: Annotated[float, Sourced("m", 2e-4, 0.2)]
+    friction_cap: Annotated[float, Sourced("", 0.01, 2.0)]
 
 
 @dataclass(frozen=True)
 class Passive:
     """Soil pushed by front and side of a sunken wheel: `bulldozing` times Rankine's passive pressure."""
 
-    unit_weight_n_per_m3: Annotated[float, Quantity("N/m3", 0.0, 3e4)] = 0.0
-    bulldozing: Annotated[float, Quantity("", 0.0, 20.0)] = 0.0
+    unit_weight_n_per_m3: Annotated[float, Sourced("N/m3", 0.0, 3e4)] = 0.0
+    bulldozing: Annotated[float, Sourced("", 0.0, 20.0)] = 0.0
 
 
 @dataclass(frozen=True)
 class Resistance:
     """Rolling resistance torque c_rr W R of a wheel and viscous drag of the hub, per wheel."""
 
-    rolling: Annotated[float, Quantity("", 0.0, 0.5)]
-    viscous_ns_per_m: Annotated[float, Quantity("N s/m", 0.0, 1000.0)]
+    rolling: Annotated[float, Sourced("", 0.0, 0.5)]
+    viscous_ns_per_m: Annotated[float, Sourced("N s/m", 0.0, 1000.0)]
 
 
 @dataclass(frozen=True)
@@ -70,32 +70,32 @@ class Mud:
     `suction_pa` is the pull per area of wet soil on the rear of the contact.
     """
 
-    pickup_per_m: Annotated[float, Quantity("1/m", 0.0, 10.0)]
-    churn_gain: Annotated[float, Quantity("", 0.0, 1000.0)]
-    shed_per_m: Annotated[float, Quantity("1/m", 0.0, 10.0)]
-    torque_nm: Annotated[float, Quantity("N m", 0.0, 1000.0)]
-    sinkage_m: Annotated[float, Quantity("m", 0.0, 0.5)]
-    suction_pa: Annotated[float, Quantity("Pa", 0.0, 1e5)] = 0.0
+    pickup_per_m: Annotated[float, Sourced("1/m", 0.0, 10.0)]
+    churn_gain: Annotated[float, Sourced("", 0.0, 1000.0)]
+    shed_per_m: Annotated[float, Sourced("1/m", 0.0, 10.0)]
+    torque_nm: Annotated[float, Sourced("N m", 0.0, 1000.0)]
+    sinkage_m: Annotated[float, Sourced("m", 0.0, 0.5)]
+    suction_pa: Annotated[float, Sourced("Pa", 0.0, 1e5)] = 0.0
 
 
 @dataclass(frozen=True)
 class Vibration:
     """Vibration of the chassis at 1 m/s (rms, vertical and roll axes) and the band it lies in."""
 
-    accel_mps2_at_1mps: Annotated[float, Quantity("m/s2", 0.0, 50.0)]
-    gyro_radps_at_1mps: Annotated[float, Quantity("rad/s", 0.0, 10.0)]
-    low_hz: Annotated[float, Quantity("Hz", 0.1, 500.0)]
-    high_hz: Annotated[float, Quantity("Hz", 0.2, 1000.0)]
+    accel_mps2_at_1mps: Annotated[float, Sourced("m/s2", 0.0, 50.0)]
+    gyro_radps_at_1mps: Annotated[float, Sourced("rad/s", 0.0, 10.0)]
+    low_hz: Annotated[float, Sourced("Hz", 0.1, 500.0)]
+    high_hz: Annotated[float, Sourced("Hz", 0.2, 1000.0)]
 
 
 @dataclass(frozen=True)
 class Validity:
     """Ranges (low, high) in which a soil's numbers hold; the module `validity` refuses what lies outside."""
 
-    ground_pressure_pa: Annotated[tuple[float, ...], Quantity("Pa", 0.0, 1e8, size=2)] = (0.0, 1e8)
-    wheel_diameter_m: Annotated[tuple[float, ...], Quantity("m", 0.0, 10.0, size=2)] = (0.0, 10.0)
-    slip: Annotated[tuple[float, ...], Quantity("", -2.0, 2.0, size=2)] = (-2.0, 2.0)
-    moisture_percent: Annotated[tuple[float, ...], Quantity("%", 0.0, 500.0, size=2)] | None = None
+    ground_pressure_pa: Annotated[tuple[float, ...], Sourced("Pa", 0.0, 1e8, size=2)] = (0.0, 1e8)
+    wheel_diameter_m: Annotated[tuple[float, ...], Sourced("m", 0.0, 10.0, size=2)] = (0.0, 10.0)
+    slip: Annotated[tuple[float, ...], Sourced("", -2.0, 2.0, size=2)] = (-2.0, 2.0)
+    moisture_percent: Annotated[tuple[float, ...], Sourced("%", 0.0, 500.0, size=2)] | None = None
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Quantity, structure
+from terrafusion.datasets.core.config import Sourced, structure
 from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
@@ -30,14 +30,14 @@ GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
 class Body:
     """Rigid body on four wheels; the centre of gravity is given from the body origin."""
 
-    mass_kg: Annotated[float, Quantity("kg", 1.0, 5000.0)]
-    payload_max_kg: Annotated[float, Quantity("kg", 0.0, 5000.0)]
-    yaw_inertia_kgm2: Annotated[float, Quantity("kg m2", 0.01, 20000.0)]
-    wheelbase_m: Annotated[float, Quantity("m", 0.05, 5.0)]
-    track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
-    cg_forward_m: Annotated[float, Quantity("m", -1.0, 1.0)]
-    cg_left_m: Annotated[float, Quantity("m", -1.0, 1.0)]
-    cg_height_m: Annotated[float, Quantity("m", 0.0, 2.0)]
+    mass_kg: Annotated[float, Sourced("kg", 1.0, 5000.0)]
+    payload_max_kg: Annotated[float, Sourced("kg", 0.0, 5000.0)]
+    yaw_inertia_kgm2: Annotated[float, Sourced("kg m2", 0.01, 20000.0)]
+    wheelbase_m: Annotated[float, Sourced("m", 0.05, 5.0)]
+    track_m: Annotated[float, Sourced("m", 0.05, 5.0)]
+    cg_forward_m: Annotated[float, Sourced("m", -1.0, 1.0)]
+    cg_left_m: Annotated[float, Sourced("m", -1.0, 1.0)]
+    cg_height_m: Annotated[float, Sourced("m", 0.0, 2.0)]
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Wheel:
     Grousers stand out by `grouser_height_m`, `grouser_count` around the rim; 0 is a smooth wheel.
     """
 
-    radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
-    width_m: Annotated[float, Quantity("m", 0.005, 1.0)]
-    inertia_kgm2: Annotated[float, Quantity("kg m2", 1e-5, 100.0)]
-    grouser_height_m: Annotated[float, Quantity("m", 0.0, 0.3)] = 0.0
-    grouser_count: Annotated[float, Quantity("", 0.0, 200.0)] = 0.0
+    radius_m: Annotated[float, Sourced("m", 0.02, 2.0)]
+    width_m: Annotated[float, Sourced("m", 0.005, 1.0)]
+    inertia_kgm2: Annotated[float, Sourced("kg m2", 1e-5, 100.0)]
+    grouser_height_m: Annotated[float, Sourced("m", 0.0, 0.3)] = 0.0
+    grouser_count: Annotated[float, Sourced("", 0.0, 200.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -63,20 +63,20 @@ class DriveTrain:
     no-load current is what friction in motor, gears and belts takes at any load.
     """
 
-    gear_ratio: Annotated[float, Quantity("", 1.0, 1000.0)]
-    gear_efficiency: Annotated[float, Quantity("", 0.1, 1.0)]
-    no_load_speed_radps: Annotated[float, Quantity("rad/s", 10.0, 5000.0)]
-    stall_torque_nm: Annotated[float, Quantity("N m", 0.001, 500.0)]
-    torque_limit_nm: Annotated[float, Quantity("N m", 0.001, 500.0)]
-    supply_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
-    speed_loop_p_nms: Annotated[float, Quantity("N m s/rad at the wheel", 0.01, 10000.0)]
-    speed_loop_i_nm: Annotated[float, Quantity("N m/rad at the wheel", 0.0, 10000.0)]
-    lag_s: Annotated[float, Quantity("s", 0.001, 1.0)]
-    dead_time_s: Annotated[float, Quantity("s", 0.0, 2.0)]
-    max_speed_mps: Annotated[float, Quantity("m/s", 0.05, 50.0)]
-    max_accel_mps2: Annotated[float, Quantity("m/s2", 0.05, 50.0)]
-    max_yaw_accel_radps2: Annotated[float, Quantity("rad/s2", 0.05, 50.0)]
-    no_load_current_a: Annotated[float, Quantity("A", 0.0, 100.0)] = 0.0
+    gear_ratio: Annotated[float, Sourced("", 1.0, 1000.0)]
+    gear_efficiency: Annotated[float, Sourced("", 0.1, 1.0)]
+    no_load_speed_radps: Annotated[float, Sourced("rad/s", 10.0, 5000.0)]
+    stall_torque_nm: Annotated[float, Sourced("N m", 0.001, 500.0)]
+    torque_limit_nm: Annotated[float, Sourced("N m", 0.001, 500.0)]
+    supply_v: Annotated[float, Sourced("V", 1.0, 1000.0)]
+    speed_loop_p_nms: Annotated[float, Sourced("N m s/rad at the wheel", 0.01, 10000.0)]
+    speed_loop_i_nm: Annotated[float, Sourced("N m/rad at the wheel", 0.0, 10000.0)]
+    lag_s: Annotated[float, Sourced("s", 0.001, 1.0)]
+    dead_time_s: Annotated[float, Sourced("s", 0.0, 2.0)]
+    max_speed_mps: Annotated[float, Sourced("m/s", 0.05, 50.0)]
+    max_accel_mps2: Annotated[float, Sourced("m/s2", 0.05, 50.0)]
+    max_yaw_accel_radps2: Annotated[float, Sourced("rad/s2", 0.05, 50.0)]
+    no_load_current_a: Annotated[float, Sourced("A", 0.0, 100.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -86,11 +86,11 @@ class Battery:
     `charge` is the share of `capacity_wh` it holds at the start of a run.
     """
 
-    full_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
-    empty_v: Annotated[float, Quantity("V", 1.0, 1000.0)]
-    resistance_ohm: Annotated[float, Quantity("ohm", 0.0, 10.0)]
-    capacity_wh: Annotated[float, Quantity("W h", 1.0, 1e6)]
-    charge: Annotated[float, Quantity("", 0.0, 1.0)]
+    full_v: Annotated[float, Sourced("V", 1.0, 1000.0)]
+    empty_v: Annotated[float, Sourced("V", 1.0, 1000.0)]
+    resistance_ohm: Annotated[float, Sourced("ohm", 0.0, 10.0)]
+    capacity_wh: Annotated[float, Sourced("W h", 1.0, 1e6)]
+    charge: Annotated[float, Sourced("", 0.0, 1.0)]
 
     def __post_init__(self) -> None:
         if self.empty_v > self.full_v:
@@ -101,8 +101,8 @@ class Battery:
 class Odometry:
     """Geometry the robot's own wheel odometry assumes (it need not be the true one)."""
 
-    wheel_radius_m: Annotated[float, Quantity("m", 0.02, 2.0)]
-    track_m: Annotated[float, Quantity("m", 0.05, 5.0)]
+    wheel_radius_m: Annotated[float, Sourced("m", 0.02, 2.0)]
+    track_m: Annotated[float, Sourced("m", 0.05, 5.0)]
 
 
 @dataclass(frozen=True, repr=False)
@@ -125,7 +125,7 @@ class VehicleParams:
     realism: SensorRealism
     battery: Battery | None = None
     topics: dict[str, str] = field(default_factory=dict)
-    effects: dict[str, Annotated[float, Quantity("")]] = field(default_factory=dict)
+    effects: dict[str, Annotated[float, Sourced("")]] = field(default_factory=dict)
     measured: tuple[str, ...] = ()
 
     @classmethod

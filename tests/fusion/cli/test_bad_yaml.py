@@ -1,4 +1,4 @@
-"""Bad `meta.yaml` and vehicle files: one line that names the key, the value and what is allowed."""
+"""Bad `meta.yaml` and vehicle files: a line an error, that names the key, the value and what is allowed."""
 
 from __future__ import annotations
 
@@ -69,10 +69,14 @@ BAD_META: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         ("unknown vehicle 'shopping_trolley'", "elevate"),
     ),
     "meta: no vehicle": (meta(drop="vehicle"), ("log", "names no vehicle", "--vehicle")),
-    "meta: aliases that blow up": (meta(f"{BOMB}]", drop="description"), ("meta.yaml", "'description'")),
+    "meta: aliases that blow up": (meta(f"{BOMB}]", drop="description"), ("meta.yaml", "aliases")),
     "meta: alias of itself": (
         meta("description: &a [*a]", drop="description"),
-        ("meta.yaml", "'description'", "text"),
+        ("meta.yaml", "line", "'*a' stands for nothing"),
+    ),
+    "meta: merge keys": (
+        meta("a: &a {b: 1}", "c: {<<: *a}"),
+        ("meta.yaml", "line", "merge keys '<<' are not allowed"),
     ),
     "meta: 10 000 brackets": (meta("track_m: " + "[" * 10_000), ("meta.yaml", "not valid YAML")),
     "meta: 10 MB": (written("start_ns: 0\n" * 900_000), ("meta.yaml",)),
@@ -135,7 +139,7 @@ BAD_VEHICLES: dict[str, tuple[str, str, tuple[str, ...]]] = {
     "unknown key": (r"^name: ", "colour: red\nname: ", ("unknown key 'colour'",)),
     "section is a list": (r"^odometry:\n(  .*\n)+", "odometry: [1, 2]\n", ("odometry", "not a section")),
     "axes": (r"axes: .*$", 'axes: ["+x", "+x", "+z"]', ("axes",)),
-    "aliases that blow up": (r"^description: .*$", f"{BOMB}]", ("'description'", "text")),
+    "aliases that blow up": (r"^description: .*$", f"{BOMB}]", ("line 3", "aliases")),
 }
 
 
