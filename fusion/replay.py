@@ -38,7 +38,7 @@ from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 from terrafusion.fusion.metrics.metrics import Outage, Scores, score
 from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.fusion.terrain.external import external_probabilities
-from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, load_vehicle, with_overrides
+from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle, geometry_notes, with_overrides
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ HELD_OUT_EVERY = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Replay:
+class ReplayResult:
     """One replayed drive.
 
     Attributes:
@@ -77,16 +77,18 @@ class Replay:
         return self.recording.duration_s() / max(self.seconds, 1e-9)
 
 
-def choose_vehicle(recording: Recording, name: str | None) -> tuple[VehicleParams, tuple[str, ...]]:
+def choose_vehicle(
+    recording: Recording, vehicle: str | Path | VehicleParams | None
+) -> tuple[VehicleParams, tuple[str, ...]]:
     """The vehicle asked for, or named by the log, or a generic one; with the log's own geometry on top.
 
     Raises:
         DataError: nothing tells the robot's geometry.
         ConfigError: an unknown vehicle name.
     """
-    asked = name or recording.vehicle
+    asked = vehicle or recording.vehicle
     overrides = recording.overrides
-    loaded = load_vehicle(asked or "generic")
+    loaded = as_vehicle(asked or "generic")
     notes = geometry_notes(loaded, overrides)
     if asked:
         return with_overrides(loaded, overrides), notes
@@ -121,7 +123,7 @@ def split_fixes(recording: Recording, outages: Sequence[Outage]) -> tuple[Gnss |
 def replay(
     recording: Recording,
     *,
-    vehicle: str | None = None,
+    vehicle: str | Path | VehicleParams | None = None,
     mode: str = "adaptive",
     policy: Path | Policy | None = None,
     outages: Sequence[Outage] = (),
@@ -129,11 +131,11 @@ def replay(
     progress: Callable[[float], None] | None = None,
     magnetometer: bool = False,
     settings: Mapping[str, Any] | None = None,
-) -> Replay:
+) -> ReplayResult:
     """Estimate and score one drive.
 
     Args:
-        vehicle: name or YAML file; by default what the log says.
+        vehicle: name, YAML file or `VehicleParams`; by default what the log says.
         mode: "adaptive", "fixed", "robust" or "innovation".
         policy: weighting policy, or its file; by default the shipped one.
         outages: stretches in which the estimator gets no fix.
@@ -192,7 +194,7 @@ def replay(
         antenna_m=antenna,
         aligned=estimator.gnss.local,
     )
-    return Replay(
+    return ReplayResult(
         recording, params, mode, rows, estimate, scores, used, held_out, outages, seconds, latencies,
         estimator.gnss.rejected, estimator.wheels_rejected,
     )  # fmt: skip

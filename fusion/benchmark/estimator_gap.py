@@ -22,7 +22,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.infer.refit import effects_at
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
@@ -56,7 +56,11 @@ class Compared:
 
 
 def judged(
-    found: Diagnosis, runs: Sequence[Recording], references: Sequence[Recording], judge: Judge, seed: int = 0
+    found: GapDiagnosis,
+    runs: Sequence[Recording],
+    references: Sequence[Recording],
+    judge: Judge,
+    seed: int = 0,
 ) -> tuple[list[Compared], list[str]]:
     """Marks of real logs, and of the twin's logs of the judged runs' drives; and why some have none.
 

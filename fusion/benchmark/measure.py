@@ -19,7 +19,7 @@ from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.health import examine_estimate
 from terrafusion.fusion.metrics.metrics import OutageScore
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 Array = NDArray[np.float64]
@@ -106,7 +106,7 @@ def measure(drive: Drive, arm: Arm) -> Row | None:
     return _measured(empty, drive, result)
 
 
-def _measured(row: Row, drive: Drive, result: Replay) -> Row:
+def _measured(row: Row, drive: Drive, result: ReplayResult) -> Row:
     assert drive.recording.wheels is not None
     radius_m = result.vehicle.rig().wheel_radius_m
     health = examine_estimate(result.estimate, drive.recording.wheels, radius_m)

@@ -9,7 +9,7 @@ from pathlib import Path
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.reports.replay import write_comparison, write_replay
 from terrafusion.twin.simulate import simulate
 
@@ -33,7 +33,7 @@ def run_demo(out: Path, seed: int, progress: Callable[[float], None] | None = No
     return [*comparison(results), f"report: {out / 'report.html'}"]
 
 
-def comparison(results: list[Replay]) -> list[str]:
+def comparison(results: list[ReplayResult]) -> list[str]:
     """A table of the replays, one column each."""
     first = results[0]
     yaw = [r.scores.yaw_rmse_rad for r in results]
@@ -54,6 +54,6 @@ def comparison(results: list[Replay]) -> list[str]:
     return lines
 
 
-def _grounds(result: Replay) -> list[str]:
+def _grounds(result: ReplayResult) -> list[str]:
     terrain = result.recording.terrain
     return [] if terrain is None else [str(label) for label in terrain.label]

@@ -23,7 +23,7 @@ from terrafusion.fusion.cli.common import (
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.benchmark.estimator_gap import Compared
-    from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+    from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
 RunsArgument = Annotated[
     list[str],
@@ -108,7 +108,7 @@ def gap(
 
 
 def _judged(
-    found: Diagnosis, runs: list[Recording], references: list[Recording], vehicle: str, seed: int
+    found: GapDiagnosis, runs: list[Recording], references: list[Recording], vehicle: str, seed: int
 ) -> tuple[list[Compared], list[str]]:
     from terrafusion.fusion.benchmark.estimator_gap import judged
     from terrafusion.fusion.benchmark.judge import estimator_judge

@@ -24,7 +24,7 @@ from terrafusion.fusion.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from terrafusion.fusion.replay import Replay
+    from terrafusion.fusion.replay import ReplayResult
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results and report.html.")]
 OutageOption = Annotated[
@@ -148,7 +148,7 @@ def replay(
     print(f"written to {out}")
 
 
-def _write_bag(result: Replay, path: Path) -> None:
+def _write_bag(result: ReplayResult, path: Path) -> None:
     """The log and the estimate beside it; prints what is not in standard messages."""
     from terrafusion.datasets.writers.mcap import write_mcap
     from terrafusion.fusion.outputs.ros_estimate import written_estimate
@@ -158,7 +158,7 @@ def _write_bag(result: Replay, path: Path) -> None:
         print(f"not in standard messages: {part}")
 
 
-def summary(result: Replay) -> list[str]:
+def summary(result: ReplayResult) -> list[str]:
     """The result in a few lines of text."""
     from terrafusion.fusion.outputs.linear_states import calibration, cells
     from terrafusion.fusion.outputs.replay_files import final_status

@@ -14,6 +14,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import gtsam
+from pathlib import Path
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -51,6 +53,7 @@ from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
+from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
 Array = NDArray[np.float64]
 
@@ -104,11 +107,10 @@ class Estimator:
         self._propagator = Propagator(self._preintegrator)
 
     @classmethod
-    def for_vehicle(cls, name: str, mode: str = "adaptive") -> Estimator:
-        """An estimator for a vehicle of the library (or a vehicle YAML)."""
-        from terrafusion.twin.model.vehicle import load_vehicle
-
-        return cls(EstimatorConfig(load_vehicle(name).rig(), name, mode))
+    def for_vehicle(cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive") -> Estimator:
+        """An estimator for a vehicle, given by its name in the library, its YAML file or itself."""
+        params = as_vehicle(vehicle)
+        return cls(EstimatorConfig(params.rig(), params.name, mode))
 
     def add(self, message: Message) -> None:
         """One message of `Recording.messages()` or of a driver; see `messages.add_message`."""

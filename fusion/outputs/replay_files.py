@@ -30,7 +30,7 @@ from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.metrics.metrics import Scores
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
 from terrafusion.fusion.outputs.linear_states import series
-from terrafusion.fusion.replay import Replay
+from terrafusion.fusion.replay import ReplayResult
 
 SCHEMA = "terrafusion.replay/1"
 MODES = ("adaptive", "fixed", "robust", "innovation")
@@ -140,7 +140,7 @@ def is_local(estimate: Estimate) -> bool:
     return bool(len(estimate.status)) and bool((estimate.status == "no_gnss").all())
 
 
-def metrics_of(result: Replay) -> dict[str, Any]:
+def metrics_of(result: ReplayResult) -> dict[str, Any]:
     """The content of `metrics.json` (docs/schemas/metrics.schema.json) for one replay."""
     estimate = result.estimate
     return build_metrics(

@@ -14,7 +14,7 @@ from terrafusion.fusion.benchmark.estimator_gap import Compared
 from terrafusion.fusion.reports.gap_text import sentences
 from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
 from terrafusion.fusion.reports.plots import gap as plots
-from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
 MOST_RUNS = 3
 """Runs beyond these have no plots of their own."""
@@ -23,7 +23,7 @@ MOST_CAUSES = 12
 
 def write_diagnosis(
     out: Path,
-    d: Diagnosis,
+    d: GapDiagnosis,
     provenance: Mapping[str, object] | None = None,
     judged: tuple[Sequence[Compared], Sequence[str]] | None = None,
 ) -> None:
@@ -62,7 +62,7 @@ def _judged(marks: Sequence[Compared], failed: Sequence[str]) -> str:
     return f"<h2>As the estimator sees it</h2>\n{said}\n{table(heads, rows, (1, 2, 3, 4))}\n{lost}"
 
 
-def _where(d: Diagnosis) -> str:
+def _where(d: GapDiagnosis) -> str:
     if not d.where:
         return "<h2>Where</h2>\n<p>There are no references to compare with, or too few rows.</p>"
     fig, _ = plots.plot_map(d)
@@ -79,7 +79,7 @@ def _where(d: Diagnosis) -> str:
     )
 
 
-def _causes(d: Diagnosis) -> str:
+def _causes(d: GapDiagnosis) -> str:
     fig, _ = plots.plot_causes(d)
     c, rows = d.bench.candidates, []
     for cause in d.verdict.causes[:MOST_CAUSES]:
@@ -101,7 +101,7 @@ def _within(sigma: float) -> str:
     return f"&plusmn; {sigma:.2g}" if math.isfinite(sigma) else "(fit failed)"
 
 
-def _shrink(d: Diagnosis) -> str:
+def _shrink(d: GapDiagnosis) -> str:
     if d.shrinking is None:
         return ""
     fig, _ = plots.plot_shrink(d)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
 from terrafusion.twin.gap.answer.verdict import Cause
 from terrafusion.twin.gap.answer.where import LEAST_REFERENCES
@@ -12,7 +12,7 @@ from terrafusion.twin.gap.answer.where import LEAST_REFERENCES
 MOST_LISTED = 4
 
 
-def sentences(d: Diagnosis) -> list[str]:
+def sentences(d: GapDiagnosis) -> list[str]:
     """The answer in sentences."""
     said = [_detection(d)]
     if d.detected:
@@ -28,7 +28,7 @@ def sentences(d: Diagnosis) -> list[str]:
     return [s for s in said if s]
 
 
-def _detection(d: Diagnosis) -> str:
+def _detection(d: GapDiagnosis) -> str:
     p, runs = d.detection.p_value, f"{len(d.runs)} run(s), {d.seconds:.0f} s"
     against = f"{len(d.references)} reference run(s)" if d.references else "the twin's own replicates"
     if not d.detected:
@@ -39,7 +39,7 @@ def _detection(d: Diagnosis) -> str:
     return f"There is a gap: {runs} differ from {against} (p = {p:.3g}, threshold {d.significance:g})."
 
 
-def _cause(d: Diagnosis) -> str:
+def _cause(d: GapDiagnosis) -> str:
     verdict, first = d.verdict, d.verdict.causes[0]
     share = "" if first.share is None else f", which explains {100.0 * first.share:.0f} % of it"
     if verdict.kind == "unknown":
@@ -69,7 +69,7 @@ def _class_of(cause: Cause) -> str:
     return f"one of {', '.join(cause.members)}, which these runs cannot tell apart"
 
 
-def numbers(d: Diagnosis, cause: Cause | None = None) -> str:
+def numbers(d: GapDiagnosis, cause: Cause | None = None) -> str:
     """A cause's parameters with one sigma; None: the first one's."""
     cause, c = cause or d.verdict.causes[0], d.bench.candidates
     parts = []
@@ -82,7 +82,7 @@ def numbers(d: Diagnosis, cause: Cause | None = None) -> str:
     return ", ".join(parts)
 
 
-def _place(d: Diagnosis) -> str:
+def _place(d: GapDiagnosis) -> str:
     if len(d.references) < LEAST_REFERENCES:
         return f"In which channel and regime it shows is not told: that takes {LEAST_REFERENCES} references."
     sure = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
@@ -92,7 +92,7 @@ def _place(d: Diagnosis) -> str:
     return f"It shows in: {listed}. A channel in which a gap shows is not its cause."
 
 
-def _shrink(d: Diagnosis) -> str:
+def _shrink(d: GapDiagnosis) -> str:
     s = d.shrinking
     if s is None or not d.verdict.named:
         return ""

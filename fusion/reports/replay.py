@@ -19,7 +19,7 @@ from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.metrics import Outage, Scores
 from terrafusion.fusion.outputs.linear_states import cells
 from terrafusion.fusion.outputs.replay_files import metrics_of, write_outputs
-from terrafusion.fusion.replay import Replay
+from terrafusion.fusion.replay import ReplayResult
 from terrafusion.fusion.reports import replay_text as words
 from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
 from terrafusion.fusion.reports.plots import replay as plots
@@ -90,7 +90,7 @@ def write_report(
     return write_page(path, title, body)
 
 
-def write_replay(out: Path, result: Replay, provenance: Mapping[str, object] | None = None) -> None:
+def write_replay(out: Path, result: ReplayResult, provenance: Mapping[str, object] | None = None) -> None:
     """All files of one replay in the folder `out`, numbers first, so that they stay if a plot fails.
 
     Raises:
@@ -101,7 +101,7 @@ def write_replay(out: Path, result: Replay, provenance: Mapping[str, object] | N
 
 
 def write_comparison(
-    path: Path, title: str, results: Sequence[Replay], provenance: Mapping[str, object] | None = None
+    path: Path, title: str, results: Sequence[ReplayResult], provenance: Mapping[str, object] | None = None
 ) -> None:
     """One report over several replays of the same drive."""
     first = results[0]

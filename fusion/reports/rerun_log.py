@@ -32,7 +32,7 @@ from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.replay_map import ellipse_rows, ellipses, refused_fixes
 
 if TYPE_CHECKING:
-    from terrafusion.fusion.replay import Replay
+    from terrafusion.fusion.replay import ReplayResult
 
 TimesNs = NDArray[np.int64]
 Array = NDArray[np.float64]
@@ -55,7 +55,7 @@ def require_rerun() -> Any:
     return rerun
 
 
-def write_rerun(result: Replay, path: Path) -> Path:
+def write_rerun(result: ReplayResult, path: Path) -> Path:
     """Write the replay to `path` (.rrd), which appears when it is whole.
 
     Raises:
@@ -105,7 +105,7 @@ class _Log:
             self.over_time(entity, t_ns[known], self.rr.Scalars.columns(scalars=values[known]))
 
 
-def _world(log: _Log, result: Replay) -> None:
+def _world(log: _Log, result: ReplayResult) -> None:
     rr, estimate, recording = log.rr, result.estimate, result.recording
     path = estimate.trajectory
     log.fixed("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)

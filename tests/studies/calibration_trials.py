@@ -20,7 +20,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA, CRAWL_MPS
 from terrafusion.fusion.outputs.linear_states import series
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
@@ -141,14 +141,14 @@ def surge_slip(recording: Recording) -> tuple[float, float]:
     return float(share), float(extra / share)
 
 
-def found(result: Replay, state: str) -> tuple[float, float]:
+def found(result: ReplayResult, state: str) -> tuple[float, float]:
     """Value and sigma of a state at the end of the drive."""
     values = series(result.estimate, state)
     assert values is not None
     return float(values[0][-1]), float(values[1][-1])
 
 
-def calibrated(recording: Recording) -> Replay:
+def calibrated(recording: Recording) -> ReplayResult:
     """The drive, live, with the states of a calibration."""
     return replay(recording, settings={"calibrate": True})
 

@@ -20,7 +20,7 @@ import numpy as np
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import lookup
-from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.rollout.sensitivities import Drive
@@ -62,7 +62,7 @@ class Bench:
         run = simulate(drive, vehicle=self.vehicle, seed=1000 * self.seed + number, effects=own)
         return dataclasses.replace(run, name=f"run{number}", truth=None, truth_channels=())
 
-    def diagnoses(self, changes: Sequence[Mapping[str, float]]) -> Iterator[Diagnosis]:
+    def diagnoses(self, changes: Sequence[Mapping[str, float]]) -> Iterator[GapDiagnosis]:
         """One for each change, against the same references."""
         normal = [self.recorded(i, {}) for i in range(self.references)]
         kept = dict[str, Drive]()
@@ -84,7 +84,7 @@ def first_forms(effects: Sequence[str] | None = None) -> dict[str, str]:
     return found
 
 
-def row(found: Diagnosis, key: str, size: float) -> str:
+def row(found: GapDiagnosis, key: str, size: float) -> str:
     """A line of the table."""
     told = found.to_json()
     first, unit = told["causes"][0], lookup(key)[1].unit

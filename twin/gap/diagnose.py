@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
-from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import NextRun, propose
 from terrafusion.twin.gap.answer.shrink import adapted, own_error, shrink
 from terrafusion.twin.gap.answer.verdict import HeldOut, Search, Verdict, alike, floor_of, judge
@@ -56,7 +56,7 @@ def diagnose(
     jobs: int = 2,
     progress: Callable[[float], None] | None = None,
     kept: dict[str, Drive] | None = None,
-) -> Diagnosis:
+) -> GapDiagnosis:
     """Compare runs with reference runs through the twin.
 
     Args:
@@ -100,7 +100,7 @@ def diagnosed(
     significance: float = SIGNIFICANCE,
     seed: int = 0,
     progress: Callable[[float], None] | None = None,
-) -> Diagnosis:
+) -> GapDiagnosis:
     """The diagnosis of gathered evidence; arguments as those of `diagnose`."""
     began, candidates, runs = time.perf_counter(), bench.candidates, bench.runs
     sigma = learnt_sigma(bench.references, state_sigmas(candidates))
@@ -137,7 +137,7 @@ def diagnosed(
     notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
     if verdict.fit is not None and verdict.fit.failure:
         notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")
-    return Diagnosis(
+    return GapDiagnosis(
         tuple(r.name for r in runs), tuple(r.name for r in bench.references), vehicle,
         sum(r.seconds for r in runs), found, significance, uncalibrated, where, choice, verdict, shrinking,
         following, refits, bench, tuple(notes), time.perf_counter() - began,

@@ -191,6 +191,11 @@ def load_vehicle(name_or_path: str | Path) -> VehicleParams:
     return found
 
 
+def as_vehicle(vehicle: str | Path | VehicleParams) -> VehicleParams:
+    """The vehicle of a name, of a YAML file, or itself."""
+    return vehicle if isinstance(vehicle, VehicleParams) else load_vehicle(vehicle)
+
+
 def with_payload(
     vehicle: VehicleParams, payload_kg: float, at_m: tuple[float, float, float] | None = None
 ) -> VehicleParams:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from terrafusion.fusion.reports.plots import style
-from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES
 from terrafusion.twin.gap.rollout.nuisance import NAMES
 
@@ -20,7 +20,7 @@ SHOWN = 8
 """Causes in the plot."""
 
 
-def plot_map(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_map(d: GapDiagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     """Channel by regime (both bands): share of the excess error; a dot where it is significant."""
     channels = list(dict.fromkeys(c.channel for c in d.where))
     columns = [(r, b) for r, _ in REGIMES for b in BANDS]
@@ -40,7 +40,7 @@ def plot_map(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     return fig, ax
 
 
-def plot_causes(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_causes(d: GapDiagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     """Probability of the first causes, of an unknown one and of none."""
     rows = [(c.effect, c.probability) for c in d.verdict.causes[:SHOWN]]
     rows += [("unknown cause", d.verdict.p_unknown), ("no gap", d.verdict.p_null)]
@@ -56,7 +56,7 @@ def plot_causes(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     return fig, ax
 
 
-def plot_shrink(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_shrink(d: GapDiagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     """Whitened error of every channel before and after, and in the references."""
     assert d.shrinking is not None
     names = list(d.shrinking.channels)
@@ -77,7 +77,7 @@ def plot_shrink(d: Diagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     return fig, ax
 
 
-def plot_errors(d: Diagnosis, run: int) -> Figure:
+def plot_errors(d: GapDiagnosis, run: int) -> Figure:
     """Whitened errors of one run over time, channel by channel, before and after."""
     from matplotlib.figure import Figure
 

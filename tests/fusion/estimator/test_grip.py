@@ -23,7 +23,7 @@ from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.live import messages
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.replay import Replay, choose_vehicle, replay
+from terrafusion.fusion.replay import ReplayResult, choose_vehicle, replay
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate_run
 
@@ -77,11 +77,11 @@ def asphalt(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return driven(tmp_path_factory.mktemp("asphalt"), None)
 
 
-def places(found: Replay) -> bytes:
+def places(found: ReplayResult) -> bytes:
     return found.estimate.trajectory.position_m.tobytes()
 
 
-def rms_m(found: Replay) -> float:
+def rms_m(found: ReplayResult) -> float:
     assert found.scores.errors is not None
     return float(np.sqrt(np.nanmean(found.scores.errors.distance_m() ** 2)))
 

@@ -13,7 +13,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
@@ -45,7 +45,7 @@ def aided_drive(heading_deg: float, until_s: float) -> Recording:
     return dataclasses.replace(recording, gnss=lifted.select((t_s > WITHOUT_S) & (t_s < until_s)))
 
 
-def yaw_errors(result: Replay) -> np.ndarray:
+def yaw_errors(result: ReplayResult) -> np.ndarray:
     errors = result.scores.errors
     assert errors is not None
     return np.abs(wrap_angle(errors.estimate_yaw_rad - errors.reference_yaw_rad))

@@ -23,7 +23,7 @@ from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.planar import PlanarPreintegrator, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 
@@ -41,7 +41,7 @@ def noisy() -> Recording:
 
 
 @pytest.fixture(scope="module")
-def full(noisy: Recording) -> Replay:
+def full(noisy: Recording) -> ReplayResult:
     return replay(noisy)
 
 
@@ -78,7 +78,7 @@ def turned(recording: Recording, angle_rad: float) -> Recording:
     return dataclasses.replace(recording, gnss=moved, truth=path, truth_channels=("position",))
 
 
-def yaw_of(result: Replay) -> np.ndarray:
+def yaw_of(result: ReplayResult) -> np.ndarray:
     x, y, z, w = result.estimate.trajectory.quaternion.T
     return np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
@@ -102,7 +102,7 @@ def test_exact_yaw_rate_alone_keeps_the_heading_without_gnss(exact: Recording) -
 
 @pytest.mark.parametrize(("what", "factor"), [(what, 1.3) for what in REDUCED[:3]])
 def test_error_stays_within_a_factor_of_the_full_graph(
-    noisy: Recording, full: Replay, what: str, factor: float
+    noisy: Recording, full: ReplayResult, what: str, factor: float
 ) -> None:
     """With RTK fixes the position hardly suffers, whatever tells the yaw."""
     ate = replay(reduced(noisy, what)).scores.ate_m

@@ -19,7 +19,7 @@ from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.live import messages
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate, simulate_run
 from tests.studies.mode_tuning import DRIVES
@@ -59,7 +59,7 @@ def thinned(recording: Recording, every: int, planar: bool) -> Recording:
     return dataclasses.replace(recording, gnss=type(gnss)(**kept), imu=imu)
 
 
-def rms_m(found: Replay) -> float:
+def rms_m(found: ReplayResult) -> float:
     assert found.scores.errors is not None
     return float(np.sqrt(np.nanmean(found.scores.errors.distance_m() ** 2)))
 

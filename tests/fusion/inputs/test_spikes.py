@@ -15,7 +15,7 @@ from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.preintegration import HELD_INFLATION, Preintegrator
 from terrafusion.fusion.inputs.streams import RECENT, SHOCK_MPS2, SPIN_RADPS, ImuStream
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.fusion.estimator.test_gnss import winding
 
@@ -83,7 +83,7 @@ def test_a_held_sample_makes_what_its_sensor_tells_less_certain_and_nothing_else
 
 
 @pytest.fixture(scope="module")
-def runs() -> tuple[Replay, Replay]:
+def runs() -> tuple[ReplayResult, ReplayResult]:
     drive: Recording = winding()
     imu = drive.imu
     assert imu is not None
@@ -93,7 +93,7 @@ def runs() -> tuple[Replay, Replay]:
     return replay(drive), replay(spiked)
 
 
-def test_two_samples_of_140_mps2_hardly_move_the_state(runs: tuple[Replay, Replay]) -> None:
+def test_two_samples_of_140_mps2_hardly_move_the_state(runs: tuple[ReplayResult, ReplayResult]) -> None:
     plain, spiked = (run.estimate for run in runs)
 
     def moved(read: str) -> float:
@@ -112,7 +112,7 @@ def read_of(estimate: Estimate, what: str) -> np.ndarray:
     return path.twist_body[:, :3]
 
 
-def test_the_run_says_what_it_did_not_believe(runs: tuple[Replay, Replay]) -> None:
+def test_the_run_says_what_it_did_not_believe(runs: tuple[ReplayResult, ReplayResult]) -> None:
     plain, spiked = (" ".join(run.estimate.notes) for run in runs)
     assert "2 IMU samples beyond" in spiked
     assert "IMU samples beyond" not in plain

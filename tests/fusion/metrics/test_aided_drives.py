@@ -17,7 +17,7 @@ from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.sensor_realism import BarometerRealism, MagnetometerRealism
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -63,7 +63,7 @@ def parked() -> Recording:
     return simulate(scenario, vehicle=aided("elevate"), seed=2)
 
 
-def yaw_errors(run: Replay) -> np.ndarray:
+def yaw_errors(run: ReplayResult) -> np.ndarray:
     """Heading errors of all keyframes, deg."""
     truth, got = run.recording.truth, run.estimate.trajectory
     rows = np.searchsorted(truth.t_ns, got.t_ns).clip(0, len(truth) - 1)
@@ -80,7 +80,7 @@ def with_field(recording: Recording, change: Callable[[np.ndarray, np.ndarray], 
     )
 
 
-def notes_of(run: Replay) -> str:
+def notes_of(run: ReplayResult) -> str:
     return "\n".join(run.estimate.notes)
 
 
@@ -149,7 +149,7 @@ def test_they_change_nothing_when_they_are_off(turning: Recording) -> None:
     assert "barometer: height differences of" in notes_of(replay(turning))
 
 
-def height_drift_m(run: Replay, begin_s: float, end_s: float) -> float:
+def height_drift_m(run: ReplayResult, begin_s: float, end_s: float) -> float:
     """Root mean square of the height error between two times, less that of the second before."""
     truth, got = run.recording.truth, run.estimate.trajectory
     rows = np.searchsorted(truth.t_ns, got.t_ns).clip(0, len(truth) - 1)

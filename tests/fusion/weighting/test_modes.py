@@ -19,7 +19,7 @@ from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import ModeTuning, NoiseTuning, load_modes, write_modes
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.fusion.weighting.innovation import SageHusa, Variational
 from terrafusion.fusion.weighting.robust import LEAST_WEIGHT, cauchy_weight, settled, truncated_weights
@@ -36,7 +36,7 @@ def sand() -> Recording:
     return simulate("figure_eight", terrain="loose_sand", seed=7)
 
 
-def run(recording: Recording, method: str, **options: object) -> Replay:
+def run(recording: Recording, method: str, **options: object) -> ReplayResult:
     mode, variant = MODE_OF[method]
     return replay(recording, mode=mode, settings=variant, **options)  # type: ignore[arg-type]
 
@@ -59,7 +59,7 @@ def with_fixes(recording: Recording, error_m: np.ndarray, claimed_m: float | Non
     return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma))
 
 
-def errors_m(result: Replay) -> np.ndarray:
+def errors_m(result: ReplayResult) -> np.ndarray:
     assert result.scores.errors is not None
     return result.scores.errors.distance_m()
 
@@ -160,7 +160,7 @@ def test_innovation_finds_the_noise_of_fixes_that_claim_too_little(sand: Recordi
     assert sand.gnss is not None
     liar = with_fixes(sand, 30.0 * rng.normal(size=(len(sand.gnss), 2)), claimed_m=3.0)
 
-    def late_nis(result: Replay) -> float:
+    def late_nis(result: ReplayResult) -> float:
         nis = [i.nis / i.dof for i in result.estimate.innovations if i.sensor == "gnss"]
         return float(np.median(nis[len(nis) // 2 :]))
 

@@ -44,7 +44,7 @@ from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, wri
 from terrafusion.fusion.config.estimator_config import MODES
 from terrafusion.fusion.metrics.health import examine_estimate
 from terrafusion.fusion.metrics.metrics import Outage
-from terrafusion.fusion.replay import Replay, replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.executors import open_workers
 
 FIRST_MODES = ("adaptive", "fixed")
@@ -201,7 +201,7 @@ def _tried(
     return dataclasses.replace(_run(task, result, reference, test, outage), drive=drive, seed=task.seed)
 
 
-def _run(task: Task, result: Replay, reference: str, test: str, outage: Outage | None) -> Run:
+def _run(task: Task, result: ReplayResult, reference: str, test: str, outage: Outage | None) -> Run:
     recording, scores = result.recording, result.scores
     assert recording.wheels is not None
     health = examine_estimate(result.estimate, recording.wheels, result.vehicle.rig().wheel_radius_m)
@@ -242,7 +242,7 @@ def _run(task: Task, result: Replay, reference: str, test: str, outage: Outage |
     )
 
 
-def _nees_in(result: Replay, outage: Outage) -> float | None:
+def _nees_in(result: ReplayResult, outage: Outage) -> float | None:
     errors = result.scores.errors
     if errors is None:
         return None

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.fusion.reports.gap_text import sentences
 from terrafusion.fusion.reports.plots.gap import plot_shrink
-from terrafusion.twin.gap import Diagnosis, diagnose
+from terrafusion.twin.gap import GapDiagnosis, diagnose
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES
 from terrafusion.twin.gap.answer.verdict import LAW_MOVES, UNKNOWN
@@ -34,12 +34,12 @@ def references() -> list[Recording]:
 
 
 @pytest.fixture(scope="module")
-def wide(references: list[Recording]) -> Diagnosis:
+def wide(references: list[Recording]) -> GapDiagnosis:
     """Wheels 3 % larger than the twin's."""
     return diagnose(runs(300, 2, WIDE), references, VEHICLE)
 
 
-def checked(d: Diagnosis) -> dict:
+def checked(d: GapDiagnosis) -> dict:
     answer = d.to_json()
     jsonschema.validate(answer, SCHEMA)
     probabilities = [c["probability"] for c in answer["causes"]]
@@ -71,7 +71,7 @@ def test_effect_a_wider_track(references: list[Recording]) -> None:
     assert answer["next_run"] is None
 
 
-def test_ambiguous_larger_wheels_and_grousers(wide: Diagnosis) -> None:
+def test_ambiguous_larger_wheels_and_grousers(wide: GapDiagnosis) -> None:
     answer = checked(wide)
     assert answer["verdict"] == "ambiguous"
     assert answer["named"] == ["wheel_radius"]
@@ -180,7 +180,7 @@ def _swinging(run: Recording) -> Recording:
     return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
 
 
-def test_the_gap_shrinks_on_runs_left_out(wide: Diagnosis) -> None:
+def test_the_gap_shrinks_on_runs_left_out(wide: GapDiagnosis) -> None:
     s = wide.to_json()["shrink"]
     assert s["after"] < s["before"]
     assert s["after"] < 1.2 * s["floor"]
@@ -188,7 +188,7 @@ def test_the_gap_shrinks_on_runs_left_out(wide: Diagnosis) -> None:
     assert set(s["per_channel"]) >= {"gnss_position", "yaw_rate", "wheel_left"}
 
 
-def test_the_map_names_a_cell_of_the_gap(wide: Diagnosis) -> None:
+def test_the_map_names_a_cell_of_the_gap(wide: GapDiagnosis) -> None:
     cells = wide.to_json()["where"]
     assert cells[0]["p_value"] <= 0.05
     assert sum(c["share"] for c in cells) == pytest.approx(1.0, abs=1e-6)
@@ -201,12 +201,12 @@ def fresh() -> list[Recording]:
 
 
 @pytest.fixture(scope="module")
-def unreferred(fresh: list[Recording]) -> Diagnosis:
+def unreferred(fresh: list[Recording]) -> GapDiagnosis:
     """Against the uncorrected twin alone."""
     return diagnose(fresh, [], VEHICLE)
 
 
-def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferred: Diagnosis) -> None:
+def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferred: GapDiagnosis) -> None:
     answer = checked(unreferred)
     assert answer["gap"]["uncalibrated"]
     assert answer["gap"]["detected"]
@@ -217,7 +217,7 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
     assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale", "grousers")
 
 
-def test_a_plot_names_references_where_there_are_any(wide: Diagnosis, unreferred: Diagnosis) -> None:
+def test_a_plot_names_references_where_there_are_any(wide: GapDiagnosis, unreferred: GapDiagnosis) -> None:
     for found, labels in ((wide, ["before", "after", "references"]), (unreferred, ["before", "after"])):
         legend = plot_shrink(found)[1].get_legend()
         assert legend is not None
@@ -232,12 +232,12 @@ def test_without_references_the_twins_own_runs_are_no_gap(first: int) -> None:
     assert answer["verdict"] == "no_gap"
 
 
-def test_the_same_input_gives_the_same_bits(fresh: list[Recording], unreferred: Diagnosis) -> None:
+def test_the_same_input_gives_the_same_bits(fresh: list[Recording], unreferred: GapDiagnosis) -> None:
     assert json.dumps(diagnose(fresh, [], VEHICLE).to_json()) == json.dumps(unreferred.to_json())
 
 
 def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
-    wide: Diagnosis, fresh: list[Recording], unreferred: Diagnosis, tmp_path: Path
+    wide: GapDiagnosis, fresh: list[Recording], unreferred: GapDiagnosis, tmp_path: Path
 ) -> None:
     target = tmp_path / "corrected.yaml"
     said = write_corrected(wide, "elevate", target)
@@ -261,12 +261,12 @@ ACROSS = {"cross_slope/uniform": 0.0873}
 
 
 @pytest.fixture(scope="module")
-def across(references: list[Recording]) -> Diagnosis:
+def across(references: list[Recording]) -> GapDiagnosis:
     """On a slope of 5 deg to the left."""
     return diagnose(runs(310, 2, ACROSS), references, VEHICLE)
 
 
-def test_a_slope_is_taken_in_the_direction_it_has_to_a_robot_that_crabs(across: Diagnosis) -> None:
+def test_a_slope_is_taken_in_the_direction_it_has_to_a_robot_that_crabs(across: GapDiagnosis) -> None:
     answer = checked(across)
     assert answer["named"] == ["cross_slope"]
     assert values_of(across)["cross_slope/uniform"] == pytest.approx(0.0873, abs=0.0015)
@@ -275,7 +275,7 @@ def test_a_slope_is_taken_in_the_direction_it_has_to_a_robot_that_crabs(across: 
 
 
 def test_an_effect_that_is_no_number_of_the_vehicle_goes_into_its_file(
-    across: Diagnosis, tmp_path: Path
+    across: GapDiagnosis, tmp_path: Path
 ) -> None:
     target, fresh = tmp_path / "corrected.yaml", runs(330, 2, ACROSS)
     assert any("cross_slope/uniform" in line for line in write_corrected(across, "elevate", target))
@@ -290,7 +290,7 @@ def test_an_effect_that_is_no_number_of_the_vehicle_goes_into_its_file(
     assert not after.detected
 
 
-def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: Diagnosis) -> None:
+def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: GapDiagnosis) -> None:
     on_it = dataclasses.replace(VEHICLE, effects=values_of(across))
     found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], on_it, effects=("gyro_bias",))
     assert found.bench.candidates.effects == ("gyro_bias", "cross_slope")

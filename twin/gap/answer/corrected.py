@@ -13,7 +13,7 @@ from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams
 
 if TYPE_CHECKING:
-    from terrafusion.twin.gap.answer.diagnosis import Diagnosis
+    from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
 FIELDS = {
     "mass/at_cg": (("body.mass_kg", "times"), ("body.yaw_inertia_kgm2", "times")),
@@ -34,7 +34,7 @@ _CHANGES = {
 }
 
 
-def values_of(diagnosis: Diagnosis) -> dict[str, float]:
+def values_of(diagnosis: GapDiagnosis) -> dict[str, float]:
     """Parameters of the effects named, by key."""
     answer = diagnosis.to_json()
     named = set(answer["named"])
@@ -46,7 +46,7 @@ def values_of(diagnosis: Diagnosis) -> dict[str, float]:
     }
 
 
-def write_corrected(diagnosis: Diagnosis, vehicle: str | Path, target: Path) -> list[str]:
+def write_corrected(diagnosis: GapDiagnosis, vehicle: str | Path, target: Path) -> list[str]:
     """Write the vehicle's file with the effects named; what was done, in sentences.
 
     The twin of that file has them: `terrafusion gap` and `simulate` with `--vehicle` as with `--effect`.

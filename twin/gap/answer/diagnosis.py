@@ -1,4 +1,4 @@
-"""`Diagnosis`: what a diagnosis found, and the same as `diagnosis.json` has it."""
+"""`GapDiagnosis`: what a diagnosis found, and the same as `diagnosis.json` has it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SCHEMA = "terrafusion.gap/1"
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnosis:
+class GapDiagnosis:
     """What `diagnose` finds.
 
     Attributes:
@@ -66,7 +66,7 @@ class Diagnosis:
         return as_dict(self)
 
 
-def as_dict(d: Diagnosis) -> dict[str, Any]:
+def as_dict(d: GapDiagnosis) -> dict[str, Any]:
     """The diagnosis in plain types; what is not known is null."""
     found, verdict = d.detection, d.verdict
     return {
@@ -106,7 +106,7 @@ def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _cause(d: Diagnosis, cause: Cause) -> dict[str, Any]:
+def _cause(d: GapDiagnosis, cause: Cause) -> dict[str, Any]:
     c, base = d.bench.candidates, d.bench.model.effects
     parameters = {}
     for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):

@@ -1,0 +1,87 @@
+"""`terrafusion.diagnose`: where robot and twin differ, and which effect causes it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from terrafusion.datasets.core.display import text_html
+from terrafusion.fusion.api.logs import Log, opened
+from terrafusion.fusion.reports.gap import write_diagnosis
+from terrafusion.fusion.reports.gap_text import sentences
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
+from terrafusion.twin.gap.diagnose import diagnose as run
+from terrafusion.twin.model.soil import SoilParams
+from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
+
+Soils = str | SoilParams | Mapping[str, str | SoilParams] | None
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Diagnosis(GapDiagnosis):
+    """A diagnosis: `summary`, `to_json` and `report`."""
+
+    def summary(self) -> str:
+        """The answer in a few sentences that say only what the numbers carry."""
+        return " ".join(sentences(self))
+
+    def report(self, out: str | Path) -> Path:
+        """Writes diagnosis.json and report.html into a folder and returns the page.
+
+        Raises:
+            TerrafusionError: the folder cannot be written.
+        """
+        write_diagnosis(Path(out), self)
+        return Path(out) / "report.html"
+
+    def __repr__(self) -> str:
+        named = ", ".join(self.verdict.named) or "none"
+        lines = [
+            f"Diagnosis of {len(self.runs)} run(s) against {len(self.references)} reference run(s), "
+            f"{self.vehicle}",
+            f"  gap detected: {'yes' if self.detected else 'no'} (p = {self.detection.p_value:.3g})",
+            f"  verdict: {self.verdict.kind}; named: {named}",
+        ]
+        for cause in self.verdict.causes[:4] if self.detected else ():
+            lines.append(f"  {cause.effect}: probability {cause.probability:.2f}")
+        return "\n".join(lines)
+
+    def _repr_html_(self) -> str:
+        return text_html(repr(self))
+
+
+def diagnose(
+    runs: Log | Sequence[Log],
+    *,
+    references: Log | Sequence[Log] = (),
+    vehicle: str | Path | VehicleParams = "elevate",
+    terrain: Soils = None,
+    effects: Sequence[str] | None = None,
+    significance: float = 0.05,
+    seed: int = 0,
+    progress: Callable[[float], None] | None = None,
+) -> Diagnosis:
+    """Compare runs with reference runs of the same robot through its twin.
+
+    Args:
+        runs: one log or several: the robot as it is now.
+        references: logs that count as normal; none: replicates of the twin stand in for them.
+        vehicle: the twin's vehicle: name, YAML file or `Vehicle`.
+        terrain: the ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
+        effects: candidates by name; None: the whole catalogue.
+        significance: threshold of the test for a gap.
+        seed: of the permutations and replicates.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        ConfigError: an unknown effect, soil or vehicle.
+        DataError: a log without what the diagnosis needs, or given twice.
+    """
+    params = as_vehicle(vehicle)
+    judged, normal = opened(runs, params.rig()), opened(references, params.rig())
+    result = run(
+        judged, normal, params, terrain, effects=effects, significance=significance, seed=seed,
+        progress=progress,
+    )  # fmt: skip
+    return Diagnosis(**vars(result))

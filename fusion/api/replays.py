@@ -1,0 +1,111 @@
+"""`terrafusion.replay`: a recorded drive through the estimator, with its scores and its report."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.display import text_html
+from terrafusion.fusion.api.logs import Log, opened
+from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.noise.policy import Policy
+from terrafusion.fusion.replay import ReplayResult
+from terrafusion.fusion.replay import replay as run
+from terrafusion.fusion.outputs.replay_files import metrics_of
+from terrafusion.fusion.reports.replay import write_replay
+from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Replay(ReplayResult):
+    """A replayed drive: `estimate`, `metrics` and `report`."""
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """The content of `metrics.json`; it keeps to docs/schemas/metrics.schema.json."""
+        return metrics_of(self)
+
+    def report(self, out: str | Path) -> Path:
+        """Writes metrics.json, estimate.csv, trajectory.tum, weights.jsonl and report.html into a folder.
+
+        Returns:
+            the page.
+
+        Raises:
+            TerrafusionError: the folder cannot be written.
+        """
+        write_replay(Path(out), self)
+        return Path(out) / "report.html"
+
+    def __repr__(self) -> str:
+        scores = self.scores
+        lines = [
+            f"Replay of '{self.recording.name}' ({self.vehicle.name}, {self.mode}), "
+            f"{self.recording.duration_s():.1f} s at {self.realtime_factor():.0f} x real time"
+        ]
+        if scores.ate_m is not None:
+            lines.append(f"  position error against {scores.against}: {scores.ate_m:.3f} m (RMS)")
+        if scores.held_out is not None:
+            held = scores.held_out
+            lines.append(f"  {held.fixes} fixes held out: median error {held.median_m:.2f} m")
+        for outage in scores.outages[:4]:
+            end = "not scored" if outage.end_error_m is None else f"{outage.end_error_m:.2f} m at its end"
+            lines.append(f"  outage {outage.start_s:g} to {outage.start_s + outage.seconds:g} s: {end}")
+        return "\n".join([*lines, *(f"  {line}" for line in repr(self.estimate).splitlines())])
+
+    def _repr_html_(self) -> str:
+        return text_html(repr(self))
+
+
+def replay(
+    log: Log,
+    *,
+    vehicle: str | Path | VehicleParams | None = None,
+    mode: str = "adaptive",
+    policy: Path | Policy | None = None,
+    outages: Sequence[tuple[float, float] | Outage] = (),
+    batch: bool = False,
+    magnetometer: bool = False,
+    calibrate: bool = False,
+    lag_s: float = 5.0,
+    progress: Callable[[float], None] | None = None,
+) -> Replay:
+    """Estimate a recorded drive and score it against its truth, or against fixes that are held out.
+
+    Args:
+        log: a `Recording`, or the path or catalogue name of one.
+        vehicle: name, YAML file or `Vehicle`; by default what the log says.
+        mode: "adaptive", "fixed", "robust" or "innovation".
+        policy: weighting policy, or its file; by default the shipped one.
+        outages: (start, length) in s, from the start of the log: no fix is given to the estimator there.
+        batch: smooth the whole drive at once, instead of a fixed lag as live.
+        magnetometer: use the log's magnetometer.
+        calibrate: also estimate wheel radius, antenna, IMU rotation and delays.
+        lag_s: length of the smoothing window.
+        progress: called with the share done, 0 to 1.
+
+    Raises:
+        TerrafusionError: the log or the vehicle cannot be used; one line says what, where and what to do.
+
+    Example:
+        >>> import terrafusion as tf
+        >>> result = tf.replay(tf.simulate("straight"), outages=[(20, 10)])
+        >>> result.metrics["mode"]
+        'adaptive'
+    """
+    known = None if vehicle is None else as_vehicle(vehicle)
+    (recording,) = opened(log, None if known is None else known.rig())
+    result = run(
+        recording,
+        vehicle=known,
+        mode=mode,
+        policy=policy,
+        outages=[o if isinstance(o, Outage) else Outage(*map(float, o)) for o in outages],
+        batch=batch,
+        progress=progress,
+        magnetometer=magnetometer,
+        settings={"calibrate": calibrate, "lag_s": lag_s},
+    )
+    return Replay(**vars(result))
