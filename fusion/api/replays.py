@@ -11,9 +11,9 @@ from terrafusion.datasets.core.display import text_html
 from terrafusion.fusion.api.logs import Log, opened
 from terrafusion.fusion.metrics.metrics import Outage
 from terrafusion.fusion.noise.policy import Policy
+from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import ReplayResult
 from terrafusion.fusion.replay import replay as run
-from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.reports.replay import write_replay
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 

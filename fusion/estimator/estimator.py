@@ -11,11 +11,10 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import gtsam
-from pathlib import Path
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
