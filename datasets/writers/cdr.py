@@ -17,7 +17,7 @@ _ENCAPSULATION = b"\x00\x01\x00\x00"
 """Plain CDR, little endian (OMG DDS-XTypes 1.3, sec. 7.6.3.1.2)."""
 
 
-class Layout:
+class CdrTemplate:
     """The layout of a message, built field after field in the order of its definition.
 
     CDR aligns each primitive to its own size, counted from behind the four bytes of encapsulation.
@@ -30,27 +30,27 @@ class Layout:
     def _align(self, size: int) -> None:
         self._bytes.extend(bytes(-(len(self._bytes) - 4) % size))
 
-    def constant(self, code: str, *values: float) -> Layout:
+    def constant(self, code: str, *values: float) -> CdrTemplate:
         """Numbers that are the same in all messages; `code` as in `struct`."""
         self._align(struct.calcsize(code))
         self._bytes.extend(struct.pack(f"<{len(values)}{code}", *values))
         return self
 
-    def string(self, text: str) -> Layout:
+    def string(self, text: str) -> CdrTemplate:
         """A text that is the same in all messages."""
         data = text.encode() + b"\0"
         self.constant("I", len(data))
         self._bytes.extend(data)
         return self
 
-    def strings(self, texts: Sequence[str]) -> Layout:
+    def strings(self, texts: Sequence[str]) -> CdrTemplate:
         """A sequence of such texts."""
         self.constant("I", len(texts))
         for text in texts:
             self.string(text)
         return self
 
-    def field(self, name: str, dtype: str = "<f8", count: int = 1) -> Layout:
+    def field(self, name: str, dtype: str = "<f8", count: int = 1) -> CdrTemplate:
         """`count` numbers that vary, found under `name` in the rows."""
         kind = np.dtype(dtype)
         self._align(kind.itemsize)
@@ -58,12 +58,12 @@ class Layout:
         self._bytes.extend(bytes(kind.itemsize * count))
         return self
 
-    def sequence(self, name: str, count: int) -> Layout:
+    def sequence(self, name: str, count: int) -> CdrTemplate:
         """A sequence of `count` doubles that vary."""
         self.constant("I", count)
         return self.field(name, count=count) if count else self
 
-    def header(self, frame_id: str) -> Layout:
+    def header(self, frame_id: str) -> CdrTemplate:
         """std_msgs/Header; see `stamp`."""
         return self.field("sec", "<i4").field("nanosec", "<u4").string(frame_id)
 
@@ -88,6 +88,6 @@ class Layout:
 
 
 def split(rows: NDArray[Any]) -> list[bytes]:
-    """The messages of `Layout.rows` one by one."""
+    """The messages of `CdrTemplate.rows` one by one."""
     data, size = rows.view(np.uint8).tobytes(), rows.dtype.itemsize  # as bytes: fields alone have gaps
     return [data[first : first + size] for first in range(0, len(data), size)]

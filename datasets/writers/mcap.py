@@ -19,7 +19,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
-from terrafusion.datasets.writers.mcap_file import Definition, Topic, write_mcap_file
+from terrafusion.datasets.writers.mcap_file import Definition, TopicMessages, write_mcap_file
 from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
 
 if TYPE_CHECKING:
@@ -107,7 +107,7 @@ def _later(recording: Recording, shift_ns: int) -> Recording:
     return dataclasses.replace(recording, start_ns=recording.start_ns + shift_ns, **moved)
 
 
-def _check_times(topic: Topic, path: Path) -> None:
+def _check_times(topic: TopicMessages, path: Path) -> None:
     for t in topic.t_ns[:1].tolist() + topic.t_ns[-1:].tolist():
         if not 0 <= t < END_NS:
             raise DataError(
@@ -115,7 +115,7 @@ def _check_times(topic: Topic, path: Path) -> None:
             )
 
 
-def _definitions(topics: list[Topic]) -> dict[str, Definition]:
+def _definitions(topics: list[TopicMessages]) -> dict[str, Definition]:
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.ROS2_HUMBLE)
@@ -144,7 +144,7 @@ class _Parts:
         tables = {name: list(self.tables[name].columns) for name in sorted(self.only_here)}
         return {"tables": tables, "words": self.words}
 
-    def once(self, start_ns: int) -> Iterator[Topic]:
+    def once(self, start_ns: int) -> Iterator[TopicMessages]:
         """Topics with one message at the start."""
         positions = self._positions()
         if positions:
@@ -160,7 +160,7 @@ class _Parts:
         }
         return {frame: position for frame, position in known.items() if position is not None}
 
-    def standard(self) -> Iterator[Topic]:
+    def standard(self) -> Iterator[TopicMessages]:
         """Topics of the channels: standard messages, then the tables of those they cannot hold."""
         r = self.recording
         if r.command is not None:
@@ -211,10 +211,10 @@ class _Parts:
     def _imu_frame(self) -> str:
         return "imu_link" if "imu_link" in self._positions() else "base_link"
 
-    def _imu(self, imu: Imu) -> Topic:
+    def _imu(self, imu: Imu) -> TopicMessages:
         return ros.imu(self._complete("imu", imu, imu.columns()), self._imu_frame())
 
-    def _wheels(self, wheels: Wheels) -> Iterator[Topic]:
+    def _wheels(self, wheels: Wheels) -> Iterator[TopicMessages]:
         complete: Wheels = self._complete("wheels", wheels, wheels.columns())
         if wheels.unit == "radps" and wheels.has_sides():
             yield ros.joint_states(complete)
@@ -230,7 +230,7 @@ class _Parts:
             self.unseen.append("wheels: wheel angles (Odometry has none)")
         yield ros.wheel_odometry(complete, track)
 
-    def _gnss(self, gnss: Gnss) -> Iterator[Topic]:
+    def _gnss(self, gnss: Gnss) -> Iterator[TopicMessages]:
         if (gnss.fix == Fix.FLOAT).any():
             self.unseen.append("gnss: the 'float' fix class (NavSatFix has none; written as augmented, SBAS)")
         if self.recording.datum is None:
@@ -239,7 +239,7 @@ class _Parts:
         if gnss.velocity_enu_mps is not None:
             yield ros.gnss_velocity(gnss.select(np.isfinite(gnss.velocity_enu_mps[:, :2]).all(axis=1)))
 
-    def _truth(self, truth: Trajectory) -> Topic:
+    def _truth(self, truth: Trajectory) -> TopicMessages:
         if not _odometry_holds(truth):
             self.only_here.add("truth")
         known = np.isfinite(truth.position_m[:, :2]).all(axis=1)

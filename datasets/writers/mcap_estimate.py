@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.writers import ros_messages as ros
-from terrafusion.datasets.writers.cdr import Layout, split
-from terrafusion.datasets.writers.mcap_file import Topic
+from terrafusion.datasets.writers.cdr import CdrTemplate, split
+from terrafusion.datasets.writers.mcap_file import TopicMessages
 
 
 class Level(IntEnum):
@@ -50,7 +50,7 @@ class WrittenEstimate:
     diagnostics_ns: NDArray[np.int64] = dataclasses.field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     diagnostics: Sequence[Sequence[Status]] = ()
 
-    def topics(self, shift_ns: int) -> Iterator[Topic]:
+    def topics(self, shift_ns: int) -> Iterator[TopicMessages]:
         """`/odometry/filtered`, and `/tf` and `/diagnostics` where there is something; stamps are shifted."""
         path = dataclasses.replace(self.trajectory, t_ns=self.trajectory.t_ns + shift_ns)
         yield ros.trajectory(
@@ -62,17 +62,17 @@ class WrittenEstimate:
             yield _diagnostics(self.diagnostics_ns + shift_ns, self.diagnostics)
 
 
-def _diagnostics(t_ns: NDArray[np.int64], statuses: Sequence[Sequence[Status]]) -> Topic:
+def _diagnostics(t_ns: NDArray[np.int64], statuses: Sequence[Sequence[Status]]) -> TopicMessages:
     """diagnostic_msgs/DiagnosticArray; texts differ in length, so each message has its own layout."""
 
     def encode(rows: slice) -> list[bytes]:
         return [_array(t, found) for t, found in zip(t_ns[rows].tolist(), statuses[rows], strict=True)]
 
-    return Topic("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", t_ns, encode)
+    return TopicMessages("/diagnostics", "diagnostic_msgs/msg/DiagnosticArray", t_ns, encode)
 
 
 def _array(t_ns: int, statuses: Sequence[Status]) -> bytes:
-    layout = Layout().header("").constant("I", len(statuses))
+    layout = CdrTemplate().header("").constant("I", len(statuses))
     for status in statuses:
         layout.constant("B", int(status.level))
         layout.string(status.name).string(status.message).string("")

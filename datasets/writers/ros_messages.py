@@ -24,8 +24,8 @@ from terrafusion.datasets.core.channels import (
 from terrafusion.datasets.core.frames import enu_to_geodetic, rpy_to_quaternion
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
-from terrafusion.datasets.writers.cdr import Layout, split
-from terrafusion.datasets.writers.mcap_file import Topic
+from terrafusion.datasets.writers.cdr import CdrTemplate, split
+from terrafusion.datasets.writers.mcap_file import TopicMessages
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -39,7 +39,7 @@ EARTH_M = 1e7
 """ENU coordinates beyond this are nowhere on Earth."""
 
 
-def _topic(name: str, msgtype: str, layout: Layout, t_ns: TimesNs, **fields: Array) -> Topic:
+def _topic(name: str, msgtype: str, layout: CdrTemplate, t_ns: TimesNs, **fields: Array) -> TopicMessages:
     """Messages with a header; `fields` (N, ...) go by the names of the layout."""
 
     def encode(rows: slice) -> list[bytes]:
@@ -48,18 +48,20 @@ def _topic(name: str, msgtype: str, layout: Layout, t_ns: TimesNs, **fields: Arr
             block[key] = values[rows]
         return split(block)
 
-    return Topic(name, msgtype, t_ns, encode)
+    return TopicMessages(name, msgtype, t_ns, encode)
 
 
-def text(name: str, t_ns: int, content: str) -> Topic:
+def text(name: str, t_ns: int, content: str) -> TopicMessages:
     """One latched std_msgs/String."""
-    message = split(Layout().string(content).rows(1))
-    return Topic(name, "std_msgs/msg/String", np.array([t_ns]), lambda rows: message[rows], latched=True)
+    message = split(CdrTemplate().string(content).rows(1))
+    return TopicMessages(
+        name, "std_msgs/msg/String", np.array([t_ns]), lambda rows: message[rows], latched=True
+    )
 
 
-def imu(imu: Imu, frame: str) -> Topic:
+def imu(imu: Imu, frame: str) -> TopicMessages:
     """sensor_msgs/Imu; an absent group is zero under a covariance of -1, an absent axis is NaN."""
-    layout = Layout().header(frame).constant("d", *IDENTITY, -1.0, *[0.0] * 8)
+    layout = CdrTemplate().header(frame).constant("d", *IDENTITY, -1.0, *[0.0] * 8)
     fields = {}
     for name, values in (("gyro", imu.gyro_radps), ("accel", imu.accel_mps2)):
         absent = bool(np.isnan(values).all())
@@ -68,25 +70,25 @@ def imu(imu: Imu, frame: str) -> Topic:
     return _topic("/imu/data", "sensor_msgs/msg/Imu", layout, imu.t_ns, **fields)
 
 
-def pressure(barometer: Barometer) -> Topic:
+def pressure(barometer: Barometer) -> TopicMessages:
     """sensor_msgs/FluidPressure; the variance is not known, which is 0 there."""
-    layout = Layout().header("base_link").field("pressure").constant("d", 0.0)
+    layout = CdrTemplate().header("base_link").field("pressure").constant("d", 0.0)
     kind = "sensor_msgs/msg/FluidPressure"
     return _topic("/pressure", kind, layout, barometer.t_ns, pressure=barometer.pressure_pa)
 
 
-def magnetic_field(magnetometer: Magnetometer, frame: str) -> Topic:
+def magnetic_field(magnetometer: Magnetometer, frame: str) -> TopicMessages:
     """sensor_msgs/MagneticField, tesla; the covariance is not known, which is 0 there (REP-145)."""
-    layout = Layout().header(frame).field("field", count=3).constant("d", *[0.0] * 9)
+    layout = CdrTemplate().header(frame).field("field", count=3).constant("d", *[0.0] * 9)
     kind = "sensor_msgs/msg/MagneticField"
     return _topic("/imu/mag", kind, layout, magnetometer.t_ns, field=magnetometer.field_t)
 
 
-def joint_states(wheels: Wheels) -> Topic:
+def joint_states(wheels: Wheels) -> TopicMessages:
     """sensor_msgs/JointState with one joint a wheel, rad/s and rad."""
     names = [f"{name}_wheel_joint" for name in wheels.names]
     angle = wheels.angle_rad if wheels.angle_rad is not None else wheels.speed[:, :0]
-    layout = Layout().header("").strings(names)
+    layout = CdrTemplate().header("").strings(names)
     layout.sequence("angle", angle.shape[1]).sequence("speed", len(names)).sequence("effort", 0)
     fields = {"speed": wheels.speed} | ({"angle": angle} if angle.shape[1] else {})
     return _topic("/joint_states", "sensor_msgs/msg/JointState", layout, wheels.t_ns, **fields)
@@ -94,14 +96,14 @@ def joint_states(wheels: Wheels) -> Topic:
 
 def _odometry(
     name: str, frames: tuple[str, str], t_ns: TimesNs, pose: Array, P: Array, twist: Array, Q: Array
-) -> Topic:
+) -> TopicMessages:
     """nav_msgs/Odometry of `pose` (N, 7) and `twist` (N, 6); covariances (N, 36) in ROS order."""
-    layout = Layout().header(frames[0]).string(frames[1])
+    layout = CdrTemplate().header(frames[0]).string(frames[1])
     layout.field("pose", count=7).field("P", count=36).field("twist", count=6).field("Q", count=36)
     return _topic(name, "nav_msgs/msg/Odometry", layout, t_ns, pose=pose, P=P, twist=twist, Q=Q)
 
 
-def wheel_odometry(wheels: Wheels, track_m: float | None) -> Topic:
+def wheel_odometry(wheels: Wheels, track_m: float | None) -> TopicMessages:
     """Wheel speeds in m/s as body twist, and the pose by dead reckoning.
 
     Where sides or track are not known the yaw rate is zero under a variance of 1e6.
@@ -131,7 +133,7 @@ def trajectory(
     *,
     frame: str = "map",
     twist_covariance: Array | None = None,
-) -> Topic:
+) -> TopicMessages:
     """nav_msgs/Odometry, `frame` -> `child`; what is unknown is 0 under a variance of 1e6.
 
     The covariance of the pose is about the axes of `frame`, that of the twist (N, 6, 6) about those
@@ -164,7 +166,7 @@ def _known(values: Array) -> Array:
     return np.where(np.isnan(values), 0.0, values)
 
 
-def fixes(gnss: Gnss, datum: tuple[float, float, float]) -> Topic:
+def fixes(gnss: Gnss, datum: tuple[float, float, float]) -> TopicMessages:
     """sensor_msgs/NavSatFix of the antenna; an unknown height is NaN, a place not on Earth is no fix."""
     flat = np.asarray(np.isnan(gnss.enu_m[:, 2]))
     enu = np.where(flat[:, None] & [False, False, True], 0.0, gnss.enu_m)
@@ -176,15 +178,15 @@ def fixes(gnss: Gnss, datum: tuple[float, float, float]) -> Topic:
     return _fix_topic("/fix", gnss.t_ns, llh, np.where(lost, -1, status), gnss.sigma_enu_m)
 
 
-def datum(t_ns: int, datum: tuple[float, float, float]) -> Topic:
+def datum(t_ns: int, datum: tuple[float, float, float]) -> TopicMessages:
     """The origin of ENU, once, as sensor_msgs/NavSatFix."""
     times, unknown = np.array([t_ns]), np.full((1, 3), np.nan)
     topic = _fix_topic("/datum", times, np.array([datum]), np.zeros(1), unknown)
-    return Topic(topic.name, topic.msgtype, times, topic.encode, latched=True)
+    return TopicMessages(topic.name, topic.msgtype, times, topic.encode, latched=True)
 
 
-def _fix_topic(name: str, t_ns: TimesNs, llh: Array, status: NDArray[Any], sigma: Array) -> Topic:
-    layout = Layout().header("gnss_antenna").field("status", "i1").constant("H", 1)
+def _fix_topic(name: str, t_ns: TimesNs, llh: Array, status: NDArray[Any], sigma: Array) -> TopicMessages:
+    layout = CdrTemplate().header("gnss_antenna").field("status", "i1").constant("H", 1)
     layout.field("llh", count=3).field("P", count=9).field("kind", "u1")
     with np.errstate(over="ignore"):
         variance = sigma**2
@@ -195,7 +197,7 @@ def _fix_topic(name: str, t_ns: TimesNs, llh: Array, status: NDArray[Any], sigma
     return _topic(name, "sensor_msgs/msg/NavSatFix", layout, t_ns, status=status, llh=llh, P=P, kind=kind)
 
 
-def gnss_velocity(gnss: Gnss) -> Topic:
+def gnss_velocity(gnss: Gnss) -> TopicMessages:
     """geometry_msgs/TwistWithCovarianceStamped: east, north, up velocity of the antenna."""
     assert gnss.velocity_enu_mps is not None
     sigma = gnss.sigma_v_mps if gnss.sigma_v_mps is not None else np.zeros(len(gnss))
@@ -204,52 +206,54 @@ def gnss_velocity(gnss: Gnss) -> Topic:
     Q = np.zeros((len(gnss), 36))
     Q[:, 0:21:7], Q[:, 21::7] = variance, UNKNOWN_VARIANCE
     twist = np.hstack([_known(gnss.velocity_enu_mps), np.zeros((len(gnss), 3))])
-    layout = Layout().header("map").field("twist", count=6).field("Q", count=36)
+    layout = CdrTemplate().header("map").field("twist", count=6).field("Q", count=36)
     kind = "geometry_msgs/msg/TwistWithCovarianceStamped"
     return _topic("/fix_velocity", kind, layout, gnss.t_ns, twist=twist, Q=Q)
 
 
-def command(command: Command) -> Topic:
+def command(command: Command) -> TopicMessages:
     """geometry_msgs/TwistStamped in base_link."""
     twist = np.zeros((len(command), 6))
     twist[:, 0], twist[:, 5] = command.v_mps, command.yaw_rate_radps
-    layout = Layout().header("base_link").field("twist", count=6)
+    layout = CdrTemplate().header("base_link").field("twist", count=6)
     return _topic("/cmd_vel", "geometry_msgs/msg/TwistStamped", layout, command.t_ns, twist=twist)
 
 
-def terrain(terrain: Terrain) -> Topic:
+def terrain(terrain: Terrain) -> TopicMessages:
     """std_msgs/String with the label, at the time of the label."""
     labels = [str(label) for label in terrain.label.tolist()]
-    messages = {label: split(Layout().string(label).rows(1))[0] for label in set(labels)}
-    return Topic(
+    messages = {label: split(CdrTemplate().string(label).rows(1))[0] for label in set(labels)}
+    return TopicMessages(
         "/terrain", "std_msgs/msg/String", terrain.t_ns, lambda rows: [messages[x] for x in labels[rows]]
     )
 
 
-def static_transforms(t_ns: int, positions_m: Mapping[str, Sequence[float]]) -> Topic:
+def static_transforms(t_ns: int, positions_m: Mapping[str, Sequence[float]]) -> TopicMessages:
     """tf2_msgs/TFMessage, latched: base_link -> each frame, at its position and not turned."""
-    layout = Layout().constant("I", len(positions_m))
+    layout = CdrTemplate().constant("I", len(positions_m))
     for frame, position in positions_m.items():
         stamp = divmod(t_ns, 1_000_000_000)
         layout.constant("I", *stamp).string("base_link").string(frame)
         layout.constant("d", *position, *IDENTITY)
     message = split(layout.rows(1))
-    return Topic("/tf_static", "tf2_msgs/msg/TFMessage", np.array([t_ns]), lambda r: message[r], latched=True)
+    return TopicMessages(
+        "/tf_static", "tf2_msgs/msg/TFMessage", np.array([t_ns]), lambda r: message[r], latched=True
+    )
 
 
-def transforms(trajectory: Trajectory, frame: str, child: str) -> Topic:
+def transforms(trajectory: Trajectory, frame: str, child: str) -> TopicMessages:
     """tf2_msgs/TFMessage, `frame` -> `child`, one transform a message; orientations must be known."""
-    layout = Layout().constant("I", 1).header(frame).string(child).field("pose", count=7)
+    layout = CdrTemplate().constant("I", 1).header(frame).string(child).field("pose", count=7)
     pose = np.hstack([_known(trajectory.position_m), _oriented(trajectory)])
     return _topic("/tf", "tf2_msgs/msg/TFMessage", layout, trajectory.t_ns, pose=pose)
 
 
-def table(channel: str, t_ns: TimesNs, columns: dict[str, Array]) -> Topic:
+def table(channel: str, t_ns: TimesNs, columns: dict[str, Array]) -> TopicMessages:
     """std_msgs/Float64MultiArray: stamp (s, ns) and one row of the columns, which the label names."""
     stamps = [part.astype(float) for part in np.divmod(t_ns, 1_000_000_000)]
     values = np.stack([*stamps, *columns.values()], axis=1)
     count = values.shape[1]
-    layout = Layout().constant("I", 1).string(",".join([*STAMP, *columns]))
+    layout = CdrTemplate().constant("I", 1).string(",".join([*STAMP, *columns]))
     layout.constant("I", count, count, 0).sequence("data", count)
 
     def encode(rows: slice) -> list[bytes]:
@@ -257,7 +261,7 @@ def table(channel: str, t_ns: TimesNs, columns: dict[str, Array]) -> Topic:
         block["data"] = values[rows]
         return split(block)
 
-    return Topic(f"{PREFIX}{channel}", ROW, t_ns, encode)
+    return TopicMessages(f"{PREFIX}{channel}", ROW, t_ns, encode)
 
 
 def dead_reckoning(t_ns: TimesNs, v_mps: Array, rate_radps: Array) -> tuple[Array, Array, Array]:

@@ -1,7 +1,7 @@
-"""The container MCAP (mcap.dev/spec), with chunks or without, indexed or not.
+"""The container MCAP, with chunks or without, indexed or not.
 
-A file is a row of records: one byte for the kind, eight for the length, content. The records are found by
-one walk over their lengths; an index is used to pass over chunks, where there is one.
+Schemas, channels and chunks are parsed by the `mcap` library; message records, whose library reader takes
+one at a time, are found by one walk over their lengths. An index is used to skip chunks, where there is one.
 """
 
 from __future__ import annotations
@@ -9,10 +9,15 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, Chunk, Schema, Statistics
+from mcap.writer import MCAP0_MAGIC
 
 from terrafusion.datasets.readers.ros.raw import (
     MAX_CHUNK_BYTES,
@@ -28,8 +33,7 @@ from terrafusion.datasets.readers.ros.raw import (
     within_reason,
 )
 
-MAGIC = b"\x89MCAP0\r\n"
-HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, INDEX, STATISTICS = 1, 2, 3, 4, 5, 6, 7, 11
+MESSAGE = int(Opcode.MESSAGE)
 RECORD_HEAD = 9
 """Kind and length, before a record's content."""
 MESSAGE_HEAD = 31
@@ -41,31 +45,11 @@ LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl", "omgidl": "idl", "ros1msg": "ms
 _head = struct.Struct("<BQ").unpack_from
 
 
-class _Chunk(NamedTuple):
+class _ChunkPlace(NamedTuple):
     start: int
     size: int
     channels: set[int]
     """Those of the index records behind the chunk; empty without them."""
-
-
-class _Text:
-    """Reads numbers and strings off a record's content."""
-
-    def __init__(self, data: bytes) -> None:
-        self.data, self.position = data, 0
-
-    def number(self, size: int) -> int:
-        return int.from_bytes(self.take(size), "little")
-
-    def text(self) -> str:
-        return self.take(self.number(4)).decode(errors="replace")
-
-    def take(self, size: int) -> bytes:
-        taken = self.data[self.position : self.position + size]
-        if len(taken) != size:
-            raise BagError("a record is shorter than its content")
-        self.position += size
-        return taken
 
 
 class McapFile:
@@ -78,11 +62,11 @@ class McapFile:
     def __init__(self, path: Path) -> None:
         self._file = path.open("rb")
         self._end = path.stat().st_size
-        self._schemas: dict[int, tuple[str, str, str]] = {}
-        self._channels: dict[int, tuple[int, str, str]] = {}
-        self._chunks: list[_Chunk] = []
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._chunks: list[_ChunkPlace] = []
         self._loose = np.zeros(0, dtype=np.int64)  # where the messages outside of chunks begin
-        self._counts: dict[int, int] | None = None
+        self._counts: dict[int, int] = {}
         try:
             self._walk()
             if not self._is_summed_up():
@@ -96,37 +80,37 @@ class McapFile:
         self._file.close()
 
     def _is_summed_up(self) -> bool:
-        """Whether the summary tells of every channel its messages and, where it has one, its schema."""
-        told = (
-            bool(self._counts) and self._counts is not None and self._counts.keys() <= self._channels.keys()
+        """Whether the summary has the messages of every channel and, where it has one, its schema."""
+        counted = bool(self._counts) and self._counts.keys() <= self._channels.keys()
+        return counted and all(
+            not channel.schema_id or channel.schema_id in self._schemas for channel in self._channels.values()
         )
-        return told and all(not s or s in self._schemas for s, _, _ in self._channels.values())
 
     def _walk(self) -> None:
         """Go over all records of the file, without unpacking chunks."""
-        if self._read(0, len(MAGIC)) != MAGIC:
+        if self._read(0, len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise BagError("it does not begin as MCAP")
         kind, loose = 0, []
         for kind, start, size in self._records():
             if kind == MESSAGE:
                 loose.append(start - RECORD_HEAD)
-            elif kind == CHUNK:
-                self._chunks.append(_Chunk(start, size, set()))
-            elif kind == INDEX and self._chunks and size >= 6:
+            elif kind == Opcode.CHUNK:
+                self._chunks.append(_ChunkPlace(start, size, set()))
+            elif kind == Opcode.MESSAGE_INDEX and self._chunks and size >= 6:
                 number, length = struct.unpack("<HI", self._read(start, 6))
                 if length:
                     self._chunks[-1].channels.add(number)
-            elif kind in (SCHEMA, CHANNEL, STATISTICS):
-                self._learn(kind, self._content(start, size))
-            elif kind == FOOTER:
+            elif kind in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.STATISTICS):
+                self._learn(kind, self._read(start, size))
+            elif kind == Opcode.FOOTER:
                 break
         self._loose = np.array(loose, dtype=np.int64)
-        if kind != FOOTER or self._read(self._end - len(MAGIC), len(MAGIC)) != MAGIC:
+        if kind != Opcode.FOOTER or self._read(self._end - len(MCAP0_MAGIC), len(MCAP0_MAGIC)) != MCAP0_MAGIC:
             raise BagError("the file breaks off: it has no footer")
 
     def _records(self) -> Iterator[tuple[int, int, int]]:
         """Kind, place and length of the content of each record of the file."""
-        position, base, block = len(MAGIC), 0, b""
+        position, base, block = len(MCAP0_MAGIC), 0, b""
         while position < self._end:
             at = position - base
             if at + RECORD_HEAD > len(block):
@@ -146,20 +130,16 @@ class McapFile:
         self._file.seek(max(position, 0))
         return self._file.read(size)
 
-    def _content(self, start: int, size: int) -> _Text:
-        return _Text(self._read(start, size))
-
-    def _learn(self, kind: int, content: _Text) -> None:
-        if kind == SCHEMA:
-            number = content.number(2)
-            self._schemas[number] = content.text(), content.text(), content.text()
-        elif kind == CHANNEL:
-            number = content.number(2)
-            self._channels[number] = content.number(2), content.text(), content.text()
-        elif kind == STATISTICS:
-            content.take(42)
-            counts = content.take(content.number(4))
-            self._counts = dict(struct.iter_unpack("<HQ", counts)) if len(counts) % 10 == 0 else None
+    def _learn(self, kind: int, content: bytes) -> None:
+        stream = ReadDataStream(BytesIO(content))
+        if kind == Opcode.SCHEMA:
+            schema = Schema.read(stream)
+            self._schemas[schema.id] = schema
+        elif kind == Opcode.CHANNEL:
+            channel = Channel.read(stream)
+            self._channels[channel.id] = channel
+        elif kind == Opcode.STATISTICS:
+            self._counts = Statistics.read(stream).channel_message_counts
 
     def _count(self) -> None:
         """Learn channels and the numbers of their messages from the messages themselves."""
@@ -171,12 +151,11 @@ class McapFile:
             self._counts[channels[batch.group]] += len(batch.starts)
 
     def _source(self, number: int) -> Source:
-        schema, topic, encoding = self._channels[number]
-        name, language, definition = self._schemas.get(schema, ("", "", ""))
-        count = (self._counts or {}).get(number, 0)
-        return Source(
-            number, topic, normal_type(name), definition, LANGUAGES.get(language, "msg"), encoding, count
-        )
+        channel = self._channels[number]
+        schema = self._schemas.get(channel.schema_id, Schema(0, b"", "", ""))
+        definition, language = schema.data.decode(errors="replace"), LANGUAGES.get(schema.encoding, "msg")
+        count, msgtype = self._counts.get(number, 0), normal_type(schema.name)
+        return Source(number, channel.topic, msgtype, definition, language, channel.message_encoding, count)
 
     def batches(self, wanted: Groups) -> Iterator[Batch]:
         """The messages of the wanted groups of channels, block by block."""
@@ -203,13 +182,10 @@ class McapFile:
         )
         return within_reason(chunks, self._end)
 
-    def _unpack(self, chunk: _Chunk) -> bytes:
-        content = self._content(chunk.start, chunk.size)
-        content.take(16)
-        size, checksum = content.number(8), content.number(4)
-        compression = content.text()
-        data = decompress(content.take(content.number(8)), compression, size)
-        if checksum and zlib.crc32(data) != checksum:
+    def _unpack(self, place: _ChunkPlace) -> bytes:
+        chunk = Chunk.read(ReadDataStream(BytesIO(self._read(place.start, place.size))))
+        data = decompress(chunk.data, chunk.compression, chunk.uncompressed_size)
+        if chunk.uncompressed_crc and zlib.crc32(data) != chunk.uncompressed_crc:
             raise BagError("a chunk's checksum does not match")
         return data
 
@@ -223,10 +199,10 @@ class McapFile:
                     if size < MESSAGE_HEAD - RECORD_HEAD:
                         raise BagError("a message record is broken")
                     starts.append(position)
-                elif kind not in (SCHEMA, CHANNEL) or size < MIN_CHANNEL_BYTES:
+                elif kind not in (Opcode.SCHEMA, Opcode.CHANNEL) or size < MIN_CHANNEL_BYTES:
                     raise BagError("a chunk holds what is neither message, channel nor schema")
                 elif learn:
-                    self._learn(kind, _Text(chunk[position + RECORD_HEAD :][:size]))
+                    self._learn(kind, chunk[position + RECORD_HEAD :][:size])
                 position += RECORD_HEAD + size
         except struct.error:
             position = -1

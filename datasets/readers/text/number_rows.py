@@ -95,13 +95,7 @@ def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, he
     far = np.flatnonzero(np.abs(t_ns) > MAX_T_NS)
     if far.size:
         raise table.bad_cell(columns[0], int(far[0]), "give a time in seconds")
-    rows = Rows(
-        path,
-        t_ns,
-        table.stack(columns[1:]),
-        np.arange(len(t_ns)) + layout.first_line,
-        table.notes,
-    )
+    rows = Rows(path, t_ns, table.stack(columns[1:]), np.arange(len(t_ns)) + layout.first_line, table.notes)
     _refuse_missing(table, rows, columns)
     return rows
 

@@ -15,10 +15,7 @@ from terrafusion.datasets.readers.text.delimited import Columns
 Array = NDArray[np.float64]
 
 ACC, GYR = ("Acc_X", "Acc_Y", "Acc_Z"), ("Gyr_X", "Gyr_Y", "Gyr_Z")
-INCREMENTS = (
-    ("VelInc_X", "VelInc_Y", "VelInc_Z"),
-    ("OriInc_q0", "OriInc_q1", "OriInc_q2", "OriInc_q3"),
-)
+INCREMENTS = (("VelInc_X", "VelInc_Y", "VelInc_Z"), ("OriInc_q0", "OriInc_q1", "OriInc_q2", "OriInc_q3"))
 """Velocity increments m/s and orientation increments (w, x, y, z), both of one packet's interval."""
 
 ATTITUDES = (("Quat_q0", "Quat_q1", "Quat_q2", "Quat_q3"), ("Roll", "Pitch", "Yaw"))
