@@ -1,14 +1,16 @@
-"""Columns of a delimited text file, whatever its separator: strict about cells, exact about times.
+"""Columns of a delimited text file: strict about cells, exact about times, errors with line and time.
 
-The parsing is pandas' C parser; every line's cells are counted first, since that parser fills short
-lines up and cuts long ones without a word.
+The parsing is pandas' C parser; the cells of every line are counted first, because that parser fills short
+lines and cuts long ones silently.
 """
 
 from __future__ import annotations
 
 import csv
+import gzip
 import io
 import re
+import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -33,32 +35,48 @@ BLANKS = r"\s+"
 MISSING = ("", "NaN", "nan", "NAN", "-nan")
 """Cells of a numeric column that stand for no value."""
 
+TRUTH_WORDS = (b"rue", b"RUE", b"alse", b"ALSE")
+"""In words that pandas takes for 1 and 0."""
+
 _CHUNK = 2**24
 
 
 @dataclass(frozen=True)
-class Layout:
-    """How the rows of a text file stand.
+class TextLayout:
+    """How the rows of a text file are written.
 
     Attributes:
         names: columns in the order of the file.
         separator: one character, or `BLANKS`.
         first_line: number, from 1, of the first line that may hold a row.
-        comment: character that begins lines which are no rows; "" for none.
+        comment: character that begins lines without a row; "" for none.
+        time: column of seconds, for the times in errors; "" for none.
+        strict: a log folder's rules: only an empty cell is a missing value, blanks belong to the cell,
+            a last line that was cut off is an error, times count from 0 instead of the first row.
     """
 
     names: tuple[str, ...]
     separator: str
     first_line: int
     comment: str = ""
+    time: str = ""
+    strict: bool = False
+
+    def seconds(self, cells: Sequence[str]) -> float | None:
+        """The time of a row; None where it cannot be read."""
+        try:
+            seconds = float(cells[self.names.index(self.time)])
+        except (ValueError, IndexError):
+            return None
+        return seconds if np.isfinite(seconds) else None
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class TextTable:
     """Columns read from a file: `numbers` (N,) float, NaN where missing; `texts` (N,) str."""
 
     path: Path
-    layout: Layout
+    layout: TextLayout
     data: bytes
     numbers: dict[str, Array]
     texts: dict[str, NDArray[Any]]
@@ -72,7 +90,7 @@ class Columns:
         missing = np.full(len(self), np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
 
-    def times_ns(self, name: str, unit: str = "s") -> NDArray[np.int64]:
+    def times_ns(self, name: str, unit: str = "s", remedy: str = "") -> NDArray[np.int64]:
         """A text column of decimal times as nanoseconds (N,).
 
         Raises:
@@ -81,32 +99,32 @@ class Columns:
         try:
             return to_ns(self.texts[name].tolist(), unit)
         except NotADecimal as bad:
-            raise self.bad_cell(name, bad.row, f"give a time in {unit}") from None
+            raise self.bad_cell(name, bad.row, remedy or f"give a time in {unit}") from None
 
     def bad_cell(self, name: str, row: int, remedy: str) -> DataError:
-        """The error for what stands in column `name` of data row `row` (from 0)."""
+        """The error for column `name` of data row `row` (from 0)."""
         line, cells = next(islice(_rows(self.data, self.layout), row, None), (0, []))
         cell = dict(zip(self.layout.names, cells, strict=False)).get(name, "")
         what = f"line {line} has no '{name}'" if not cell.strip() else _cell_is(name, cell, line)
-        return DataError(what, file=self.path, remedy=remedy)
+        return _line_error(self.path, self.data, self.layout, what, cells, remedy)
 
 
 def read_text(path: Path) -> bytes:
-    """The bytes of a text file, without a byte order mark.
+    """The bytes of a text file, unpacked where it is a .gz, without a byte order mark.
 
     Raises:
         DataError: unreadable, empty, over 512 MB, or no UTF-8 text.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise DataError(
-                f"has more than {MAX_BYTES // 2**20} MB",
-                file=path,
-                remedy="split it, or convert it to Parquet",
-            )
-        data = path.read_bytes().removeprefix(BOM)
-    except OSError as error:
-        raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
+        with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+    except (OSError, EOFError, zlib.error) as error:
+        what = f"cannot be read: {getattr(error, 'strerror', '') or error}"
+        raise DataError(what, file=path, remedy="is it complete?") from None
+    if len(data) > MAX_BYTES:
+        what, remedy = f"has more than {MAX_BYTES // 2**20} MB", "split it, or convert it to Parquet"
+        raise DataError(what, file=path, remedy=remedy)
+    data = data.removeprefix(BOM)
     if not data or data.isspace():
         raise DataError("the file is empty", file=path, remedy="record or copy it again")
     try:
@@ -148,63 +166,73 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def read_columns(
-    path: Path, data: bytes, layout: Layout, numbers: Sequence[str], texts: Sequence[str] = ()
-) -> Columns:
-    """Parse the columns that are asked for.
+    path: Path, data: bytes, layout: TextLayout, numbers: Sequence[str], texts: Sequence[str] = ()
+) -> TextTable:
+    """Parse the columns that are asked for; a last line that was cut off is left out with a note.
 
     Args:
         path: the file, for messages.
         data: its bytes, of `read_text`.
-        layout: what stands where.
+        layout: how its rows are written.
         numbers: columns of numbers; empty and NaN cells are missing values.
-        texts: columns that are kept as text.
+        texts: columns that stay text.
 
     Raises:
         DataError: no rows, a line with too few or too many cells, a cell that is no finite number.
-            A last line that was cut off (short, and without a line end) is left out with a note.
     """
-    cut, notes = _cut_off(path, data, layout)
-    data = data[:cut]
+    end, notes = _complete_end(path, data, layout)
+    data = data[:end]
     _check_counts(path, data, layout)
     table = _parse(data, layout, numbers, texts)
-    if table is None or any(np.isinf(table[name]).any() for name in numbers):
+    if table is None or _is_suspect(table, data, layout, numbers):
         _check_cells(path, data, layout, set(numbers))
     if table is None:
         raise DataError("cannot be read as a table", file=path, remedy="write plain separated numbers")
-    columns = Columns(path, layout, data, {n: table[n] for n in numbers}, {n: table[n] for n in texts}, notes)
-    if not len(columns):
+    columns = TextTable(
+        path, layout, data, {n: table[n] for n in numbers}, {n: table[n] for n in texts}, notes
+    )
+    if not len(columns) and not layout.strict:
         raise DataError("holds a header but no rows", file=path, remedy="record or copy it again")
     return columns
 
 
-def _cut_off(path: Path, data: bytes, layout: Layout) -> tuple[int, tuple[str, ...]]:
-    """Bytes up to where complete lines end, and what is to be noted."""
+def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tuple[str, ...]]:
+    """Where complete lines end, and what to note of the last one."""
     if data.endswith((b"\n", b"\r")):
         return len(data), ()
     begin = data.rfind(b"\n") + 1
     last = data[begin : begin + MAX_LINE].decode("utf-8", "replace")
     long = len(data) - begin > MAX_LINE
     first = data.count(b"\n", 0, begin) + 1 < layout.first_line
-    if not long and not first and len(split(last, layout.separator)) < len(layout.names):
+    if not (long or first or layout.strict) and len(split(last, layout.separator)) < len(layout.names):
         return begin, (f"{path.name}: the last line was cut off and is left out",)
     return len(data), (f"{path.name}: the last line has no line end; was it cut off?",)
 
 
-def _check_counts(path: Path, data: bytes, layout: Layout) -> None:
+def _check_counts(path: Path, data: bytes, layout: TextLayout) -> None:
     """Refuse the first line that has not as many cells as there are columns."""
     quoted = layout.separator != BLANKS and b'"' in data
-    suspects = _quoted_misfits(path, data, layout) if quoted else _misfits(data, layout)
-    for line, text, count in suspects:
+    for line, text, count in _quoted_misfits(path, data, layout) if quoted else _misfits(data, layout):
         if line < layout.first_line or not text.strip() or (layout.comment and text[0] == layout.comment):
             continue
-        raise DataError(
-            f"line {line} has {count} cells for {len(layout.names)} columns",
-            file=path,
-            remedy="is it cut off, or of another table?",
-        )
+        what = f"line {line} has {count} cells for {len(layout.names)} columns"
+        cells, remedy = split(text, layout.separator), "is it cut off, or of another table?"
+        if layout.strict:
+            remedy = "an unknown value is an empty cell between commas"
+        raise _line_error(path, data, layout, what, cells, remedy)
 
 
-def _misfits(data: bytes, layout: Layout) -> Iterator[tuple[int, str, int]]:
+def _line_error(
+    path: Path, data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str
+) -> DataError:
+    """An error about a line of these cells, with its time where that can be read."""
+    first = [] if layout.strict or not layout.time else next(_rows(data, layout), (0, []))[1]
+    time_s, origin_s = layout.seconds(cells), 0.0 if layout.strict else layout.seconds(first)
+    known = time_s is not None and origin_s is not None
+    return DataError(what, file=path, time_s=time_s - origin_s if known else None, remedy=remedy)
+
+
+def _misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
     """Line number, beginning and cells of lines with another number of cells than columns."""
     blanks = np.zeros(256, dtype=bool)
     blanks[[9, 10, 13, 32]] = True
@@ -226,22 +254,22 @@ def _misfits(data: bytes, layout: Layout) -> Iterator[tuple[int, str, int]]:
         counts = np.diff(np.searchsorted(marks, ends), prepend=0) + extra
         for i in np.flatnonzero(counts != len(layout.names)).tolist():
             start = begin + (int(ends[i - 1]) + 1 if i else 0)
-            text = data[start : min(begin + int(ends[i]), start + 80)].decode("utf-8", "replace")
+            text = data[start : min(begin + int(ends[i]), start + 500)].decode("utf-8", "replace")
             yield line + i, text, int(counts[i])
         begin, line = end, line + len(ends)
 
 
-def _quoted_misfits(path: Path, data: bytes, layout: Layout) -> Iterator[tuple[int, str, int]]:
+def _quoted_misfits(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
     try:
         for line, cells in _rows(data, layout):
             if len(cells) != len(layout.names):
-                yield line, cells[0] or ".", len(cells)
+                yield line, layout.separator.join(cells) or ".", len(cells)
     except csv.Error as error:
         raise DataError(f"not a table: {error}", file=path, remedy="write plain separated numbers") from None
 
 
 def _parse(
-    data: bytes, layout: Layout, numbers: Sequence[str], texts: Sequence[str]
+    data: bytes, layout: TextLayout, numbers: Sequence[str], texts: Sequence[str]
 ) -> dict[str, NDArray[Any]] | None:
     """The columns by pandas' C parser, bit-exact; None when a cell does not parse."""
     import pandas as pd
@@ -252,7 +280,7 @@ def _parse(
     old = tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1)
     options: dict[str, Any] = {"float_precision": "round_trip"} if old else {}
     options["dtype"] = {positions[name]: "float64" if name in numbers else "object" for name in asked}
-    options["na_values"] = {positions[name]: list(MISSING) for name in numbers}
+    options["na_values"] = {positions[name]: [""] if layout.strict else list(MISSING) for name in numbers}
     if layout.comment:  # whole lines only: pandas would also cut a cell there
         data = re.sub(rb"(?m)^" + re.escape(layout.comment.encode()) + rb"[^\n]*", b"", data)
     try:
@@ -264,7 +292,7 @@ def _parse(
             skiprows=layout.first_line - 1,
             usecols=sorted(positions[name] for name in asked),
             keep_default_na=False,
-            skipinitialspace=True,
+            skipinitialspace=not layout.strict,
             **options,
         )
     except pd.errors.EmptyDataError:
@@ -274,19 +302,27 @@ def _parse(
     return {name: frame[positions[name]].to_numpy() for name in asked}
 
 
-def _check_cells(path: Path, data: bytes, layout: Layout, numbers: set[str]) -> None:
+def _is_suspect(
+    table: dict[str, NDArray[Any]], data: bytes, layout: TextLayout, numbers: Sequence[str]
+) -> bool:
+    """Whether a number may not be what the file says: infinite, a truth value, in a log folder "nan"."""
+    if any(np.isinf(table[name]).any() for name in numbers) or any(word in data for word in TRUTH_WORDS):
+        return True
+    blank = layout.strict and any(np.isnan(table[name]).any() for name in numbers)
+    return blank and re.search(rb"(?i)nan|[ \t],|,[ \t]", data) is not None
+
+
+def _check_cells(path: Path, data: bytes, layout: TextLayout, numbers: set[str]) -> None:
     """Raise for the first cell of a numeric column that is neither finite nor missing."""
+    remedy = "give a finite number, or leave the cell empty where the value is missing"
     for line, cells in _rows(data, layout):
         for name, cell in zip(layout.names, cells, strict=False):
-            if name in numbers and cell.strip() not in MISSING and not _is_finite(cell):
-                raise DataError(
-                    _cell_is(name, cell, line),
-                    file=path,
-                    remedy="give a finite number, or leave the cell empty where the value is missing",
-                )
+            missing = not cell if layout.strict else cell.strip() in MISSING
+            if name in numbers and not missing and not _is_finite(cell):
+                raise _line_error(path, data, layout, _cell_is(name, cell, line), cells, remedy)
 
 
-def _rows(data: bytes, layout: Layout) -> Iterator[tuple[int, list[str]]]:
+def _rows(data: bytes, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every row."""
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", newline="")
     if layout.separator == BLANKS:
@@ -297,9 +333,9 @@ def _rows(data: bytes, layout: Layout) -> Iterator[tuple[int, list[str]]]:
     for _ in range(layout.first_line - 1):
         text.readline()
     lines = ("\n" if layout.comment and line.startswith(layout.comment) else line for line in text)
-    reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=True)
+    reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=not layout.strict)
     for cells in reader:
-        if cells:
+        if len(cells) > 1 or "".join(cells).strip():
             yield reader.line_num + layout.first_line - 1, cells
 
 

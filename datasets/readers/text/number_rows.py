@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import io
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -18,9 +15,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.text.delimited import (
     BLANKS,
-    MAX_LINE,
-    Columns,
-    Layout,
+    TextLayout,
     head_lines,
     read_columns,
     read_text,
@@ -85,19 +80,17 @@ def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, he
         remedy = "split it into shorter recordings"
         raise DataError(f"has more than {MAX_LINES} lines", file=path, remedy=remedy)
     names = _header(path, data, columns, separator) if header else tuple(columns)
-    layout = Layout(names, separator, first_line=2 if header else 1)
-    try:
-        table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
-    except DataError as error:
-        time_s = _time_of_line(error.what, data, layout, columns[0])
-        raise DataError(error.what, file=path, time_s=time_s, remedy=error.remedy) from None
+    layout = TextLayout(names, separator, first_line=2 if header else 1, time=columns[0])
+    table = read_columns(path, data, layout, columns[1:], texts=columns[:1])
     t_ns = table.times_ns(columns[0])
     far = np.flatnonzero(np.abs(t_ns) > MAX_T_NS)
     if far.size:
         raise table.bad_cell(columns[0], int(far[0]), "give a time in seconds")
-    rows = Rows(path, t_ns, table.stack(columns[1:]), np.arange(len(t_ns)) + layout.first_line, table.notes)
-    _refuse_missing(table, rows, columns)
-    return rows
+    values = table.stack(columns[1:])
+    missing = np.argwhere(np.isnan(values))
+    if missing.size:
+        raise table.bad_cell(columns[int(missing[0, 1]) + 1], int(missing[0, 0]), "give a finite number")
+    return Rows(path, t_ns, values, np.arange(len(t_ns)) + layout.first_line, table.notes)
 
 
 def put_in_time(
@@ -147,29 +140,3 @@ def _header(path: Path, data: bytes, columns: Sequence[str], separator: str) -> 
     if sorted(names) != sorted(columns):
         raise DataError(f"the header is '{shown(line)}'", file=path, remedy=f"give {', '.join(columns)}")
     return names
-
-
-def _time_of_line(what: str, data: bytes, layout: Layout, time: str) -> float | None:
-    """Seconds from the first row to the line that a message names."""
-    named = re.search(r"\bline (\d+)", what)
-    column = layout.names.index(time)
-    if named is None:
-        return None
-    seconds = []
-    for number in (layout.first_line, int(named[1])):
-        line = next(islice(io.BytesIO(data), number - 1, None), b"")[:MAX_LINE]
-        try:
-            seconds.append(float(split(line.decode("utf-8", "replace"), layout.separator)[column]))
-        except (ValueError, IndexError):
-            return None
-    return seconds[1] - seconds[0] if np.isfinite(seconds).all() else None
-
-
-def _refuse_missing(table: Columns, rows: Rows, columns: Sequence[str]) -> None:
-    missing = np.argwhere(np.isnan(rows.values))
-    if not missing.size:
-        return
-    row, column = (int(i) for i in missing[0])
-    told = table.bad_cell(columns[column + 1], row, "give a finite number")
-    time_s = (int(rows.t_ns[row]) - int(rows.t_ns[0])) * 1e-9
-    raise DataError(told.what, file=told.file, time_s=time_s, remedy=told.remedy)

@@ -20,8 +20,8 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.delimited import (
     BLANKS,
-    Columns,
-    Layout,
+    TextLayout,
+    TextTable,
     head_lines,
     read_columns,
     read_text,
@@ -136,7 +136,7 @@ def _numbers(text: str) -> tuple[float, ...] | None:
         return None
 
 
-def _columns(path: Path, data: bytes, header: Header) -> Columns:
+def _columns(path: Path, data: bytes, header: Header) -> TextTable:
     """All columns; dates take one cell or two, angles in degrees, minutes and seconds three each."""
     names: list[str] = []
     for name in header.names:
@@ -148,11 +148,11 @@ def _columns(path: Path, data: bytes, header: Header) -> Columns:
     cells = split(row, header.separator)
     one_cell = bool(cells) and "/" in cells[0] and ":" in cells[0]
     time = ["date"] if one_cell else ["date", "clock"] if "/" in row[:11] else ["week", "tow"]
-    layout = Layout((*time, *names), header.separator, header.line + 1, "%")
+    layout = TextLayout((*time, *names), header.separator, header.line + 1, "%")
     return read_columns(path, data, layout, names, time)
 
 
-def _times(path: Path, columns: Columns, header: Header) -> tuple[TimesNs, list[str]]:
+def _times(path: Path, columns: TextTable, header: Header) -> tuple[TimesNs, list[str]]:
     """Unix nanoseconds of the rows as the file has them, and how UTC was got."""
     gps_epoch_ns = np.datetime64("1980-01-06", "ns").astype(np.int64)
     if "week" in columns.texts:
@@ -177,7 +177,7 @@ def _times(path: Path, columns: Columns, header: Header) -> tuple[TimesNs, list[
     return t_ns, []
 
 
-def _calendar_ns(columns: Columns) -> TimesNs:
+def _calendar_ns(columns: TextTable) -> TimesNs:
     text = columns.texts["date"]
     if "clock" in columns.texts:
         text = text + " " + columns.texts["clock"]
@@ -190,7 +190,7 @@ def _calendar_ns(columns: Columns) -> TimesNs:
 class _Solution:
     """The rows of a file, in the order of their times."""
 
-    def __init__(self, request: Request, columns: Columns, header: Header, times: RowTimes) -> None:
+    def __init__(self, request: Request, columns: TextTable, header: Header, times: RowTimes) -> None:
         self.request, self.columns, self.header, self.times = request, columns, header, times
         self.notes: list[str] = []
         self.fix = self._fix()

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.text.column_map import TEXT_FIELDS, ColumnMap
 from terrafusion.datasets.readers.text.delimited import (
-    Columns,
-    Layout,
+    TextLayout,
+    TextTable,
     head_lines,
     read_columns,
     read_text,
@@ -36,7 +36,7 @@ class TextColumns:
         self._data = read_text(path)
         self._layout = _layout(path, self._data, found)
         self.names = list(self._layout.names)
-        self._columns: Columns | None = None
+        self._columns: TextTable | None = None
         self.notes: tuple[str, ...] = ()
 
     def read(self, names: list[str]) -> None:
@@ -69,7 +69,7 @@ class TextColumns:
         return self._columns.times_ns(name, unit)
 
 
-def _layout(path: Path, data: bytes, found: ColumnMap | None) -> Layout:
+def _layout(path: Path, data: bytes, found: ColumnMap | None) -> TextLayout:
     """Names from the first line that is no comment, or from the comment before a first line of numbers."""
     comment, header, number = "", "", 0
     for at, line in head_lines(data):
@@ -90,7 +90,7 @@ def _layout(path: Path, data: bytes, found: ColumnMap | None) -> Layout:
     repeated = [name for i, name in enumerate(cells) if name in cells[:i] and name]
     if repeated:
         raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="rename one of them")
-    return Layout(tuple(cells), separator, first_line, COMMENT)
+    return TextLayout(tuple(cells), separator, first_line, COMMENT)
 
 
 def _is_row(cells: list[str]) -> bool:

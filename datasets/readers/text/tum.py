@@ -12,7 +12,13 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.delimited import BLANKS, Layout, head_lines, read_columns, read_text
+from terrafusion.datasets.readers.text.delimited import (
+    BLANKS,
+    TextLayout,
+    head_lines,
+    read_columns,
+    read_text,
+)
 from terrafusion.datasets.readers.text.row_times import row_times
 
 Array = NDArray[np.float64]
@@ -91,7 +97,7 @@ def tum_rows(path: Path) -> tuple[NDArray[np.int64], Array, tuple[str, ...]]:
     first = next((line for _, line in head_lines(data) if line.strip() and line.strip()[0] != "#"), "")
     if not first:
         raise DataError("no poses", file=path, remedy="a line is: t x y z qx qy qz qw")
-    layout = Layout(("t", *COLUMNS), "," if "," in first else BLANKS, 1, "#")
+    layout = TextLayout(("t", *COLUMNS), "," if "," in first else BLANKS, 1, "#")
     columns = read_columns(path, data, layout, COLUMNS, ["t"])
     table = columns.stack(COLUMNS)
     unknown = np.flatnonzero(np.isnan(table).any(axis=1))

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.readers.text.delimited import Columns
+from terrafusion.datasets.readers.text.delimited import TextTable
 
 TimesNs = NDArray[np.int64]
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ class Clock:
     notes: tuple[str, ...]
 
 
-def clock_of(path: Path, columns: Columns, settings: dict[str, str]) -> Clock:
+def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Clock:
     """The best clock the export has.
 
     UTC on every row is taken as it is. Else the ticks count from one to the next row, and the
@@ -78,7 +78,7 @@ def _left_out(rows: NDArray[np.bool_]) -> tuple[str, ...]:
     return () if rows.all() else (f"{int((~rows).sum())} of {len(rows)} rows have no time; left out",)
 
 
-def _utc(path: Path, columns: Columns) -> tuple[TimesNs, NDArray[np.bool_]]:
+def _utc(path: Path, columns: TextTable) -> tuple[TimesNs, NDArray[np.bool_]]:
     """UTC as Unix nanoseconds (N,), and the rows (N,) that hold it."""
     parts = columns.stack(UTC)
     valid = np.asarray(np.isfinite(parts[:, :6]).all(axis=1))

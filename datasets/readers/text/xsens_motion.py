@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
-from terrafusion.datasets.readers.text.delimited import Columns
+from terrafusion.datasets.readers.text.delimited import TextTable
 
 Array = NDArray[np.float64]
 
@@ -28,7 +28,7 @@ DEG = np.pi / 180.0
 
 
 def inertial(
-    path: Path, columns: Columns, t_ns: NDArray[np.int64], settings: dict[str, str]
+    path: Path, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Imu | None, list[str]]:
     """The IMU channel of the rows that hold a sample (None where none does), and notes.
 
@@ -57,7 +57,7 @@ def inertial(
 
 
 def _in_radps(
-    path: Path, gyro: Array, columns: Columns, t_ns: NDArray[np.int64], settings: dict[str, str]
+    path: Path, gyro: Array, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Array, list[str]]:
     """Rates in rad/s: as the column's name says, else as the attitude shows, else as documented."""
     units = {settings.get(f"unit of {name}", "") for name in GYR}
@@ -88,7 +88,7 @@ def _in_radps(
     return gyro, []
 
 
-def _rate_ratio(gyro: Array, columns: Columns, t_ns: NDArray[np.int64]) -> float | None:
+def _rate_ratio(gyro: Array, columns: TextTable, t_ns: NDArray[np.int64]) -> float | None:
     """How many times faster the gyro turns than the attitude does; None where that cannot be told."""
     if all(name in columns.numbers for name in ATTITUDES[0]):
         q = columns.stack(ATTITUDES[0])[:CHECKED_ROWS, [1, 2, 3, 0]]

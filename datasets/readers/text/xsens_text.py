@@ -20,8 +20,8 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.delimited import (
-    Columns,
-    Layout,
+    TextLayout,
+    TextTable,
     head_lines,
     read_columns,
     read_text,
@@ -41,7 +41,7 @@ POSITION = ("Latitude", "Longitude", "Altitude")
 VELOCITIES = (("Vel_X", "Vel_Y", "Vel_Z"), ("Vel_E", "Vel_N", "Vel_U"))
 STATUS = ("StatusWord", "Status")
 OTHER_DEVICES = ("Euler_X", "dq_W", "dv[1]")
-"""Columns of Xsens DOT exports, whose units differ (us, deg/s)."""
+"""TextTable of Xsens DOT exports, whose units differ (us, deg/s)."""
 
 ENU_OF = {"ENU": (0, 1, 2), "NED": (1, 0, 2), "NWU": (1, 0, 2)}
 ENU_SIGNS = {"ENU": (1, 1, 1), "NED": (1, 1, -1), "NWU": (-1, 1, 1)}
@@ -105,7 +105,7 @@ def _bare(name: str) -> str:
     return re.sub(r"\s*[\[(](?:rad/s|deg/s|m/s2|m/s\^2|deg|m|m/s)[\])]$", "", name)
 
 
-def _columns(path: Path) -> tuple[Columns, dict[str, str], list[str]]:
+def _columns(path: Path) -> tuple[TextTable, dict[str, str], list[str]]:
     data = read_text(path)
     found = _header(data)
     if found is None:
@@ -122,7 +122,7 @@ def _columns(path: Path) -> tuple[Columns, dict[str, str], list[str]]:
     repeated = [name for i, name in enumerate(names) if name in names[:i]]
     if repeated:
         raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="export it again")
-    layout = Layout((*names, *_unnamed(data, number, separator, len(names))), separator, number + 1)
+    layout = TextLayout((*names, *_unnamed(data, number, separator, len(names))), separator, number + 1)
     attitudes = [name for group in ATTITUDES for name in group]
     wanted = {*COUNTERS, TICKS, *ACC, *GYR, *INCREMENTS[0], *INCREMENTS[1], *attitudes, *POSITION, *UTC}
     wanted |= {name for group in VELOCITIES for name in group}
@@ -145,7 +145,7 @@ def _unnamed(data: bytes, header: int, separator: str, count: int) -> list[str]:
     return [""] if row.endswith(separator) and row.count(separator) == count else []
 
 
-def _select(columns: Columns, rows: NDArray[np.bool_], order: Any) -> Columns:
+def _select(columns: TextTable, rows: NDArray[np.bool_], order: Any) -> TextTable:
     return dataclasses.replace(
         columns,
         numbers={name: values[rows][order] for name, values in columns.numbers.items()},
@@ -160,7 +160,7 @@ def _device(settings: dict[str, str]) -> str:
 
 
 def _gnss(
-    request: Request, columns: Columns, t_ns: NDArray[np.int64], settings: dict[str, str]
+    request: Request, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Gnss | None, tuple[float, float, float] | None, list[str]]:
     if not {"Latitude", "Longitude"} <= columns.numbers.keys():
         return None, None, []
@@ -182,7 +182,7 @@ def _gnss(
     return gnss, datum, [*notes, *told, *more, *rest]
 
 
-def _fix(path: Path, columns: Columns, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
+def _fix(path: Path, columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
     name = next((name for name in STATUS if name in columns.texts), None)
     if name is None:
         return np.full(int(rows.sum()), Fix.SINGLE, dtype=np.uint8), [
@@ -231,7 +231,7 @@ def _class_of(status: int) -> Fix:
     return {1: Fix.FLOAT, 2: Fix.FIXED}.get(rtk, Fix.SINGLE)
 
 
-def _velocity(columns: Columns, settings: dict[str, str]) -> tuple[Array | None, list[str]]:
+def _velocity(columns: TextTable, settings: dict[str, str]) -> tuple[Array | None, list[str]]:
     if all(name in columns.numbers for name in VELOCITIES[1][:2]):
         return columns.stack(VELOCITIES[1]), []
     if not all(name in columns.numbers for name in VELOCITIES[0]):

@@ -17,7 +17,8 @@ from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers import csv_table, open_recording
+from terrafusion.datasets.readers import open_recording
+from terrafusion.datasets.readers.text import delimited
 from terrafusion.datasets.writers import log_folder, write_log_folder
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
@@ -268,12 +269,12 @@ def test_a_line_of_blanks_late_in_a_log(tmp_path: Path) -> None:
 
 def test_a_packed_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A few kilobytes of gzip can stand for gigabytes."""
-    monkeypatch.setattr(csv_table, "MAX_BYTES", 2**20)
+    monkeypatch.setattr(delimited, "MAX_BYTES", 2**20)
     folder = folder_with(tmp_path)
     (folder / "imu.csv.gz").write_bytes(gzip.compress(b"t_s,gyro_z_radps\n" + b"0,0\n" * 10**6))
     with pytest.raises(TerrafusionError) as caught:
         open_recording(folder)
-    one_line(caught.value, "imu.csv.gz", "more than 1 MiB", "split")
+    one_line(caught.value, "imu.csv.gz", "more than 1 MB", "split")
 
 
 @pytest.mark.parametrize(

@@ -118,7 +118,7 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     ),
     "empty time cells, as pandas writes NaN": (
         cells("imu.csv", "t_s", "", slice(50, 60)),
-        ("imu.csv", "line 52 has no t_s", "needs its time"),
+        ("imu.csv", "line 52 has no 't_s'", "needs its time"),
     ),
     "unix time": (
         scaled("imu.csv", ("t_s",), 1.0, 1.7e9),
