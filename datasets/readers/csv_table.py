@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import ClockError, DataError
-from terrafusion.datasets.readers.text.delimited import TextLayout, head_lines, read_columns, read_text, split
+from terrafusion.datasets.readers.delimited import TextLayout, head_lines, read_columns, read_text, split
 
 Array = NDArray[np.float64]
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import TERRAINS, Imu, Motor, Terrain, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.readers.delimited import head_lines, split
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.delimited import head_lines, split
 from terrafusion.datasets.readers.text.number_rows import Rows, put_in_time, read_rows
 
 COLUMNS = {

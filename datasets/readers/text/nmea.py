@@ -13,8 +13,8 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
+from terrafusion.datasets.readers.delimited import MAX_BYTES
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.delimited import MAX_BYTES
 from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, Epochs, collect
 from terrafusion.datasets.readers.text.row_times import row_times

@@ -13,7 +13,7 @@ from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
-from terrafusion.datasets.readers.text.delimited import (
+from terrafusion.datasets.readers.delimited import (
     BLANKS,
     TextLayout,
     head_lines,

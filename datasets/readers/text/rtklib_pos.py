@@ -17,8 +17,7 @@ from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.delimited import (
+from terrafusion.datasets.readers.delimited import (
     BLANKS,
     TextLayout,
     TextTable,
@@ -27,6 +26,7 @@ from terrafusion.datasets.readers.text.delimited import (
     read_text,
     split,
 )
+from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
 

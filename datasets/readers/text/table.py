@@ -20,6 +20,7 @@ from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import GNSS_VELOCITY, QUATERNION, ChannelReader
 from terrafusion.datasets.readers.csv_table import ChannelTable
+from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.text.column_map import (
@@ -31,7 +32,6 @@ from terrafusion.datasets.readers.text.column_map import (
     read_column_map,
     starter_map,
 )
-from terrafusion.datasets.readers.text.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
 from terrafusion.datasets.readers.text.parquet import ParquetColumns
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times

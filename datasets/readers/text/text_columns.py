@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.readers.text.column_map import TEXT_FIELDS, ColumnMap
-from terrafusion.datasets.readers.text.delimited import (
+from terrafusion.datasets.readers.delimited import (
     TextLayout,
     TextTable,
     head_lines,
@@ -19,6 +18,7 @@ from terrafusion.datasets.readers.text.delimited import (
     separator_of,
     split,
 )
+from terrafusion.datasets.readers.text.column_map import TEXT_FIELDS, ColumnMap
 
 COMMENT = "#"
 

@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.delimited import (
+from terrafusion.datasets.readers.delimited import (
     BLANKS,
     TextLayout,
     head_lines,
     read_columns,
     read_text,
 )
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.text.row_times import row_times
 
 Array = NDArray[np.float64]

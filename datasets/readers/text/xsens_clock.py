@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.readers.text.delimited import TextTable
+from terrafusion.datasets.readers.delimited import TextTable
 
 TimesNs = NDArray[np.int64]
 Array = NDArray[np.float64]

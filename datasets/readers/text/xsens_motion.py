@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
-from terrafusion.datasets.readers.text.delimited import TextTable
+from terrafusion.datasets.readers.delimited import TextTable
 
 Array = NDArray[np.float64]
 

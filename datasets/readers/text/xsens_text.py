@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.delimited import (
+from terrafusion.datasets.readers.delimited import (
     TextLayout,
     TextTable,
     head_lines,
@@ -28,6 +27,7 @@ from terrafusion.datasets.readers.text.delimited import (
     separator_of,
     split,
 )
+from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
 from terrafusion.datasets.readers.text.row_times import row_times
 from terrafusion.datasets.readers.text.xsens_clock import UTC, clock_of

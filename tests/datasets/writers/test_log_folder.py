@@ -17,8 +17,7 @@ from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.text import delimited
+from terrafusion.datasets.readers import delimited, open_recording
 from terrafusion.datasets.writers import log_folder, write_log_folder
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
