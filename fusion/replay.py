@@ -35,7 +35,7 @@ from terrafusion.fusion.graph.key_state import (
     quaternion_of,
 )
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
-from terrafusion.fusion.metrics.metrics import Outage, Scores, score
+from terrafusion.fusion.metrics.scores import Outage, Scores, score
 from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle, geometry_notes, with_overrides

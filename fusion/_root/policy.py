@@ -38,11 +38,11 @@ def fit(
         ConfigError: an unknown vehicle.
         DataError: a log without labels or reference.
     """
-    from terrafusion.fusion.training.drives import GROUNDS
-    from terrafusion.fusion.training.policy_fit import Logged, default_grid, fit_policy, write_policy
+    from terrafusion.fusion.training.policy_fit import LoggedSamples, default_grid, fit_policy, write_policy
     from terrafusion.fusion.training.policy_logs import read_logs
+    from terrafusion.fusion.training.simulated_runs import GROUNDS
 
-    logged = read_logs([str(log) for log in logs], vehicle) if logs else Logged()
+    logged = read_logs([str(log) for log in logs], vehicle) if logs else LoggedSamples()
     fitted = fit_policy(default_grid(seeds, tuple(GROUNDS), vehicle), progress or (lambda: None), logged)
     write_policy(fitted, Path(out), made_by=f"terrafusion.policy.fit, seeds {seeds}, vehicle {vehicle}")
     return load(Path(out))

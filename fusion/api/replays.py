@@ -9,7 +9,7 @@ from typing import Any
 
 from terrafusion.datasets.core.display import text_html
 from terrafusion.fusion.api.logs import Log, opened
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.policy import Policy
 from terrafusion.fusion.outputs.replay_files import metrics_of
 from terrafusion.fusion.replay import ReplayResult

@@ -73,11 +73,11 @@ def benchmark(
 
     import pandas as pd
 
-    from terrafusion.fusion.benchmark.plan import Plan, families_of
+    from terrafusion.fusion.benchmark.plan import BenchmarkPlan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.reports.benchmark import at_the_end, origin_of, write_benchmark
 
-    plan = Plan(families_of(list(only)), seeds, quick)
+    plan = BenchmarkPlan(families_of(list(only)), seeds, quick)
     origin = origin_of(plan, "terrafusion.benchmark")
     result = run_benchmark(plan, Path(out), jobs=jobs, progress=progress)
     write_benchmark(Path(out), result, at_the_end(origin))

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.benchmark.arms import BASE, ORACLE, OWN
-from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, ORACLE
+from terrafusion.fusion.benchmark.run_score import RunScore
 
 Array = NDArray[np.float64]
 Interval = tuple[float, float]
@@ -61,7 +61,7 @@ class Contrast:
 
 
 @dataclass(frozen=True)
-class Share:
+class GainShare:
     """How much of the oracle's gain over the fixed row the detected ground keeps; None where it has none."""
 
     family: str
@@ -70,15 +70,15 @@ class Share:
     interval: Interval | None
 
 
-def groups_of(rows: Sequence[Row]) -> dict[tuple[str, str], list[Row]]:
+def groups_of(rows: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]:
     """Rows by family and plant, in their order."""
-    groups: dict[tuple[str, str], list[Row]] = {}
+    groups: dict[tuple[str, str], list[RunScore]] = {}
     for row in rows:
         groups.setdefault((row.family, row.plant), []).append(row)
     return groups
 
 
-def contrasts(rows: Sequence[Row], base: str = BASE) -> list[Contrast]:
+def contrasts(rows: Sequence[RunScore], base: str = BASELINE) -> list[Contrast]:
     """Every arm against `base`, group by group."""
     out = []
     for (family, plant), group in groups_of(rows).items():
@@ -90,12 +90,12 @@ def contrasts(rows: Sequence[Row], base: str = BASE) -> list[Contrast]:
     return out
 
 
-def shares(rows: Sequence[Row]) -> list[Share]:
+def shares(rows: Sequence[RunScore]) -> list[GainShare]:
     """Share of the oracle's gain, group by group."""
-    return [Share(*key, *_share(errors_by_unit(group))) for key, group in groups_of(rows).items()]
+    return [GainShare(*key, *_share(errors_by_unit(group))) for key, group in groups_of(rows).items()]
 
 
-def errors_by_unit(rows: Sequence[Row]) -> dict[str, dict[str, dict[str, float]]]:
+def errors_by_unit(rows: Sequence[RunScore]) -> dict[str, dict[str, dict[str, float]]]:
     """arm -> unit -> drive -> error in m, infinite where the replay failed; without one it is left out."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
@@ -170,7 +170,7 @@ def _contrast(
 
 
 def _share(errors: dict[str, dict[str, dict[str, float]]]) -> tuple[float | None, Interval | None]:
-    own, best = (log_ratios(errors, arm, BASE) for arm in (OWN, ORACLE))
+    own, best = (log_ratios(errors, arm, BASELINE) for arm in (ADAPTIVE, ORACLE))
     units = [unit for unit in own if unit in best]
     if not units:
         return None, None

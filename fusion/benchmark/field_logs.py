@@ -16,12 +16,12 @@ from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.errors import DataError, TerrafusionError, errors_of
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
-from terrafusion.fusion.benchmark.arms import known_labels, true_labels
-from terrafusion.fusion.benchmark.drives import FIELD, Drive
-from terrafusion.fusion.benchmark.joined_windows import joined_drives
+from terrafusion.fusion.benchmark.joined_windows import joined_runs
+from terrafusion.fusion.benchmark.methods import known_labels, true_labels
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, plan_outages, until
+from terrafusion.fusion.benchmark.twin_runs import FIELD, BenchmarkRun
 from terrafusion.fusion.metrics.health import rolled_until_m
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import choose_vehicle
 
 AID_SEED = 1
@@ -60,7 +60,7 @@ class Refusal:
 
 
 @dataclass(frozen=True)
-class Log:
+class FieldLog:
     """A field log, and how many outages of each length it is to have at most."""
 
     name: str
@@ -72,22 +72,22 @@ class Log:
         return f"{FIELD}-{self.starts}-{self.name.replace('/', '_').replace('#', '_')}"
 
 
-def logs_at_hand(starts: int) -> list[Log]:
+def logs_at_hand(starts: int) -> list[FieldLog]:
     """Logs of the catalogue whose files are there."""
-    return [Log(name, starts) for name in catalogued()]
+    return [FieldLog(name, starts) for name in catalogued()]
 
 
-def drives_of(log: Log) -> list[Drive | Refusal]:
+def drives_of(log: FieldLog) -> list[BenchmarkRun | Refusal]:
     """All drives of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
     return each_drive(log.name, lambda name, _, recording: _drives(log, name, recording))
 
 
-def _drives(log: Log, name: str, recording: Recording) -> Iterator[Drive]:
+def _drives(log: FieldLog, name: str, recording: Recording) -> Iterator[BenchmarkRun]:
     check_log(recording)
     reference = reference_of(recording)
     ground = ground_of(log.name, recording) or NOT_LABELLED
     labels = known_labels(true_labels(recording))
-    whole = Drive(FIELD, ground, name, f"{name}, whole", recording, None, labels)
+    whole = BenchmarkRun(FIELD, ground, name, f"{name}, whole", recording, None, labels)
     if reference == "none":
         yield dataclasses.replace(whole, judged=False)
         return
@@ -157,7 +157,7 @@ def read_runs(log: str) -> tuple[list[Recording], bool]:
     recordings = open_recordings(log)
     if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= LEAST_DRIVE_S:
         return recordings, False
-    drives = [d for d in joined_drives(log, recordings) if d.duration_s() >= LEAST_JOINED_S]
+    drives = [d for d in joined_runs(log, recordings) if d.duration_s() >= LEAST_JOINED_S]
     drives = [d for d in drives if d.truth is not None]
     if not drives:
         told = f"holds {len(recordings)} pieces that make no drive of {LEAST_JOINED_S:g} s with a truth"

@@ -28,7 +28,7 @@ LONGEST_HOLE_S = 1.0
 """Over longer holes in the truth of a drive nothing is joined."""
 
 
-def joined_drives(name: str, recordings: Sequence[Recording]) -> list[Recording]:
+def joined_runs(name: str, recordings: Sequence[Recording]) -> list[Recording]:
     """The drives of two windows and more that `recordings`, in their order, make.
 
     Each starts at time 0, heading along x from the origin, and has wheels, IMU and truth; other channels are

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 
 Array = NDArray[np.float64]
 

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.fusion.benchmark.arms import ARMS
-from terrafusion.fusion.benchmark.drives import FAMILIES, FIELD, FIRST_SEED, PLANTS, Case
-from terrafusion.fusion.benchmark.field_logs import Log, logs_at_hand
+from terrafusion.fusion.benchmark.field_logs import FieldLog, logs_at_hand
+from terrafusion.fusion.benchmark.methods import METHODS
+from terrafusion.fusion.benchmark.twin_runs import FAMILIES, FIELD, FIRST_SEED, PLANTS, BenchmarkCase
 
 SEEDS = 20
 MOST_SEEDS = 10_000
@@ -17,14 +17,14 @@ QUICK_SEEDS = {"mixed": 2}
 STARTS = 1
 """Outages of each length in a field log, at most."""
 QUICK_LOGS = ("norlab_drive/grass_2024_8_8_16h11s19/raw",)
-ARM_NAMES = tuple(arm.name for arm in ARMS)
+ARM_NAMES = tuple(arm.name for arm in METHODS)
 
 
 @dataclass(frozen=True)
 class Job:
     """A drive of the twin, or a field log, with some arms: what one process does in one piece."""
 
-    item: Case | Log
+    item: BenchmarkCase | FieldLog
     arms: tuple[str, ...]
 
     @property
@@ -35,7 +35,7 @@ class Job:
 
 
 @dataclass(frozen=True)
-class Plan:
+class BenchmarkPlan:
     """A benchmark.
 
     Attributes:
@@ -73,7 +73,7 @@ class Plan:
                 for plant in PLANTS:
                     first = plant == next(iter(PLANTS)) or family == next(iter(FAMILIES))
                     if n < self.seed_count(family) and (first or not self.quick):
-                        yield Job(Case(family, plant, FIRST_SEED + n), ARM_NAMES)
+                        yield Job(BenchmarkCase(family, plant, FIRST_SEED + n), ARM_NAMES)
 
     def _field_jobs(self) -> Iterator[Job]:
         if FIELD not in self.families:

@@ -11,9 +11,9 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from terrafusion.fusion.benchmark.arms import ORACLE, OWN
 from terrafusion.fusion.benchmark.compare import EVEN, Contrast, contrasts, groups_of
-from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, ORACLE
+from terrafusion.fusion.benchmark.run_score import RunScore
 
 BASELINES = ("data sheet", "fixed", "robust", "innovation")
 KINDS = {
@@ -51,12 +51,15 @@ class Reason:
         return "detector" if self.oracle < 1.0 else "policy"
 
 
-def reasons(rows: Sequence[Row]) -> list[Reason]:
+def reasons(rows: Sequence[RunScore]) -> list[Reason]:
     """One for each group in which some baseline beats the adaptive weighting by more than `EVEN`."""
     out = []
     for (family, plant), group in groups_of(rows).items():
         lost = [
-            c for base in BASELINES for c in contrasts(group, base) if c.arm == OWN and c.ratio > 1.0 + EVEN
+            c
+            for base in BASELINES
+            for c in contrasts(group, base)
+            if c.arm == ADAPTIVE and c.ratio > 1.0 + EVEN
         ]
         if lost:
             worst = max(lost, key=lambda c: c.ratio)
@@ -64,7 +67,7 @@ def reasons(rows: Sequence[Row]) -> list[Reason]:
     return out
 
 
-def _reason(family: str, plant: str, worst: Contrast, group: Sequence[Row]) -> Reason:
+def _reason(family: str, plant: str, worst: Contrast, group: Sequence[RunScore]) -> Reason:
     told = [c.ratio for c in contrasts(group, worst.base) if c.arm == ORACLE]
     ground, kind = _where(group, worst.base)
     return Reason(
@@ -80,21 +83,21 @@ def _reason(family: str, plant: str, worst: Contrast, group: Sequence[Row]) -> R
     )
 
 
-def recognised(rows: Sequence[Row], ground: str = "") -> float | None:
+def recognised(rows: Sequence[RunScore], ground: str = "") -> float | None:
     """Share of the time in outages in which the adaptive arm's ground was the true one, on one or all."""
     total = right = 0.0
     for row in rows:
         for g in row.grounds:
-            if row.arm == OWN and g.recognised is not None and ground in ("", g.ground):
+            if row.arm == ADAPTIVE and g.recognised is not None and ground in ("", g.ground):
                 total, right = total + g.seconds, right + g.seconds * g.recognised
     return right / total if total > 0.0 else None
 
 
-def _where(rows: Sequence[Row], winner: str) -> tuple[str, str]:
+def _where(rows: Sequence[RunScore], winner: str) -> tuple[str, str]:
     """Ground and kind of error in which the adaptive arm loses most to the winner."""
     excess: dict[tuple[str, str], float] = defaultdict(float)
     for row in rows:
-        sign = {OWN: 1.0, winner: -1.0}.get(row.arm, 0.0)
+        sign = {ADAPTIVE: 1.0, winner: -1.0}.get(row.arm, 0.0)
         for g in row.grounds:
             for kind, words in KINDS.items():
                 error = getattr(g, kind)

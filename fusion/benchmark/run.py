@@ -10,31 +10,31 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import check_folder
-from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
-from terrafusion.fusion.benchmark.drives import Case, drive_of
+from terrafusion.fusion.benchmark.checkpoints import FOLDER, log_state, read_part, write_part
 from terrafusion.fusion.benchmark.field_logs import Refusal, drives_of
-from terrafusion.fusion.benchmark.measure import Row, measure
-from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, write_part
-from terrafusion.fusion.benchmark.plan import Job, Plan
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, METHODS
+from terrafusion.fusion.benchmark.plan import BenchmarkPlan, Job
+from terrafusion.fusion.benchmark.run_score import RunScore, measure
+from terrafusion.fusion.benchmark.twin_runs import BenchmarkCase, simulate_case
 from terrafusion.twin.executors import open_workers
 
 
 @dataclass(frozen=True)
-class Found:
+class BenchmarkResult:
     """All rows of a plan, and what was not run; the same plan and sources find the same but for `seconds`."""
 
-    rows: tuple[Row, ...]
+    rows: tuple[RunScore, ...]
     refused: tuple[Refusal, ...]
 
     @classmethod
-    def read(cls, raw: dict[str, Any]) -> Found:
+    def read(cls, raw: dict[str, Any]) -> BenchmarkResult:
         """What a part holds."""
-        return cls(tuple(map(Row.read, raw["rows"])), tuple(Refusal(**one) for one in raw["refused"]))
+        return cls(tuple(map(RunScore.read, raw["rows"])), tuple(Refusal(**one) for one in raw["refused"]))
 
 
 def run_benchmark(
-    plan: Plan, out: Path, *, jobs: int = 1, progress: Callable[[float], None] | None = None
-) -> Found:
+    plan: BenchmarkPlan, out: Path, *, jobs: int = 1, progress: Callable[[float], None] | None = None
+) -> BenchmarkResult:
     """Run the jobs whose results `out` does not hold yet, and return the rows of all, in the plan's order.
 
     Args:
@@ -57,36 +57,36 @@ def run_benchmark(
     missing = [job for job in wanted if job not in found]
     with open_workers("loky", min(jobs, max(len(missing), 1))) as pool:
         for job, new in pool.results(run_job, [(job,) for job in missing]):
-            found[job] = Found.read(write_part(out, job.key, dataclasses.asdict(new), _state(job)))
+            found[job] = BenchmarkResult.read(write_part(out, job.key, dataclasses.asdict(new), _state(job)))
             if progress is not None:
                 progress(len(found) / len(wanted))
     rows = tuple(row for job in wanted for row in found[job].rows)
-    return Found(rows, tuple(dict.fromkeys(one for job in wanted for one in found[job].refused)))
+    return BenchmarkResult(rows, tuple(dict.fromkeys(one for job in wanted for one in found[job].refused)))
 
 
-def _kept(out: Path, job: Job) -> Found | None:
+def _kept(out: Path, job: Job) -> BenchmarkResult | None:
     """What `out` holds of a job; None also where something was refused: it may be mended by now."""
     try:
         part = read_part(out, job.key, _state(job))
-        found = None if part is None else Found.read(part)
+        found = None if part is None else BenchmarkResult.read(part)
     except (KeyError, TypeError):  # JSON, but no part
         return None
     return None if found is None or found.refused else found
 
 
 def _state(job: Job) -> str:
-    return "" if isinstance(job.item, Case) else log_state(job.item.name)
+    return "" if isinstance(job.item, BenchmarkCase) else log_state(job.item.name)
 
 
-def run_job(job: Job) -> tuple[Job, Found]:
+def run_job(job: Job) -> tuple[Job, BenchmarkResult]:
     """The job, and what every drive of it gives with every arm of it."""
-    arms = [arm for arm in ARMS if arm.name in job.arms]
-    rows: list[Row] = []
+    arms = [arm for arm in METHODS if arm.name in job.arms]
+    rows: list[RunScore] = []
     refused: list[Refusal] = []
-    for drive in [drive_of(job.item)] if isinstance(job.item, Case) else drives_of(job.item):
+    for drive in [simulate_case(job.item)] if isinstance(job.item, BenchmarkCase) else drives_of(job.item):
         if isinstance(drive, Refusal):
             refused.append(drive)
         else:
-            chosen = arms if drive.judged else [arm for arm in arms if arm.name in (OWN, BASE)]
+            chosen = arms if drive.judged else [arm for arm in arms if arm.name in (ADAPTIVE, BASELINE)]
             rows += [row for arm in chosen if (row := measure(drive, arm)) is not None]
-    return job, Found(tuple(rows), tuple(refused))
+    return job, BenchmarkResult(tuple(rows), tuple(refused))

@@ -7,12 +7,19 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from terrafusion.fusion.benchmark.arms import BASE, OWN
-from terrafusion.fusion.benchmark.compare import Contrast, Interval, Share, contrasts, median_interval, shares
-from terrafusion.fusion.benchmark.drives import FIELD
-from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.benchmark.compare import (
+    Contrast,
+    GainShare,
+    Interval,
+    contrasts,
+    median_interval,
+    shares,
+)
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE
+from terrafusion.fusion.benchmark.run_score import RunScore
+from terrafusion.fusion.benchmark.twin_runs import FIELD
 from terrafusion.fusion.metrics.consistency import Consistency
-from terrafusion.fusion.metrics.pooled_consistency import Cell, pool
+from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency, pool
 
 REACHED, OPEN, MISSED = "reached", "open", "missed"
 """By the whole interval; by neither of its ends; by no part of it."""
@@ -50,32 +57,34 @@ class Target:
         return REACHED if low >= self.limit else MISSED if high < self.limit else OPEN
 
 
-def targets(rows: Sequence[Row]) -> list[Target]:
+def targets(rows: Sequence[RunScore]) -> list[Target]:
     """G1, G2, G5 and G9, as far as there are drives for them."""
     out: list[Target] = []
     against_base, against_innovation = contrasts(rows), contrasts(rows, "innovation")
     for plant in dict.fromkeys(row.plant for row in rows if row.family == "mixed"):
         at = ("mixed", plant)
         out += [
-            _ratio("G1", 0.60, against_base, *at, OWN),
-            _ratio("G1", 0.75, against_innovation, *at, OWN),
+            _ratio("G1", 0.60, against_base, *at, ADAPTIVE),
+            _ratio("G1", 0.75, against_innovation, *at, ADAPTIVE),
             _kept(shares(rows), plant),
             _ratio("G2", 1.10, against_base, *at, "shuffled"),
         ]
     for plant in dict.fromkeys(row.plant for row in rows if row.family == "firm"):
-        out.append(_ratio("G2", 1.03, against_base, "firm", plant, OWN))
+        out.append(_ratio("G2", 1.03, against_base, "firm", plant, ADAPTIVE))
     for family, limit in (("outages", 1.0), ("firm", 0.5)):
         for plant in dict.fromkeys(row.plant for row in rows if row.family == family):
             out.append(_drift(rows, family, plant, limit))
     for ground in dict.fromkeys(row.plant for row in rows if row.family == FIELD):
-        own = [r for r in rows if (r.family, r.plant, r.arm) == (FIELD, ground, OWN)]
+        own = [r for r in rows if (r.family, r.plant, r.arm) == (FIELD, ground, ADAPTIVE)]
         broken = sum(bool(r.failed or r.diverged) for r in own)
-        found = _ratio("G9", 1.0, against_base, FIELD, ground, OWN)
+        found = _ratio("G9", 1.0, against_base, FIELD, ground, ADAPTIVE)
         out.append(dataclasses.replace(found, broken=broken))
     return [target for target in out if target.found is not None or target.broken]
 
 
-def nees_cells(rows: Sequence[Row], arms: Iterable[str] = (OWN, BASE)) -> list[Cell]:
+def nees_cells(
+    rows: Sequence[RunScore], arms: Iterable[str] = (ADAPTIVE, BASELINE)
+) -> list[PooledConsistency]:
     """NEES of the position by arm and ground over all twin drives: whole drives, and their outages alone."""
     cells = []
     for arm in arms:
@@ -88,7 +97,7 @@ def nees_cells(rows: Sequence[Row], arms: Iterable[str] = (OWN, BASE)) -> list[C
     return cells
 
 
-def _consistencies(row: Row, ground: str) -> tuple[Consistency, ...]:
+def _consistencies(row: RunScore, ground: str) -> tuple[Consistency, ...]:
     out = []
     for g in row.grounds:
         pairs = ((INSIDE, g.nees, g.effective), (IN_OUTAGE, g.nees_outage, g.effective_outage))
@@ -106,7 +115,7 @@ def _ratio(name: str, limit: float, found: Sequence[Contrast], family: str, plan
     return Target(name, what, limit, True, None, None)
 
 
-def _kept(found: Sequence[Share], plant: str) -> Target:
+def _kept(found: Sequence[GainShare], plant: str) -> Target:
     what = f"mixed, {plant}: share of the oracle's gain"
     for share in found:
         if (share.family, share.plant) == ("mixed", plant):
@@ -114,9 +123,9 @@ def _kept(found: Sequence[Share], plant: str) -> Target:
     return Target("G1", what, 0.70, False, None, None)
 
 
-def _drift(rows: Sequence[Row], family: str, plant: str, limit: float) -> Target:
-    what = f"{family}, {plant}: drift of {OWN} in {LONG_S:g} s, % of the way"
-    own = [row for row in rows if (row.family, row.plant, row.arm) == (family, plant, OWN)]
+def _drift(rows: Sequence[RunScore], family: str, plant: str, limit: float) -> Target:
+    what = f"{family}, {plant}: drift of {ADAPTIVE} in {LONG_S:g} s, % of the way"
+    own = [row for row in rows if (row.family, row.plant, row.arm) == (family, plant, ADAPTIVE)]
     percent = [row.percent for row in own if row.outage_s == LONG_S and row.percent is not None]
     percent += [math.inf for row in own if row.failed]
     if not percent:

@@ -41,7 +41,7 @@ def benchmark(
     """
     import joblib
 
-    from terrafusion.fusion.benchmark.plan import Plan, families_of
+    from terrafusion.fusion.benchmark.plan import BenchmarkPlan, families_of
     from terrafusion.fusion.benchmark.run import run_benchmark
     from terrafusion.fusion.reports.benchmark import (
         at_the_end,
@@ -52,7 +52,7 @@ def benchmark(
     )
     from terrafusion.fusion.reports.benchmark_tables import markdown
 
-    plan = Plan(families_of(only or []), seeds, quick)
+    plan = BenchmarkPlan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]
     words += [f"--seeds {seeds}"] if seeds else []
     words += [f"--only {name}" for name in only or []]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers.log_folder import write_log_folder
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.reports.replay import write_comparison, write_replay
 from terrafusion.twin.simulate import simulate

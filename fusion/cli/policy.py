@@ -45,14 +45,14 @@ def fit(
     Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
     """
     from terrafusion.fusion.cli.terrain import checked_output, progress
-    from terrafusion.fusion.training.drives import GROUNDS
-    from terrafusion.fusion.training.policy_fit import Logged, default_grid, fit_policy, write_policy
+    from terrafusion.fusion.training.policy_fit import LoggedSamples, default_grid, fit_policy, write_policy
     from terrafusion.fusion.training.policy_logs import read_logs
+    from terrafusion.fusion.training.simulated_runs import GROUNDS
 
     checked_output(out)
     grounds = chosen("soils", "soil", tuple(dict.fromkeys(ground or GROUNDS)))
     grid = default_grid(seeds, grounds, *chosen("vehicles", "vehicle", (vehicle or "elevate",)))
-    logged = read_logs(logs, vehicle) if logs else Logged()
+    logged = read_logs(logs, vehicle) if logs else LoggedSamples()
     with progress("drives", len(grid.conditions())) as tick:
         fitted = fit_policy(grid, tick, logged)
     write_policy(fitted, out, made_by=made_by(seeds, ground, vehicle, logs))

@@ -109,7 +109,7 @@ def replay(
     from terrafusion.datasets.core.files import check_folder
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config.estimator_config import MODES
-    from terrafusion.fusion.metrics.metrics import parse_outage
+    from terrafusion.fusion.metrics.scores import parse_outage
     from terrafusion.fusion.replay import replay as run
     from terrafusion.fusion.reports.replay import write_replay
     from terrafusion.fusion.reports.rerun_log import require_rerun, write_rerun

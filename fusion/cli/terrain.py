@@ -14,7 +14,7 @@ import typer
 from terrafusion.datasets.core.errors import TerrafusionError
 
 if TYPE_CHECKING:
-    from terrafusion.fusion.training.evaluate import Scores
+    from terrafusion.fusion.training.detector_scores import DetectorScores
 
 app = typer.Typer(help="The terrain detector: train its model, score it.", no_args_is_help=True)
 
@@ -43,10 +43,10 @@ def train(
         no_seeds(seeds)
         train_on_logs(logs, out)
         return
-    from terrafusion.fusion.training.train import Plan, write_model
-    from terrafusion.fusion.training.train import train as run
+    from terrafusion.fusion.training.train_detector import TrainingPlan, write_model
+    from terrafusion.fusion.training.train_detector import train as run
 
-    plan = Plan() if seeds is None else Plan(seeds=seeds)
+    plan = TrainingPlan() if seeds is None else TrainingPlan(seeds=seeds)
     with progress("drives", plan.drives()) as tick:
         model, scores = run(plan, tick)
     write_model(model, out)
@@ -58,7 +58,7 @@ def train_on_logs(logs: list[str], out: Path) -> None:
     """Fit, calibrate and write a learner of labelled logs."""
     import dataclasses
 
-    from terrafusion.fusion.training.labelled import check_runs, hashes_of, open_runs, train_on
+    from terrafusion.fusion.training.cross_validation import check_runs, hashes_of, open_runs, train_on
 
     runs = open_runs(logs)
     check_runs(runs)
@@ -114,7 +114,7 @@ def evaluate(
     if test or out is not None:
         raise TerrafusionError("--test and --out are of labelled logs", remedy="name the logs to train on")
     from terrafusion.fusion.terrain.classifier import load_terrain_model
-    from terrafusion.fusion.training import trials
+    from terrafusion.fusion.training import detector_trials as trials
 
     loaded = load_terrain_model(model)
     with progress("drives", trials.count(seeds or 1)) as tick:
@@ -126,7 +126,7 @@ def evaluate(
 
 def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
     """Print the figures of labelled logs, and write them."""
-    from terrafusion.fusion.training.labelled import hashes_of, open_runs
+    from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
     from terrafusion.fusion.training.surface_report import STEPS, lines_of, report_on
 
     runs, others = open_runs(logs), open_runs(test) if test else []
@@ -138,7 +138,7 @@ def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
 
 def evaluate_learner(model: Path, logs: list[str], out: Path | None) -> None:
     """Print how a learner does on labelled logs that it has not seen, and write it."""
-    from terrafusion.fusion.training.labelled import hashes_of, open_runs
+    from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
     from terrafusion.fusion.training.softmax import read_softmax
     from terrafusion.fusion.training.surface_report import figures_lines, score
 
@@ -173,7 +173,7 @@ def no_seeds(seeds: int | None) -> None:
         raise TerrafusionError("--seeds is of the twin's drives", remedy="leave it out, or the logs")
 
 
-def print_scores(name: str, scores: Scores) -> None:
+def print_scores(name: str, scores: DetectorScores) -> None:
     """The scores as a small table."""
     median, p95, largest = scores.switch_delay_s
     print(f"{name}: {scores.windows} windows")

@@ -23,7 +23,7 @@ MARKS = {"consistent": "=", "overconfident": "+", "cautious": "-"}
 
 
 @dataclass(frozen=True)
-class Cell:
+class PooledConsistency:
     """One quantity on one ground in one mode, over all drives.
 
     Attributes:
@@ -47,7 +47,7 @@ class Cell:
         return verdict(self.mean, *self.band)
 
 
-def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> list[Cell]:
+def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> list[PooledConsistency]:
     """The drives of one ground and mode together, every drive counting the same."""
     cells = []
     for quantity in dict.fromkeys(row.quantity for drive in drives for row in drive):
@@ -57,7 +57,7 @@ def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> 
         effective = len(rows) ** 2 / sum(1.0 / row.effective for row in rows)
         degrees = effective * (2 if quantity in TWO_DIMENSIONAL else 1)
         cells.append(
-            Cell(
+            PooledConsistency(
                 terrain,
                 mode,
                 quantity,

@@ -27,7 +27,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
 from terrafusion.fusion.graph.key_state import LINEAR
-from terrafusion.fusion.metrics.metrics import Scores
+from terrafusion.fusion.metrics.scores import Scores
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.replay import ReplayResult

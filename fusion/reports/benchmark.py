@@ -19,14 +19,14 @@ from typing import Any
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import to_json
+from terrafusion.fusion.benchmark.checkpoints import LIBRARIES, hash_sources, sources_sha256
 from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
-from terrafusion.fusion.benchmark.drives import FIELD
-from terrafusion.fusion.benchmark.parts import LIBRARIES, hash_sources, sources_sha256
-from terrafusion.fusion.benchmark.plan import Plan
+from terrafusion.fusion.benchmark.plan import BenchmarkPlan
 from terrafusion.fusion.benchmark.reasons import reasons
-from terrafusion.fusion.benchmark.run import Found
+from terrafusion.fusion.benchmark.run import BenchmarkResult
 from terrafusion.fusion.benchmark.targets import nees_cells, targets
-from terrafusion.fusion.metrics.pooled_consistency import Cell
+from terrafusion.fusion.benchmark.twin_runs import FIELD
+from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.reports import page
@@ -41,7 +41,7 @@ CAPTION = (
 )
 
 
-def write_benchmark(out: Path, found: Found, origin: Mapping[str, str]) -> list[Table]:
+def write_benchmark(out: Path, found: BenchmarkResult, origin: Mapping[str, str]) -> list[Table]:
     """All files but the parts; returns the tables.
 
     Raises:
@@ -56,7 +56,9 @@ def write_benchmark(out: Path, found: Found, origin: Mapping[str, str]) -> list[
     return made
 
 
-def write_document(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> None:
+def write_document(
+    path: Path, made: Sequence[Table], found: BenchmarkResult, origin: Mapping[str, str]
+) -> None:
     """Put the tables into a document: what follows its line `MARK` is replaced, the rest is kept.
 
     Raises:
@@ -83,7 +85,7 @@ def document_head(path: Path) -> str:
     return head
 
 
-def origin_of(plan: Plan, command: str) -> dict[str, str]:
+def origin_of(plan: BenchmarkPlan, command: str) -> dict[str, str]:
     """What the numbers are made by and of: to be asked before they are made."""
     seeds = [f"{family} {plan.seed_count(family)}" for family in plan.families if family != FIELD]
     return {
@@ -120,7 +122,7 @@ def _git(folder: Path, *words: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
 
-def document_lines(made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> list[str]:
+def document_lines(made: Sequence[Table], found: BenchmarkResult, origin: Mapping[str, str]) -> list[str]:
     """The tables as Markdown, and where they come from."""
     lines: list[str] = []
     for table in made:
@@ -130,7 +132,7 @@ def document_lines(made: Sequence[Table], found: Found, origin: Mapping[str, str
     return [*lines, "## Made by", "", *(f"- {name}: `{text}`" for name, text in origin.items())]
 
 
-def _content(found: Found, origin: Mapping[str, str]) -> dict[str, Any]:
+def _content(found: BenchmarkResult, origin: Mapping[str, str]) -> dict[str, Any]:
     rows = found.rows
     return {
         "schema": SCHEMA,
@@ -147,14 +149,14 @@ def _content(found: Found, origin: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _cell(cell: Cell) -> dict[str, Any]:
+def _cell(cell: PooledConsistency) -> dict[str, Any]:
     """A cell with its verdict, or without verdict and interval where its drives are too few."""
     few = cell.drives < LEAST_UNITS
     known = {"interval": None, "verdict": None} if few else {"verdict": cell.verdict()}
     return dataclasses.asdict(cell) | known
 
 
-def _page(path: Path, made: Sequence[Table], found: Found, origin: Mapping[str, str]) -> None:
+def _page(path: Path, made: Sequence[Table], found: BenchmarkResult, origin: Mapping[str, str]) -> None:
     body = ["<h1>Fixed against adaptive weighting</h1>"]
     for k, table in enumerate(made):
         cells = [[escape(cell) for cell in row] for row in table.rows]

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from terrafusion.datasets.core.tables import number
-from terrafusion.fusion.benchmark.arms import ARMS, BASE, OWN
 from terrafusion.fusion.benchmark.compare import (
     LEAST_UNITS,
     Contrast,
@@ -18,11 +17,12 @@ from terrafusion.fusion.benchmark.compare import (
     known_median,
     shares,
 )
-from terrafusion.fusion.benchmark.drives import FAMILIES, FIELD, PLANTS
-from terrafusion.fusion.benchmark.measure import Row
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, METHODS
 from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
+from terrafusion.fusion.benchmark.run_score import RunScore
 from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, nees_cells, targets
-from terrafusion.fusion.metrics.pooled_consistency import MARKS, Cell
+from terrafusion.fusion.benchmark.twin_runs import FAMILIES, FIELD, PLANTS
+from terrafusion.fusion.metrics.pooled_consistency import MARKS, PooledConsistency
 
 Cells = list[str]
 
@@ -37,7 +37,7 @@ class Table:
     rows: tuple[Cells, ...]
 
 
-def tables(rows: Sequence[Row]) -> list[Table]:
+def tables(rows: Sequence[RunScore]) -> list[Table]:
     """All tables, the main one first; those without rows are left out."""
     made = (
         _main(rows), _targets(targets(rows)), _reasons(reasons(rows)), _wins(contrasts(rows)), _shares(rows),
@@ -58,24 +58,24 @@ def group_name(family: str, plant: str) -> str:
     return f"{family}, {plant}"
 
 
-def _main(rows: Sequence[Row]) -> Table:
+def _main(rows: Sequence[RunScore]) -> Table:
     """Median error of the fixed row, and the ratios to it."""
     found = contrasts(rows)
-    arms = [arm.name for arm in ARMS if arm.name != BASE]
+    arms = [arm.name for arm in METHODS if arm.name != BASELINE]
     lines = []
     for family, plant in groups_of(rows):
         of = {c.arm: c for c in found if (c.family, c.plant) == (family, plant)}
-        if BASE in of:
-            units = of[BASE].units
-            head = [group_name(family, plant), str(units), number(of[BASE].error_m)]
+        if BASELINE in of:
+            units = of[BASELINE].units
+            head = [group_name(family, plant), str(units), number(of[BASELINE].error_m)]
             lines.append([*head, *(_ratio(of.get(arm), units) for arm in arms)])
     about = (
-        f"Root mean square position error inside the outage: its median for {BASE} (tuned), and for the "
+        f"Root mean square position error inside the outage: its median for {BASELINE} (tuned), and for the "
         f"others the median of the paired ratios to it, with its 95 % interval from {LEAST_UNITS} pairs on. "
         "Below 1 is better. A replay that failed counts as infinitely wrong; in brackets the pairs where not "
         "every drive has labels."
     )
-    return Table("Errors", about, ("drives", "pairs", f"{BASE}, m", *arms), tuple(lines))
+    return Table("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *arms), tuple(lines))
 
 
 def _targets(found: Iterable[Target]) -> Table:
@@ -89,7 +89,7 @@ def _targets(found: Iterable[Target]) -> Table:
     ]  # fmt: skip
     about = (
         "Reached or missed: by the whole interval. Open: the interval holds the limit, or there is none "
-        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {OWN} that fails or diverges, "
+        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {ADAPTIVE} that fails or diverges, "
         "and the estimator was made with its logs in view."
     )
     return Table("Targets", about, ("target", "what", "limit", "found", "verdict"), tuple(lines))
@@ -113,7 +113,7 @@ def _reasons(found: Iterable[Reason]) -> Table:
 
 
 def _wins(found: Iterable[Contrast]) -> Table:
-    arms = [arm.name for arm in ARMS if arm.name != BASE]
+    arms = [arm.name for arm in METHODS if arm.name != BASELINE]
     groups: dict[tuple[str, str], dict[str, Contrast]] = {}
     for c in found:
         groups.setdefault((c.family, c.plant), {})[c.arm] = c
@@ -121,22 +121,24 @@ def _wins(found: Iterable[Contrast]) -> Table:
         [group_name(*key), *(f"{of[a].wins} : {of[a].losses}" if a in of else "-" for a in arms)]
         for key, of in groups.items()
     ]
-    about = f"Drives (logs in the field) won and lost against {BASE} by more than 3 %."
+    about = f"Drives (logs in the field) won and lost against {BASELINE} by more than 3 %."
     return Table("Wins and losses", about, ("drives", *arms), tuple(lines))
 
 
-def _shares(rows: Sequence[Row]) -> Table:
+def _shares(rows: Sequence[RunScore]) -> Table:
     groups = groups_of(rows)
     lines = []
     for s in shares(rows):
         known = recognised(groups[s.family, s.plant])
-        delays = [r.switch_s for r in groups[s.family, s.plant] if r.arm == OWN and r.switch_s is not None]
+        delays = [
+            r.switch_s for r in groups[s.family, s.plant] if r.arm == ADAPTIVE and r.switch_s is not None
+        ]
         if s.share is not None or known is not None:
             share = "no gain" if s.share is None else f"{number(s.share)}{_ends(s.interval)}"
             after = f"{np.median(delays):.1f} s" if delays else "-"
             lines.append([group_name(s.family, s.plant), share, _percent(known), after])
     about = (
-        f"Gain of the detected ground over {BASE} as a share of the gain with true labels, and how much of "
+        f"Gain of the detected ground over {BASELINE} as a share of the gain with true labels, and how much of "
         "the outages the detector names the ground, and how long after a change (median over drives). "
         "No gain: the oracle is no better than 3 %."
     )
@@ -145,8 +147,8 @@ def _shares(rows: Sequence[Row]) -> Table:
     )
 
 
-def _nees(cells: Iterable[Cell]) -> Table:
-    groups: dict[tuple[str, str], dict[str, Cell]] = {}
+def _nees(cells: Iterable[PooledConsistency]) -> Table:
+    groups: dict[tuple[str, str], dict[str, PooledConsistency]] = {}
     for cell in cells:
         groups.setdefault((cell.terrain, cell.mode), {})[cell.quantity] = cell
     lines = []
@@ -162,27 +164,28 @@ def _nees(cells: Iterable[Cell]) -> Table:
     return Table("Consistency", about, heads, tuple(lines))
 
 
-def _field(rows: Sequence[Row]) -> Table:
+def _field(rows: Sequence[RunScore]) -> Table:
     """Log by log: medians over its outages."""
     own = [row for row in rows if row.family == FIELD and row.error_m is not None]
     lines = []
     for log in dict.fromkeys(row.unit for row in own):
         of = {
-            arm.name: [row.error_m for row in own if (row.unit, row.arm) == (log, arm.name)] for arm in ARMS
+            arm.name: [row.error_m for row in own if (row.unit, row.arm) == (log, arm.name)]
+            for arm in METHODS
         }
-        lines.append([log, str(len(of[BASE])), *(_median(of[arm.name]) for arm in ARMS)])
+        lines.append([log, str(len(of[BASELINE])), *(_median(of[arm.name]) for arm in METHODS)])
     about = "Median over the outages of a log, m; against truth, or fixes kept back with their noise."
-    return Table("Field logs", about, ("log", "drives", *(arm.name for arm in ARMS)), tuple(lines))
+    return Table("Field logs", about, ("log", "drives", *(arm.name for arm in METHODS)), tuple(lines))
 
 
-def _failures(rows: Sequence[Row]) -> Table:
+def _failures(rows: Sequence[RunScore]) -> Table:
     found = [(row, row.failed or f"diverged: {row.diverged}") for row in rows if row.failed or row.diverged]
     lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.arm, why] for row, why in found)
     return Table("Replays that failed or diverged", "All of them.", ("drive", "arm", "why"), lines)
 
 
 def _arms() -> Table:
-    lines = [[arm.name, arm.about] for arm in ARMS]
+    lines = [[arm.name, arm.about] for arm in METHODS]
     lines += [[name, family.about] for name, family in FAMILIES.items()]
     lines += [[FIELD, "field logs at hand, 30, 60 and 120 s without GNSS; by ground"]]
     lines += [[name, about] for name, about in PLANTS.items()]
@@ -202,7 +205,7 @@ def _ends(interval: Interval | None, decimals: int | None = None) -> str:
     return f" [{low}, {high}]"
 
 
-def _cell(cell: Cell) -> str:
+def _cell(cell: PooledConsistency) -> str:
     if cell.drives < LEAST_UNITS:
         return f"{cell.mean:.2f}"
     (low, high), band = cell.interval, cell.band

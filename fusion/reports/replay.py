@@ -16,7 +16,7 @@ from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
-from terrafusion.fusion.metrics.metrics import Outage, Scores
+from terrafusion.fusion.metrics.scores import Outage, Scores
 from terrafusion.fusion.outputs.linear_states import cells
 from terrafusion.fusion.outputs.replay_files import metrics_of, write_outputs
 from terrafusion.fusion.replay import ReplayResult

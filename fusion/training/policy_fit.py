@@ -19,8 +19,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.noise.policy import SCHEMA, Policy, SensorNoise, within_ranges
-from terrafusion.fusion.training.drives import GROUNDS, Grid, run_all
-from terrafusion.fusion.training.policy_evidence import (
+from terrafusion.fusion.training.ground_samples import (
     ACCEL_S,
     BIAS_S,
     GYRO_S,
@@ -32,9 +31,10 @@ from terrafusion.fusion.training.policy_evidence import (
     STUCK_MPS,
     TURNING_MPS,
     YAWING_RADPS,
-    Evidence,
-    evidence_of,
+    GroundSamples,
+    samples_of,
 )
+from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, run_all
 
 Array = NDArray[np.float64]
 
@@ -54,18 +54,20 @@ DIGITS = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Logged:
+class LoggedSamples:
     """What labelled logs say: evidence by ground, from means of `mean_s`.
 
     `inputs` is file name -> SHA-256 of what was read.
     """
 
-    grounds: Mapping[str, Evidence] = dataclasses.field(default_factory=dict)
+    grounds: Mapping[str, GroundSamples] = dataclasses.field(default_factory=dict)
     inputs: Mapping[str, str] = dataclasses.field(default_factory=dict)
     mean_s: float = 0.0
 
 
-def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logged = Logged()) -> Policy:
+def fit_policy(
+    grid: Grid, tick: Callable[[], None] = lambda: None, logged: LoggedSamples = LoggedSamples()
+) -> Policy:
     """Simulate the drives of `grid` and fit a row to each ground; `tick` is called after each drive.
 
     What logs say of a ground goes into the twin's row of it, or into the row of all grounds together where
@@ -74,10 +76,10 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logg
     Raises:
         TerrafusionError: on some ground the wheels hardly turned.
     """
-    drives: dict[str, list[Evidence]] = {ground: [] for ground in grid.grounds}
+    drives: dict[str, list[GroundSamples]] = {ground: [] for ground in grid.grounds}
     for condition, recording in run_all(grid.conditions(), tick):
-        drives[condition.terrain].append(evidence_of(recording))
-    grounds = {name: Evidence.joined(parts) for name, parts in drives.items()}
+        drives[condition.terrain].append(samples_of(recording))
+    grounds = {name: GroundSamples.joined(parts) for name, parts in drives.items()}
     found = {name: _row_on(name, evidence) for name, evidence in grounds.items()}
     fixed = row_of(list(grounds.values()))
     found |= {name: informed(found.get(name, fixed), told) for name, told in sorted(logged.grounds.items())}
@@ -90,7 +92,7 @@ def fit_policy(grid: Grid, tick: Callable[[], None] = lambda: None, logged: Logg
     )
 
 
-def informed(row: SensorNoise, told: Evidence) -> SensorNoise:
+def informed(row: SensorNoise, told: GroundSamples) -> SensorNoise:
     """A row of the twin with what logs tell: they move its means; a scatter they may widen, not narrow.
 
     Logs are few, and their means are long. The slope over the grade is theirs only where they were in hills.
@@ -119,7 +121,7 @@ def default_grid(seeds: int, grounds: tuple[str, ...] = GROUNDS, vehicle: str = 
     return Grid(SCENARIOS, SLOPES_DEG, PAYLOADS_KG, tuple(range(seeds)), grounds, vehicle)
 
 
-def _row_on(ground: str, evidence: Evidence) -> SensorNoise:
+def _row_on(ground: str, evidence: GroundSamples) -> SensorNoise:
     try:
         return row_of([evidence])
     except ValueError as error:
@@ -128,7 +130,7 @@ def _row_on(ground: str, evidence: Evidence) -> SensorNoise:
         ) from None
 
 
-def row_of(grounds: list[Evidence]) -> SensorNoise:
+def row_of(grounds: list[GroundSamples]) -> SensorNoise:
     """The row of one ground, or of several with equal weight.
 
     Raises:
@@ -167,7 +169,7 @@ def _yaw_scale_of(found: list[Array]) -> tuple[float, float]:
     return mean, max(_rms([scales - mean for scales in found]), LEAST_YAW_SCALE_SIGMA)
 
 
-def _slip_line(grounds: list[Evidence]) -> tuple[float, float]:
+def _slip_line(grounds: list[GroundSamples]) -> tuple[float, float]:
     """Slip on the level and its slope over the grade: the mean of the grounds' own lines.
 
     Least absolute deviations, by reweighted least squares: slip has a long tail
@@ -219,7 +221,7 @@ def _rounded(row: SensorNoise) -> SensorNoise:
     return within_ranges(SensorNoise(*digits))
 
 
-def fingerprint_of(grid: Grid, logged: Logged = Logged()) -> str:
+def fingerprint_of(grid: Grid, logged: LoggedSamples = LoggedSamples()) -> str:
     """SHA-256 of what a policy fitted on `grid` and logs depends on: parameter files, logs and settings."""
     settings = {
         "schema": SCHEMA,

@@ -27,14 +27,14 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 from terrafusion.fusion.terrain.external import TRUE_SOURCES
-from terrafusion.fusion.training.policy_evidence import (
+from terrafusion.fusion.training.ground_samples import (
     SLIP_S,
-    Evidence,
+    GroundSamples,
     side_slips_of,
     slips_of,
     yaw_scales_of,
 )
-from terrafusion.fusion.training.policy_fit import Logged
+from terrafusion.fusion.training.policy_fit import LoggedSamples
 
 Array = NDArray[np.float64]
 
@@ -48,7 +48,7 @@ _HALF_NS = round(0.5e9 * MEAN_S)
 
 
 @dataclass(frozen=True, eq=False)
-class Motion:
+class MeasuredMotion:
     """Means over `MEAN_S` every `SLIP_S`, NaN where not known, (n,) each.
 
     `t_ns` is the middle; speeds in m/s: of the wheels' mean, forward and to the left; yaw rates in rad/s by
@@ -64,7 +64,7 @@ class Motion:
     grade: Array
 
 
-def read_logs(logs: Sequence[str], vehicle: str | None = None) -> Logged:
+def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
     """The evidence of logs: files, folders, or names of the catalogue; `vehicle` for those that name none.
 
     Raises:
@@ -72,14 +72,14 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> Logged:
         TerrafusionError: a log cannot be read.
     """
     from terrafusion.datasets.readers import open_recordings
-    from terrafusion.fusion.training.labelled import hashes_of
+    from terrafusion.fusion.training.cross_validation import hashes_of
 
-    parts: dict[str, list[Evidence]] = {}
+    parts: dict[str, list[GroundSamples]] = {}
     for log in logs:
         for recording in open_recordings(log):
-            for ground, evidence in logged_evidence(recording, vehicle).items():
+            for ground, evidence in logged_samples(recording, vehicle).items():
                 parts.setdefault(ground, []).append(evidence)
-    grounds = {name: Evidence.joined(found) for name, found in parts.items()}
+    grounds = {name: GroundSamples.joined(found) for name, found in parts.items()}
     for name, evidence in grounds.items():
         if len(evidence.slip) < LEAST_SLIPS:
             raise DataError(
@@ -87,10 +87,10 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> Logged:
                 channel="terrain",
                 remedy="give longer drives on that ground, or leave its logs out",
             )
-    return Logged(grounds, hashes_of(logs), MEAN_S)
+    return LoggedSamples(grounds, hashes_of(logs), MEAN_S)
 
 
-def logged_evidence(recording: Recording, vehicle: str | None = None) -> dict[str, Evidence]:
+def logged_samples(recording: Recording, vehicle: str | None = None) -> dict[str, GroundSamples]:
     """What a recorded drive says of each of its grounds."""
     motion, grounds = motion_of(recording, vehicle), grounds_of(recording)
     names = np.array([_ground_around(t, grounds) for t in motion.t_ns.tolist()])
@@ -102,7 +102,7 @@ def logged_evidence(recording: Recording, vehicle: str | None = None) -> dict[st
         yaw = yaw_scales_of(motion.wheel_radps, np.where(here, motion.true_radps, np.nan))
         side = side_slips_of(forward, motion.lateral_mps, motion.true_radps)
         none = np.empty(0)
-        found[ground] = Evidence(*slip, none, yaw, side, none, none, none, none)
+        found[ground] = GroundSamples(*slip, none, yaw, side, none, none, none, none)
     return found
 
 
@@ -133,7 +133,7 @@ def _ground_around(t_ns: int, grounds: list[tuple[int, str]]) -> str:
     return seen.pop() if last and len(seen) == 1 else ""
 
 
-def motion_of(recording: Recording, vehicle: str | None = None) -> Motion:
+def motion_of(recording: Recording, vehicle: str | None = None) -> MeasuredMotion:
     """Wheels and truth of a recorded drive.
 
     Raises:
@@ -166,7 +166,9 @@ def motion_of(recording: Recording, vehicle: str | None = None) -> Motion:
     )
     forward, lateral, rate = _means(truth.t_ns, _moved(truth), middle)
     grade = np.interp(middle, truth.t_ns, _rotations(truth)[:, 2, 0])
-    return Motion(middle, 0.5 * (left + right), forward, lateral, (right - left) / rig.track_m, rate, grade)
+    return MeasuredMotion(
+        middle, 0.5 * (left + right), forward, lateral, (right - left) / rig.track_m, rate, grade
+    )
 
 
 def _means(t_ns: NDArray[np.int64], path: Array, middle_ns: NDArray[np.int64]) -> Array:

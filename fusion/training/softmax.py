@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.config import read_yaml
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.terrain.sequence import PatchFilter
-from terrafusion.fusion.training.surface_features import GROUPS, HOP_S, SURFACE_FEATURES, WINDOW_S, Windows
+from terrafusion.fusion.training.surface_features import (
+    GROUPS,
+    HOP_S,
+    SURFACE_FEATURES,
+    WINDOW_S,
+    SurfaceWindows,
+)
 
 Array = NDArray[np.float64]
 
@@ -92,7 +98,7 @@ class SoftmaxModel:
         seen = np.maximum(np.isfinite(np.atleast_2d(x)).sum(axis=1), 1)
         return np.asarray(distance.min(axis=1) / seen)
 
-    def filtered(self, windows: Windows) -> Array:
+    def filtered(self, windows: SurfaceWindows) -> Array:
         """Class probabilities (n, k) along the n windows of a drive."""
         log_p, recent = self.log_probabilities(windows.x), self.log_probabilities(windows.recent)
         patches = PatchFilter(len(self.classes), PATCH_LENGTH_M)

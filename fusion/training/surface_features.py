@@ -110,7 +110,7 @@ def signals_of(recording: Recording) -> Signals:
 
 
 @dataclass(frozen=True, eq=False)
-class Windows:
+class SurfaceWindows:
     """What a drive shows every `HOP_S`.
 
     Attributes:
@@ -129,12 +129,12 @@ class Windows:
         """The number of windows."""
         return len(self.end_s)
 
-    def first(self, count: int) -> Windows:
+    def first(self, count: int) -> SurfaceWindows:
         """The first `count` of them."""
-        return Windows(self.end_s[:count], self.x[:count], self.recent[:count], self.rolled_m[:count])
+        return SurfaceWindows(self.end_s[:count], self.x[:count], self.recent[:count], self.rolled_m[:count])
 
 
-def surface_windows(signals: Signals) -> Windows:
+def surface_windows(signals: Signals) -> SurfaceWindows:
     """Cut a drive into windows."""
     begin = max(float(signals.imu_s[0]), float(signals.wheels_s[0]))
     span = signals.end_s() - begin
@@ -150,7 +150,7 @@ def surface_windows(signals: Signals) -> Windows:
         recent[i] = window_features(window.between(end - RECENT_S, end), RECENT_S)
         if len(window.sides_mps):
             rolled[i] = float(np.abs(window.sides_mps).mean(axis=0).max()) * HOP_S
-    return Windows(ends, x, recent, rolled)
+    return SurfaceWindows(ends, x, recent, rolled)
 
 
 def window_features(window: Signals, length_s: float = WINDOW_S) -> Array:

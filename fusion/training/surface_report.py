@@ -11,21 +11,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.training.labelled import (
+from terrafusion.fusion.training.change_detection import LEAST_RUN_S, changes_seen
+from terrafusion.fusion.training.cross_validation import (
     FOLDS,
     LEAST_RUNS,
-    Folded,
-    Run,
+    CrossValidation,
+    LabelledRun,
+    assign_folds,
     check_runs,
     cross_validate,
-    deal,
-    figures_of,
     labels_of,
+    learner_scores,
     train_on,
     window_ms,
 )
 from terrafusion.fusion.training.softmax import SoftmaxModel, fit_softmax
-from terrafusion.fusion.training.spliced import LEAST_RUN_S, changes_seen
 from terrafusion.fusion.training.surface_features import GROUPS, SURFACE_FEATURES
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ ABLATION_TEMPERATURE = 8.0
 
 
 def report_on(
-    runs: Sequence[Run], others: Sequence[Run] = (), tick: Callable[[], None] = lambda: None
+    runs: Sequence[LabelledRun], others: Sequence[LabelledRun] = (), tick: Callable[[], None] = lambda: None
 ) -> dict[str, Any]:
     """All figures of one set of labelled runs, and of a model of it on `others`; JSON-able.
 
@@ -66,7 +66,10 @@ def report_on(
     }
     tick()
     report["ablation"] = ablation(runs, tick)
-    report["reference"] = {"extra trees, by run": trees(runs, deal(runs)), "split that leaks": leaking(runs)}
+    report["reference"] = {
+        "extra trees, by run": trees(runs, assign_folds(runs)),
+        "split that leaks": leaking(runs),
+    }
     tick()
     report["ground never seen"] = never_seen(runs)
     tick()
@@ -75,7 +78,7 @@ def report_on(
     return report
 
 
-def ablation(runs: Sequence[Run], tick: Callable[[], None]) -> dict[str, dict[str, float]]:
+def ablation(runs: Sequence[LabelledRun], tick: Callable[[], None]) -> dict[str, dict[str, float]]:
     """Macro-F1 by run without each input, and with it alone."""
     table: dict[str, dict[str, float]] = {}
     for name, features in {"nothing": (), **GROUPS}.items():
@@ -87,30 +90,30 @@ def ablation(runs: Sequence[Run], tick: Callable[[], None]) -> dict[str, dict[st
     return table
 
 
-def trees(runs: Sequence[Run], fold_of: NDArray[np.intp]) -> float:
+def trees(runs: Sequence[LabelledRun], fold_of: NDArray[np.intp]) -> float:
     """Macro-F1, window by window, of extremely randomised trees (Geurts et al. 2006) on the same folds."""
     x, y, fold = _stacked(runs, fold_of)
     return _tree_f1(x, y, fold)
 
 
-def leaking(runs: Sequence[Run]) -> dict[str, float]:
+def leaking(runs: Sequence[LabelledRun]) -> dict[str, float]:
     """Macro-F1 where windows, not runs, are dealt to the folds: overlapping windows in training and test."""
-    x, y, _ = _stacked(runs, deal(runs))
+    x, y, _ = _stacked(runs, assign_folds(runs))
     fold = np.random.default_rng(0).permutation(len(x)) % FOLDS
     p = np.zeros((len(x), len(set(y.tolist()))))
     for k in range(FOLDS):
         model = fit_softmax(x[fold != k], y[fold != k].tolist())
         p[fold == k] = np.exp(model.log_probabilities(x[fold == k]))
     return {
-        "softmax": figures_of(model.classes, runs, [p]).macro_f1,
+        "softmax": learner_scores(model.classes, runs, [p]).macro_f1,
         "extra trees": _tree_f1(x, y, fold),
     }
 
 
-def never_seen(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
+def never_seen(runs: Sequence[LabelledRun]) -> dict[str, dict[str, float]]:
     """Shares of windows called odd: of a ground left out of the training, and of runs of known ground."""
     shares: dict[str, dict[str, float]] = {}
-    fold_of = deal(runs)
+    fold_of = assign_folds(runs)
     for ground in sorted({r.label for r in runs}):
         known = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f != 0]
         test = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f == 0]
@@ -126,7 +129,7 @@ def never_seen(runs: Sequence[Run]) -> dict[str, dict[str, float]]:
     return shares
 
 
-def transfer(runs: Sequence[Run], others: Sequence[Run]) -> dict[str, Any]:
+def transfer(runs: Sequence[LabelledRun], others: Sequence[LabelledRun]) -> dict[str, Any]:
     """A model of `runs` on another set, by the inputs that set has, on the grounds both have."""
     common = sorted({r.label for r in runs} & {r.label for r in others})
     test = [r for r in others if r.label in common]
@@ -140,13 +143,13 @@ def transfer(runs: Sequence[Run], others: Sequence[Run]) -> dict[str, Any]:
         back = [r for r in on if r.label in common]
         model = train_on(here, features, ABLATION_TEMPERATURE)
         x = np.vstack([r.x for r in back])
-        single = figures_of(model.classes, back, [np.exp(model.log_probabilities(x))])
+        single = learner_scores(model.classes, back, [np.exp(model.log_probabilities(x))])
         result[name] = dataclasses.asdict(single)
     result["odd"] = float(np.mean(_odd(runs, test, features)))
     return result
 
 
-def score(model: SoftmaxModel, runs: Sequence[Run]) -> dict[str, Any]:
+def score(model: SoftmaxModel, runs: Sequence[LabelledRun]) -> dict[str, Any]:
     """Figures of a finished model on runs that it was not trained on; JSON-able.
 
     Raises:
@@ -163,7 +166,7 @@ def score(model: SoftmaxModel, runs: Sequence[Run]) -> dict[str, Any]:
         "window by window": [np.exp(model.log_probabilities(r.x)) for r in runs],
         "filtered": [model.filtered(r.windows) for r in runs],
     }
-    return {name: dataclasses.asdict(figures_of(model.classes, runs, p)) for name, p in answers.items()}
+    return {name: dataclasses.asdict(learner_scores(model.classes, runs, p)) for name, p in answers.items()}
 
 
 def figures_lines(report: dict[str, Any]) -> list[str]:
@@ -234,16 +237,20 @@ def _table(figures: dict[str, Any]) -> list[str]:
     return [head, *(f"{c:14s}" + " ".join(f"{share:12.3f}" for share in row) for c, row in rows)]
 
 
-def _odd(runs: Sequence[Run], others: Sequence[Run], features: Sequence[str]) -> NDArray[np.bool_]:
+def _odd(
+    runs: Sequence[LabelledRun], others: Sequence[LabelledRun], features: Sequence[str]
+) -> NDArray[np.bool_]:
     model = train_on(runs, features)
     return np.asarray(model.oddness(np.vstack([r.x for r in others])) > model.odd_distance)
 
 
-def _f1(folded: Folded) -> float:
+def _f1(folded: CrossValidation) -> float:
     return folded.figures().macro_f1
 
 
-def _stacked(runs: Sequence[Run], fold_of: NDArray[np.intp]) -> tuple[Array, NDArray[Any], NDArray[np.intp]]:
+def _stacked(
+    runs: Sequence[LabelledRun], fold_of: NDArray[np.intp]
+) -> tuple[Array, NDArray[Any], NDArray[np.intp]]:
     x = np.vstack([r.x for r in runs])
     return x, np.array(labels_of(runs)), np.repeat(fold_of, [len(r.x) for r in runs])
 

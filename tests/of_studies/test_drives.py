@@ -5,28 +5,29 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.fusion.benchmark.arms import ARMS
-from terrafusion.fusion.benchmark.drives import (
+from terrafusion.fusion.benchmark.methods import METHODS
+from terrafusion.fusion.benchmark.run_score import measure
+from terrafusion.fusion.benchmark.twin_runs import (
     FAMILIES,
     FIRST_SEED,
     LEAD_S,
     PLANTS,
-    Case,
-    drive_of,
+    BenchmarkCase,
     perturbed,
+    simulate_case,
     soils_of,
 )
-from terrafusion.fusion.benchmark.measure import measure
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.terrain.external import external_probabilities
-from terrafusion.fusion.training import train, trials
-from terrafusion.fusion.training.drives import SOIL_SCATTER
+from terrafusion.fusion.training import detector_trials as trials
+from terrafusion.fusion.training import train_detector as train
 from terrafusion.fusion.training.policy_fit import default_grid
+from terrafusion.fusion.training.simulated_runs import SOIL_SCATTER
 from terrafusion.twin.model.soil import load_soil
 from tests.studies import twin_consistency
 from tests.studies.mode_tuning import DRIVES, MIXED
 
-SHORT = Case("outages", "twin", FIRST_SEED + 2)
+SHORT = BenchmarkCase("outages", "twin", FIRST_SEED + 2)
 
 
 def test_no_seed_of_training_or_of_scores_while_developing_is_used() -> None:
@@ -41,19 +42,19 @@ def test_no_seed_of_training_or_of_scores_while_developing_is_used() -> None:
 
 
 def test_the_same_case_gives_the_same_bits() -> None:
-    one, other = drive_of(SHORT), drive_of(SHORT)
+    one, other = simulate_case(SHORT), simulate_case(SHORT)
     assert np.array_equal(one.recording.imu.accel_mps2, other.recording.imu.accel_mps2)
     assert np.array_equal(one.recording.truth.position_m, other.recording.truth.position_m)
     assert (one.outage, one.labels) == (other.outage, other.labels)
 
 
 def test_a_recording_tells_the_estimator_nothing_of_its_ground() -> None:
-    terrain = drive_of(SHORT).recording.terrain
+    terrain = simulate_case(SHORT).recording.terrain
     assert list(external_probabilities(terrain, load_policy().names())) == []
 
 
 def test_plants_drive_the_same_on_other_ground() -> None:
-    drives = {plant: drive_of(Case("outages", plant, FIRST_SEED + 2)) for plant in PLANTS}
+    drives = {plant: simulate_case(BenchmarkCase("outages", plant, FIRST_SEED + 2)) for plant in PLANTS}
     commands = [d.recording.command.v_mps for d in drives.values()]
     assert all(np.array_equal(commands[0], other) for other in commands[1:])
     assert len({d.outage for d in drives.values()}) == 1
@@ -63,7 +64,7 @@ def test_plants_drive_the_same_on_other_ground() -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_an_outage_follows_the_lead_and_lasts_to_the_end(family: str) -> None:
-    drive = drive_of(Case(family, "twin", FIRST_SEED + 2))
+    drive = simulate_case(BenchmarkCase(family, "twin", FIRST_SEED + 2))
     assert LEAD_S[0] <= drive.outage.start_s <= LEAD_S[1]
     assert drive.outage.seconds in FAMILIES[family].outages_s
     assert drive.recording.duration_s() >= drive.outage.start_s + drive.outage.seconds
@@ -71,7 +72,7 @@ def test_an_outage_follows_the_lead_and_lasts_to_the_end(family: str) -> None:
 
 
 def test_mixed_drives_change_their_ground_in_the_outage() -> None:
-    drive = drive_of(Case("mixed", "twin", FIRST_SEED))
+    drive = simulate_case(BenchmarkCase("mixed", "twin", FIRST_SEED))
     terrain = drive.recording.terrain
     inside = drive.outage.covers(terrain.t_ns, drive.recording.start_ns)
     assert len(set(terrain.label[inside].astype(str))) >= 2
@@ -93,8 +94,8 @@ def test_soils_of_the_twin_stay_in_the_scatter_of_training() -> None:
 
 
 def test_the_oracle_of_ground_that_the_policy_never_saw_is_right_to_call_it_unknown() -> None:
-    drive = drive_of(Case("unseen", "twin", FIRST_SEED))
-    row = measure(drive, next(arm for arm in ARMS if arm.name == "oracle"))
+    drive = simulate_case(BenchmarkCase("unseen", "twin", FIRST_SEED))
+    row = measure(drive, next(arm for arm in METHODS if arm.name == "oracle"))
     assert row is not None
     (ground,) = row.grounds
     assert ground.ground in FAMILIES["unseen"].grounds

@@ -15,7 +15,8 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark import field_logs, parts
+from terrafusion.fusion.benchmark import checkpoints as parts
+from terrafusion.fusion.benchmark import field_logs
 from terrafusion.fusion.benchmark.field_logs import Refusal
 from terrafusion.twin.simulate import simulate
 from tests.studies.field_table import table as field_table

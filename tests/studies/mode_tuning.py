@@ -31,20 +31,20 @@ import numpy as np
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark.drives import (
+from terrafusion.fusion.benchmark.twin_runs import (
     FAMILIES,
     LEAD_S,
     LEG_M,
     MUD_LEG_M,
     TAIL_S,
-    Case,
-    drive_of,
+    BenchmarkCase,
+    simulate_case,
 )
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.modes import ModeTuning, bounds, load_modes, write_modes
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import replay
-from terrafusion.fusion.training.drives import GROUNDS, Grid, scattered_soil
+from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, scattered_soil
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate
 
@@ -125,12 +125,12 @@ DRIVES = (
     Training("figure_eight", "loose_sand", 6.0, 1004, "outliers"),
     Training("staircase", "asphalt", 3.0, 1005, "optimistic"),
 )
-MIXED = tuple(Case("mixed", "twin", seed) for seed in range(1006, 1012))
+MIXED = tuple(BenchmarkCase("mixed", "twin", seed) for seed in range(1006, 1012))
 
 
-def mixed_lesson(case: Case) -> Lesson:
+def mixed_lesson(case: BenchmarkCase) -> Lesson:
     """A drive of the benchmark's families, with the outage that it has there."""
-    drive = drive_of(case)
+    drive = simulate_case(case)
     assert drive.outage is not None
     return Lesson(drive.recording, drive.outage)
 

@@ -27,7 +27,7 @@ from terrafusion.fusion.metrics.consistency import (
     summarise,
     whitened_series,
 )
-from terrafusion.fusion.metrics.pooled_consistency import IN_OUTAGE, MARKS, Cell, pool
+from terrafusion.fusion.metrics.pooled_consistency import IN_OUTAGE, MARKS, PooledConsistency, pool
 
 MODES = ("adaptive", "fixed")
 SCENARIO = "waypoints"
@@ -43,7 +43,7 @@ TABLES = (
 
 
 @dataclass(frozen=True)
-class Plan:
+class ConsistencyPlan:
     """Which drives are made: `seeds` of each ground, in each mode."""
 
     seeds: int
@@ -58,24 +58,24 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Found:
+class ConsistencyResult:
     """What the drives of a plan gave; `refused` says which of them could not be estimated, and why."""
 
-    cells: tuple[Cell, ...]
+    cells: tuple[PooledConsistency, ...]
     refused: tuple[str, ...] = ()
 
 
-def run(plan: Plan, progress: Callable[[float], None] | None = None) -> Found:
+def run(plan: ConsistencyPlan, progress: Callable[[float], None] | None = None) -> ConsistencyResult:
     """Drive, replay and test; the same plan finds the same.
 
     Raises:
         ConfigError: no seeds, or an unknown ground or scenario.
     """
-    from terrafusion.fusion.training.drives import Condition
+    from terrafusion.fusion.training.simulated_runs import Condition
 
     if plan.seeds < 1:
         raise ConfigError(f"{plan.seeds} seeds are none", remedy="give --seeds 1 or more")
-    cells: list[Cell] = []
+    cells: list[PooledConsistency] = []
     refused: list[str] = []
     done = 0
     for terrain in plan.terrains:
@@ -92,12 +92,12 @@ def run(plan: Plan, progress: Callable[[float], None] | None = None) -> Found:
                     progress(done / plan.runs())
         for mode in plan.modes:
             cells += pool(terrain, mode, drives[mode])
-    return Found(tuple(cells), tuple(refused))
+    return ConsistencyResult(tuple(cells), tuple(refused))
 
 
 def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
     """Replay one drive; its quantities, those against the truth apart inside and outside the outage."""
-    from terrafusion.fusion.metrics.metrics import Outage
+    from terrafusion.fusion.metrics.scores import Outage
     from terrafusion.fusion.replay import replay
 
     outage = Outage(*OUTAGE_S)
@@ -115,7 +115,7 @@ def checked_drive(recording: Recording, mode: str) -> tuple[Consistency, ...]:
     return tuple(row for row in rows if row is not None)
 
 
-def table(cells: Sequence[Cell], quantities: Sequence[str]) -> list[str]:
+def table(cells: Sequence[PooledConsistency], quantities: Sequence[str]) -> list[str]:
     """Markdown: a row for each ground and mode, a column for each quantity that was found."""
     shown = [q for q in quantities if any(cell.quantity == q for cell in cells)]
     lines = ["| ground | mode | " + " | ".join(shown) + " |", "| --- | --- |" + " --- |" * len(shown)]
@@ -126,7 +126,7 @@ def table(cells: Sequence[Cell], quantities: Sequence[str]) -> list[str]:
     return lines
 
 
-def _text(cell: Cell) -> str:
+def _text(cell: PooledConsistency) -> str:
     (a, b), (low, high) = cell.interval, cell.band
     return f"{cell.mean:.2f} [{a:.2f}, {b:.2f}] {MARKS[cell.verdict()]} {low:.2f}..{high:.2f}"
 
@@ -143,14 +143,16 @@ def command(arguments: list[str] | None = None) -> int:
         description="NEES and NIS of the estimator on twin drives of each ground.",
         epilog="example: python -m tests.studies.twin_consistency --seeds 10",
     )
-    plan = Plan(seeds=0)
+    plan = ConsistencyPlan(seeds=0)
     parser.add_argument("--seeds", type=int, default=5, help="drives of each ground (default 5)")
     parser.add_argument("--terrain", nargs="+", default=plan.terrains, help="grounds")
     parser.add_argument("--mode", nargs="+", default=plan.modes, help="modes of the estimator")
     parser.add_argument("--scenario", default=plan.scenario, help=f"default {plan.scenario}")
     parser.add_argument("--slope-deg", type=float, default=plan.slope_deg, help="default 0")
     given = parser.parse_args(arguments)
-    asked = Plan(given.seeds, tuple(given.terrain), tuple(given.mode), given.scenario, given.slope_deg)
+    asked = ConsistencyPlan(
+        given.seeds, tuple(given.terrain), tuple(given.mode), given.scenario, given.slope_deg
+    )
     try:
         with progress_bar("consistency") as progress:
             found = run(asked, progress)
@@ -161,7 +163,7 @@ def command(arguments: list[str] | None = None) -> int:
     return 0
 
 
-def report(plan: Plan, found: Found) -> list[str]:
+def report(plan: ConsistencyPlan, found: ConsistencyResult) -> list[str]:
     """Everything the command prints."""
     start, seconds = OUTAGE_S
     lines = [

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from terrafusion.fusion.benchmark.arms import BASE, OWN
 from terrafusion.fusion.benchmark.compare import Contrast
+from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE
 from terrafusion.fusion.reports.plots import style
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def plot_ratios(found: Sequence[Contrast]) -> Figure:
     from matplotlib.figure import Figure
     from matplotlib.ticker import FuncFormatter, NullFormatter
 
-    shown = [c for c in found if c.arm != BASE]
+    shown = [c for c in found if c.arm != BASELINE]
     groups = list(dict.fromkeys((c.family, c.plant) for c in shown))
     arms = list(dict.fromkeys(c.arm for c in shown))
     figure = Figure(figsize=(9.0, 1.3 + ROW_IN * len(groups)), layout="constrained")
@@ -37,7 +37,7 @@ def plot_ratios(found: Sequence[Contrast]) -> Figure:
         reach = [[r - e[0] for r, e in zip(ratio, ends, strict=True)],
                  [e[1] - r for r, e in zip(ratio, ends, strict=True)]]  # fmt: skip
         ax.errorbar(
-            ratio, height, xerr=reach, fmt="D" if arm == OWN else "o", markersize=6 if arm == OWN else 4,
+            ratio, height, xerr=reach, fmt="D" if arm == ADAPTIVE else "o", markersize=6 if arm == ADAPTIVE else 4,
             color=style.colour_of(arm, COLOURS), elinewidth=1.2, label=arm,
         )  # fmt: skip
     ax.axvline(1.0, color=style.TRUTH, linewidth=0.8)
@@ -52,7 +52,7 @@ def plot_ratios(found: Sequence[Contrast]) -> Figure:
     ax.set_yticks(range(len(groups)), [f"{family}, {plant}" for family, plant in groups])
     ax.invert_yaxis()
     style.dress(
-        ax, x=f"position error in the outage over that of {BASE} (tuned): median of pairs, 95 % interval"
+        ax, x=f"position error in the outage over that of {BASELINE} (tuned): median of pairs, 95 % interval"
     )
     style.legend_above(ax)
     return figure

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate, WeightChange
 from terrafusion.fusion.metrics.error_series import Errors
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics import consistency
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.replay import TIME, shade_outages
 

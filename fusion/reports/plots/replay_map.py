@@ -12,7 +12,7 @@ from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.error_series import Errors
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.outputs.replay_files import is_local
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.replay import TIME, shade_outages

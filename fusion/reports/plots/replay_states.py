@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import Estimate
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.reports.plots import style
 from terrafusion.fusion.reports.plots.replay import TIME, shade_outages

@@ -10,16 +10,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.fusion.benchmark.compare import contrasts, median_interval, shares
-from terrafusion.fusion.benchmark.measure import GroundRow, Row, switch_delay_s
 from terrafusion.fusion.benchmark.reasons import reasons
+from terrafusion.fusion.benchmark.run_score import GroundScore, RunScore, switch_delay_s
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, nees_cells, targets
 from terrafusion.fusion.reports.benchmark_tables import markdown, tables
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 
-def rows(arm: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[Row]:
+def rows(arm: str, errors, family: str = "mixed", plant: str = "twin", **fields) -> list[RunScore]:
     return [
-        Row(family, plant, f"seed {i}", f"seed {i}", arm, error_m=e, **fields) for i, e in enumerate(errors)
+        RunScore(family, plant, f"seed {i}", f"seed {i}", arm, error_m=e, **fields)
+        for i, e in enumerate(errors)
     ]
 
 
@@ -27,8 +28,8 @@ def spread(n: int = 40) -> np.ndarray:
     return np.exp(np.random.default_rng(0).normal(size=n))
 
 
-def ground(name: str, forward: float, recognised: float = 0.5) -> GroundRow:
-    return GroundRow(name, 10.0, forward, 0.01, 0.01, recognised, 1.0, 20.0, 1.0, 5.0)
+def ground(name: str, forward: float, recognised: float = 0.5) -> GroundScore:
+    return GroundScore(name, 10.0, forward, 0.01, 0.01, recognised, 1.0, 20.0, 1.0, 5.0)
 
 
 @given(st.floats(0.1, 10.0))
@@ -78,8 +79,8 @@ def test_few_units_have_no_interval_and_decide_nothing(units: int) -> None:
 
 
 def test_a_failed_replay_loses_and_where_the_base_failed_nothing_is_compared() -> None:
-    def failing(arm: str, unit: str) -> Row:
-        return Row("mixed", "twin", unit, unit, arm, failed="RuntimeError: singular")
+    def failing(arm: str, unit: str) -> RunScore:
+        return RunScore("mixed", "twin", unit, unit, arm, failed="RuntimeError: singular")
 
     base = [failing("fixed", f"seed {i}") for i in (0, 1)] + rows("fixed", np.ones(12))[2:]
     own = [failing("adaptive", "seed 0"), *rows("adaptive", np.full(12, 0.5))[1:4]]
@@ -110,7 +111,9 @@ def test_one_field_log_that_fails_or_diverges_misses_its_target(trouble) -> None
 
 def test_a_failed_replay_drifts_without_end() -> None:
     own = rows("adaptive", [1.0] * 6, family="firm", outage_s=120.0, percent=0.3)
-    broken = [Row("firm", "twin", f"seed {i}", f"seed {i}", "adaptive", failed="singular") for i in (7, 8)]
+    broken = [
+        RunScore("firm", "twin", f"seed {i}", f"seed {i}", "adaptive", failed="singular") for i in (7, 8)
+    ]
     assert [t.verdict() for t in targets(own)] == [REACHED]
     (target,) = targets(own + broken)
     assert (target.found, target.interval, target.verdict()) == (0.3, (0.3, np.inf), OPEN)
@@ -131,8 +134,8 @@ def test_drives_that_one_arm_lacks_are_left_out() -> None:
 
 
 def test_outages_of_one_log_make_one_unit() -> None:
-    def log(arm: str, errors: list[float]) -> list[Row]:
-        return [Row("field", "firm", "log", f"outage {i}", arm, error_m=e) for i, e in enumerate(errors)]
+    def log(arm: str, errors: list[float]) -> list[RunScore]:
+        return [RunScore("field", "firm", "log", f"outage {i}", arm, error_m=e) for i, e in enumerate(errors)]
 
     found = contrasts(log("fixed", [1.0, 2.0, 4.0]) + log("adaptive", [0.5, 1.0, 40.0]))
     assert found[1].units == 1
@@ -236,7 +239,7 @@ def test_consistency_of_few_drives_has_no_interval_and_no_verdict() -> None:
 
 def test_tables_are_rectangular_and_tell_failures() -> None:
     base = spread(3)
-    failed = [Row("mixed", "twin", "seed 9", "seed 9", "robust", failed="the start was not found")]
+    failed = [RunScore("mixed", "twin", "seed 9", "seed 9", "robust", failed="the start was not found")]
     made = tables(rows("fixed", base) + rows("adaptive", base) + failed)
     for table in made:
         assert {len(cells) for cells in table.rows} == {len(table.heads)}

@@ -13,7 +13,7 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.open import open_recordings
-from terrafusion.fusion.benchmark.joined_windows import joined_drives
+from terrafusion.fusion.benchmark.joined_windows import joined_runs
 from terrafusion.twin.simulate import simulate
 
 WINDOW_S = 2.0
@@ -49,7 +49,7 @@ def drive() -> Recording:
 
 
 def test_the_joined_path_is_that_of_the_drive(drive: Recording) -> None:
-    (joined,) = joined_drives("cut", windows(drive, 40.0))
+    (joined,) = joined_runs("cut", windows(drive, 40.0))
     assert joined.truth is not None
     assert joined.imu is not None
     assert joined.wheels is not None
@@ -82,13 +82,13 @@ def test_windows_that_do_not_follow_each_other_are_not_joined(drive: Recording) 
     assert wheels is not None
     faster = dataclasses.replace(wheels, speed=wheels.speed + 3.0)
     cut[3] = dataclasses.replace(cut[3], wheels=faster)
-    assert [d.duration_s() for d in joined_drives("cut", cut)] == pytest.approx([6.0, 4.0], abs=0.1)
+    assert [d.duration_s() for d in joined_runs("cut", cut)] == pytest.approx([6.0, 4.0], abs=0.1)
 
 
 def test_a_hole_in_the_truth_is_not_bridged(drive: Recording) -> None:
     cut = windows(drive, 20.0)
     blind = [dataclasses.replace(w, truth=None) if k in (4, 5) else w for k, w in enumerate(cut)]
-    (joined,) = joined_drives("cut", blind)
+    (joined,) = joined_runs("cut", blind)
     assert joined.truth is None
 
 
@@ -97,7 +97,7 @@ def test_the_ice_rink_makes_drives_of_a_minute() -> None:
     if not root or not (Path(root) / "norlab_drive").is_dir():
         pytest.skip("TERRAFUSION_DATA names no folder with norlab_drive: the field logs are not at hand")
     name = "norlab_drive/ice_2024_7_30_16h30s21/windows"
-    drives = joined_drives(name, open_recordings(name))
+    drives = joined_runs(name, open_recordings(name))
     assert sum(d.duration_s() > 39.0 for d in drives) >= 6
     for d in drives:
         assert d.truth is None or np.isfinite(d.truth.position_m).all()

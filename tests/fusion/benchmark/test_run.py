@@ -10,33 +10,34 @@ from types import SimpleNamespace
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
-from terrafusion.fusion.benchmark import field_logs, parts, plan, run
-from terrafusion.fusion.benchmark.arms import ARMS
-from terrafusion.fusion.benchmark.drives import FIRST_SEED, Case
-from terrafusion.fusion.benchmark.field_logs import Log, Refusal
-from terrafusion.fusion.benchmark.measure import Row
-from terrafusion.fusion.benchmark.plan import Job, Plan, families_of
-from terrafusion.fusion.benchmark.run import Found, run_benchmark
+from terrafusion.fusion.benchmark import checkpoints as parts
+from terrafusion.fusion.benchmark import field_logs, plan, run
+from terrafusion.fusion.benchmark.field_logs import FieldLog, Refusal
+from terrafusion.fusion.benchmark.methods import METHODS
+from terrafusion.fusion.benchmark.plan import BenchmarkPlan, Job, families_of
+from terrafusion.fusion.benchmark.run import BenchmarkResult, run_benchmark
+from terrafusion.fusion.benchmark.run_score import RunScore
+from terrafusion.fusion.benchmark.twin_runs import FIRST_SEED, BenchmarkCase
 from terrafusion.fusion.reports import benchmark as outputs
 from terrafusion.fusion.reports.benchmark import MARK, write_benchmark, write_document
 
 FEW = ("fixed", "adaptive", "oracle")
-JOB = Job(Case("outages", "twin", FIRST_SEED + 2), FEW)
-PLAN = Plan({"outages": None}, seeds=1)
+JOB = Job(BenchmarkCase("outages", "twin", FIRST_SEED + 2), FEW)
+PLAN = BenchmarkPlan({"outages": None}, seeds=1)
 ORIGIN = {"command": "terrafusion benchmark"}
 
 
 @pytest.fixture
 def one_job(monkeypatch: pytest.MonkeyPatch) -> None:
     """Every plan is one drive of 75 s with three arms."""
-    monkeypatch.setattr(Plan, "jobs", lambda self: [JOB])
+    monkeypatch.setattr(BenchmarkPlan, "jobs", lambda self: [JOB])
 
 
 @pytest.fixture(scope="module")
-def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Found]:
+def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, BenchmarkResult]:
     out = tmp_path_factory.mktemp("benchmark")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Plan, "jobs", lambda self: [JOB])
+        patch.setattr(BenchmarkPlan, "jobs", lambda self: [JOB])
         return out, run_benchmark(PLAN, out)
 
 
@@ -60,21 +61,25 @@ def test_finished_jobs_are_not_run_again(found, one_job, monkeypatch) -> None:
 
 def test_results_of_other_sources_are_not_taken(found, one_job, monkeypatch) -> None:
     monkeypatch.setattr(parts, "sources_sha256", lambda: "other")
-    monkeypatch.setattr(run, "run_job", lambda job: (job, Found((Row("a", "b", "c", "d", "e"),), ())))
+    monkeypatch.setattr(
+        run, "run_job", lambda job: (job, BenchmarkResult((RunScore("a", "b", "c", "d", "e"),), ()))
+    )
     assert run_benchmark(PLAN, found[0]).rows[0].family == "a"
 
 
 def test_jobs_whose_parts_another_process_overwrites_meanwhile_are_not_lost(tmp_path, monkeypatch) -> None:
-    jobs = [Job(Case("mixed", "twin", FIRST_SEED + i), FEW) for i in range(3)]
+    jobs = [Job(BenchmarkCase("mixed", "twin", FIRST_SEED + i), FEW) for i in range(3)]
 
-    def job(one: Job) -> tuple[Job, Found]:
+    def job(one: Job) -> tuple[Job, BenchmarkResult]:
         for file in (tmp_path / parts.FOLDER).glob("*"):
             file.write_text(json.dumps({"sources_sha256": "of other sources", "state": ""}))
-        return one, Found((Row("mixed", "twin", one.key, one.key, "fixed", error_m=1.0),), ())
+        return one, BenchmarkResult((RunScore("mixed", "twin", one.key, one.key, "fixed", error_m=1.0),), ())
 
-    monkeypatch.setattr(Plan, "jobs", lambda self: jobs)
+    monkeypatch.setattr(BenchmarkPlan, "jobs", lambda self: jobs)
     monkeypatch.setattr(run, "run_job", job)
-    assert [row.unit for row in run_benchmark(Plan({"mixed": 3}), tmp_path).rows] == [one.key for one in jobs]
+    assert [row.unit for row in run_benchmark(BenchmarkPlan({"mixed": 3}), tmp_path).rows] == [
+        one.key for one in jobs
+    ]
 
 
 def test_logs_are_run_again_once_their_files_differ_or_where_they_were_refused(tmp_path, monkeypatch) -> None:
@@ -83,20 +88,20 @@ def test_logs_are_run_again_once_their_files_differ_or_where_they_were_refused(t
     wheels = log / "wheels.csv"
     wheels.write_text("t_ns\n")
     begun: list[Job] = []
-    given: list[tuple[tuple[Row, ...], tuple[Refusal, ...]]] = []
+    given: list[tuple[tuple[RunScore, ...], tuple[Refusal, ...]]] = []
 
-    def job(one: Job) -> tuple[Job, Found]:
+    def job(one: Job) -> tuple[Job, BenchmarkResult]:
         begun.append(one)
-        return one, Found(*given[-1])
+        return one, BenchmarkResult(*given[-1])
 
-    monkeypatch.setattr(Plan, "jobs", lambda self: [Job(Log(str(log), 1), ("fixed",))])
+    monkeypatch.setattr(BenchmarkPlan, "jobs", lambda self: [Job(FieldLog(str(log), 1), ("fixed",))])
     monkeypatch.setattr(run, "run_job", job)
-    row = Row("field", "firm", "log", "log", "fixed", error_m=1.0)
+    row = RunScore("field", "firm", "log", "log", "fixed", error_m=1.0)
     for rows, refused, runs in (
         ((), (Refusal("log", "no IMU"),), 1), ((row,), (), 2), ((row,), (), 2),
     ):  # fmt: skip
         given.append((rows, refused))
-        assert run_benchmark(PLAN, tmp_path / "out") == Found(rows, refused)
+        assert run_benchmark(PLAN, tmp_path / "out") == BenchmarkResult(rows, refused)
         assert len(begun) == runs
     wheels.write_text("t_ns\n0\n")
     run_benchmark(PLAN, tmp_path / "out")
@@ -117,8 +122,8 @@ def test_an_unforeseen_error_in_a_log_becomes_a_refusal(place, monkeypatch) -> N
     field_logs.read_runs.cache_clear()
     monkeypatch.setattr(field_logs, "open_recordings", lambda log: [SimpleNamespace(duration_s=lambda: 20.0)])
     monkeypatch.setattr(*place, fail)
-    _, found = run.run_job(Job(Log("one", 1), ("fixed",)))
-    assert found == Found((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
+    _, found = run.run_job(Job(FieldLog("one", 1), ("fixed",)))
+    assert found == BenchmarkResult((), (Refusal("one", "FAILED, ValueError: from a reader or planner"),))
     field_logs.read_runs.cache_clear()
 
 
@@ -199,25 +204,25 @@ def test_a_document_keeps_what_stands_before_the_mark(found, tmp_path) -> None:
 
 
 def test_plans() -> None:
-    quick = Plan(families_of(["firm", "mixed"]), quick=True).jobs()
+    quick = BenchmarkPlan(families_of(["firm", "mixed"]), quick=True).jobs()
     assert [(job.item.family, job.item.plant) for job in quick] == [
         ("mixed", "twin"), ("mixed", "perturbed"), ("mixed", "second"), ("firm", "twin"),
         ("mixed", "twin"), ("mixed", "perturbed"), ("mixed", "second"),
     ]  # fmt: skip
-    full = Plan({"mixed": None, "firm": None}, seeds=3).jobs()
+    full = BenchmarkPlan({"mixed": None, "firm": None}, seeds=3).jobs()
     assert len({job.key for job in full}) == len(full) == 2 * 3 * 3
-    assert {job.arms for job in full} == {tuple(arm.name for arm in ARMS)}
+    assert {job.arms for job in full} == {tuple(arm.name for arm in METHODS)}
     with pytest.raises(ConfigError, match="0 seeds"):
-        Plan({"mixed": None}, seeds=0)
+        BenchmarkPlan({"mixed": None}, seeds=0)
     with pytest.raises(ConfigError, match="field logs have no seeds"):
-        Plan({"field": None}, seeds=3)
-    assert outputs.origin_of(Plan({"mixed": 7, "field": None}), "")["seeds"] == "mixed 7"
+        BenchmarkPlan({"field": None}, seeds=3)
+    assert outputs.origin_of(BenchmarkPlan({"mixed": 7, "field": None}), "")["seeds"] == "mixed 7"
 
 
 def test_families_by_name_with_seeds_of_their_own() -> None:
     assert list(families_of([])) == ["mixed", "slopes", "outages", "firm", "unseen", "field"]
     assert families_of(["field", "mixed=7"]) == {"mixed": 7, "field": None}
-    assert Plan(families_of(["mixed=7", "firm"]), seeds=3).seed_count("mixed") == 7
+    assert BenchmarkPlan(families_of(["mixed=7", "firm"]), seeds=3).seed_count("mixed") == 7
     with pytest.raises(ConfigError, match="unknown family 'mixd'"):
         families_of(["mixd"])
     with pytest.raises(ConfigError, match="'mixed=all' names no number"):
@@ -227,7 +232,7 @@ def test_families_by_name_with_seeds_of_their_own() -> None:
 def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(plan, "logs_at_hand", lambda starts: [])
     with pytest.raises(TerrafusionError, match="no field log is at hand"):
-        run_benchmark(Plan({"field": None}), tmp_path)
+        run_benchmark(BenchmarkPlan({"field": None}), tmp_path)
 
 
 def test_the_command(terrafusion, one_job, tmp_path) -> None:

@@ -9,7 +9,7 @@ from typer.testing import CliRunner
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli import policy, terrain
-from terrafusion.fusion.training.evaluate import Scores
+from terrafusion.fusion.training.detector_scores import DetectorScores
 
 
 @pytest.mark.parametrize(("app", "command"), [(terrain.app, "train"), (policy.app, "fit")])
@@ -32,7 +32,9 @@ def test_a_missing_model_is_a_known_error(tmp_path: Path) -> None:
 
 def test_scores_are_printed_for_the_grounds_that_occurred(capsys: pytest.CaptureFixture[str]) -> None:
     confusion = ((0.9, 0.1, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    scores = Scores(("mud", "ice", "unknown"), confusion, 0.9, 0.01, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2, 50)
+    scores = DetectorScores(
+        ("mud", "ice", "unknown"), confusion, 0.9, 0.01, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2, 50
+    )
     terrain.print_scores("trial", scores)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "trial: 50 windows"

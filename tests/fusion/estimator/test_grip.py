@@ -22,7 +22,7 @@ from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.live import messages
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, choose_vehicle, replay
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate_run

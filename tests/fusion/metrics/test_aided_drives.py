@@ -16,7 +16,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import BarometerSpec, MagnetometerSpec
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.sensor_realism import BarometerRealism, MagnetometerRealism
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle

@@ -14,7 +14,7 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics import consistency as c
 from terrafusion.fusion.metrics import pooled_consistency
-from terrafusion.fusion.metrics.metrics import score
+from terrafusion.fusion.metrics.scores import score
 from tests.studies import twin_consistency as twin
 
 
@@ -229,7 +229,7 @@ def test_the_table_marks_what_is_not_consistent():
 
 
 def test_a_twin_drive_is_tested_inside_and_outside_its_outage():
-    plan = twin.Plan(1, terrains=("asphalt",), modes=("adaptive",), scenario="figure_eight")
+    plan = twin.ConsistencyPlan(1, terrains=("asphalt",), modes=("adaptive",), scenario="figure_eight")
     found = twin.run(plan)
     cells = found.cells
     assert {cell.quantity for cell in cells} >= {
@@ -245,7 +245,7 @@ def test_a_drive_that_cannot_be_estimated_is_told_and_not_counted(monkeypatch):
         raise DataError("the robot never moved", channel="gnss")
 
     monkeypatch.setattr(twin, "checked_drive", refuses)
-    plan = twin.Plan(2, terrains=("asphalt",), modes=("fixed",), scenario="straight")
+    plan = twin.ConsistencyPlan(2, terrains=("asphalt",), modes=("fixed",), scenario="straight")
     found = twin.run(plan)
     assert found.cells == ()
     assert [line.split(":")[0] for line in found.refused] == [
@@ -256,7 +256,7 @@ def test_a_drive_that_cannot_be_estimated_is_told_and_not_counted(monkeypatch):
 
 def test_no_seeds_is_a_one_line_error(capsys):
     with pytest.raises(ConfigError, match="0 seeds are none"):
-        twin.run(twin.Plan(0))
+        twin.run(twin.ConsistencyPlan(0))
     assert twin.command(["--seeds", "0"]) == 1
     assert capsys.readouterr().err.count("\n") == 1
     assert twin.command(["--seeds", "1", "--terrain", "cheese"]) == 1

@@ -15,7 +15,7 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import choose_vehicle, replay, split_fixes
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario

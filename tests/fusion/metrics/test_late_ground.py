@@ -7,7 +7,7 @@ import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator import estimator
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

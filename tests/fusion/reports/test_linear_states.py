@@ -19,7 +19,7 @@ from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR, ON_DEMAND
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
-from terrafusion.fusion.metrics.metrics import score
+from terrafusion.fusion.metrics.scores import score
 from terrafusion.fusion.outputs.linear_states import QUANTITIES, calibration, cells, series
 from terrafusion.fusion.outputs.replay_files import build_metrics, estimate_columns, final_status
 from terrafusion.fusion.outputs.ros_estimate import written_estimate

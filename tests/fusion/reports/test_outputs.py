@@ -15,7 +15,7 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.readers.text.tum import read_tum
-from terrafusion.fusion.metrics.metrics import HeldOut, Outage, Scores, score
+from terrafusion.fusion.metrics.scores import HeldOut, Outage, Scores, score
 from terrafusion.fusion.outputs.replay_files import (
     MODES,
     build_metrics,

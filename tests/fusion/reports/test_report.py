@@ -15,7 +15,7 @@ from terrafusion.datasets.core.channels import Fix, Gnss, Terrain
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.tables import number
 from terrafusion.fusion.estimate.estimate import WeightChange
-from terrafusion.fusion.metrics.metrics import Outage, score
+from terrafusion.fusion.metrics.scores import Outage, score
 from terrafusion.fusion.outputs.replay_files import (
     build_metrics,
     final_status,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.reports.rerun_log import require_rerun, write_rerun
 
 

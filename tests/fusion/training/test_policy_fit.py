@@ -10,13 +10,12 @@ import pytest
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.noise.policy import Policy, load_policy, within_ranges
-from terrafusion.fusion.training.drives import Grid
-from terrafusion.fusion.training.policy_evidence import (
+from terrafusion.fusion.training.ground_samples import (
     LAG_S,
     SLIP_S,
     STUCK_COUNTS_S,
-    Evidence,
-    evidence_of,
+    GroundSamples,
+    samples_of,
 )
 from terrafusion.fusion.training.policy_fit import (
     RADIUS_SIGMA,
@@ -27,6 +26,7 @@ from terrafusion.fusion.training.policy_fit import (
     row_of,
     write_policy,
 )
+from terrafusion.fusion.training.simulated_runs import Grid
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 
@@ -38,7 +38,7 @@ def policy() -> Policy:
     return fit_policy(GRID)
 
 
-def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: int) -> Evidence:
+def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: int) -> GroundSamples:
     rng = np.random.default_rng(seed)
     keep = np.exp(-SLIP_S / tau_s)
     slip = np.empty(n)
@@ -53,7 +53,7 @@ def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: in
 
     pairs = np.stack([slip[:-lag], slip[lag:]], axis=1)
     flat, level = np.zeros(n), np.zeros_like(pairs)
-    return Evidence(
+    return GroundSamples(
         slip,
         flat,
         pairs,
@@ -129,7 +129,7 @@ def test_any_soil_of_the_library_is_covered_by_the_row_of_unknown() -> None:
     row = load_policy().classes["unknown"]
     for soil in ("gravel", "grass", "ploughed_soil", "snow"):
         for condition in Grid(("staircase",), (0.0, 6.0), (30.0,), (9,), (soil,)).conditions():
-            evidence = evidence_of(condition.run())
+            evidence = samples_of(condition.run())
             away = (evidence.slip - row.slip_mean - row.slip_per_grade * evidence.grade) / row.slip_sigma
             assert np.mean(np.abs(away) < 2.0) > 0.95, (soil, condition.slope_deg)
             assert row_of([evidence]).side_slip_sigma < row.side_slip_sigma
@@ -138,7 +138,7 @@ def test_any_soil_of_the_library_is_covered_by_the_row_of_unknown() -> None:
 
 
 def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
-    nothing = Evidence(
+    nothing = GroundSamples(
         *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(7)))
     )
     with pytest.raises(ValueError, match="never turned"):
@@ -151,7 +151,7 @@ def test_of_a_robot_that_spins_on_the_spot_only_the_onset_counts() -> None:
         route=(RouteLeg("mud"),), slope_deg=20.0,
     )  # fmt: skip
     recording = simulate(stuck, seed=1)
-    evidence = evidence_of(recording)
+    evidence = samples_of(recording)
     full = evidence.slip > 0.95
     spells = 1 + np.count_nonzero(np.diff(full.astype(int)) > 0)
     assert full.sum() * SLIP_S <= spells * (STUCK_COUNTS_S + 1.0)
@@ -159,7 +159,7 @@ def test_of_a_robot_that_spins_on_the_spot_only_the_onset_counts() -> None:
 
 def test_noiseless_drives_leave_almost_no_sensor_error() -> None:
     recording: Recording = simulate("figure_eight", terrain="asphalt", noiseless=True)
-    evidence = evidence_of(recording)
+    evidence = samples_of(recording)
     assert np.sqrt(np.mean(evidence.gyro**2)) < 1e-6
     assert np.sqrt(np.mean(evidence.accel**2)) < 1e-6
     assert np.abs(evidence.gnss).max() < 1e-6

@@ -20,10 +20,10 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.cli.main import app
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.training import policy_fit
-from terrafusion.fusion.training.drives import Grid
-from terrafusion.fusion.training.policy_evidence import SLIP_S, evidence_of
-from terrafusion.fusion.training.policy_fit import Logged, fingerprint_of, fit_policy, informed
-from terrafusion.fusion.training.policy_logs import MEAN_S, logged_evidence, motion_of, read_logs
+from terrafusion.fusion.training.ground_samples import SLIP_S, samples_of
+from terrafusion.fusion.training.policy_fit import LoggedSamples, fingerprint_of, fit_policy, informed
+from terrafusion.fusion.training.policy_logs import MEAN_S, logged_samples, motion_of, read_logs
+from terrafusion.fusion.training.simulated_runs import Grid
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 
@@ -62,7 +62,7 @@ def circled(
 @settings(deadline=None)
 @given(st.floats(-0.3, 0.6), st.floats(-0.4, 0.4), st.floats(-3.0, 3.0))
 def test_slip_and_yaw_scale_of_a_circle_are_exact(slip: float, rate: float, heading: float) -> None:
-    evidence = logged_evidence(circled(slip, rate, 16.0, heading))["grass"]
+    evidence = logged_samples(circled(slip, rate, 16.0, heading))["grass"]
     assert evidence.slip == pytest.approx(slip, abs=1e-3)
     assert evidence.side_slip == pytest.approx(0.0, abs=2e-3)
     if abs(rate) > 0.06:
@@ -70,7 +70,7 @@ def test_slip_and_yaw_scale_of_a_circle_are_exact(slip: float, rate: float, head
 
 
 def test_a_pose_good_to_2_cm_tells_slip_to_half_a_percent() -> None:
-    slips = logged_evidence(circled(noise_m=0.02, seconds=400.0))["grass"].slip
+    slips = logged_samples(circled(noise_m=0.02, seconds=400.0))["grass"].slip
     assert np.std(slips) == pytest.approx(np.sqrt(2.0) * 0.02 / MEAN_S, rel=0.3)
     assert np.mean(slips) == pytest.approx(0.1, abs=0.003)
 
@@ -78,10 +78,10 @@ def test_a_pose_good_to_2_cm_tells_slip_to_half_a_percent() -> None:
 def test_poses_of_the_twin_tell_what_its_true_velocity_tells() -> None:
     for scenario in ("staircase", "figure_eight"):
         drive = simulate(scenario, terrain="loose_sand", seed=3)
-        known = evidence_of(drive)
+        known = samples_of(drive)
         assert drive.truth is not None
         blind = dataclasses.replace(drive, truth=dataclasses.replace(drive.truth, twist_body=None))
-        found = logged_evidence(blind)["loose_sand"]
+        found = logged_samples(blind)["loose_sand"]
         assert np.median(found.slip) == pytest.approx(np.median(known.slip), abs=0.01)
         assert len(found.wheel_mps) == len(found.gyro) == len(found.accel) == len(found.gnss) == 0
         if scenario == "figure_eight":
@@ -91,9 +91,9 @@ def test_poses_of_the_twin_tell_what_its_true_velocity_tells() -> None:
 
 def test_a_mean_over_two_grounds_is_of_neither() -> None:
     labels = Terrain(nanoseconds(np.array([0.0, 15.0])), np.array(["grass", "gravel"]))
-    found = logged_evidence(dataclasses.replace(circled(), terrain=labels))
+    found = logged_samples(dataclasses.replace(circled(), terrain=labels))
     assert set(found) == {"grass", "gravel"}
-    lost = len(logged_evidence(circled())["grass"].slip) - sum(len(e.slip) for e in found.values())
+    lost = len(logged_samples(circled())["grass"].slip) - sum(len(e.slip) for e in found.values())
     assert lost == pytest.approx(MEAN_S / SLIP_S, abs=1)
 
 
@@ -120,13 +120,13 @@ def test_samples_that_are_no_numbers_are_left_out() -> None:
         truth=dataclasses.replace(whole.truth, position_m=position),
         wheels=dataclasses.replace(whole.wheels, speed=speed),
     )
-    slip = logged_evidence(holed)["grass"].slip
-    assert len(slip) == len(logged_evidence(whole)["grass"].slip)
+    slip = logged_samples(holed)["grass"].slip
+    assert len(slip) == len(logged_samples(whole)["grass"].slip)
     assert slip == pytest.approx(0.1, abs=1e-3)
 
 
 def test_a_drive_labelled_unknown_names_no_ground() -> None:
-    assert logged_evidence(dataclasses.replace(circled(), terrain_name="unknown")) == {}
+    assert logged_samples(dataclasses.replace(circled(), terrain_name="unknown")) == {}
 
 
 @pytest.mark.parametrize(
@@ -144,13 +144,13 @@ def test_a_drive_labelled_unknown_names_no_ground() -> None:
 def test_a_log_that_lacks_something_is_refused(changes: dict[str, object], words: str) -> None:
     recording = dataclasses.replace(circled(), **changes)  # type: ignore[arg-type]
     with pytest.raises(DataError, match=words):
-        logged_evidence(recording)
+        logged_samples(recording)
 
 
 def test_labels_of_the_detector_itself_are_none() -> None:
     guess = Terrain(nanoseconds(np.array([0.0])), np.array(["mud"]), "detector")
     with pytest.raises(DataError, match="no ground label"):
-        logged_evidence(dataclasses.replace(circled(), terrain=guess, terrain_name=""))
+        logged_samples(dataclasses.replace(circled(), terrain=guess, terrain_name=""))
 
 
 def test_too_little_driving_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -160,9 +160,9 @@ def test_too_little_driving_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_log_moves_the_means_and_the_rest_stays() -> None:
-    told = logged_evidence(circled(slip=0.25, seconds=120.0))["grass"]
+    told = logged_samples(circled(slip=0.25, seconds=120.0))["grass"]
     plain = fit_policy(GRID)
-    logged = Logged({"asphalt": told, "grass": told}, {"a.csv": "12ab"})
+    logged = LoggedSamples({"asphalt": told, "grass": told}, {"a.csv": "12ab"})
     fitted = fit_policy(GRID, logged=logged)
     assert fitted.names() == ("asphalt", "medium_sand", "loose_sand", "mud", "grass", "unknown")
     moved = {"slip_mean": 0.25, "yaw_scale_mean": -0.5}
@@ -180,7 +180,7 @@ def test_a_log_moves_the_means_and_the_rest_stays() -> None:
 
 def test_a_log_widens_a_scatter_and_never_narrows_it() -> None:
     row = load_policy().fixed
-    told = logged_evidence(circled(seconds=60.0))["grass"]
+    told = logged_samples(circled(seconds=60.0))["grass"]
     sure = informed(row, told)
     for name in ("slip_sigma", "yaw_scale_sigma", "side_slip_sigma"):
         assert getattr(sure, name) == getattr(row, name)
@@ -191,7 +191,7 @@ def test_a_log_widens_a_scatter_and_never_narrows_it() -> None:
 
 def test_the_slope_over_the_grade_is_the_logs_only_in_hills() -> None:
     row = load_policy().classes["loose_sand"]
-    told = logged_evidence(circled(seconds=60.0))["grass"]
+    told = logged_samples(circled(seconds=60.0))["grass"]
     wave = np.sin(np.arange(len(told.slip)))
     for height, slope in ((0.01, row.slip_per_grade), (0.1, 2.0)):
         grade = height * wave
@@ -202,7 +202,7 @@ def test_the_slope_over_the_grade_is_the_logs_only_in_hills() -> None:
 
 def test_a_drive_straight_ahead_tells_nothing_of_turning() -> None:
     row = load_policy().fixed
-    found = informed(row, logged_evidence(circled(rate=0.0, slip=0.2))["grass"])
+    found = informed(row, logged_samples(circled(rate=0.0, slip=0.2))["grass"])
     assert found == dataclasses.replace(row, slip_mean=found.slip_mean)
     assert found.slip_mean + 0.0 == pytest.approx(0.2, abs=1e-3)
 
@@ -236,7 +236,7 @@ def test_the_command_takes_soils_and_logs(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_ground_on_which_the_wheels_never_turn_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    still = logged_evidence(circled(seconds=7.0))["grass"]
+    still = logged_samples(circled(seconds=7.0))["grass"]
     monkeypatch.setattr(policy_fit, "evidence_of", lambda recording: still)
     with pytest.raises(TerrafusionError, match=r"asphalt.*never turned"):
         fit_policy(GRID)

@@ -16,9 +16,9 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.fusion.terrain.classifier import LikelihoodTable, TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.features import FEATURES, SLIP, YAW_SLIP
 from terrafusion.fusion.terrain.sequence import PatchFilter
-from terrafusion.fusion.training.drives import Grid
 from terrafusion.fusion.training.mixture import fit, fit_best, shrink
-from terrafusion.fusion.training.train import Plan, fingerprint_of, write_model
+from terrafusion.fusion.training.simulated_runs import Grid
+from terrafusion.fusion.training.train_detector import TrainingPlan, fingerprint_of, write_model
 
 D = len(FEATURES)
 CLASSES = ("asphalt", "medium_sand", "loose_sand", "mud", "unknown")
@@ -43,7 +43,7 @@ def posterior(model: TerrainModel, values: Any, variances: Any = None) -> Any:
 def test_the_shipped_model_is_of_the_present_parameter_files(model: TerrainModel) -> None:
     # If this fails, a soil, scenario or vehicle changed: run `terrafusion terrain train --out ...` again.
     seeds = int(model.made_by.rsplit(" ", 1)[1])
-    assert model.inputs_sha256 == fingerprint_of(Plan(seeds=seeds))
+    assert model.inputs_sha256 == fingerprint_of(TrainingPlan(seeds=seeds))
     assert Grid(("staircase",), (0.0,), (0.0,), (0,)).fingerprint() != model.inputs_sha256
 
 

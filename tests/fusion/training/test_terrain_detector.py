@@ -16,9 +16,9 @@ from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.terrain.classifier import TerrainModel, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
-from terrafusion.fusion.training.drives import Condition, Grid, windows_of
-from terrafusion.fusion.training.evaluate import Route, changes_in, evaluate, splice
-from terrafusion.fusion.training.train import Plan, calibrate, drives_of, train
+from terrafusion.fusion.training.detector_scores import LabelledRoute, changes_in, evaluate, splice
+from terrafusion.fusion.training.simulated_runs import Condition, Grid, windows_of
+from terrafusion.fusion.training.train_detector import TrainingPlan, calibrate, drives_of, train
 from terrafusion.twin.simulate import simulate
 
 CLASSES = load_policy().names()
@@ -26,7 +26,7 @@ MODEL = load_terrain_model()
 
 
 @pytest.fixture(scope="module")
-def route() -> Route:
+def route() -> LabelledRoute:
     """Patches of eight drives with a seed that neither training, calibration nor scoring use."""
     grid = Grid(("figure_eight",), (0.0, 3.0), (15.0,), (77,))
     return splice(list(drives_of(grid, lambda: None)), patches=30, seed=77)
@@ -42,7 +42,7 @@ def window(seed: int = 0, **changes: float | None) -> Window:
     return dataclasses.replace(plain, **changes)  # type: ignore[arg-type]
 
 
-def test_grounds_are_told_apart_and_changes_seen_within_two_seconds(route: Route) -> None:
+def test_grounds_are_told_apart_and_changes_seen_within_two_seconds(route: LabelledRoute) -> None:
     scores = evaluate(MODEL, [route])
     assert scores.macro_f1 > 0.95
     assert scores.ece < 0.05
@@ -53,12 +53,12 @@ def test_grounds_are_told_apart_and_changes_seen_within_two_seconds(route: Route
     assert scores.update_ms < 2.0
 
 
-def test_grounds_are_told_apart_without_slip(route: Route) -> None:
+def test_grounds_are_told_apart_without_slip(route: LabelledRoute) -> None:
     windows = [dataclasses.replace(w, slip=None, slip_sigma=None) for w in route.windows]
     assert evaluate(MODEL, [dataclasses.replace(route, windows=windows)]).macro_f1 > 0.9
 
 
-def test_a_ground_left_out_of_the_model_becomes_unknown(route: Route) -> None:
+def test_a_ground_left_out_of_the_model_becomes_unknown(route: LabelledRoute) -> None:
     fewer = {name: mixture for name, mixture in MODEL.classes.items() if name != "asphalt"}
     labels = np.where(route.labels == "asphalt", "unknown", route.labels)
     scores = evaluate(dataclasses.replace(MODEL, classes=fewer), [dataclasses.replace(route, labels=labels)])
@@ -74,7 +74,9 @@ def test_the_twins_own_route_over_five_grounds() -> None:
 
 
 def test_training_on_a_few_drives_tells_held_out_ones() -> None:
-    plan = Plan(seeds=1, scenarios=("staircase", "figure_eight"), slopes_deg=(0.0,), payloads_kg=(0.0,))
+    plan = TrainingPlan(
+        seeds=1, scenarios=("staircase", "figure_eight"), slopes_deg=(0.0,), payloads_kg=(0.0,)
+    )
     ticks: list[None] = []
     model, scores = train(plan, lambda: ticks.append(None))
     assert len(ticks) == plan.drives() == 24
@@ -83,7 +85,7 @@ def test_training_on_a_few_drives_tells_held_out_ones() -> None:
     assert model.scores["macro_f1"] == round(scores.macro_f1, 4)
 
 
-def test_calibration_cools_a_model_that_is_too_sure(route: Route) -> None:
+def test_calibration_cools_a_model_that_is_too_sure(route: LabelledRoute) -> None:
     sure = {name: dataclasses.replace(m, covariance=0.3 * m.covariance) for name, m in MODEL.classes.items()}
     calibrated = calibrate(dataclasses.replace(MODEL, classes=sure), route)
     assert calibrated.temperature > MODEL.temperature
@@ -134,7 +136,7 @@ def test_a_camera_is_evidence_but_not_proof() -> None:
     assert start == pytest.approx(np.full(len(CLASSES), 0.2))
 
 
-def test_a_lying_camera_is_mostly_outvoted_by_the_ground(route: Route) -> None:
+def test_a_lying_camera_is_mostly_outvoted_by_the_ground(route: LabelledRoute) -> None:
     detector = TerrainDetector(MODEL, CLASSES)
     right = []
     for w, label in zip(route.windows[:800], route.labels, strict=False):

@@ -18,24 +18,24 @@ from typer.testing import CliRunner
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.cli.terrain import app
-from terrafusion.fusion.training.labelled import (
+from terrafusion.fusion.training.change_detection import changes_seen, spliced
+from terrafusion.fusion.training.cross_validation import (
     FOLDS,
-    Run,
+    LabelledRun,
+    assign_folds,
     check_runs,
     cross_validate,
-    deal,
     hashes_of,
     open_runs,
     train_on,
     window_ms,
 )
 from terrafusion.fusion.training.softmax import SoftmaxModel, read_softmax
-from terrafusion.fusion.training.spliced import changes_seen, spliced
 from terrafusion.fusion.training.surface_features import (
     GROUPS,
     SURFACE_FEATURES,
     Signals,
-    Windows,
+    SurfaceWindows,
     surface_windows,
     window_features,
 )
@@ -65,23 +65,23 @@ def made_drive(label: str, seed: int, seconds: float = 40.0, level: float | None
     return Signals(t, gyro, accel, w, sides + 0.005 * rng.normal(size=sides.shape), 0.5, w, current)
 
 
-def made_run(label: str, seed: int, **how: float) -> Run:
+def made_run(label: str, seed: int, **how: float) -> LabelledRun:
     signals = made_drive(label, seed, **how)
-    return Run(f"{label}/{seed}", label, signals, surface_windows(signals))
+    return LabelledRun(f"{label}/{seed}", label, signals, surface_windows(signals))
 
 
 @pytest.fixture(autouse=True)
 def short_routes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("terrafusion.fusion.training.spliced.PATCHES", 6)
+    monkeypatch.setattr("terrafusion.fusion.training.change_detection.PATCHES", 6)
 
 
 @pytest.fixture(scope="module")
-def runs() -> list[Run]:
+def runs() -> list[LabelledRun]:
     return [made_run(label, 10 * i + n) for i, label in enumerate(SHAKES) for n in range(6)]
 
 
 @pytest.fixture(scope="module")
-def model(runs: Sequence[Run]) -> SoftmaxModel:
+def model(runs: Sequence[LabelledRun]) -> SoftmaxModel:
     return train_on([r for r in runs if not r.name.endswith("5")])
 
 
@@ -139,16 +139,16 @@ def _axes() -> list[str]:
     return [n.split("_")[0] for n in SURFACE_FEATURES if n.endswith("_1.5_hz")]
 
 
-def test_no_run_is_in_two_folds_and_every_ground_is_in_each(runs: Sequence[Run]) -> None:
-    fold_of = deal(runs)
+def test_no_run_is_in_two_folds_and_every_ground_is_in_each(runs: Sequence[LabelledRun]) -> None:
+    fold_of = assign_folds(runs)
     assert len(fold_of) == len(runs)
     assert set(fold_of.tolist()) == set(range(FOLDS))
     for fold in range(FOLDS):
         assert {r.label for r, f in zip(runs, fold_of, strict=True) if f != fold} == set(SHAKES)
-    assert np.array_equal(deal(runs), fold_of)
+    assert np.array_equal(assign_folds(runs), fold_of)
 
 
-def test_grounds_are_learnt_by_run(runs: Sequence[Run]) -> None:
+def test_grounds_are_learnt_by_run(runs: Sequence[LabelledRun]) -> None:
     folded = cross_validate(runs)
     single, filtered = folded.figures(filtered=False), folded.figures()
     assert single.macro_f1 > 0.9
@@ -164,14 +164,14 @@ def test_grounds_are_learnt_by_run(runs: Sequence[Run]) -> None:
     assert changes.median_s < 2.0
 
 
-def test_labels_at_random_are_not_learnt(runs: Sequence[Run]) -> None:
+def test_labels_at_random_are_not_learnt(runs: Sequence[LabelledRun]) -> None:
     names = list(SHAKES)
     mixed = [dataclasses.replace(r, label=names[i % 3]) for i, r in enumerate(runs)]
     assert cross_validate(mixed, temperature=4.0).figures().macro_f1 < 0.6
 
 
 def test_every_window_gets_probabilities_whatever_is_missing(
-    model: SoftmaxModel, runs: Sequence[Run]
+    model: SoftmaxModel, runs: Sequence[LabelledRun]
 ) -> None:
     whole = runs[0].windows
     x, recent = whole.x.copy(), whole.recent.copy()
@@ -185,7 +185,7 @@ def test_every_window_gets_probabilities_whatever_is_missing(
     assert (p > 0.0).all()
 
 
-def test_a_ground_unlike_all_others_is_odd(model: SoftmaxModel, runs: Sequence[Run]) -> None:
+def test_a_ground_unlike_all_others_is_odd(model: SoftmaxModel, runs: Sequence[LabelledRun]) -> None:
     known = np.vstack([r.x for r in runs if r.name.endswith("5")])
     strange = made_run("gravel", 99, level=8.0)
     assert np.mean(model.oddness(known) > model.odd_distance) < 0.25
@@ -193,19 +193,19 @@ def test_a_ground_unlike_all_others_is_odd(model: SoftmaxModel, runs: Sequence[R
 
 
 def test_a_change_is_seen_while_the_window_still_shows_both_grounds(
-    model: SoftmaxModel, runs: Sequence[Run]
+    model: SoftmaxModel, runs: Sequence[LabelledRun]
 ) -> None:
     lawn, gravel = (next(r for r in runs if r.label == label).windows for label in ("lawn", "gravel"))
     # After the change the window of two seconds answers as before for as long as we please: 2 s here.
     kept = np.vstack([lawn.x[:20], lawn.x[20:24], gravel.x[:6]])
     recent = np.vstack([lawn.recent[:20], gravel.recent[:10]])
-    drive = Windows(0.5 * np.arange(30.0), kept, recent, np.full(30, 0.25))
+    drive = SurfaceWindows(0.5 * np.arange(30.0), kept, recent, np.full(30, 0.25))
     named = np.array(model.classes)[model.filtered(drive).argmax(axis=1)]
     assert (named[:20] == "lawn").all()
     assert (named[20:] == "gravel").all()
 
 
-def test_one_odd_second_does_not_lose_the_ground(model: SoftmaxModel, runs: Sequence[Run]) -> None:
+def test_one_odd_second_does_not_lose_the_ground(model: SoftmaxModel, runs: Sequence[LabelledRun]) -> None:
     lawn, gravel = (next(r for r in runs if r.label == label).windows for label in ("lawn", "gravel"))
     recent = lawn.recent.copy()
     recent[20] = gravel.recent[0]
@@ -214,7 +214,7 @@ def test_one_odd_second_does_not_lose_the_ground(model: SoftmaxModel, runs: Sequ
     assert (named[22:] == "lawn").all()
 
 
-def test_a_route_is_made_of_the_raw_samples(runs: Sequence[Run]) -> None:
+def test_a_route_is_made_of_the_raw_samples(runs: Sequence[LabelledRun]) -> None:
     route, begins = spliced([(r.signals, r.label) for r in runs], 1)
     assert (np.diff(route.imu_s) > 0.0).all()
     assert all(a[1] != b[1] for a, b in itertools.pairwise(begins))
@@ -222,7 +222,7 @@ def test_a_route_is_made_of_the_raw_samples(runs: Sequence[Run]) -> None:
     assert np.array_equal(again.accel_mps2, route.accel_mps2)
 
 
-def test_written_and_read_back(model: SoftmaxModel, tmp_path: Path, runs: Sequence[Run]) -> None:
+def test_written_and_read_back(model: SoftmaxModel, tmp_path: Path, runs: Sequence[LabelledRun]) -> None:
     model.write(tmp_path / "a.yaml")
     again = read_softmax(tmp_path / "a.yaml")
     again.write(tmp_path / "b.yaml")
@@ -254,12 +254,12 @@ def test_a_wrong_file_is_one_line(
     assert "\n" not in str(caught.value)
 
 
-def test_one_ground_is_too_few(runs: Sequence[Run]) -> None:
+def test_one_ground_is_too_few(runs: Sequence[LabelledRun]) -> None:
     with pytest.raises(ConfigError, match="two grounds"):
         train_on([r for r in runs if r.label == "lawn"])
 
 
-def test_the_report_of_made_drives(runs: Sequence[Run]) -> None:
+def test_the_report_of_made_drives(runs: Sequence[LabelledRun]) -> None:
     short = [dataclasses.replace(r, windows=r.windows.first(15)) for r in runs]
     others = [
         dataclasses.replace(r, windows=dataclasses.replace(r.windows, x=r.x + 0.01)) for r in short[::2]
@@ -279,7 +279,9 @@ def test_the_report_of_made_drives(runs: Sequence[Run]) -> None:
 
 
 @pytest.mark.parametrize("counts", [(6, 6, 1), (1, 1, 1)])
-def test_a_ground_of_one_run_is_refused_by_name(runs: Sequence[Run], counts: tuple[int, int, int]) -> None:
+def test_a_ground_of_one_run_is_refused_by_name(
+    runs: Sequence[LabelledRun], counts: tuple[int, int, int]
+) -> None:
     few = [
         r for label, n in zip(SHAKES, counts, strict=True) for r in [x for x in runs if x.label == label][:n]
     ]
@@ -303,7 +305,7 @@ def test_two_runs_a_ground_are_reported_with_what_they_cannot_tell() -> None:
 
 
 def test_folds_of_one_ground_or_of_short_runs_are_left_out_of_the_changes(
-    model: SoftmaxModel, runs: Sequence[Run]
+    model: SoftmaxModel, runs: Sequence[LabelledRun]
 ) -> None:
     whole = [(r.signals, r.label) for r in runs if r.name.endswith("5")]
     short = [(signals.between(0.0, 10.0), label) for signals, label in whole]
@@ -334,7 +336,7 @@ def test_what_was_learnt_from_is_every_file_that_was_read(tmp_path: Path) -> Non
         hashes_of(["absent.csv"])
 
 
-def test_a_learner_is_scored_on_grounds_it_knows(model: SoftmaxModel, runs: Sequence[Run]) -> None:
+def test_a_learner_is_scored_on_grounds_it_knows(model: SoftmaxModel, runs: Sequence[LabelledRun]) -> None:
     held = [r for r in runs if r.name.endswith("5")]
     report = score(model, held)
     assert report["filtered"]["macro_f1"] > 0.9

@@ -15,7 +15,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import ModeTuning, NoiseTuning, load_modes, write_modes
 from terrafusion.fusion.noise.policy import load_policy

@@ -28,6 +28,7 @@ import numpy as np
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.files import check_folder
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.checkpoints import FOLDER, log_state, read_part, write_part
 from terrafusion.fusion.benchmark.field_logs import (
     UNFORESEEN,
     Refusal,
@@ -40,10 +41,9 @@ from terrafusion.fusion.benchmark.field_logs import (
     refusal_of,
 )
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, until
-from terrafusion.fusion.benchmark.parts import FOLDER, log_state, read_part, write_part
 from terrafusion.fusion.config.estimator_config import MODES
 from terrafusion.fusion.metrics.health import examine_estimate
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.executors import open_workers
 

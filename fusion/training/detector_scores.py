@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from terrafusion.fusion.terrain.classifier import UNKNOWN, TerrainModel
 from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
-from terrafusion.fusion.training.drives import UPDATE_S, WINDOW_S
+from terrafusion.fusion.training.simulated_runs import UPDATE_S, WINDOW_S
 
 Array = NDArray[np.float64]
 
@@ -26,7 +26,7 @@ ECE_BINS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Route:
+class LabelledRoute:
     """Windows in driving order, the true ground (n,) of each, and the rows where the ground changes."""
 
     windows: list[Window]
@@ -35,7 +35,7 @@ class Route:
 
 
 @dataclass(frozen=True)
-class Scores:
+class DetectorScores:
     """Figures of a detector over sequences; only windows in which the robot or its wheels moved count.
 
     Attributes:
@@ -63,7 +63,7 @@ class Scores:
     windows: int
 
 
-def splice(drives: Sequence[tuple[list[Window], str]], patches: int, seed: int) -> Route:
+def splice(drives: Sequence[tuple[list[Window], str]], patches: int, seed: int) -> LabelledRoute:
     """One long drive over `patches` grounds, cut from drives (windows, ground) on one ground each."""
     rng = np.random.default_rng([seed, 11])
     grounds = sorted({ground for _, ground in drives})
@@ -84,15 +84,15 @@ def splice(drives: Sequence[tuple[list[Window], str]], patches: int, seed: int) 
         windows += source[begin:end]
         labels += [ground] * len(source[begin:end])
         last = ground
-    return Route(windows, np.array(labels), starts)
+    return LabelledRoute(windows, np.array(labels), starts)
 
 
-def changes_in(windows: list[Window], labels: NDArray[Any]) -> Route:
+def changes_in(windows: list[Window], labels: NDArray[Any]) -> LabelledRoute:
     """A drive of the twin over several grounds as a sequence."""
-    return Route(windows, labels, [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist()])
+    return LabelledRoute(windows, labels, [0, *(np.flatnonzero(labels[1:] != labels[:-1]) + 1).tolist()])
 
 
-def evaluate(model: TerrainModel, sequences: Sequence[Route]) -> Scores:
+def evaluate(model: TerrainModel, sequences: Sequence[LabelledRoute]) -> DetectorScores:
     """Run a fresh detector along each sequence and score it."""
     classes = (*model.classes, UNKNOWN)
     named, sure, truth = [], [], []
@@ -124,7 +124,7 @@ def evaluate(model: TerrainModel, sequences: Sequence[Route]) -> Scores:
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
     present = counts.sum(axis=1) > 0
     quantiles = np.quantile(delays, [0.5, 0.95, 1.0]) if delays else np.full(3, np.nan)
-    return Scores(
+    return DetectorScores(
         classes=classes,
         confusion=tuple(tuple(row) for row in shares.tolist()),
         macro_f1=float(f1[present].mean()),
@@ -146,7 +146,7 @@ def calibration_error(confidence: Array, correct: NDArray[np.bool_]) -> float:
 
 
 def _switches(
-    sequence: Route, winner: NDArray[Any], true: NDArray[Any], moving: NDArray[np.bool_]
+    sequence: LabelledRoute, winner: NDArray[Any], true: NDArray[Any], moving: NDArray[np.bool_]
 ) -> tuple[list[float], int, int]:
     """Delays (s of driving) of the changes of ground, how many were missed, how many were false."""
     delays, missed = [], 0

@@ -22,7 +22,7 @@ SEEN_WITHIN_S = 2.0
 
 
 @dataclass(frozen=True)
-class Changes:
+class ChangeDetection:
     """Delays of the changes of ground: quantiles of those seen, s, and shares of all changes.
 
     A change counts as seen when its new ground first has the largest
@@ -94,7 +94,7 @@ def delays(
 
 def changes_seen(
     models: Sequence[SoftmaxModel], held_out: Sequence[Sequence[tuple[Signals, str]]]
-) -> Changes | None:
+) -> ChangeDetection | None:
     """Each model on two routes over the runs (signals, label) it has not seen.
 
     None where no model has runs of two grounds that are long enough.
@@ -112,7 +112,7 @@ def changes_seen(
     if not found:
         return None
     seen = np.array([d for d in found if np.isfinite(d)])
-    return Changes(
+    return ChangeDetection(
         median_s=float(np.median(seen)) if len(seen) else np.inf,
         p95_s=float(np.quantile(seen, 0.95)) if len(seen) else np.inf,
         within_2_s=float(np.mean(np.array(found) <= SEEN_WITHIN_S)),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.catalog.catalog import sha256_of
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of
-from terrafusion.fusion.training.evaluate import calibration_error
+from terrafusion.fusion.training.detector_scores import calibration_error
 from terrafusion.fusion.training.softmax import (
     UNKNOWN_SHARE,
     SoftmaxModel,
@@ -23,7 +23,7 @@ from terrafusion.fusion.training.softmax import (
 from terrafusion.fusion.training.surface_features import (
     SURFACE_FEATURES,
     Signals,
-    Windows,
+    SurfaceWindows,
     signals_of,
     surface_windows,
 )
@@ -40,13 +40,13 @@ only runs on one ground, so it would go further, at the cost of every change of 
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class LabelledRun:
     """One drive on one ground: its signals, and what its n windows show."""
 
     name: str
     label: str
     signals: Signals
-    windows: Windows
+    windows: SurfaceWindows
 
     @property
     def x(self) -> Array:
@@ -55,7 +55,7 @@ class Run:
 
 
 @dataclass(frozen=True)
-class Figures:
+class LearnerScores:
     """Scores over windows: rows of `confusion` are true grounds, as shares; `ece` of the winner."""
 
     classes: tuple[str, ...]
@@ -67,22 +67,22 @@ class Figures:
 
 
 @dataclass(frozen=True, eq=False)
-class Folded:
+class CrossValidation:
     """Answers (n, k) of the windows of all runs, each by the model that has not seen its fold."""
 
     classes: tuple[str, ...]
-    runs: tuple[Run, ...]
+    runs: tuple[LabelledRun, ...]
     fold_of: NDArray[np.intp]
     models: tuple[SoftmaxModel, ...]
     single: tuple[Array, ...]
     filtered: tuple[Array, ...]
 
-    def figures(self, filtered: bool = True) -> Figures:
+    def figures(self, filtered: bool = True) -> LearnerScores:
         """Scores of the filtered answers, or of each window by itself."""
-        return figures_of(self.classes, self.runs, self.filtered if filtered else self.single)
+        return learner_scores(self.classes, self.runs, self.filtered if filtered else self.single)
 
 
-def open_runs(logs: Sequence[str]) -> list[Run]:
+def open_runs(logs: Sequence[str]) -> list[LabelledRun]:
     """The labelled runs of logs: files, folders of them, or names of the catalogue.
 
     Raises:
@@ -99,7 +99,7 @@ def open_runs(logs: Sequence[str]) -> list[Run]:
             signals = signals_of(recording)
             windows = surface_windows(signals)
             if len(windows):
-                runs.append(Run(recording.name, recording.terrain_name, signals, windows))
+                runs.append(LabelledRun(recording.name, recording.terrain_name, signals, windows))
     if not runs:
         raise DataError("no labelled windows in the logs given", channel="terrain")
     return runs
@@ -123,7 +123,7 @@ def hashes_of(logs: Sequence[str]) -> dict[str, str]:
     return {name: sha256_of(file) for name, file in zip(names, files, strict=True)}
 
 
-def check_runs(runs: Sequence[Run]) -> None:
+def check_runs(runs: Sequence[LabelledRun]) -> None:
     """Refuse what no run can be left out of.
 
     Raises:
@@ -138,7 +138,7 @@ def check_runs(runs: Sequence[Run]) -> None:
             )
 
 
-def deal(runs: Sequence[Run], folds: int = FOLDS) -> NDArray[np.intp]:
+def assign_folds(runs: Sequence[LabelledRun], folds: int = FOLDS) -> NDArray[np.intp]:
     """The fold (n,) of each run: by ground, the longest first, each to the fold with least of that ground."""
     fold_of = np.zeros(len(runs), dtype=np.intp)
     total = np.zeros(folds)
@@ -153,7 +153,7 @@ def deal(runs: Sequence[Run], folds: int = FOLDS) -> NDArray[np.intp]:
 
 
 def train_on(
-    runs: Sequence[Run],
+    runs: Sequence[LabelledRun],
     features: Sequence[str] = SURFACE_FEATURES,
     temperature: float | None = None,
 ) -> SoftmaxModel:
@@ -168,8 +168,8 @@ def train_on(
     model = fit_softmax(np.vstack([r.x for r in runs]), labels_of(runs), features)
     if temperature is not None:
         return dataclasses.replace(model, temperature=temperature)
-    fold_of = deal(runs, INNER_FOLDS)
-    held: list[tuple[SoftmaxModel, Run]] = []
+    fold_of = assign_folds(runs, INNER_FOLDS)
+    held: list[tuple[SoftmaxModel, LabelledRun]] = []
     for fold in range(INNER_FOLDS):
         inner = [r for r, f in zip(runs, fold_of, strict=True) if f != fold]
         if {r.label for r in inner} != set(model.classes):
@@ -192,22 +192,22 @@ def train_on(
     return dataclasses.replace(model, temperature=min(TEMPERATURES, key=loss), odd_distance=float(odd))
 
 
-def labels_of(runs: Sequence[Run]) -> list[str]:
+def labels_of(runs: Sequence[LabelledRun]) -> list[str]:
     """The label of each window of the runs."""
     return [label for r in runs for label in [r.label] * len(r.x)]
 
 
 def cross_validate(
-    runs: Sequence[Run], features: Sequence[str] = SURFACE_FEATURES, temperature: float | None = None
-) -> Folded:
+    runs: Sequence[LabelledRun], features: Sequence[str] = SURFACE_FEATURES, temperature: float | None = None
+) -> CrossValidation:
     """Train on four fifths of the runs and answer for the others, for each fifth."""
-    fold_of = deal(runs)
+    fold_of = assign_folds(runs)
     models = tuple(
         train_on([r for r, f in zip(runs, fold_of, strict=True) if f != fold], features, temperature)
         for fold in range(FOLDS)
     )
     chosen = [models[f] for f in fold_of]
-    return Folded(
+    return CrossValidation(
         classes=models[0].classes,
         runs=tuple(runs),
         fold_of=fold_of,
@@ -217,7 +217,9 @@ def cross_validate(
     )
 
 
-def figures_of(classes: tuple[str, ...], runs: Sequence[Run], answers: Sequence[Array]) -> Figures:
+def learner_scores(
+    classes: tuple[str, ...], runs: Sequence[LabelledRun], answers: Sequence[Array]
+) -> LearnerScores:
     """Scores of probabilities (n, k) for the windows of each run."""
     k = len(classes)
     p = np.vstack(list(answers))
@@ -227,7 +229,7 @@ def figures_of(classes: tuple[str, ...], runs: Sequence[Run], answers: Sequence[
     present = counts.sum(axis=1) > 0
     f1 = 2.0 * np.diag(counts) / np.maximum(counts.sum(axis=0) + counts.sum(axis=1), 1.0)
     shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
-    return Figures(
+    return LearnerScores(
         classes=classes,
         macro_f1=float(f1[present].mean()),
         accuracy=float((winner == true).mean()),
@@ -237,7 +239,7 @@ def figures_of(classes: tuple[str, ...], runs: Sequence[Run], answers: Sequence[
     )
 
 
-def window_ms(model: SoftmaxModel, run: Run, windows: int = 200) -> float:
+def window_ms(model: SoftmaxModel, run: LabelledRun, windows: int = 200) -> float:
     """Mean computing time of one window, features and answers, ms."""
     from terrafusion.fusion.training.surface_features import HOP_S, RECENT_S, WINDOW_S, window_features
 

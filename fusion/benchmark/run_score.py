@@ -11,13 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.fusion.benchmark.arms import Arm, replay_options
-from terrafusion.fusion.benchmark.drives import Drive
 from terrafusion.fusion.benchmark.field_logs import UNFORESEEN
+from terrafusion.fusion.benchmark.methods import Method, replay_options
+from terrafusion.fusion.benchmark.twin_runs import BenchmarkRun
 from terrafusion.fusion.metrics.consistency import estimated_ground_at, position, summarise
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.health import examine_estimate
-from terrafusion.fusion.metrics.metrics import OutageScore
+from terrafusion.fusion.metrics.scores import OutageScore
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.terrain.classifier import UNKNOWN
@@ -27,7 +27,7 @@ Rows = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class GroundRow:
+class GroundScore:
     """One replay on one true ground, inside the outage.
 
     Attributes:
@@ -53,7 +53,7 @@ class GroundRow:
 
 
 @dataclass(frozen=True)
-class Row:
+class RunScore:
     """One drive with one arm.
 
     Attributes:
@@ -83,17 +83,17 @@ class Row:
     seconds: float | None = None
     diverged: str = ""
     failed: str = ""
-    grounds: tuple[GroundRow, ...] = ()
+    grounds: tuple[GroundScore, ...] = ()
 
     @classmethod
-    def read(cls, raw: dict[str, Any]) -> Row:
+    def read(cls, raw: dict[str, Any]) -> RunScore:
         """A row from its JSON object."""
-        return cls(**{**raw, "grounds": tuple(GroundRow(**ground) for ground in raw["grounds"])})
+        return cls(**{**raw, "grounds": tuple(GroundScore(**ground) for ground in raw["grounds"])})
 
 
-def measure(drive: Drive, arm: Arm) -> Row | None:
+def measure(drive: BenchmarkRun, arm: Method) -> RunScore | None:
     """Replay a drive with an arm; None where the arm needs labels that the drive does not have."""
-    empty = Row(drive.family, drive.plant, drive.unit, drive.name, arm.name)
+    empty = RunScore(drive.family, drive.plant, drive.unit, drive.name, arm.name)
     options = replay_options(arm, drive.labels, drive.seed)
     if options is None:
         return None
@@ -106,7 +106,7 @@ def measure(drive: Drive, arm: Arm) -> Row | None:
     return _measured(empty, drive, result)
 
 
-def _measured(row: Row, drive: Drive, result: ReplayResult) -> Row:
+def _measured(row: RunScore, drive: BenchmarkRun, result: ReplayResult) -> RunScore:
     assert drive.recording.wheels is not None
     radius_m = result.vehicle.rig().wheel_radius_m
     health = examine_estimate(result.estimate, drive.recording.wheels, radius_m)
@@ -144,7 +144,7 @@ def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], right: Rows) -> 
     return float(np.mean(delays)) if delays else None
 
 
-def _with_outage(row: Row, outage: OutageScore) -> Row:
+def _with_outage(row: RunScore, outage: OutageScore) -> RunScore:
     return dataclasses.replace(
         row,
         outage_s=outage.seconds,
@@ -158,7 +158,7 @@ def _with_outage(row: Row, outage: OutageScore) -> Row:
 
 def _by_ground(
     errors: Errors, true: NDArray[Any], right: Rows, inside: Rows, start_ns: int
-) -> list[GroundRow]:
+) -> list[GroundScore]:
     whitened = position(errors)
     speed = np.gradient(errors.path_m(), errors.t_ns * 1e-9) if len(errors.t_ns) > 1 else np.zeros(1)
     step_s = float(np.median(np.diff(errors.t_ns))) * 1e-9 if len(errors.t_ns) > 1 else 0.0
@@ -169,7 +169,7 @@ def _by_ground(
         whole = summarise(whitened, here, start_ns)
         outage = summarise(whitened, lost, start_ns)
         rows.append(
-            GroundRow(
+            GroundScore(
                 ground=ground,
                 seconds=step_s * float(lost.sum()),
                 forward_mps=_rms(errors.velocity_error_mps[lost, 0]),

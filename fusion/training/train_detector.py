@@ -19,9 +19,9 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
 from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, Window, extract
 from terrafusion.fusion.terrain.sequence import PatchFilter
-from terrafusion.fusion.training.drives import GROUNDS, Grid, run_all, windows_of
-from terrafusion.fusion.training.evaluate import Route, Scores, evaluate, splice
+from terrafusion.fusion.training.detector_scores import DetectorScores, LabelledRoute, evaluate, splice
 from terrafusion.fusion.training.mixture import fit_best
+from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, run_all, windows_of
 
 Array = NDArray[np.float64]
 Drive = tuple[list[Window], str]
@@ -41,7 +41,7 @@ PATCHES = 60
 
 
 @dataclass(frozen=True)
-class Plan:
+class TrainingPlan:
     """What a training runs: `seeds` seeds for the densities, one each to calibrate and to score."""
 
     seeds: int = 3
@@ -62,7 +62,7 @@ class Plan:
         return (self.seeds + 2) * len(self.grid(0).conditions())
 
 
-def train(plan: Plan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainModel, Scores]:
+def train(plan: TrainingPlan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainModel, DetectorScores]:
     """Simulate, fit, calibrate and score; `tick` is called after each drive.
 
     Raises:
@@ -96,7 +96,9 @@ def train(plan: Plan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainM
     return dataclasses.replace(model, scores=_plain(scores)), scores
 
 
-def routes_of(plan: Plan, first_seed: int, tick: Callable[[], None], seeds: int = 1) -> list[Route]:
+def routes_of(
+    plan: TrainingPlan, first_seed: int, tick: Callable[[], None], seeds: int = 1
+) -> list[LabelledRoute]:
     """Spliced routes over drives of `seeds` seeds from `first_seed`, one a seed."""
     return [
         splice(list(drives_of(plan.grid(seed), tick)), PATCHES, seed)
@@ -121,7 +123,7 @@ def features_of(windows: list[Window]) -> Array:
     return np.asarray(x[np.isfinite(x).any(axis=1)])
 
 
-def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
+def calibrate(model: TerrainModel, route: LabelledRoute) -> TerrainModel:
     """Temperature by the filtered log-score of the true ground, then the weight of `unknown`.
 
     The weight is the largest of a falling series for which at most
@@ -137,7 +139,7 @@ def calibrate(model: TerrainModel, route: Route) -> TerrainModel:
     return dataclasses.replace(model, unknown=weighted, temperature=temperature)
 
 
-def _evidence(model: TerrainModel, route: Route) -> list[tuple[float, Array, int]]:
+def _evidence(model: TerrainModel, route: LabelledRoute) -> list[tuple[float, Array, int]]:
     """Distance driven, untempered log-likelihoods (k,) and true class of every moving window."""
     classes = (*model.classes, UNKNOWN)
     table = LikelihoodTable(dataclasses.replace(model, temperature=1.0), classes)
@@ -177,7 +179,7 @@ def _broad(mixtures: dict[str, Mixture]) -> Mixture:
     return Mixture(np.zeros(1), mean[None], UNKNOWN_SPREAD**2 * covariance[None])
 
 
-def fingerprint_of(plan: Plan) -> str:
+def fingerprint_of(plan: TrainingPlan) -> str:
     """SHA-256 of what a model made by `plan` depends on: parameter files and settings."""
     settings = {
         "plan": dataclasses.asdict(plan),
@@ -189,7 +191,7 @@ def fingerprint_of(plan: Plan) -> str:
     return plan.training().fingerprint(settings=settings)
 
 
-def _plain(scores: Scores) -> dict[str, Any]:
+def _plain(scores: DetectorScores) -> dict[str, Any]:
     """The figures that come out the same on every machine, rounded."""
     median, p95, largest = scores.switch_delay_s
     return {

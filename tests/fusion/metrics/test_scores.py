@@ -16,7 +16,7 @@ from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.metrics.error_series import Errors, travelled_m
-from terrafusion.fusion.metrics.metrics import (
+from terrafusion.fusion.metrics.scores import (
     Outage,
     Scores,
     parse_outage,

@@ -44,7 +44,7 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import GRAVITY_MPS2, quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ImuSpec
-from terrafusion.fusion.training.drives import seconds, wheel_samples
+from terrafusion.fusion.training.simulated_runs import seconds, wheel_samples
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
 Array = NDArray[np.float64]
@@ -58,7 +58,7 @@ BIAS_S = 60.0
 
 
 @dataclass(frozen=True, eq=False)
-class Evidence:
+class GroundSamples:
     """What one drive, or many, say of a ground: (n,) samples of each quantity.
 
     `slip_pairs` and `grade_pairs` (n, 2) are slips and grades `LAG_S` apart; `gyro` (roll and pitch),
@@ -78,21 +78,21 @@ class Evidence:
     gnss: Array
 
     @staticmethod
-    def joined(parts: Iterable[Evidence]) -> Evidence:
+    def joined(parts: Iterable[GroundSamples]) -> GroundSamples:
         """All of them together."""
         listed = list(parts)
-        names = [f.name for f in dataclasses.fields(Evidence)]
-        return Evidence(**{n: np.concatenate([getattr(p, n) for p in listed]) for n in names})
+        names = [f.name for f in dataclasses.fields(GroundSamples)]
+        return GroundSamples(**{n: np.concatenate([getattr(p, n) for p in listed]) for n in names})
 
 
-def evidence_of(recording: Recording) -> Evidence:
+def samples_of(recording: Recording) -> GroundSamples:
     """Everything one simulated drive says of its ground."""
     truth = recording.truth
     assert truth is not None
     assert truth.twist_body is not None
     slip, grade, pairs, grade_pairs, wheel = _slip_evidence(recording)
     gyro, gyro_yaw, accel = _imu_evidence(recording)
-    return Evidence(
+    return GroundSamples(
         slip,
         grade,
         pairs,

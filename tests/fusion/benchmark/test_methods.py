@@ -6,8 +6,8 @@ import dataclasses
 
 import pytest
 
-from terrafusion.fusion.benchmark.arms import (
-    ARMS,
+from terrafusion.fusion.benchmark.methods import (
+    METHODS,
     SHEET,
     known_labels,
     misleading,
@@ -34,26 +34,26 @@ def two_grounds():
 
 
 def test_every_arm_is_a_mode_with_its_own_name() -> None:
-    assert len({arm.name for arm in ARMS}) == len(ARMS) == 8
-    for arm in ARMS:
+    assert len({arm.name for arm in METHODS}) == len(METHODS) == 8
+    for arm in METHODS:
         options = replay_options(arm, LABELS, seed=3)
         assert options is not None
         assert options["mode"] == arm.mode
 
 
 def test_arms_that_need_labels_have_none_without_them() -> None:
-    without = {arm.name for arm in ARMS if replay_options(arm, None, seed=3) is None}
+    without = {arm.name for arm in METHODS if replay_options(arm, None, seed=3) is None}
     assert without == {"oracle", "shuffled", "adversarial"}
 
 
 def test_ground_that_the_policy_does_not_know_has_no_adversary() -> None:
     snow = GroundLabels((START_NS,), ("snow",))
-    without = {arm.name for arm in ARMS if replay_options(arm, snow, seed=3) is None}
+    without = {arm.name for arm in METHODS if replay_options(arm, snow, seed=3) is None}
     assert without == {"adversarial"}
 
 
 def test_the_data_sheet_knows_no_slip_and_no_tuning() -> None:
-    options = replay_options(ARMS[0], None, seed=0)
+    options = replay_options(METHODS[0], None, seed=0)
     assert options is not None
     row = options["policy"].fixed
     assert {name: getattr(row, name) for name in SHEET} == SHEET

@@ -36,7 +36,7 @@ SHUFFLE_S = 10.0
 
 
 @dataclass(frozen=True)
-class Arm:
+class Method:
     """One way to weight.
 
     Attributes:
@@ -53,21 +53,21 @@ class Arm:
     labels: str = ""
 
 
-ARMS = (
-    Arm("data sheet", "fixed", "one row, from data sheets", sheet=True),
-    Arm("fixed", "fixed", "one row for all grounds, tuned on the training drives"),
-    Arm("robust", "robust", "that row under a Cauchy loss, its scales tuned"),
-    Arm("innovation", "innovation", "that row, followed by the innovations (variational)"),
-    Arm("adaptive", "adaptive", "the policy's rows by the detected ground"),
-    Arm("oracle", "adaptive", "the policy's rows by the true ground", labels="true"),
-    Arm("shuffled", "adaptive", "rows of grounds drawn at random, a new one each 10 s", labels="shuffled"),
-    Arm("adversarial", "adaptive", "the row most foreign to the true ground", labels="adversarial"),
+METHODS = (
+    Method("data sheet", "fixed", "one row, from data sheets", sheet=True),
+    Method("fixed", "fixed", "one row for all grounds, tuned on the training drives"),
+    Method("robust", "robust", "that row under a Cauchy loss, its scales tuned"),
+    Method("innovation", "innovation", "that row, followed by the innovations (variational)"),
+    Method("adaptive", "adaptive", "the policy's rows by the detected ground"),
+    Method("oracle", "adaptive", "the policy's rows by the true ground", labels="true"),
+    Method("shuffled", "adaptive", "rows of grounds drawn at random, a new one each 10 s", labels="shuffled"),
+    Method("adversarial", "adaptive", "the row most foreign to the true ground", labels="adversarial"),
 )
-OWN, BASE, ORACLE = "adaptive", "fixed", "oracle"
+ADAPTIVE, BASELINE, ORACLE = "adaptive", "fixed", "oracle"
 """The arm that is judged, the one it is judged against, and the best labels can do."""
 
 
-def replay_options(arm: Arm, labels: GroundLabels | None, seed: int) -> dict[str, Any] | None:
+def replay_options(arm: Method, labels: GroundLabels | None, seed: int) -> dict[str, Any] | None:
     """Arguments of `replay` for an arm, or None where it needs labels and there are none.
 
     Of ground that the policy does not know the oracle says "unknown", and an adversary has nothing to say.

@@ -17,10 +17,10 @@ from pathlib import Path
 import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark.arms import true_labels
-from terrafusion.fusion.metrics.metrics import Outage
+from terrafusion.fusion.benchmark.methods import true_labels
+from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.labels import GroundLabels
-from terrafusion.fusion.training.drives import GROUNDS, SOIL_SCATTER, scattered_soil
+from terrafusion.fusion.training.simulated_runs import GROUNDS, SOIL_SCATTER, scattered_soil
 from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.soil import SoilParams, load_soil
@@ -83,7 +83,7 @@ FIELD = "field"
 
 
 @dataclass(frozen=True)
-class Case:
+class BenchmarkCase:
     """One drive of the twin."""
 
     family: str
@@ -101,7 +101,7 @@ class Case:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class BenchmarkRun:
     """A recording, the outage in it (None: the whole of it is judged) and its true ground where known.
 
     `unit` is what is independent of other drives: the seed, or the log that several outages are of. A drive
@@ -119,7 +119,7 @@ class Drive:
     judged: bool = True
 
 
-def drive_of(case: Case) -> Drive:
+def simulate_case(case: BenchmarkCase) -> BenchmarkRun:
     """Simulate a case; the same case gives the same bits."""
     family = FAMILIES[case.family]
     rng = case.stream(case.family)
@@ -145,10 +145,12 @@ def drive_of(case: Case) -> Drive:
     seed = int(case.stream(case.family, case.plant, "noise").integers(2**31))
     recording = simulate_run(scenario, soils=soils, effects=effects, seed=seed).recording
     unit = f"seed {case.seed}"
-    return Drive(case.family, case.plant, unit, unit, recording, outage, true_labels(recording), case.seed)
+    return BenchmarkRun(
+        case.family, case.plant, unit, unit, recording, outage, true_labels(recording), case.seed
+    )
 
 
-def soils_of(case: Case, names: set[str]) -> dict[str, SoilParams]:
+def soils_of(case: BenchmarkCase, names: set[str]) -> dict[str, SoilParams]:
     """The case's own soils: scattered as in training, or every number off by `PERTURBATION`."""
     rng = case.stream(case.family, case.plant, "soil")
     with tempfile.TemporaryDirectory() as folder:

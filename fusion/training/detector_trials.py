@@ -9,9 +9,15 @@ import numpy as np
 
 from terrafusion.fusion.terrain.classifier import TerrainModel
 from terrafusion.fusion.terrain.features import Window
-from terrafusion.fusion.training.drives import GROUNDS, Condition, windows_of
-from terrafusion.fusion.training.evaluate import Route, Scores, changes_in, evaluate, splice
-from terrafusion.fusion.training.train import FRESH_SEED, PATCHES, Plan, drives_of
+from terrafusion.fusion.training.detector_scores import (
+    DetectorScores,
+    LabelledRoute,
+    changes_in,
+    evaluate,
+    splice,
+)
+from terrafusion.fusion.training.simulated_runs import GROUNDS, Condition, windows_of
+from terrafusion.fusion.training.train_detector import FRESH_SEED, PATCHES, TrainingPlan, drives_of
 from terrafusion.twin.simulate import simulate
 
 MIXED_RUNS = 4
@@ -21,10 +27,12 @@ SLOW_HZ = 30.0
 
 def count(seeds: int) -> int:
     """Number of drives `run` simulates."""
-    return seeds * len(Plan().grid(0).conditions()) + seeds * MIXED_RUNS
+    return seeds * len(TrainingPlan().grid(0).conditions()) + seeds * MIXED_RUNS
 
 
-def run(model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None) -> dict[str, Scores]:
+def run(
+    model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None
+) -> dict[str, DetectorScores]:
     """Scores by trial; `tick` is called after each drive.
 
     - spliced: patches of fresh drives on single grounds, cut together;
@@ -35,7 +43,7 @@ def run(model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None
     - without X: X left out of the model, so that `unknown` is the right answer there.
     """
     fresh = range(FRESH_SEED, FRESH_SEED + seeds)
-    routes = [splice(list(drives_of(Plan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
+    routes = [splice(list(drives_of(TrainingPlan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
     mixed = [_mixed(MIXED_RUNS * FRESH_SEED + number, tick) for number in range(MIXED_RUNS * seeds)]
     foreign = model.for_vehicle(None)
     firm = sorted(set(model.classes) - set(foreign.classes))
@@ -54,18 +62,18 @@ def run(model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None
     return scores
 
 
-def _mixed(seed: int, tick: Callable[[], None]) -> Route:
+def _mixed(seed: int, tick: Callable[[], None]) -> LabelledRoute:
     recording = simulate("mixed_terrain", seed=seed)
     tick()
     stream = Condition("mixed_terrain", "mixed", 0.0, 0.0, seed).stream("estimator")
     return changes_in(*windows_of(recording, stream))
 
 
-def _changed(route: Route, change: Callable[[Window], Window]) -> Route:
+def _changed(route: LabelledRoute, change: Callable[[Window], Window]) -> LabelledRoute:
     return dataclasses.replace(route, windows=[change(w) for w in route.windows])
 
 
-def _relabelled(route: Route, *grounds: str) -> Route:
+def _relabelled(route: LabelledRoute, *grounds: str) -> LabelledRoute:
     labels = np.where(np.isin(route.labels, grounds), "unknown", route.labels)
     return dataclasses.replace(route, labels=labels)
 
