@@ -1,0 +1,229 @@
+"""Every experiment whose figures the documents quote: what it asks, how it is run, which figures it gives.
+
+A study is a command. What it prints is its table; figures are read from it by patterns, as they are printed.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+OUT = "{out}"
+"""Stands for the study's own folder, where it may keep parts of a long run."""
+DATA = "{data}"
+"""Stands for the folder of the public field logs (TERRAFUSION_DATA)."""
+
+
+@dataclass(frozen=True)
+class Study:
+    """One experiment.
+
+    Attributes:
+        question: what it answers, in a sentence.
+        command: arguments of `python`; a word that is `terrafusion` stands for the command line.
+        minutes: on two idle cores, about.
+        figures: name -> regular expression with one group; it is searched in what the command prints, line
+            by line from its beginning.
+        picture: file that the command leaves in its folder, if it draws one.
+    """
+
+    name: str
+    question: str
+    command: tuple[str, ...]
+    minutes: float
+    figures: dict[str, str] = field(default_factory=dict)
+    picture: str = ""
+
+    def needs_logs(self) -> bool:
+        """Whether it reads public field logs."""
+        return DATA in self.command or self.name in READS_LOGS
+
+
+READS_LOGS = ("survey", "field_table", "fault_injection", "benchmark", "effective_track")
+
+
+def _module(name: str, *arguments: str) -> tuple[str, ...]:
+    return ("-m", f"tests.studies.{name}", *arguments)
+
+
+STUDIES = (
+    Study(
+        "demo_seeds",
+        "What do adaptive weights gain over fixed ones on drives of the twin, over ten seeds?",
+        _module("demo_seeds", "--seeds", "10"),
+        12,
+        {
+            f"{drive}_{mode}_{what}": rf"{drive} +{mode}" + r" +[\d.]+" * i + r" +([\d.]+)"
+            for drive in ("demo", "mixed_terrain", "paper_profile", "figure_eight")
+            for mode in ("fixed", "adaptive")
+            for i, what in enumerate(("ate_m", "median_m", "end_m"))
+        },
+    ),
+    Study(
+        "engine_accuracy",
+        "How accurate is the twin's integrator at its own step?",
+        _module("engine_accuracy"),
+        1,
+        {"parked_creep_mud_mmps": r"parked on .*mud ([\d.]+)"},
+    ),
+    Study(
+        "engine_speed",
+        "How fast is the twin, beside other ways to integrate the same drive?",
+        _module("engine_speed"),
+        3,
+        {
+            "run_300_s": r"one run of 300 s +([\d.]+) s",
+            "batch_s": r"1000 runs of 60 s, 2 threads +([\d.]+) s",
+        },
+    ),
+    Study(
+        "estimator_speed",
+        "How long does the estimator compute, live and in batch, beside GTSAM's own optimisers?",
+        _module("speed.speed"),
+        3,
+    ),
+    Study(
+        "coverage",
+        "Do two sigma of `calibrate` hold the true number?",
+        _module("coverage"),
+        15,
+        {"within_2_sigma_percent": r"all +\d+ +([\d.]+) %"},
+    ),
+    Study(
+        "single_wheel",
+        "Does the wheel model predict forces on a measured wheel that it was not fitted to?",
+        _module("twin_field.single_wheel", f"{DATA}/cmu_single_wheel/all_smooth_data.mat", "--out", OUT),
+        1,
+        picture="single_wheel.png",
+    ),
+    Study(
+        "twin_field",
+        "Does the twin predict measured drives better than kinematic models?",
+        _module("twin_field.compare_drives", DATA, "--out", OUT),
+        25,
+    ),
+    Study(
+        "survey",
+        "Do the public recordings hold what their publishers say of them?",
+        _module("survey.survey"),
+        3,
+    ),
+    Study(
+        "source_study",
+        "Does the twin reproduce the source study?",
+        ("terrafusion", "study", "--out", OUT),
+        8,
+        {
+            "agree": r".*?(\d+) agree",
+            "partly": r".*?(\d+) partly",
+            "disagree": r".*?(\d+) disagree",
+        },
+    ),
+    Study(
+        "slip",
+        "How far off is the estimated slip, and how late is immobilisation seen?",
+        _module("slip_trials"),
+        30,
+        {
+            f"{ground}_{what}": rf" *{ground} \d+ deg:" + (r" [\d.]+," if i else "") + r" ([\d.]+)"
+            for ground in ("mud", "loose_sand", "medium_sand", "asphalt")
+            for i, what in enumerate(("filtered", "smoothed"))
+        },
+    ),
+    Study(
+        "calibration_states",
+        "Does the estimator find wrong numbers of the vehicle file while it drives?",
+        _module("calibration_trials"),
+        20,
+    ),
+    Study(
+        "twin_consistency",
+        "Are NEES and NIS in their bands on every ground of the twin?",
+        _module("twin_consistency"),
+        15,
+    ),
+    Study(
+        "field_table",
+        "How do the modes compare on every field log, with fixes and in outages?",
+        _module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
+        240,
+        picture="field_logs.png",
+    ),
+    Study(
+        "benchmark",
+        "What do adaptive weights gain over fixed and other baselines, in pairs of the same drives?",
+        ("terrafusion", "benchmark", "--out", OUT),
+        300,
+        picture="ratios.png",
+    ),
+    Study(
+        "detector",
+        "How well are grounds told apart, on fresh drives, with sensors missing, on grounds never seen?",
+        ("terrafusion", "terrain", "eval"),
+        20,
+    ),
+    Study(
+        "effect_sweep",
+        "Which effects does the diagnosis see in the twin's own runs, and at what size?",
+        _module("effect_sweep"),
+        20,
+    ),
+    Study(
+        "fault_injection",
+        "Does the diagnosis name known changes that are put into real logs?",
+        _module("fault_injection.table", "--out", OUT),
+        60,
+    ),
+    Study(
+        "effective_track",
+        "Which track do wheels and gyro of a skid-steered robot imply on each ground?",
+        _module("effective_track", f"{DATA}/husky_parkinglot/test1.bag", "--vehicle", "husky"),
+        1,
+    ),
+    Study(
+        "blind",
+        "Does the diagnosis hold on a plant that is not the twin, with sealed labels?",
+        ("terrafusion", "gap-blind", "--seed", "7", "--jobs", "2", "--out", OUT),
+        100,
+        picture="blind.png",
+    ),
+    Study(
+        "blind_power",
+        "At what multiple of an observer's half-power point does the diagnosis detect?",
+        _module("blind.power", "--shapes", "24"),
+        60,
+    ),
+    Study(
+        "blind_plant",
+        "How far do plant and twin lie apart without noise or effects?",
+        _module("blind.plant_against_twin"),
+        1,
+    ),
+    Study(
+        "blind_timing",
+        "How long does a diagnosis take?",
+        _module("blind.timing", "--site", "7", "--trials", "0", "1", "2"),
+        3,
+    ),
+    Study(
+        "bag_speed",
+        "How long does a bag of a million messages take to read, beside rosbags' own reader?",
+        ("tests/datasets/bench_bags.py",),
+        3,
+    ),
+    Study(
+        "reader_fuzz",
+        "Do mutated files crash, hang or bloat a reader?",
+        ("tests/datasets/fuzz.py",),
+        15,
+    ),
+)
+"""All of them, quick ones and long ones."""
+
+
+def by_name(name: str) -> Study:
+    """The study of a name.
+
+    Raises:
+        KeyError: there is none.
+    """
+    return {study.name: study for study in STUDIES}[name]
