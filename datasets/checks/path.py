@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.yaw_signals import account, seconds, typical_sigma
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
@@ -195,9 +196,9 @@ def scale_of(windows: Windows, source: str) -> Scale | None:
     if use.sum() < max(LEAST_WINDOWS, 0.5 * len(use)):
         return None
     weight, scale = windows.weight[use], windows.scale[use]
-    draws = np.random.default_rng(SEED).integers(0, len(scale), (RESAMPLES, len(scale)))
+    draws = resampled_rows(len(scale), RESAMPLES, SEED)
     drawn = (weight * scale)[draws].sum(axis=1) / weight[draws].sum(axis=1)
-    low, high = np.percentile(drawn, [2.5, 97.5]).tolist()
+    low, high = percentile_interval(drawn)
     return Scale(float(np.sum(weight * scale) / weight.sum()), low, high, int(use.sum()), source)
 
 

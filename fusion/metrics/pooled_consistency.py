@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.fusion.metrics.consistency import CONFIDENCE, Consistency, band, verdict
 
 Array = NDArray[np.float64]
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 RESAMPLES = 4000
 IN_OUTAGE = ", outage"
 TWO_DIMENSIONAL = ("position", f"position{IN_OUTAGE}", "nis gnss")
-MARKS = {"consistent": "=", "overconfident": "+", "cautious": "-"}
+VERDICT_SIGNS = {"consistent": "=", "overconfident": "+", "cautious": "-"}
 
 
 @dataclass(frozen=True)
@@ -64,17 +65,14 @@ def pool(terrain: str, mode: str, drives: Sequence[tuple[Consistency, ...]]) -> 
                 len(rows),
                 effective,
                 float(means.mean()),
-                bootstrap(means),
+                mean_interval(means),
                 band(degrees),
             )
         )
     return cells
 
 
-def bootstrap(values: Array, seed: int = 0) -> tuple[float, float]:
-    """Percentile interval of the mean of independent `values` (M,); a point where there is one value."""
-    rng = np.random.default_rng(seed)
-    means = rng.choice(values, size=(RESAMPLES, len(values))).mean(axis=1)
-    tail = 50.0 * (1.0 - CONFIDENCE)
-    low, high = np.percentile(means, [tail, 100.0 - tail])
-    return float(low), float(high)
+def mean_interval(values: Array, seed: int = 0) -> tuple[float, float]:
+    """Interval of the mean of independent `values` (M,); a point where there is one value."""
+    means = values[resampled_rows(len(values), RESAMPLES, seed)].mean(axis=1)
+    return percentile_interval(means, 50.0 * (1.0 - CONFIDENCE))

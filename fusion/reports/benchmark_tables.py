@@ -22,7 +22,7 @@ from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
 from terrafusion.fusion.benchmark.run_score import RunScore
 from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, nees_cells, targets
 from terrafusion.fusion.benchmark.twin_runs import FAMILIES, FIELD, PLANTS
-from terrafusion.fusion.metrics.pooled_consistency import MARKS, PooledConsistency
+from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 
 Cells = list[str]
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
-from terrafusion.fusion.metrics.pooled_consistency import bootstrap
+from terrafusion.fusion.metrics.pooled_consistency import mean_interval
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
@@ -156,7 +156,7 @@ def delays_text(found: Sequence[Told]) -> str:
     late = np.array([told.told_s - told.onset_s for told in found if told.told_s is not None])
     if not len(late):
         return f"never told in {len(found)}"
-    low, high = bootstrap(late)
+    low, high = mean_interval(late)
     told = f"{late.mean():.2f} s late [{low:.2f}, {high:.2f}], at most {late.max():.2f} s"
     return f"{told}; told in {len(late)} of {len(found)}"
 

@@ -212,10 +212,10 @@ def test_the_bootstrap_holds_the_mean_as_often_as_it_says():
     rng = np.random.default_rng(1)
     held = 0
     for _ in range(200):
-        low, high = pooled_consistency.bootstrap(rng.normal(3.0, 1.0, size=10))
+        low, high = pooled_consistency.mean_interval(rng.normal(3.0, 1.0, size=10))
         held += low <= 3.0 <= high
     assert 0.82 <= held / 200 <= 0.98
-    assert pooled_consistency.bootstrap(np.array([2.0])) == (2.0, 2.0)
+    assert pooled_consistency.mean_interval(np.array([2.0])) == (2.0, 2.0)
 
 
 def test_the_table_marks_what_is_not_consistent():

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import resampled_groups
 from terrafusion.fusion.benchmark.body_velocity import heading
 from terrafusion.fusion.benchmark.field_runs import DT_S
-from tests.studies.twin_field.bootstrap import resamples
 from tests.studies.twin_field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ def medians(values: Array, group: NDArray[np.str_]) -> tuple[Array, Array]:
 
     Unknown values (NaN) are left out, column by column.
     """
-    draws = np.array([_medians(values[rows]) for rows in resamples(group, DRAWS, SEED)])
+    draws = np.array([_medians(values[rows]) for rows in resampled_groups(group, DRAWS, SEED)])
     return _medians(values), draws
 
 

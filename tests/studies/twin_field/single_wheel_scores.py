@@ -7,11 +7,11 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import resampled_groups
 from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
-from tests.studies.twin_field.bootstrap import resamples
 from tests.studies.twin_field.single_wheel_fit import (
     EXPONENT,
     FREE,
@@ -124,7 +124,7 @@ def score(trials: WheelTrials, predicted: Array, rows: Mask, seed: int) -> dict[
     """
     target, group = measured(trials), conditions(trials)
     whole = np.flatnonzero(rows)
-    drawn = [whole[at] for at in resamples(group[whole], RESAMPLES, seed)]
+    drawn = [whole[at] for at in resampled_groups(group[whole], RESAMPLES, seed)]
     out: dict[str, dict[str, object]] = {}
     for k, name in enumerate(OUTPUTS):
         if not np.isfinite(predicted[:, k]).all():

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import resampled_groups
 from terrafusion.fusion.benchmark.field_runs import DT_S
-from tests.studies.twin_field.bootstrap import resamples
 from tests.studies.twin_field.compare import SAME, Result
 from tests.studies.twin_field.forks import N_PAST, Forks
 from tests.studies.twin_field.models import BEST_KINEMATIC, TWIN, TWIN_NOMINAL
@@ -105,5 +105,5 @@ def _track(apart: Array, turned: Array) -> float:
 def _interval(statistic: Callable[[NDArray[np.int64]], Any], group: NDArray[np.str_]) -> Interval:
     if not len(group):
         return Interval(np.nan, np.nan, np.nan)
-    draws = np.array([statistic(rows) for rows in resamples(group, DRAWS, SEED)])
+    draws = np.array([statistic(rows) for rows in resampled_groups(group, DRAWS, SEED)])
     return interval(float(statistic(np.arange(len(group)))), draws)

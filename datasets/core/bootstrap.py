@@ -1,0 +1,33 @@
+"""Percentile bootstrap over independent units (Efron and Tibshirani 1993, chapters 6 and 13).
+
+Own lines in place of `scipy.stats.bootstrap`: its import is slow, and it refuses samples of one unit.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def resampled_rows(rows: int, resampled_groups: int, seed: int) -> NDArray[np.int64]:
+    """Row numbers (resamples, rows), drawn with replacement; the same seed gives the same rows."""
+    return np.random.default_rng(seed).integers(rows, size=(resampled_groups, rows))
+
+
+def resampled_groups(group: NDArray[Any], resampled_groups: int, seed: int) -> list[NDArray[np.int64]]:
+    """Row numbers of resamples of whole groups (F,): rows of one group are drawn together."""
+    rng = np.random.default_rng(seed)
+    names, index = np.unique(group, return_inverse=True)
+    members = [np.flatnonzero(index == k) for k in range(len(names))]
+    return [
+        np.concatenate([members[k] for k in rng.integers(len(names), size=len(names))])
+        for _ in range(resampled_groups)
+    ]
+
+
+def percentile_interval(samples: NDArray[np.float64], tail_percent: float = 2.5) -> tuple[float, float]:
+    """Percentiles of the resampled statistic (R,) that leave `tail_percent` out at each end."""
+    low, high = np.percentile(samples, [tail_percent, 100.0 - tail_percent])
+    return float(low), float(high)
