@@ -209,7 +209,7 @@ def _cell(cell: PooledConsistency) -> str:
     if cell.drives < LEAST_UNITS:
         return f"{cell.mean:.2f}"
     (low, high), band = cell.interval, cell.band
-    return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {MARKS[cell.verdict()]} {band[0]:.2f}..{band[1]:.2f}"
+    return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {VERDICT_SIGNS[cell.verdict()]} {band[0]:.2f}..{band[1]:.2f}"
 
 
 def _percent(share: float | None) -> str:

@@ -128,7 +128,7 @@ def table(cells: Sequence[PooledConsistency], quantities: Sequence[str]) -> list
 
 def _text(cell: PooledConsistency) -> str:
     (a, b), (low, high) = cell.interval, cell.band
-    return f"{cell.mean:.2f} [{a:.2f}, {b:.2f}] {MARKS[cell.verdict()]} {low:.2f}..{high:.2f}"
+    return f"{cell.mean:.2f} [{a:.2f}, {b:.2f}] {VERDICT_SIGNS[cell.verdict()]} {low:.2f}..{high:.2f}"
 
 
 def command(arguments: list[str] | None = None) -> int:

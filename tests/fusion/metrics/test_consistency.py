@@ -218,7 +218,7 @@ def test_the_bootstrap_holds_the_mean_as_often_as_it_says():
     assert pooled_consistency.mean_interval(np.array([2.0])) == (2.0, 2.0)
 
 
-def test_the_table_marks_what_is_not_consistent():
+def test_the_table_flags_what_is_not_consistent():
     cells = pooled_consistency.pool(
         "mud", "fixed", [(consistency(3.0), consistency(0.1, quantity="heading"))]
     )
