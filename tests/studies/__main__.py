@@ -4,8 +4,9 @@
     python -m tests.studies run NAME... | --all   run; a study that has a result of this code is skipped
     python -m tests.studies figures [--write]     do README and docs quote what the results hold?
 
-A result is `results/NAME.json` (figures, command, commit, time), `results/NAME.md` (what was printed) and, where
-the study draws one, `results/NAME.png`. A long study keeps parts in `--work` and goes on where it was stopped.
+A result is `results/NAME.json` (figures, command, commit, time), `results/NAME.md` (what was printed) and,
+where the study draws one, `results/NAME.png`. A long study keeps parts in `--work` and goes on where it was
+stopped.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import time
 from pathlib import Path
 
 from tests.studies.figures import differences, documents, rewritten
-from tests.studies.registry import DATA, OUT, STUDIES, Study, by_name
+from tests.studies.registry import DATA, OUT, STUDIES, Study
 
 ROOT = Path(__file__).parents[2]
 RESULTS = Path(__file__).parent / "results"
@@ -134,10 +135,14 @@ def main() -> int:
         return 0
     if given.verb == "figures":
         return check(given.write)
-    chosen = sorted(STUDIES, key=lambda s: s.minutes) if given.all else [by_name(n) for n in given.names]
+    known = {study.name: study for study in STUDIES}
+    if unknown := set(given.names) - set(known):
+        parser.error(f"no study '{min(unknown)}'; see `list`")
+    chosen = sorted(STUDIES, key=lambda s: s.minutes) if given.all else [known[n] for n in given.names]
     if not chosen:
         parser.error("name a study, or give --all")
-    return int(not all([run(study, given.work.absolute(), given.again) for study in chosen]))
+    failed = [study.name for study in chosen if not run(study, given.work.absolute(), given.again)]
+    return int(bool(failed))
 
 
 if __name__ == "__main__":

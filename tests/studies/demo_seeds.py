@@ -1,4 +1,4 @@
-"""Adaptive against fixed weights on four drives of the twin, median over seeds the policy was not fitted on."""
+"""Adaptive against fixed weights on four drives of the twin: medians over seeds that fitted no policy."""
 
 from __future__ import annotations
 

@@ -218,12 +218,3 @@ STUDIES = (
     ),
 )
 """All of them, quick ones and long ones."""
-
-
-def by_name(name: str) -> Study:
-    """The study of a name.
-
-    Raises:
-        KeyError: there is none.
-    """
-    return {study.name: study for study in STUDIES}[name]
