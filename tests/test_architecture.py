@@ -6,38 +6,9 @@ import ast
 import statistics
 import subprocess
 import sys
-from functools import cache
 from graphlib import CycleError, TopologicalSorter
-from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
-PACKAGES = ("datasets", "twin", "fusion")
-
-
-@cache
-def modules() -> dict[str, Path]:
-    """Files of the library by module name."""
-    found = {}
-    for package in PACKAGES:
-        for path in sorted((ROOT / package).rglob("*.py")):
-            parts = path.relative_to(ROOT).with_suffix("").parts
-            if parts[:2] == ("fusion", "_root"):
-                parts = parts[2:]
-            name = ".".join(("terrafusion", *(p for p in parts if p != "__init__")))
-            found[name] = path
-    return found
-
-
-def imports(path: Path) -> set[str]:
-    """Modules of the library that a file imports anywhere: at its top, in a function or for types only."""
-    known, found = modules(), set()
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        if isinstance(node, ast.Import):
-            found |= {alias.name for alias in node.names if alias.name in known}
-        elif isinstance(node, ast.ImportFrom) and node.module in known:
-            inside = {f"{node.module}.{alias.name}" for alias in node.names}
-            found |= inside & known.keys() or {node.module}
-    return found
+from tests.architecture import PAGE, ROOT, drawn, imports, modules
 
 
 def assert_no_circle(graph: dict[str, set[str]]) -> None:
@@ -79,3 +50,8 @@ def test_nothing_shipped_imports_a_test_or_a_study() -> None:
             for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
             if isinstance(node, ast.ImportFrom)
         )
+
+
+def test_the_drawing_is_of_these_imports() -> None:
+    text = PAGE.read_text(encoding="utf-8")
+    assert text == drawn(text), "run: python -m tests.architecture --write"
