@@ -8,4 +8,4 @@ from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.plausibility import check_magnitude
 from terrafusion.datasets.checks.run import CHECKS, repair, run_checks
 
-__all__ = ["CHECKS", "Finding", "CheckContext", "check_magnitude", "run_checks", "repair"]
+__all__ = ["CHECKS", "CheckContext", "Finding", "check_magnitude", "repair", "run_checks"]

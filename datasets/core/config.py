@@ -1,4 +1,4 @@
-"""Strict loading of parameter files into frozen dataclasses and typed dictionaries, by pydantic.
+"""Strict loading of parameter files into frozen dataclasses, by pydantic.
 
 A number is annotated with its unit and the closed range it must lie in: `Quantity("m", 0, 5)` where it stands
 plain in the file, `Sourced("m", 0, 5)` where it stands with its source::
@@ -18,34 +18,25 @@ import difflib
 import functools
 import math
 import reprlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import UnionType
-from typing import (
-    Annotated,
-    Any,
-    Literal,
-    TypeVar,
-    Union,
-    cast,
-    get_args,
-    get_origin,
-    get_type_hints,
-    is_typeddict,
-)
+from typing import Annotated, Any, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.yaml_file import MAX_BYTES, read_yaml
 
 __all__ = [
-    "MAX_BYTES", "OneOf", "Position", "Prepared", "Quantity", "RejectedError", "Sourced", "Switch", "Whole",
-    "checked_number", "read_yaml", "refuse", "schema", "shown", "structure",
+    "MAX_BYTES", "OneOf", "Parsed", "Position", "Prepared", "Quantity", "RejectedError", "Sourced", "Switch",
+    "Whole", "Word", "checked_number", "quantities", "read_yaml", "refuse", "schema", "shown", "structure",
 ]  # fmt: skip
 
 T = TypeVar("T")
 MAX_ERRORS = 100
 """Errors of a file that are written out."""
+_UNKNOWN = "unexpected_keyword_argument"
+"""Pydantic's error about a key that a dataclass does not have."""
 
 _SHORT = reprlib.Repr()
 _SHORT.maxlevel = 2
@@ -73,7 +64,7 @@ class RejectedError(ValueError):
         return ConfigError(self.what.replace("{key}", key), file=file, remedy=self.remedy)
 
 
-class _Parsed:
+class Parsed:
     """Annotation of a field whose value `parse` checks and converts; `schema` is its JSON schema."""
 
     def parse(self, raw: Any) -> Any:
@@ -96,7 +87,7 @@ class _Parsed:
 
 
 @dataclass(frozen=True)
-class Quantity(_Parsed):
+class Quantity(Parsed):
     """Unit and closed range of a parameter; `size` entries for a vector, one number when 0."""
 
     unit: str
@@ -205,7 +196,23 @@ Position = Annotated[tuple[float, ...], Sourced("m", -20.0, 20.0, size=3)]
 """A point in the body frame (x forward, y left, z up), metres."""
 
 
-class _Truth(_Parsed):
+@dataclass(frozen=True)
+class Word(Parsed):
+    """One of a few words."""
+
+    words: tuple[str, ...]
+
+    def parse(self, raw: Any) -> str:
+        if not isinstance(raw, str) or raw not in self.words:
+            one_of = "one of " if len(self.words) > 1 else ""
+            raise RejectedError(f"'{{key}}' is '{shown(raw)}'", f"give {one_of}{', '.join(self.words)}")
+        return raw
+
+    def schema(self) -> dict[str, Any]:
+        return {"enum": list(self.words)}
+
+
+class _Truth(Parsed):
     def parse(self, raw: Any) -> bool:
         if not isinstance(raw, bool):
             raise RejectedError(f"'{{key}}' is '{shown(raw)}'", "give true or false")
@@ -245,20 +252,25 @@ class OneOf:
         return core_schema.tagged_union_schema(choices, lambda raw: f"<{self.pick(raw)}>")
 
 
-def structure(kind: type[T], raw: Any, *, file: Path | str, key: str = "") -> T:
-    """The dataclass, typed dictionary or other type `kind` from the content `raw` of a file, strictly.
+def structure(kind: type[T], raw: Any, *, file: Path | str, key: str = "", complete: bool = False) -> T:
+    """The dataclass `kind` from the content `raw` of a file, strictly.
 
-    Nested types are sections. `key` is the path of `raw` inside the file.
+    Nested types are sections. `key` is the path of `raw` inside the file; with `complete`,
+    keys with a default must be there, too.
 
     Raises:
         ConfigError: unknown or missing keys, missing sources, wrong types, numbers out of range; all of them.
     """
     from pydantic import ValidationError
 
+    errors = list(_gaps(kind, raw, complete))
     try:
-        return cast(T, _adapter(cast(Any, kind)).validate_python(raw))
+        found = _adapter(cast(Any, kind)).validate_python(raw)
     except ValidationError as error:
-        raise ConfigError.joined(_errors(error.errors(include_url=False), kind, file, key)) from None
+        errors += error.errors(include_url=False)
+    if errors:
+        raise ConfigError.joined(_errors(errors, kind, file, key)[:MAX_ERRORS])
+    return cast(T, found)
 
 
 def checked_number(
@@ -286,6 +298,18 @@ def refuse(problems: Iterable[tuple[str, str]], file: Path | str) -> None:
         raise ConfigError.joined(errors)
 
 
+def quantities(kind: type, prefix: str = "") -> dict[str, Quantity]:
+    """Dotted names of the plain numbers in a dataclass, with unit and range."""
+    found: dict[str, Quantity] = {}
+    for name, hint in _hints(kind).items():
+        mark = _marker(hint)
+        if dataclasses.is_dataclass(hint):
+            found |= quantities(cast(type, hint), f"{prefix}{name}.")
+        elif isinstance(mark, Quantity) and not mark.size and get_origin(hint) is Annotated:
+            found[f"{prefix}{name}"] = mark
+    return found
+
+
 def schema(kind: Any, title: str = "") -> dict[str, Any]:
     """JSON schema (2020-12) of the files that `structure` loads as `kind`."""
     content: dict[str, Any] = _adapter(kind).json_schema()
@@ -296,60 +320,73 @@ def schema(kind: Any, title: str = "") -> dict[str, Any]:
 def _adapter(kind: Any) -> Any:
     from pydantic import TypeAdapter, with_config
 
-    if dataclasses.is_dataclass(kind) or is_typeddict(kind):
-        with_config({"extra": "forbid"})(kind)  # holds for the dataclasses and dictionaries inside, too
+    if dataclasses.is_dataclass(kind):
+        with_config({"extra": "forbid"})(kind)  # holds for the dataclasses inside, too
     return TypeAdapter(kind)
+
+
+def _gaps(hint: Any, raw: Any, complete: bool, place: tuple[Any, ...] = ()) -> Iterator[dict[str, Any]]:
+    """Errors, as pydantic has them, of keys without a value and, with `complete`, of absent ones."""
+    for name, kind in _hints(_bare(hint)).items() if isinstance(raw, dict) else ():
+        if name not in raw:
+            if complete:
+                yield {"type": "missing", "loc": (*place, name)}
+        elif raw[name] is None and get_origin(kind) in (Union, UnionType):
+            yield {"type": "empty", "loc": (*place, name)}
+        else:
+            yield from _gaps(kind, raw[name], complete, (*place, name))
 
 
 def _errors(found: Sequence[Any], kind: Any, file: Path | str, key: str) -> list[ConfigError]:
     """One error for each of pydantic's; a missing key that was only misspelt is left out."""
-    unknown, others, misspelt = [], [], set()
-    for error in found:
-        if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
-            *parent, name = error["loc"]
-            refused, meant = _unknown_key(str(name), _names(_at(kind, parent)))
-            misspelt.add((*parent, meant))
-            unknown.append(refused.at(_dotted(error["loc"], key), file))
-    for error in found:
-        if error["type"] in ("unexpected_keyword_argument", "extra_forbidden"):
+    errors, done = [], set()
+    for error in sorted(found, key=lambda e: e["type"] != _UNKNOWN):
+        place = tuple(error["loc"])
+        if place in done:
             continue
-        if error["type"] == "missing" and tuple(error["loc"]) in misspelt:
-            continue
-        others.append(_told(error, kind, file, _dotted(error["loc"], key)))
-    return (unknown + others)[:MAX_ERRORS]
+        done.add(place)
+        if error["type"] == _UNKNOWN:
+            *parent, name = place
+            rejected, meant = _unknown_key(str(name), _hints(_bare(_at(kind, parent))))
+            done.add((*parent, meant))
+            errors.append(rejected.at(_dotted(place, key), file))
+        else:
+            errors.append(_one_error(error, kind, file, _dotted(place, key)))
+    return errors
 
 
-def _told(error: Any, kind: Any, file: Path | str, key: str) -> ConfigError:
+def _one_error(error: Any, kind: Any, file: Path | str, key: str) -> ConfigError:
     cause = error.get("ctx", {}).get("error")
     if isinstance(cause, RejectedError):
         return cause.at(key, file)
     if cause is not None:  # of a dataclass's own check
         return ConfigError(str(cause), file=file, channel=key or None)
     hint = _at(kind, error["loc"])
+    if error["type"] == "empty":
+        return ConfigError(f"'{key}' has no value", file=file, remedy="give one, or leave the key out")
     if error["type"] == "missing":
         what = _marker(hint)
         remedy = f"add it: {what.hint()}" if what is not None and what.hint() else "add it"
         return ConfigError(f"'{key}' is missing", file=file, remedy=remedy)
     value = shown(error["input"])
     if error["type"] in ("dataclass_type", "dict_type"):
-        names = _names(hint)
+        names = _hints(_bare(hint))
         remedy = f"give keys from {', '.join(names)}" if names else "give a mapping"
         return ConfigError(f"'{value}' is not a section", file=file, channel=key or None, remedy=remedy)
     remedies = {
-        "string_type": "give a text",
+        "string_type": "give a text, in quotes",
         "tuple_type": "give a list",
-        "literal_error": f"give one of {', '.join(map(str, get_args(_bare(hint))))}",
-        "missing_key": "add it",
     }
     return ConfigError(
         f"'{key}' is '{value}'", file=file, remedy=remedies.get(error["type"], error["msg"].lower())
     )
 
 
-def _unknown_key(name: str, known: Sequence[str]) -> tuple[RejectedError, str]:
+def _unknown_key(name: str, known: Mapping[str, Any]) -> tuple[RejectedError, str]:
     """The error about a key, and the one that may be meant ("" for none)."""
     stem = name.rsplit("_", 1)[0]
-    same = [k for k in known if k.rsplit("_", 1)[0] in (stem, name)]
+    with_unit = [k for k, hint in known.items() if getattr(_marker(hint), "unit", "")]
+    same = [k for k in with_unit if k.rsplit("_", 1)[0] in (stem, name)]
     close = same or difflib.get_close_matches(name, known, n=1)
     remedy = f"known here: {', '.join(known)}"
     if same:
@@ -377,8 +414,10 @@ def _at(hint: Any, place: Iterable[Any]) -> Any:
             hint = marker.kinds[int(str(part).strip("<>"))]
             continue
         kind = _bare(hint)
-        if get_origin(kind) in (dict, tuple):
-            hint = get_args(kind)[get_origin(kind) is dict]
+        if get_origin(kind) is dict:
+            hint = get_args(kind)[1]
+        elif get_origin(kind) is tuple:
+            hint = get_args(kind)[0 if get_args(kind)[-1] is ... else part]
         else:
             hint = _hints(kind).get(part)
     return hint
@@ -389,15 +428,15 @@ def _bare(hint: Any) -> Any:
     origin = get_origin(hint)
     if origin in (Union, UnionType):
         return _bare(next(kind for kind in get_args(hint) if kind is not type(None)))
-    if origin is not None and origin not in (dict, tuple, Literal):
+    if origin is not None and origin not in (dict, tuple):
         return _bare(get_args(hint)[0])
     return hint
 
 
 def _marker(hint: Any) -> Any:
     """What a type is annotated with here, None where it is not."""
-    while get_origin(hint) is not None and get_origin(hint) not in (dict, tuple, Literal):
-        marks = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, (_Parsed, OneOf))]
+    while get_origin(hint) is not None and get_origin(hint) not in (dict, tuple):
+        marks = [m for m in getattr(hint, "__metadata__", ()) if isinstance(m, (Parsed, OneOf))]
         if marks:
             return marks[0]
         hint = next(kind for kind in get_args(hint) if kind is not type(None))
@@ -406,10 +445,6 @@ def _marker(hint: Any) -> Any:
 
 def _hints(kind: Any) -> dict[str, Any]:
     """Keys of a section and their types; none for a type that is no section."""
-    if dataclasses.is_dataclass(kind) or is_typeddict(kind):
+    if dataclasses.is_dataclass(kind):
         return get_type_hints(kind, include_extras=True)
     return {}
-
-
-def _names(hint: Any) -> list[str]:
-    return list(_hints(_bare(hint)))

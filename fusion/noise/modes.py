@@ -6,10 +6,9 @@ import dataclasses
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
-from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.config import Quantity, Word, quantities, read_yaml, structure
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 
 SCHEMA = "terrafusion.modes/1"
@@ -88,8 +87,16 @@ SECTIONS: dict[str, type] = {
 
 def bounds(section: type, name: str) -> tuple[float, float]:
     """Least and largest allowed value of a number of a section."""
-    quantity: Quantity = get_type_hints(section, include_extras=True)[name].__metadata__[0]
+    quantity = quantities(section)[name]
     return quantity.low, quantity.high
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModesFile(ModeTuning):
+    """Keys of a tuning file; all of them, and all of each section, are needed."""
+
+    schema: Annotated[str, Word((SCHEMA,))]
+    made_by: str
 
 
 def load_modes(path: Path | None = None) -> ModeTuning:
@@ -100,38 +107,9 @@ def load_modes(path: Path | None = None) -> ModeTuning:
     """
     if path is None:
         with resources.as_file(resources.files("terrafusion.fusion.noise") / "modes.yaml") as shipped:
-            return _parse(read_yaml(shipped), shipped)
-    return _parse(read_yaml(path), path)
-
-
-def _parse(content: dict, file: Path) -> ModeTuning:
-    allowed = {"schema", "made_by", "inputs_sha256", *SECTIONS}
-    wrong = sorted(allowed.symmetric_difference(content))
-    if wrong:
-        what = "missing" if wrong[0] in allowed else "unknown"
-        raise ConfigError(
-            f"{what} key '{wrong[0]}'", file=file, remedy=f"needed: {', '.join(sorted(allowed))}"
-        )
-    if content["schema"] != SCHEMA:
-        raise ConfigError(
-            f"schema is '{content['schema']}'", file=file, remedy=f"this version reads {SCHEMA}"
-        )
-    sections: dict[str, Any] = {
-        name: _section(cls, content[name], file, name) for name, cls in SECTIONS.items()
-    }
-    return ModeTuning(**sections, inputs_sha256=str(content["inputs_sha256"]))
-
-
-def _section(cls: type, raw: object, file: Path, key: str) -> object:
-    hints = get_type_hints(cls, include_extras=True)
-    if not isinstance(raw, dict) or set(raw) != set(hints):
-        raise ConfigError(f"'{key}' must have exactly the keys {', '.join(hints)}", file=file)
-    return cls(
-        **{
-            name: checked_number(raw[name], hint.__metadata__[0], file=file, key=f"{key}.{name}")
-            for name, hint in hints.items()
-        }
-    )
+            return load_modes(shipped)
+    content = structure(ModesFile, read_yaml(path), file=path, complete=True)
+    return ModeTuning(**{f.name: getattr(content, f.name) for f in dataclasses.fields(ModeTuning)})
 
 
 def write_modes(tuning: ModeTuning, path: Path, made_by: str) -> None:

@@ -13,12 +13,12 @@ import functools
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, get_type_hints
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml
+from terrafusion.datasets.core.config import Quantity, Word, quantities, read_yaml, structure
 from terrafusion.datasets.core.errors import ConfigError
 
 SCHEMA = "terrafusion.policy/2"
@@ -68,8 +68,7 @@ _AVERAGED = np.array(
     [name in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean") for name in _FIELDS]
 )
 """Columns that blend as means; the others are standard deviations (or factors on them)."""
-_HINTS = get_type_hints(SensorNoise, include_extras=True)
-_RANGES: dict[str, Quantity] = {name: _HINTS[name].__metadata__[0] for name in _FIELDS}
+_RANGES = quantities(SensorNoise)
 
 
 def within_ranges(noise: SensorNoise) -> SensorNoise:
@@ -118,6 +117,17 @@ class Policy:
         return SensorNoise(*np.where(_AVERAGED, mean, np.sqrt(variance)).tolist())
 
 
+@dataclass(frozen=True)
+class PolicyFile:
+    """Keys of a policy file."""
+
+    schema: Annotated[str, Word((SCHEMA,))]
+    classes: dict[str, SensorNoise]
+    fixed: SensorNoise
+    inputs_sha256: str = ""
+    made_by: str = ""
+
+
 def load_policy(path: Path | None = None) -> Policy:
     """The policy file `path`, or the one shipped with the library.
 
@@ -126,34 +136,8 @@ def load_policy(path: Path | None = None) -> Policy:
     """
     if path is None:
         with resources.as_file(resources.files("terrafusion.fusion.noise") / "policy.yaml") as shipped:
-            return _parse(read_yaml(shipped), shipped)
-    return _parse(read_yaml(path), path)
-
-
-def _parse(content: dict, file: Path) -> Policy:
-    allowed = {"schema", "inputs_sha256", "made_by", "classes", "fixed"}
-    for key in content:
-        if key not in allowed:
-            raise ConfigError(
-                f"unknown key '{key}'", file=file, remedy=f"known: {', '.join(sorted(allowed))}"
-            )
-    if content.get("schema") != SCHEMA:
-        raise ConfigError(
-            f"schema is '{content.get('schema')}'", file=file, remedy=f"this version reads {SCHEMA}"
-        )
-    classes = content.get("classes")
-    if not isinstance(classes, dict) or "unknown" not in classes:
-        raise ConfigError("'classes' must map class names to rows and hold 'unknown'", file=file)
-    rows = {name: _row(row, file, f"classes.{name}") for name, row in classes.items()}
-    fixed = _row(content.get("fixed"), file, "fixed")
-    return Policy(rows, fixed, str(content.get("inputs_sha256", "")), name=file.name)
-
-
-def _row(raw: object, file: Path, key: str) -> SensorNoise:
-    if not isinstance(raw, dict) or set(raw) != set(_FIELDS):
-        raise ConfigError(f"'{key}' must have exactly the keys {', '.join(_FIELDS)}", file=file)
-    values = {
-        name: checked_number(raw[name], quantity, file=file, key=f"{key}.{name}")
-        for name, quantity in _RANGES.items()
-    }
-    return SensorNoise(**values)  # type: ignore[arg-type]
+            return load_policy(shipped)
+    content = structure(PolicyFile, read_yaml(path), file=path)
+    if "unknown" not in content.classes:
+        raise ConfigError("'classes' has no 'unknown'", file=path, remedy="add the noise of unknown ground")
+    return Policy(content.classes, content.fixed, content.inputs_sha256, name=path.name)

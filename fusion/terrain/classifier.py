@@ -12,16 +12,16 @@ training (Guo et al. 2017), as neighbouring windows repeat one another.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.config import Quantity, Word, read_yaml, refuse, structure
 from terrafusion.fusion.terrain.features import FEATURES, SLIP
 
 Array = NDArray[np.float64]
@@ -39,11 +39,6 @@ SLIP_TEMPERATURE = 20.0
 """Windows that are one observation where slip alone is judged: its estimate stays as it is for about 10 s
 (`slip_time_s` of the policy's fixed row, and receivers wander as slowly), windows come twice a second."""
 _BROAD_SHARE = 0.1
-
-_KEYS = (
-    "schema", "made_by", "inputs_sha256", "vehicles", "features", "temperature", "patch_length_m", "classes",
-    "unknown", "scores",
-)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,79 +163,80 @@ class LikelihoodTable:
         return np.asarray((top + np.log(sums)) / self._temperature)
 
 
+_FEATURE_VALUES = Quantity("", size=len(FEATURES))
+
+
+@dataclass(frozen=True)
+class ComponentFile:
+    """One Gaussian of a density."""
+
+    weight: Annotated[float, Quantity("", 1e-300, 1e300)]
+    mean: Annotated[tuple[float, ...], _FEATURE_VALUES]
+    covariance: tuple[Annotated[tuple[float, ...], _FEATURE_VALUES], ...]
+
+
+@dataclass(frozen=True)
+class TerrainModelFile:
+    """Keys of a terrain model file."""
+
+    schema: Annotated[str, Word((SCHEMA,))]
+    made_by: str
+    inputs_sha256: str
+    vehicles: tuple[str, ...]
+    features: tuple[str, ...]
+    temperature: Annotated[float, Quantity("", 1.0, 1e3)]
+    patch_length_m: Annotated[float, Quantity("m", 0.1, 1e5)]
+    classes: dict[str, tuple[ComponentFile, ...]]
+    unknown: tuple[ComponentFile, ...]
+    scores: dict[str, Any]
+
+
 def load_terrain_model(path: Path | None = None) -> TerrainModel:
     """The model file `path`, or the one shipped with the library.
 
     Raises:
-        ConfigError: unknown or missing key, wrong shape, a covariance that is none.
+        ConfigError: unknown or missing key, wrong shape, a matrix that is no covariance.
     """
     if path is None:
         with resources.as_file(resources.files("terrafusion.fusion.terrain") / "model.yaml") as shipped:
-            return _parse(read_yaml(shipped), shipped)
-    return _parse(read_yaml(path), path)
-
-
-def _parse(content: dict[str, Any], file: Path) -> TerrainModel:
-    again = "make it again with 'terrafusion terrain train'"
-    if content.get("schema") != SCHEMA:
-        raise ConfigError(
-            f"schema is '{content.get('schema')}'", file=file, remedy=f"this version reads {SCHEMA}"
-        )
-    for key in content:
-        if key not in _KEYS:
-            raise ConfigError(f"unknown key '{key}'", file=file, remedy=f"known: {', '.join(_KEYS)}")
-    for key in _KEYS:
-        if key not in content:
-            raise ConfigError(f"'{key}' is missing", file=file, remedy=again)
-    if content["features"] != list(FEATURES):
-        raise ConfigError(
-            "'features' differ from what this version computes",
-            file=file,
-            remedy=f"{again}; it must read [{', '.join(FEATURES)}]",
-        )
-    classes = content["classes"]
-    if not isinstance(classes, dict) or not classes or UNKNOWN in classes:
-        raise ConfigError("'classes' must map class names to mixtures, without 'unknown'", file=file)
-    vehicles = content["vehicles"]
-    if not isinstance(vehicles, list) or not isinstance(content["scores"], dict):
-        raise ConfigError("'vehicles' must be a list and 'scores' a mapping", file=file, remedy=again)
+            return load_terrain_model(shipped)
+    content = structure(TerrainModelFile, read_yaml(path), file=path)
+    refuse(_problems(content), path)
     return TerrainModel(
-        classes={name: _mixture(raw, file, f"classes.{name}") for name, raw in classes.items()},
-        unknown=_mixture(content["unknown"], file, UNKNOWN),
-        temperature=_number(content["temperature"], Quantity("", 1.0, 1e3), file, "temperature"),
-        patch_length_m=_number(content["patch_length_m"], Quantity("m", 0.1, 1e5), file, "patch_length_m"),
-        vehicles=tuple(str(name) for name in vehicles),
-        inputs_sha256=str(content["inputs_sha256"]),
-        made_by=str(content["made_by"]),
-        scores=content["scores"],
+        classes={name: _mixture(parts) for name, parts in content.classes.items()},
+        unknown=_mixture(content.unknown),
+        temperature=content.temperature,
+        patch_length_m=content.patch_length_m,
+        vehicles=content.vehicles,
+        inputs_sha256=content.inputs_sha256,
+        made_by=content.made_by,
+        scores=content.scores,
     )
 
 
-def _number(raw: Any, quantity: Quantity, file: Path, key: str) -> float:
-    value = checked_number(raw, quantity, file=file, key=key)
-    assert isinstance(value, float)
-    return value
+def _problems(content: TerrainModelFile) -> Iterator[tuple[str, str]]:
+    again = "make it again with 'terrafusion terrain train'"
+    if content.features != FEATURES:
+        yield (
+            "'features' differ from what this version computes",
+            f"{again}; it reads [{', '.join(FEATURES)}]",
+        )
+    if not content.classes or UNKNOWN in content.classes:
+        yield "'classes' must map class names to mixtures, without 'unknown'", again
+    densities = {f"classes.{name}": parts for name, parts in content.classes.items()}
+    for key, parts in (densities | {UNKNOWN: content.unknown}).items():
+        if not parts:
+            yield f"'{key}' is empty", f"give a list of weight, mean and covariance, or {again}"
+        for i, part in enumerate(parts):
+            matrix = np.array(part.covariance)
+            square = len(part.covariance) == len(FEATURES) and np.allclose(matrix, matrix.T)
+            if not square or not (np.linalg.eigvalsh(matrix) > 0.0).all():
+                yield f"'{key}[{i}].covariance' is not symmetric and positive definite", again
 
 
-def _mixture(raw: Any, file: Path, key: str) -> Mixture:
-    """Densities from a list of {weight, mean, covariance}."""
-    d = len(FEATURES)
-    if not isinstance(raw, list) or not raw:
-        raise ConfigError(f"'{key}' must be a list of weight, mean and covariance", file=file)
-    for part in raw:
-        if not isinstance(part, dict) or set(part) != {"weight", "mean", "covariance"}:
-            raise ConfigError(f"'{key}' must have exactly the keys weight, mean, covariance", file=file)
-    try:
-        weight = np.array([part["weight"] for part in raw], dtype=float)
-        mean = np.array([part["mean"] for part in raw], dtype=float)
-        covariance = np.array([part["covariance"] for part in raw], dtype=float)
-    except (TypeError, ValueError):
-        raise ConfigError(f"'{key}' holds something that is no number", file=file) from None
-    if mean.shape != (len(raw), d) or covariance.shape != (len(raw), d, d):
-        raise ConfigError(f"'{key}' needs {d} means and a {d} x {d} covariance", file=file)
-    definite = np.isfinite(covariance).all() and (np.linalg.eigvalsh(covariance) > 0.0).all()
-    if not definite or not np.allclose(covariance, np.swapaxes(covariance, 1, 2)):
-        raise ConfigError(f"'{key}.covariance' is not symmetric and positive definite", file=file)
-    if not np.isfinite(mean).all() or not (weight > 0.0).all() or not np.isfinite(weight).all():
-        raise ConfigError(f"'{key}' needs finite means and positive weights", file=file)
-    return Mixture(np.log(weight), mean, covariance)
+def _mixture(parts: tuple[ComponentFile, ...]) -> Mixture:
+    return Mixture(
+        np.log([part.weight for part in parts]),
+        np.array([part.mean for part in parts]),
+        np.array([part.covariance for part in parts]),
+    )

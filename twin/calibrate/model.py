@@ -11,12 +11,12 @@ import dataclasses
 import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Any, get_args, get_origin, get_type_hints
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import Quantity
+from terrafusion.datasets.core.config import Quantity, quantities
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.effects.catalogue import parameters
 from terrafusion.twin.model.soil import SoilParams
@@ -108,20 +108,6 @@ def _replaced(parent: Any, path: list[str], value: float) -> Any:
     if len(path) > 1:
         value = _replaced(getattr(parent, path[0]), path[1:], value)
     return dataclasses.replace(parent, **{path[0]: value})
-
-
-def quantities(cls: type, prefix: str = "") -> dict[str, Quantity]:
-    """Dotted names of the numbers in a dataclass, with unit and range."""
-    found: dict[str, Quantity] = {}
-    for name, hint in get_type_hints(cls, include_extras=True).items():
-        here = f"{prefix}{name}"
-        if dataclasses.is_dataclass(hint):
-            found |= quantities(hint, f"{here}.")  # type: ignore[arg-type]
-        elif get_origin(hint) is Annotated:
-            quantity = next((q for q in get_args(hint)[1:] if isinstance(q, Quantity)), None)
-            if quantity is not None and not quantity.size:
-                found[here] = quantity
-    return found
 
 
 def resolve(names: tuple[str, ...], model: Model) -> dict[str, Quantity]:

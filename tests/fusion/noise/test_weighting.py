@@ -140,7 +140,7 @@ def rows_with(**changes: object) -> dict[str, object]:
         ({"colour": "red"}, "unknown key 'colour'"),
         ({"classes": {"mud": rows_with()}}, "'unknown'"),
         ({"classes": None}, "'classes'"),
-        ({"fixed": None}, "'fixed' must have exactly the keys"),
+        ({"fixed": None}, "'fixed' is missing"),
         ({"fixed": rows_with(slip_sigma=None)}, "slip_sigma"),
         ({"fixed": rows_with(slip_sigma=-0.1)}, "fixed.slip_sigma"),
         ({"fixed": rows_with(gyro_inflation=0.5)}, "fixed.gyro_inflation"),
