@@ -6,16 +6,15 @@ import dataclasses
 import difflib
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from terrafusion.datasets.core.config import Quantity, checked_number, read_yaml, shown, structure
+from terrafusion.datasets.core.config import Prepared, Quantity, Word, read_yaml, refuse, shown, structure
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
-from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.sensors import axes_matrix
-from terrafusion.datasets.readers import log_meta
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,
     COVARIANCE,
@@ -28,7 +27,7 @@ from terrafusion.datasets.readers.channel_tables import (
     TRUTH_TWIST,
     WHEEL_LAYOUTS,
 )
-from terrafusion.datasets.readers.log_meta import Meta, parse_meta
+from terrafusion.datasets.readers.log_meta import DescriptionFile, Meta, parse_meta
 from terrafusion.datasets.readers.text.units import units_of
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
@@ -54,8 +53,16 @@ FIX_CODES = ("", "nmea", "rtklib", "navsatfix")
 
 TIME_UNITS = (*NS_PER, "iso8601")
 EPOCHS = ("unix", "gps", "none")
-META_KEYS = tuple(key for key in log_meta.KEYS if key not in ("start_ns", *log_meta.HISTORY_KEYS))
 ROWS = Quantity("rows", 1.0, 1e4)
+
+
+def _section(raw: Any) -> Any:
+    """A plain name of a column as a section."""
+    if isinstance(raw, (str, int)) and not isinstance(raw, bool):
+        return {"column": str(raw)}
+    if isinstance(raw, dict) and type(raw.get("column")) is int:
+        return raw | {"column": str(raw["column"])}
+    return raw
 
 
 @dataclass(frozen=True)
@@ -64,7 +71,7 @@ class ColumnOf:
 
     column: str
     unit: str = ""
-    sign: str = "+"
+    sign: Annotated[str, Word(("+", "-"))] = "+"
 
 
 @dataclass(frozen=True)
@@ -75,19 +82,37 @@ class TimeOf:
     """
 
     column: str
-    unit: str = "s"
+    unit: Annotated[str, Word(TIME_UNITS)] = "s"
     epoch: str = "unix"
 
 
+@dataclass(frozen=True, kw_only=True)
+class ColumnMapFile(DescriptionFile):
+    """Keys of a column map; see `ColumnMap`."""
+
+    time: Annotated[TimeOf, Prepared(_section)]
+    channels: dict[str, dict[str, Annotated[ColumnOf, Prepared(_section)]]]
+    separator: str = ""
+    header: Annotated[str, Word(("line", "none"))] = "line"
+    imu_axes: tuple[str, ...] = BODY_AXES
+    held: dict[str, Annotated[float, ROWS]] = field(default_factory=dict)
+
+
+KEYS = tuple(f.name for f in dataclasses.fields(ColumnMapFile))
+META_KEYS = tuple(f.name for f in dataclasses.fields(DescriptionFile))
+
+
 @dataclass(frozen=True)
-class Layout:
-    """How a table stands.
+class ColumnMap:
+    """What a table's columns are.
 
     Attributes:
         time, channels: where times and fields stand, by channel and field.
         separator: of the text; "" for tab, semicolon, comma or blanks, as the header shows.
         header: "none" where the first line is a row: columns are then named 1, 2, ...
         imu_axes: IMU axes that point along body x, y, z.
+        held: rows for which a channel holds a value.
+        meta: what a log folder's meta.yaml may say.
     """
 
     time: TimeOf
@@ -95,21 +120,6 @@ class Layout:
     separator: str = ""
     header: str = "line"
     imu_axes: tuple[str, ...] = BODY_AXES
-
-
-LAYOUT_KEYS = tuple(f.name for f in dataclasses.fields(Layout))
-KEYS = (*LAYOUT_KEYS, "held", *META_KEYS)
-
-
-@dataclass(frozen=True)
-class ColumnMap(Layout):
-    """What a table's columns are.
-
-    Attributes:
-        held: rows for which a channel holds a value.
-        meta: what a log folder's meta.yaml may say.
-    """
-
     held: dict[str, float] = field(default_factory=dict)
     meta: Meta = field(default_factory=lambda: Meta(0))
 
@@ -130,31 +140,11 @@ def read_column_map(path: Path) -> ColumnMap:
         ConfigError: unknown key, channel, field, unit or sign, a value of the wrong type.
     """
     raw = {key: value for key, value in read_yaml(path).items() if value is not None}
-    strange = next((key for key in raw if key not in KEYS), None)
-    if strange is not None:
-        close = difflib.get_close_matches(strange, KEYS, n=1)
-        remedy = f"did you mean '{close[0]}'?" if close else f"known are {', '.join(KEYS)}"
-        raise ConfigError(f"unknown key '{shown(strange)}'", file=path, remedy=remedy)
-    sections = {key: raw[key] for key in LAYOUT_KEYS if key in raw}
-    for key, levels in (("time", 0), ("channels", 2)):
-        if key in sections:
-            sections[key] = _columns_as_sections(sections[key], levels)
-    layout = structure(Layout, sections, file=path)
-    _check_time(path, layout.time)
-    _check_channels(path, layout.channels)
-    if layout.header not in ("line", "none"):
-        raise ConfigError(f"'header' is '{shown(layout.header)}'", file=path, remedy="give line or none")
-    if len(layout.separator) > 1:
-        raise ConfigError(
-            f"'separator' is '{shown(layout.separator)}'", file=path, remedy="give one character"
-        )
-    try:
-        axes_matrix(layout.imu_axes)
-    except ValueError as error:
-        raise ConfigError(str(error), file=path, channel="imu_axes") from None
+    found = structure(ColumnMapFile, raw, file=path)
+    refuse(_problems(found), path)
     meta = parse_meta({key: raw[key] for key in META_KEYS if key in raw} | {"start_ns": 0}, path)
-    told = {key: getattr(layout, key) for key in LAYOUT_KEYS}
-    return ColumnMap(**told, held=_held(path, raw.get("held", {})), meta=meta)
+    layout = {f.name: getattr(found, f.name) for f in dataclasses.fields(ColumnMap) if f.name != "meta"}
+    return ColumnMap(**layout, meta=meta)
 
 
 def contract_map(names: list[str]) -> ColumnMap | None:
@@ -217,73 +207,55 @@ GUESSES: tuple[tuple[str, tuple[str, str]], ...] = (
 """Names of columns that people often use, and the field they may stand for."""
 
 
-def _columns_as_sections(raw: Any, levels: int) -> Any:
-    """The same mapping with plain column names as sections, `levels` deep."""
-    if levels and isinstance(raw, dict):
-        return {key: _columns_as_sections(value, levels - 1) for key, value in raw.items()}
-    if isinstance(raw, (str, int)) and not isinstance(raw, bool):
-        return {"column": str(raw)}
-    if isinstance(raw, dict) and isinstance(raw.get("column"), int):
-        return raw | {"column": str(raw["column"])}
-    return raw
-
-
-def _held(path: Path, raw: Any) -> dict[str, float]:
-    if not isinstance(raw, dict) or not set(raw) <= set(FIELDS):
-        raise ConfigError(
-            f"'held' is '{shown(raw)}'", file=path, remedy=f"give rows by channel: {', '.join(FIELDS)}"
-        )
-    rows = {key: checked_number(value, ROWS, file=path, key=f"held.{key}") for key, value in raw.items()}
-    return {key: value for key, value in rows.items() if isinstance(value, float)}
-
-
-def _check_time(path: Path, time: TimeOf) -> None:
-    if time.unit not in TIME_UNITS:
-        raise ConfigError(
-            f"'time.unit' is '{shown(time.unit)}'", file=path, remedy=f"give one of {', '.join(TIME_UNITS)}"
-        )
-    if time.epoch in EPOCHS:
-        return
+def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
+    """What is wrong beyond single values, and the remedy."""
+    if found.time.epoch not in EPOCHS and not _is_instant(found.time.epoch):
+        instant = "an instant such as 2024-05-01T12:00:00Z, in quotes"
+        yield f"'time.epoch' is '{shown(found.time.epoch)}'", f"give {', '.join(EPOCHS)} or {instant}"
+    if len(found.separator) > 1:
+        yield f"'separator' is '{shown(found.separator)}'", "give one character"
     try:
-        dates_to_ns([time.epoch])
-    except NotADecimal:
-        raise ConfigError(
-            f"'time.epoch' is '{shown(time.epoch)}'",
-            file=path,
-            remedy=f"give {', '.join(EPOCHS)} or an instant such as 2024-05-01T12:00:00Z, in quotes",
-        ) from None
-
-
-def _check_channels(path: Path, channels: dict[str, dict[str, ColumnOf]]) -> None:
-    if not any(channels.values()):
-        raise ConfigError("'channels' is empty", file=path, remedy=f"give {', '.join(FIELDS)}")
-    for channel, fields in channels.items():
+        axes_matrix(found.imu_axes)
+    except ValueError as error:
+        what, _, remedy = str(error).partition("; ")
+        yield f"'imu_axes': {what}", remedy
+    strange = [channel for channel in found.held if channel not in FIELDS]
+    if strange:
+        yield f"'held' names the unknown channel '{shown(strange[0])}'", f"known are {', '.join(FIELDS)}"
+    if not any(found.channels.values()):
+        yield "'channels' is empty", f"give {', '.join(FIELDS)}"
+    for channel, fields in found.channels.items():
         if channel not in FIELDS:
-            raise ConfigError(
-                f"unknown channel '{shown(channel)}'", file=path, remedy=f"known are {', '.join(FIELDS)}"
-            )
+            yield f"unknown channel '{shown(channel)}'", f"known are {', '.join(FIELDS)}"
+            continue
         for name, of in fields.items():
-            _check_field(path, channel, name, of)
+            yield from _field_problems(channel, name, of)
         if channel == "gnss" and bool({"east_m", "north_m"} & set(fields)) == ("latitude_deg" in fields):
-            raise ConfigError(
-                "'gnss' must have either latitude_deg and longitude_deg or east_m and north_m", file=path
+            yield (
+                "'gnss' has no position, or two",
+                "give either latitude_deg and longitude_deg or east_m and north_m",
             )
 
 
-def _check_field(path: Path, channel: str, name: str, of: ColumnOf) -> None:
+def _field_problems(channel: str, name: str, of: ColumnOf) -> Iterator[tuple[str, str]]:
     here = f"channels.{channel}.{name}"
     if name not in FIELDS[channel] and not (channel == "terrain" and name.startswith("p_")):
         close = difflib.get_close_matches(name, FIELDS[channel], n=1)
-        known = ", ".join(FIELDS[channel][:24])
-        remedy = f"did you mean '{close[0]}'?" if close else f"known are {known}"
-        raise ConfigError(f"unknown field '{shown(here)}'", file=path, remedy=remedy)
+        known = f"known are {', '.join(FIELDS[channel][:24])}"
+        yield f"unknown field '{shown(here)}'", f"did you mean '{close[0]}'?" if close else known
+        return
     units = FIX_CODES if name == "fix" else ("",) if name == "label" else ("", *units_of(name))
     if of.unit not in units:
         allowed = ", ".join(unit for unit in units if unit)
-        raise ConfigError(
-            f"'{here}' is in the unit '{shown(of.unit)}'",
-            file=path,
-            remedy=f"give one of {allowed}" if allowed else "leave the unit out",
-        )
-    if of.sign not in ("+", "-") or (name in TEXT_FIELDS and of.sign != "+"):
-        raise ConfigError(f"'{here}' has the sign '{shown(of.sign)}'", file=path, remedy="give '+' or '-'")
+        remedy = f"give one of {allowed}" if allowed else "leave the unit out"
+        yield f"'{here}' is in the unit '{shown(of.unit)}'", remedy
+    if name in TEXT_FIELDS and of.sign != "+":
+        yield f"'{here}' has the sign '-', but is a text", "leave the sign out"
+
+
+def _is_instant(text: str) -> bool:
+    try:
+        dates_to_ns([text])
+    except NotADecimal:
+        return False
+    return True
