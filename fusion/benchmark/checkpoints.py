@@ -1,6 +1,6 @@
-"""Results of a long run, kept piece by piece: a run that was stopped goes on with the same command.
+"""Checkpoints of a long computation: an interrupted one continues with the same command.
 
-parts/<key>.json     what one piece gave, with the hash of the sources and the state of the files that made it
+parts/<key>.json     result of one part, with the hash of the sources and the state of the files it depends on
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from terrafusion.datasets.readers import files_of
 
 FOLDER = "parts"
 LIBRARIES = ("casadi", "gtsam", "numpy", "scipy")
-"""Their versions make the numbers, too."""
+"""Libraries whose version the results depend on."""
 
 
 def write_part(out: Path, key: str, content: dict[str, Any], state: str = "") -> dict[str, Any]:
-    """Keep what the piece `key`, the name of its file, gave; returns it as `read_part` does.
+    """Store the result of the part `key`, the name of its file; returns it as `read_part` does.
 
     Args:
-        state: of the files that it was made of, such as `log_state`.
+        state: of the files that it depends on, such as `log_state`.
 
     Raises:
         TerrafusionError: the folder cannot be written.
@@ -39,7 +39,7 @@ def write_part(out: Path, key: str, content: dict[str, Any], state: str = "") ->
 
 
 def read_part(out: Path, key: str, state: str = "") -> dict[str, Any] | None:
-    """What the piece `key` gave, None where it is missing, cut short, or of other sources or files."""
+    """Result of the part `key`; None if it is missing, incomplete, or of other sources or files."""
     try:
         part: dict[str, Any] = json.loads(_file(out, key).read_text(encoding="utf-8"))
         fresh = (part["sources_sha256"], part["state"]) == (sources_sha256(), state)
@@ -49,10 +49,9 @@ def read_part(out: Path, key: str, state: str = "") -> dict[str, Any] | None:
 
 
 def log_state(log: str) -> str:
-    """Hash of names, sizes and times of the files of a log.
+    """Hash of names, sizes and times of the files of a log; "" if there is no such log.
 
-    Empty for a log of the catalogue: it is only read with the bytes that the catalogue, one of the sources,
-    tells. Empty as well where there is no such log.
+    "" for a log of the catalogue, too: the catalogue, one of the sources, fixes its bytes.
     """
     if log in load_catalog().recordings():
         return ""
@@ -60,18 +59,18 @@ def log_state(log: str) -> str:
         states = [(file.name, file.stat()) for file in files_of(log)]
     except (OSError, TerrafusionError):
         return ""
-    text = "".join(f"{name}\0{found.st_size}\0{found.st_mtime_ns}\0" for name, found in states)
+    text = "".join(f"{name}\0{stat.st_size}\0{stat.st_mtime_ns}\0" for name, stat in states)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
 @functools.cache
 def sources_sha256() -> str:
-    """`hash_sources` as it was when this process first asked: pieces of two versions are not mixed."""
+    """`hash_sources` at the first call of this process: parts of two versions are never mixed."""
     return hash_sources()
 
 
 def hash_sources() -> str:
-    """Hash of everything that makes the numbers: this library and the `LIBRARIES` it computes with."""
+    """Hash of everything that results depend on: this library and the versions of `LIBRARIES`."""
     digest = hashlib.sha256()
     for name in LIBRARIES:
         digest.update(f"{name} {metadata.version(name)}\0".encode())

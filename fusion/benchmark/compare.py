@@ -1,13 +1,11 @@
-"""Paired comparison of the arms: medians over drives, intervals by the bootstrap, wins and losses.
+"""Paired comparison of methods: median error ratios with intervals, wins and losses.
 
-Two arms are compared on the same drives. The ratio of their errors is taken drive by drive; its median over
-the independent units (seeds, or field logs, whose several outages make one number by their own median) is the
-result. Its interval is the sign test's, between two of the ordered ratios (Thompson 1936, Ann. Math. Statist.
-7(3)): it holds for any distribution and any number of units from `LEAST_UNITS` on; fewer have none. That of a
-share of two gains is the percentile bootstrap's over units (Efron 1979, Ann. Statist. 7(1)), both arms
-resampled together, so that the gains keep their pairing.
+The errors of two methods are divided run by run; the result is the median ratio over independent units (seeds;
+for a field log the median over its outages). Its interval is that of the sign test, between two ordered ratios
+(Thompson 1936, Ann. Math. Statist. 7(3)): distribution-free, from `LEAST_UNITS` units on. The interval of a
+share of two gains is the percentile bootstrap's over units, both methods resampled together.
 
-A replay that failed has an infinite error, so that it loses. Where the base failed nothing is compared.
+A failed replay has an infinite error. Runs on which the base failed are left out.
 """
 
 from __future__ import annotations
@@ -19,6 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, ORACLE
 from terrafusion.fusion.benchmark.run_score import RunScore
 
@@ -29,22 +28,23 @@ RESAMPLES = 4000
 SEED = 0
 CONFIDENCE = 0.95
 LEAST_UNITS = 6
-"""Fewer have no interval: all five on one side of the median are chance once in 16 times, six in 32."""
+"""Fewer have no 95 % interval: all five fall on one side of the median once in 16 times, all six in 32."""
 LEAST_ERROR_M = 1e-3
-"""Errors below a millimetre count as one: no ratio is made of what the truth itself does not hold."""
+"""Smaller errors count as a millimetre, the accuracy of the truth."""
 EVEN = 0.03
-"""Ratios so close to 1 are neither won nor lost."""
+"""Ratios this close to 1 count as neither won nor lost."""
 
 
 @dataclass(frozen=True)
 class Contrast:
-    """One arm against another in one family on one plant.
+    """One method against another in one family on one plant.
 
     Attributes:
-        units: independent drives (or logs) in which both have an error.
-        error_m, base_m: median errors; infinite where half of the replays failed.
-        ratio, interval: median of the paired ratios, error over base; None for less than `LEAST_UNITS`.
-        wins, losses: units in which the ratio is below or above 1 by more than `EVEN`.
+        arm, base: names of the two methods.
+        units: independent runs (or logs) in which both have an error.
+        error_m, base_m: median errors; infinite if half of the replays failed.
+        ratio, interval: median of the paired ratios, error over base; no interval below `LEAST_UNITS`.
+        wins, losses: units whose ratio is below or above 1 by more than `EVEN`.
     """
 
     family: str
@@ -62,7 +62,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class GainShare:
-    """How much of the oracle's gain over the fixed row the detected ground keeps; None where it has none."""
+    """Share of the oracle's gain over fixed noise that the detected ground reaches; None without such a gain."""
 
     family: str
     plant: str
@@ -71,7 +71,7 @@ class GainShare:
 
 
 def groups_of(rows: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]:
-    """Rows by family and plant, in their order."""
+    """Scores by family and plant, in their order."""
     groups: dict[tuple[str, str], list[RunScore]] = {}
     for row in rows:
         groups.setdefault((row.family, row.plant), []).append(row)
@@ -79,7 +79,7 @@ def groups_of(rows: Sequence[RunScore]) -> dict[tuple[str, str], list[RunScore]]
 
 
 def contrasts(rows: Sequence[RunScore], base: str = BASELINE) -> list[Contrast]:
-    """Every arm against `base`, group by group."""
+    """Every method against `base`, group by group."""
     out = []
     for (family, plant), group in groups_of(rows).items():
         errors = errors_by_unit(group)
@@ -96,7 +96,7 @@ def shares(rows: Sequence[RunScore]) -> list[GainShare]:
 
 
 def errors_by_unit(rows: Sequence[RunScore]) -> dict[str, dict[str, dict[str, float]]]:
-    """arm -> unit -> drive -> error in m, infinite where the replay failed; without one it is left out."""
+    """Method -> unit -> run -> error in m, infinite for a failed replay; runs without error are left out."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for row in rows:
         broken = row.failed or (row.diverged and row.error_m is None)
@@ -108,7 +108,7 @@ def errors_by_unit(rows: Sequence[RunScore]) -> dict[str, dict[str, dict[str, fl
 
 
 def log_ratios(errors: dict[str, dict[str, dict[str, float]]], arm: str, base: str) -> dict[str, float]:
-    """Unit -> logarithm of the ratio: the median over drives of both arms in which base did not fail."""
+    """Unit -> logarithm of the ratio: median over the common runs in which the base did not fail."""
     out = {}
     for unit, own in errors.get(arm, {}).items():
         other = errors.get(base, {}).get(unit, {})
@@ -123,20 +123,18 @@ def log_ratios(errors: dict[str, dict[str, dict[str, float]]], arm: str, base: s
 
 
 def known_median(values: Sequence[float | None]) -> float | None:
-    """Median of the known ones; None where there is none."""
+    """Median of the finite values; None if there is none."""
     known = [v for v in values if v is not None and np.isfinite(v)]
     return float(np.median(known)) if known else None
 
 
 def resampled(values: Array) -> Array:
     """Medians (R, k) of columns of `values` (n, k) over bootstrap samples of its rows."""
-    rng = np.random.default_rng(SEED)
-    rows = rng.integers(len(values), size=(RESAMPLES, len(values)))
-    return np.asarray(np.median(values[rows], axis=1))
+    return np.asarray(np.median(values[resampled_rows(len(values), RESAMPLES, SEED)], axis=1))
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, Interval | None]:
-    """Median of independent values, and its interval where there are `LEAST_UNITS` of them or more."""
+    """Median of independent values, and its interval from `LEAST_UNITS` values on."""
     ordered = sorted(values)
     middle = float(np.median(ordered))
     if len(ordered) < LEAST_UNITS:
@@ -146,7 +144,7 @@ def median_interval(values: Sequence[float]) -> tuple[float, Interval | None]:
 
 
 def _sign_test_rank(n: int) -> int:
-    """How many of n ordered values may be left out at each end of an interval of the median."""
+    """Number of the n ordered values outside the interval of the median, at each end."""
     tail, k = 0.5**n, 0
     while 2.0 * (tail := tail + math.comb(n, k + 1) * 0.5**n) <= 1.0 - CONFIDENCE:
         k += 1
@@ -185,6 +183,6 @@ def _share(errors: dict[str, dict[str, dict[str, float]]]) -> tuple[float | None
     if (gains[:, 1] <= 0.0).mean() > 0.5 * (1.0 - CONFIDENCE):
         return share, None
     samples = gains[:, 0] / np.maximum(gains[:, 1], 1e-9)
-    # A sample, not a mean of two: a gain is minus infinite where half of the replays failed.
+    # A sample, not a mean of two: a gain is minus infinity if half of the replays failed.
     low, high = np.percentile(samples, [2.5, 97.5], method="inverted_cdf")
     return share, (float(low), float(high))

@@ -1,4 +1,4 @@
-"""The field logs as runs: which are at hand, where each loses its fixes, and its true ground if labelled."""
+"""Field logs as runs of the benchmark: which files are present, their outages, reference and true ground."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.replay import choose_vehicle
 
 AID_SEED = 1
-"""Of the noise on fixes that are made from truth."""
+"""Of the noise of fixes simulated from truth."""
 NOT_LABELLED = "not labelled"
 WHOLE, CUT = "raw", "windows"
-"""Of a run that is catalogued whole, the windows cut from it are left out."""
+"""Windows cut from a run that the catalogue also has as a whole are left out."""
 OUTAGES_S = (30.0, 60.0, 120.0)
-LEAST_DRIVE_S = 10.0
-"""Shorter recordings are windows cut from a drive: those that go on from each other are joined."""
-LEAST_JOINED_S = 25.0
-"""Shorter drives joined from windows hold no outage, and little driving after a start."""
-LEAD_ROLLED_M = 5.0
-"""The wheels must have rolled so far before an outage: fixes show no heading of a robot that stands."""
-LEAST_ROLLED_M = 3.0
-"""Outages in which the wheels roll less test nothing and are left out."""
+MIN_RUN_S = 10.0
+"""Shorter recordings are windows cut from a run: consecutive ones are joined."""
+MIN_JOINED_S = 25.0
+"""Shorter joined runs are left out: no outage fits into them."""
+MIN_LEAD_M = 5.0
+"""Wheel path before an outage: fixes do not show the heading of a robot at rest."""
+MIN_OUTAGE_M = 3.0
+"""Outages with a shorter wheel path are left out."""
 SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
 UNFORESEEN = (ArithmeticError, RuntimeError, ValueError)
-"""Errors of readers and solver that stop one replay, counted and not hidden, but not the whole table."""
+"""Unexpected errors of readers and solver: they end one replay, are reported, and do not end the benchmark."""
 Result = TypeVar("Result")
 SET_GROUND = {"husky_parkinglot": "firm"}
-"""Ground of sets whose logs carry no label but whose title names it."""
+"""Ground of sets whose title names it and whose logs have no label."""
 
 
 @dataclass(frozen=True)
@@ -55,34 +55,34 @@ class Refusal:
 
     @property
     def line(self) -> str:
-        """Both, as tables tell it."""
+        """Log and reason, for tables."""
         return f"{self.log}: {self.why}"
 
 
 @dataclass(frozen=True)
 class FieldLog:
-    """A field log, and how many outages of each length it is to have at most."""
+    """A field log and the largest number of outages of each length."""
 
     name: str
     starts: int
 
     @property
     def key(self) -> str:
-        """Its name as that of a file."""
+        """Name of its file."""
         return f"{FIELD}-{self.starts}-{self.name.replace('/', '_').replace('#', '_')}"
 
 
-def logs_at_hand(starts: int) -> list[FieldLog]:
-    """Logs of the catalogue whose files are there."""
+def present_logs(starts: int) -> list[FieldLog]:
+    """Logs of the catalogue whose files are present."""
     return [FieldLog(name, starts) for name in catalogued()]
 
 
-def drives_of(log: FieldLog) -> list[BenchmarkRun | Refusal]:
-    """All drives of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
-    return each_drive(log.name, lambda name, _, recording: _drives(log, name, recording))
+def runs_of(log: FieldLog) -> list[BenchmarkRun | Refusal]:
+    """All runs of a log; `plant` is its ground: "firm", "slipping" or `NOT_LABELLED`."""
+    return each_run(log.name, lambda name, _, recording: _outage_runs(log, name, recording))
 
 
-def _drives(log: FieldLog, name: str, recording: Recording) -> Iterator[BenchmarkRun]:
+def _outage_runs(log: FieldLog, name: str, recording: Recording) -> Iterator[BenchmarkRun]:
     check_log(recording)
     reference = reference_of(recording)
     ground = ground_of(log.name, recording) or NOT_LABELLED
@@ -106,7 +106,7 @@ def _drives(log: FieldLog, name: str, recording: Recording) -> Iterator[Benchmar
 
 
 def catalogued() -> list[str]:
-    """Names of the catalogue's recordings whose files are all at hand, but windows cut from one of them."""
+    """Recordings of the catalogue whose files are all present, without windows cut from another of them."""
     folders = data_folders()
 
     def complete(files: list[CatalogFile]) -> bool:
@@ -117,10 +117,10 @@ def catalogued() -> list[str]:
     return [name for name in names if name not in cut]
 
 
-def each_drive(
+def each_run(
     log: str, run: Callable[[str, int, Recording], Iterable[Result | Refusal]]
 ) -> list[Result | Refusal]:
-    """What `run` gives for name, number and recording of every drive of a log; what stops it is a refusal."""
+    """Results of `run(name, number, recording)` for every run of a log; an error becomes a `Refusal`."""
     out: list[Result | Refusal] = []
     try:
         recordings, joined = read_runs(log)
@@ -137,38 +137,40 @@ def each_drive(
 
 
 def refusal_of(name: str, error: Exception) -> Refusal:
-    """Told of the log and its file, not of the folder where they lie: tables go into documents."""
+    """A refusal without the folder of the file: tables are published."""
     if not isinstance(error, TerrafusionError):
         return Refusal(name, f"FAILED, {type(error).__name__}: {error}")
     file = None if error.file is None else Path(error.file).name
-    told = TerrafusionError(
+    reason = TerrafusionError(
         error.what,
         file=None if file == Path(name).name else file,
         channel=error.channel,
         time_s=error.time_s,
         remedy=error.remedy,
     )
-    return Refusal(name, str(told))
+    return Refusal(name, str(reason))
 
 
 @functools.lru_cache(maxsize=1)
 def read_runs(log: str) -> tuple[list[Recording], bool]:
-    """The drives of a log, read once for modes that follow each other, and whether they had to be joined."""
+    """The runs of a log, and whether they were joined from windows; cached for consecutive modes."""
     recordings = open_recordings(log)
-    if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= LEAST_DRIVE_S:
+    if len(recordings) == 1 or max(r.duration_s() for r in recordings) >= MIN_RUN_S:
         return recordings, False
-    drives = [d for d in joined_runs(log, recordings) if d.duration_s() >= LEAST_JOINED_S]
-    drives = [d for d in drives if d.truth is not None]
-    if not drives:
-        told = f"holds {len(recordings)} pieces that make no drive of {LEAST_JOINED_S:g} s with a truth"
-        raise DataError(told, remedy="give a log that is one drive")
-    return drives, True
+    joined = [run for run in joined_runs(log, recordings) if run.duration_s() >= MIN_JOINED_S]
+    runs = [run for run in joined if run.truth is not None]
+    if not runs:
+        raise DataError(
+            f"holds {len(recordings)} windows that form no run of {MIN_JOINED_S:g} s with a truth",
+            remedy="give a log of one run",
+        )
+    return runs, True
 
 
 def check_log(recording: Recording) -> None:
     """Refuse what `terrafusion replay` refuses."""
     if recording.wheels is None or recording.imu is None:
-        raise DataError("has no wheels or no IMU", remedy="nothing to estimate from: the table leaves it out")
+        raise DataError("has no wheels or no IMU", remedy="give a log with both")
     params, _ = choose_vehicle(recording, None)
     errors = [found for found in run_checks(recording, params.rig()) if found.severity == "error"]
     if errors:
@@ -178,11 +180,11 @@ def check_log(recording: Recording) -> None:
 
 
 def reference_of(recording: Recording) -> str:
-    """ "truth", "fixes kept back", or "none"."""
+    """ "truth", "held-out fixes", or "none"."""
     listed = recording.truth_channels
     if recording.truth is not None and len(recording.truth) and (not listed or "position" in listed):
         return "truth"
-    return "fixes kept back" if recording.gnss is not None and len(recording.gnss) else "none"
+    return "held-out fixes" if recording.gnss is not None and len(recording.gnss) else "none"
 
 
 def ground_of(log: str, recording: Recording) -> str:
@@ -196,7 +198,7 @@ def ground_of(log: str, recording: Recording) -> str:
 
 
 def outages_of(recording: Recording, most_starts: int) -> list[Outage]:
-    """Outages of all lengths where wheels, IMU and fixes are there and the wheels roll."""
+    """Outages of all lengths where wheels, IMU and fixes are present and the wheels roll."""
     wheels, imu, gnss = recording.wheels, recording.imu, recording.gnss
     assert wheels is not None
     assert imu is not None
@@ -206,9 +208,9 @@ def outages_of(recording: Recording, most_starts: int) -> list[Outage]:
     last_s = (min(int(c.t_ns[-1]) for c in (wheels, imu, gnss)) - start_ns) * 1e-9
     radius_m = choose_vehicle(recording, None)[0].rig().wheel_radius_m
     rolled = rolled_until_m(wheels, radius_m)
-    if rolled[-1] < LEAD_ROLLED_M:
+    if rolled[-1] < MIN_LEAD_M:
         return []
-    moved_s = (int(wheels.t_ns[np.searchsorted(rolled, LEAD_ROLLED_M)]) - start_ns) * 1e-9
+    moved_s = (int(wheels.t_ns[np.searchsorted(rolled, MIN_LEAD_M)]) - start_ns) * 1e-9
     earliest = max(first_s + lead_s(first_s, last_s), moved_s)
     planned = [o for s in OUTAGES_S for o in plan_outages(earliest, last_s, s, most_starts)]
-    return [o for o in planned if np.ptp(rolled[o.covers(wheels.t_ns, start_ns)]) >= LEAST_ROLLED_M]
+    return [o for o in planned if np.ptp(rolled[o.covers(wheels.t_ns, start_ns)]) >= MIN_OUTAGE_M]

@@ -1,6 +1,6 @@
-"""Where a drive loses its fixes in a test, and fixes for drives that have truth but no receiver.
+"""Simulated GNSS outages, and simulated fixes for runs with a truth but no receiver.
 
-The plan depends on the recording alone, never on the estimator, so all modes lose the same fixes.
+The plan depends on the recording alone, so all modes lose the same fixes.
 """
 
 from __future__ import annotations
@@ -18,23 +18,23 @@ from terrafusion.fusion.metrics.scores import Outage
 Array = NDArray[np.float64]
 
 LEAD_S, LEAD_SHARE = 40.0, 0.2
-"""Aiding before an outage: so long, or this share of a short log; heading and slip must show first."""
+"""Aiding before an outage, or its share of a short log: heading and slip must be observable first."""
 TAIL_S = 1.0
-"""Log behind an outage, so that its last reference lies inside."""
+"""Time after an outage, so that its last reference lies in the log."""
 AID_HZ, AID_SIGMA_M, AID_SIGMA_UP_M = 2.0, 0.1, 0.2
-"""Fixes made from truth: rate and white noise; assumed, between RTK and differential quality."""
+"""Simulated fixes: rate and white noise; assumed, between RTK and differential GNSS."""
 
 
 def lead_s(first_s: float, last_s: float) -> float:
-    """Least time of aiding before the first outage of a drive between two times."""
+    """Least time of aiding before the first outage of a run between two times."""
     return min(LEAD_S, LEAD_SHARE * (last_s - first_s))
 
 
 def plan_outages(earliest: float, last_s: float, seconds: float, most: int) -> tuple[Outage, ...]:
     """Outages of one length that start at `earliest` or later and end before `last_s`, evenly spread.
 
-    Starts are at least half an outage apart, and at most `most`; each is a run
-    of its own, so they may overlap. () where the stretch is too short.
+    At most `most`, starting at least half an outage apart; they are replayed one by one, so they may overlap.
+    () if the span is too short.
     """
     latest = last_s - TAIL_S - seconds
     if latest < earliest or most < 1:
@@ -45,10 +45,10 @@ def plan_outages(earliest: float, last_s: float, seconds: float, most: int) -> t
 
 
 def aided_by_truth(recording: Recording, seed: int) -> Recording:
-    """The recording with fixes made from its truth: at most `AID_HZ`, with white noise of `seed`.
+    """The recording with fixes simulated from its truth: at most `AID_HZ`, with white noise of `seed`.
 
-    A truth of the body is observed there (an antenna at the body origin), so
-    that no lever arm turns truth's heading errors into fixes.
+    For a truth of the body the antenna is at the body origin, so that no lever arm maps heading errors of the
+    truth into the fixes.
 
     Raises:
         DataError: the truth holds no positions.
@@ -56,7 +56,7 @@ def aided_by_truth(recording: Recording, seed: int) -> Recording:
     truth = recording.truth
     listed = recording.truth_channels
     if truth is None or not len(truth) or (listed and "position" not in listed):
-        raise DataError("the truth holds no positions to make fixes from", channel="truth")
+        raise DataError("the truth holds no positions to simulate fixes from", channel="truth")
     known = np.flatnonzero(np.isfinite(truth.position_m[:, :2]).all(axis=1))
     rows = known[_thinned(truth.t_ns[known], 1.0 / AID_HZ)]
     sigma = np.array([AID_SIGMA_M, AID_SIGMA_M, AID_SIGMA_UP_M])
@@ -71,7 +71,7 @@ def aided_by_truth(recording: Recording, seed: int) -> Recording:
     overrides = recording.overrides
     if recording.truth_frame == "base":
         overrides = dataclasses.replace(overrides, antenna_m=(0.0, 0.0, 0.0))
-    note = f"fixes made from the truth, {AID_HZ:g} Hz, sigma {AID_SIGMA_M:g} m, seed {seed}"
+    note = f"fixes simulated from the truth, {AID_HZ:g} Hz, sigma {AID_SIGMA_M:g} m, seed {seed}"
     return dataclasses.replace(recording, gnss=gnss, overrides=overrides).with_notes(note)
 
 

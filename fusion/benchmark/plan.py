@@ -6,42 +6,43 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.fusion.benchmark.field_logs import FieldLog, logs_at_hand
+from terrafusion.fusion.benchmark.field_logs import FieldLog, present_logs
 from terrafusion.fusion.benchmark.methods import METHODS
 from terrafusion.fusion.benchmark.twin_runs import FAMILIES, FIELD, FIRST_SEED, PLANTS, BenchmarkCase
 
 SEEDS = 20
 MOST_SEEDS = 10_000
 QUICK_SEEDS = {"mixed": 2}
-"""With --quick: seeds of a family, else 1; only "mixed" is driven on other plants than the first."""
+"""With --quick: seeds of a family, else 1; only "mixed" runs on all plants."""
 STARTS = 1
 """Outages of each length in a field log, at most."""
 QUICK_LOGS = ("norlab_drive/grass_2024_8_8_16h11s19/raw",)
-ARM_NAMES = tuple(arm.name for arm in METHODS)
+METHOD_NAMES = tuple(method.name for method in METHODS)
 
 
 @dataclass(frozen=True)
 class Job:
-    """A drive of the twin, or a field log, with some arms: what one process does in one piece."""
+    """A simulated run or a field log, with some methods: the work of one process."""
 
     item: BenchmarkCase | FieldLog
-    arms: tuple[str, ...]
+    methods: tuple[str, ...]
 
     @property
     def key(self) -> str:
-        """Its name, also that of its file."""
-        arms = "" if len(self.arms) == len(ARM_NAMES) else f"-{'-'.join(self.arms).replace(' ', '_')}"
-        return self.item.key + arms
+        """Name of the job and of its file."""
+        if len(self.methods) == len(METHOD_NAMES):
+            return self.item.key
+        return f"{self.item.key}-{'-'.join(self.methods).replace(' ', '_')}"
 
 
 @dataclass(frozen=True)
 class BenchmarkPlan:
-    """A benchmark.
+    """The runs of a benchmark.
 
     Attributes:
-        families: of `FAMILIES`, and `FIELD`, each with its own number of seeds, or None.
-        seeds: drives on each plant of a family that has no number of its own; None for the usual one.
-        quick: few drives and one log, to see that all works.
+        families: names of `FAMILIES` or `FIELD`, each with its number of seeds or None.
+        seeds: runs on each plant of families without a number; None: `SEEDS`.
+        quick: few runs and one log, as a smoke test.
     """
 
     families: Mapping[str, int | None]
@@ -56,7 +57,7 @@ class BenchmarkPlan:
             raise ConfigError("field logs have no seeds", remedy="leave out the number of seeds")
 
     def seed_count(self, family: str) -> int:
-        """Drives of a family on a plant."""
+        """Runs of a family on a plant."""
         given = self.families[family] or self.seeds
         if given is not None:
             return given
@@ -73,22 +74,22 @@ class BenchmarkPlan:
                 for plant in PLANTS:
                     first = plant == next(iter(PLANTS)) or family == next(iter(FAMILIES))
                     if n < self.seed_count(family) and (first or not self.quick):
-                        yield Job(BenchmarkCase(family, plant, FIRST_SEED + n), ARM_NAMES)
+                        yield Job(BenchmarkCase(family, plant, FIRST_SEED + n), METHOD_NAMES)
 
     def _field_jobs(self) -> Iterator[Job]:
         if FIELD not in self.families:
             return
-        for log in logs_at_hand(STARTS):
+        for log in present_logs(STARTS):
             if not self.quick or log.name in QUICK_LOGS:
-                for arm in ARM_NAMES:  # logs are long: one arm a job
-                    yield Job(log, (arm,))
+                for method in METHOD_NAMES:  # logs are long: one method a job
+                    yield Job(log, (method,))
 
 
 def families_of(words: Sequence[str]) -> dict[str, int | None]:
-    """Families from words `NAME` or `NAME=SEEDS`; all of them and the field where there is no word.
+    """Families from words `NAME` or `NAME=SEEDS`; all of them and the field logs if there is none.
 
     Raises:
-        ConfigError: an unknown name, seeds that are no number, or seeds of the field.
+        ConfigError: an unknown name, seeds that are no number, or seeds of field logs.
     """
     known = (*FAMILIES, FIELD)
     found: dict[str, int | None] = {}
@@ -97,7 +98,7 @@ def families_of(words: Sequence[str]) -> dict[str, int | None]:
         if name not in known:
             raise ConfigError(f"unknown family '{name}'", remedy=f"known are {', '.join(known)}")
         if equals and not count.isdecimal():
-            raise ConfigError(f"'{word}' names no number of seeds", remedy=f"write {name} or {name}=20")
+            raise ConfigError(f"'{word}' has no number of seeds", remedy=f"write {name} or {name}=20")
         if equals and name == FIELD:
             raise ConfigError(f"'{word}': field logs have no seeds", remedy=f"write {FIELD}")
         found[name] = int(count) if equals else None

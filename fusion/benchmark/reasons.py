@@ -1,8 +1,7 @@
-"""Why the adaptive weighting loses where it loses: detector or policy, which ground, which error.
+"""Causes of losses of the adaptive weighting: detector or policy, which ground, which error.
 
-Where true labels would have won, the detector is to blame; where they lose as well, the policy's rows are.
-The ground and the kind of error are those that gain most in mean square velocity error (which is what moves
-the position) over the arm that won, weighted by the time spent there.
+The detector is to blame if the true labels would have won, else the policy. The ground and the kind of error
+are those with the largest excess of mean square velocity error over the winning method, weighted by time.
 """
 
 from __future__ import annotations
@@ -28,10 +27,10 @@ class Reason:
     """One family on one plant in which a baseline has smaller errors.
 
     Attributes:
-        ratio: median of the paired ratios, adaptive over `winner`; `sure` where its interval lies above 1.
-        oracle: the same for true labels, None where there are none.
-        ground, kind: where and in which quantity most is lost; "" where the truth does not tell.
-        recognised: share of the outages in which the detector names the ground: on all, and on `ground`.
+        ratio: median of the paired ratios, adaptive over `winner`; `sure` if significantly above 1.
+        oracle: the same ratio for true labels, or None.
+        ground, kind: ground and quantity of the largest loss; "" without a true velocity.
+        recognised: share of the outages with the right ground detected: on all grounds, and on `ground`.
     """
 
     family: str
@@ -45,14 +44,14 @@ class Reason:
     recognised: tuple[float | None, float | None]
 
     def blame(self) -> str:
-        """ "detector", "policy" or, where no drive has true labels, "not known"."""
+        """ "detector" or "policy"; "not known" without true labels."""
         if self.oracle is None:
             return "not known"
         return "detector" if self.oracle < 1.0 else "policy"
 
 
 def reasons(rows: Sequence[RunScore]) -> list[Reason]:
-    """One for each group in which some baseline beats the adaptive weighting by more than `EVEN`."""
+    """One for each group in which a baseline beats the adaptive weighting by more than `EVEN`."""
     out = []
     for (family, plant), group in groups_of(rows).items():
         lost = [
@@ -68,7 +67,7 @@ def reasons(rows: Sequence[RunScore]) -> list[Reason]:
 
 
 def _reason(family: str, plant: str, worst: Contrast, group: Sequence[RunScore]) -> Reason:
-    told = [c.ratio for c in contrasts(group, worst.base) if c.arm == ORACLE]
+    oracle = [c.ratio for c in contrasts(group, worst.base) if c.arm == ORACLE]
     ground, kind = _where(group, worst.base)
     return Reason(
         family,
@@ -76,7 +75,7 @@ def _reason(family: str, plant: str, worst: Contrast, group: Sequence[RunScore])
         worst.base,
         worst.ratio,
         worst.interval is not None and worst.interval[0] > 1.0,
-        told[0] if told else None,
+        oracle[0] if oracle else None,
         ground,
         kind,
         (recognised(group), recognised(group, ground) if ground else None),
@@ -84,7 +83,7 @@ def _reason(family: str, plant: str, worst: Contrast, group: Sequence[RunScore])
 
 
 def recognised(rows: Sequence[RunScore], ground: str = "") -> float | None:
-    """Share of the time in outages in which the adaptive arm's ground was the true one, on one or all."""
+    """Share of the time in outages in which the adaptive method had the true ground, on one ground or all."""
     total = right = 0.0
     for row in rows:
         for g in row.grounds:
@@ -94,7 +93,7 @@ def recognised(rows: Sequence[RunScore], ground: str = "") -> float | None:
 
 
 def _where(rows: Sequence[RunScore], winner: str) -> tuple[str, str]:
-    """Ground and kind of error in which the adaptive arm loses most to the winner."""
+    """Ground and kind of error with the largest excess of the adaptive method over the winner."""
     excess: dict[tuple[str, str], float] = defaultdict(float)
     for row in rows:
         sign = {ADAPTIVE: 1.0, winner: -1.0}.get(row.arm, 0.0)

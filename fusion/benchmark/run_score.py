@@ -1,4 +1,4 @@
-"""What is kept of one replay: its errors, and on each ground where they come from."""
+"""Score of one replay: its errors, and on each ground their components."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from terrafusion.fusion.benchmark.twin_runs import BenchmarkRun
 from terrafusion.fusion.metrics.consistency import estimated_ground_at, position, summarise
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.metrics.health import examine_estimate
-from terrafusion.fusion.metrics.scores import OutageScore
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.terrain.classifier import UNKNOWN
@@ -28,15 +27,15 @@ Rows = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class GroundScore:
-    """One replay on one true ground, inside the outage.
+    """Errors of one replay on one true ground, inside the outage.
 
     Attributes:
-        seconds: spent there.
-        forward_mps, side_mps: root mean square of the velocity error along and across the robot.
-        heading_mps: that of speed times heading error: how fast a wrong heading moves the position.
-        recognised: share of the time in which the ground in force was the true one, or "unknown" where the
-            policy does not know the true one.
-        nees, effective: of the position per dimension, over the whole drive; independent samples it is worth.
+        seconds: time on it.
+        forward_mps, side_mps: rms of the velocity error along and across the robot.
+        heading_mps: rms of speed times heading error, the velocity error that a wrong heading causes.
+        recognised: share of the time in which the estimated ground was the true one ("unknown" if the policy
+            does not know it).
+        nees, effective: of the position per dimension over the whole run, and its effective samples.
         nees_outage, effective_outage: the same inside the outage.
     """
 
@@ -54,16 +53,16 @@ class GroundScore:
 
 @dataclass(frozen=True)
 class RunScore:
-    """One drive with one arm.
+    """One run with one method.
 
     Attributes:
-        error_m: root mean square of the position error inside the outage (of a whole log without one:
-            over all of it); None without a reference.
-        end_m, percent: error at the outage's end, and over the way driven in it.
+        arm: name of the method.
+        error_m: rms position error inside the outage, or over a whole log; None without a reference.
+        end_m, percent: error at the end of the outage, absolute and as percent of the distance in it.
         nees: mean in the outage, per dimension.
-        switch_s: mean time from a change of the true ground in the outage until the ground in force is the
-            new one, or changes again.
-        diverged: why the estimate cannot be of the drive, "" where it can.
+        switch_s: mean time from a change of the true ground in the outage to its detection, or to the next
+            change.
+        diverged: why the estimate is implausible, "" if it is not.
         failed: why there is no estimate.
     """
 
@@ -87,54 +86,61 @@ class RunScore:
 
     @classmethod
     def read(cls, raw: dict[str, Any]) -> RunScore:
-        """A row from its JSON object."""
+        """A score from its JSON object."""
         return cls(**{**raw, "grounds": tuple(GroundScore(**ground) for ground in raw["grounds"])})
 
 
-def measure(drive: BenchmarkRun, arm: Method) -> RunScore | None:
-    """Replay a drive with an arm; None where the arm needs labels that the drive does not have."""
-    empty = RunScore(drive.family, drive.plant, drive.unit, drive.name, arm.name)
-    options = replay_options(arm, drive.labels, drive.seed)
+def score_run(run: BenchmarkRun, method: Method) -> RunScore | None:
+    """Replay a run with a method; None if the method needs labels that the run does not have."""
+    score = RunScore(run.family, run.plant, run.unit, run.name, method.name)
+    options = replay_options(method, run.labels, run.seed)
     if options is None:
         return None
     try:
-        result = replay(drive.recording, outages=[drive.outage] if drive.outage else [], **options)
+        result = replay(run.recording, outages=[run.outage] if run.outage else [], **options)
     except TerrafusionError as error:
-        return dataclasses.replace(empty, failed=str(error))
+        return dataclasses.replace(score, failed=str(error))
     except UNFORESEEN as error:
-        return dataclasses.replace(empty, failed=f"{type(error).__name__}: {error}")
-    return _measured(empty, drive, result)
+        return dataclasses.replace(score, failed=f"{type(error).__name__}: {error}")
+    return _with_errors(score, run, result)
 
 
-def _measured(row: RunScore, drive: BenchmarkRun, result: ReplayResult) -> RunScore:
-    assert drive.recording.wheels is not None
-    radius_m = result.vehicle.rig().wheel_radius_m
-    health = examine_estimate(result.estimate, drive.recording.wheels, radius_m)
-    row = dataclasses.replace(row, diverged=health.why, seconds=result.seconds, distance_m=health.path_m)
-    errors = result.scores.errors
+def _with_errors(score: RunScore, run: BenchmarkRun, result: ReplayResult) -> RunScore:
+    recording, errors = run.recording, result.scores.errors
+    assert recording.wheels is not None
+    health = examine_estimate(result.estimate, recording.wheels, result.vehicle.rig().wheel_radius_m)
+    score = dataclasses.replace(score, diverged=health.why, seconds=result.seconds, distance_m=health.path_m)
     if errors is None:
-        return row
+        return score
     distance = errors.distance_m()
     inside = np.ones(len(distance), bool)
-    if drive.outage is not None:
-        inside = drive.outage.covers(errors.t_ns, drive.recording.start_ns)
-        row = _with_outage(row, result.scores.outages[0])
-    row = dataclasses.replace(row, error_m=_rms(distance[inside]))
-    if drive.labels is None:
-        return row
-    # The labels, not the channel: a log's own name of its terrain counts as one, too.
-    true = np.array([drive.labels.at(t) for t in errors.t_ns.tolist()])
-    known = load_policy().names()
-    right = np.where(np.isin(true, known), true, UNKNOWN) == estimated_ground_at(result.estimate, errors.t_ns)
+    if run.outage is not None:
+        inside, outage = run.outage.covers(errors.t_ns, recording.start_ns), result.scores.outages[0]
+        score = dataclasses.replace(
+            score,
+            outage_s=outage.seconds,
+            distance_m=outage.distance_m,
+            end_m=outage.end_error_m,
+            percent=outage.percent,
+            nees=outage.nees_mean,
+            heading_rad=outage.end_yaw_error_rad,
+        )
+    score = dataclasses.replace(score, error_m=_rms(distance[inside]))
+    if run.labels is None:
+        return score
+    # Labels, not the terrain channel: they include the terrain name of a whole log.
+    true = np.array([run.labels.at(t) for t in errors.t_ns.tolist()])
+    known = np.where(np.isin(true, load_policy().names()), true, UNKNOWN)
+    right = known == estimated_ground_at(result.estimate, errors.t_ns)
     return dataclasses.replace(
-        row,
+        score,
         switch_s=switch_delay_s(errors.t_ns[inside], true[inside], right[inside]),
-        grounds=tuple(_by_ground(errors, true, right, inside, drive.recording.start_ns)),
+        grounds=tuple(_by_ground(errors, true, right, inside, recording.start_ns)),
     )
 
 
 def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], right: Rows) -> float | None:
-    """Mean time from a change of `true` (N,) until `right`, at most to the next change; None without one."""
+    """Mean time from a change of `true` (N,) until `right`, limited by the next change; None without one."""
     changes = np.flatnonzero(true[1:] != true[:-1]) + 1
     delays = []
     for first, end in itertools.pairwise([*changes, len(true)]):
@@ -142,18 +148,6 @@ def switch_delay_s(t_ns: NDArray[np.int64], true: NDArray[Any], right: Rows) -> 
         last = first + seen[0] if len(seen) else end - 1
         delays.append((t_ns[last] - t_ns[first]) * 1e-9)
     return float(np.mean(delays)) if delays else None
-
-
-def _with_outage(row: RunScore, outage: OutageScore) -> RunScore:
-    return dataclasses.replace(
-        row,
-        outage_s=outage.seconds,
-        distance_m=outage.distance_m,
-        end_m=outage.end_error_m,
-        percent=outage.percent,
-        nees=outage.nees_mean,
-        heading_rad=outage.end_yaw_error_rad,
-    )
 
 
 def _by_ground(

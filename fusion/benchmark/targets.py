@@ -1,4 +1,4 @@
-"""The targets of the project that a benchmark can decide, held against what it found."""
+"""The project's targets that a benchmark can decide, and their verdicts."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ from terrafusion.fusion.metrics.consistency import Consistency
 from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency, pool
 
 REACHED, OPEN, MISSED = "reached", "open", "missed"
-"""By the whole interval; by neither of its ends; by no part of it."""
+"""The whole interval meets the limit; the interval contains it; the whole interval misses it."""
 LONG_S = 120.0
 INSIDE, IN_OUTAGE = "whole drive", "in outage"
 
 
 @dataclass(frozen=True)
 class Target:
-    """One statement: `found` is compared with `limit`; `most` tells that it must lie below.
+    """One target: `found` compared with `limit`, which is an upper limit if `most`.
 
-    `broken` replays failed or diverged where none may.
+    `broken` is the number of replays that failed or diverged, for targets that allow none.
     """
 
     name: str
@@ -44,7 +44,7 @@ class Target:
     broken: int = 0
 
     def verdict(self) -> str:
-        """`REACHED`, `OPEN` or `MISSED`; "not measured" without a number. Few drives decide nothing."""
+        """`REACHED`, `OPEN` (also without an interval) or `MISSED`; "not measured" without a number."""
         if self.broken:
             return MISSED
         if self.found is None:
@@ -58,7 +58,7 @@ class Target:
 
 
 def targets(rows: Sequence[RunScore]) -> list[Target]:
-    """G1, G2, G5 and G9, as far as there are drives for them."""
+    """G1, G2, G5 and G9, as far as there are runs for them."""
     out: list[Target] = []
     against_base, against_innovation = contrasts(rows), contrasts(rows, "innovation")
     for plant in dict.fromkeys(row.plant for row in rows if row.family == "mixed"):
@@ -66,7 +66,7 @@ def targets(rows: Sequence[RunScore]) -> list[Target]:
         out += [
             _ratio("G1", 0.60, against_base, *at, ADAPTIVE),
             _ratio("G1", 0.75, against_innovation, *at, ADAPTIVE),
-            _kept(shares(rows), plant),
+            _oracle_share(shares(rows), plant),
             _ratio("G2", 1.10, against_base, *at, "shuffled"),
         ]
     for plant in dict.fromkeys(row.plant for row in rows if row.family == "firm"):
@@ -82,10 +82,10 @@ def targets(rows: Sequence[RunScore]) -> list[Target]:
     return [target for target in out if target.found is not None or target.broken]
 
 
-def nees_cells(
+def pooled_nees(
     rows: Sequence[RunScore], arms: Iterable[str] = (ADAPTIVE, BASELINE)
 ) -> list[PooledConsistency]:
-    """NEES of the position by arm and ground over all twin drives: whole drives, and their outages alone."""
+    """NEES of the position by method and ground over all simulated runs: whole runs, and outages only."""
     cells = []
     for arm in arms:
         own = [row for row in rows if row.arm == arm and row.family != FIELD]
@@ -115,7 +115,7 @@ def _ratio(name: str, limit: float, found: Sequence[Contrast], family: str, plan
     return Target(name, what, limit, True, None, None)
 
 
-def _kept(found: Sequence[GainShare], plant: str) -> Target:
+def _oracle_share(found: Sequence[GainShare], plant: str) -> Target:
     what = f"mixed, {plant}: share of the oracle's gain"
     for share in found:
         if (share.family, share.plant) == ("mixed", plant):
@@ -124,7 +124,7 @@ def _kept(found: Sequence[GainShare], plant: str) -> Target:
 
 
 def _drift(rows: Sequence[RunScore], family: str, plant: str, limit: float) -> Target:
-    what = f"{family}, {plant}: drift of {ADAPTIVE} in {LONG_S:g} s, % of the way"
+    what = f"{family}, {plant}: drift of {ADAPTIVE} in {LONG_S:g} s, % of the distance"
     own = [row for row in rows if (row.family, row.plant, row.arm) == (family, plant, ADAPTIVE)]
     percent = [row.percent for row in own if row.outage_s == LONG_S and row.percent is not None]
     percent += [math.inf for row in own if row.failed]

@@ -1,9 +1,8 @@
-"""Drives of the twin on which the arms are compared: what is driven, on which ground, by which laws.
+"""Simulated runs of the benchmark.
 
-A case is a family of drives, a plant and a seed. Commands, grounds, slope, heading and the time of the
-outage depend on family and seed alone, so that the three plants drive the same; soils and noise are drawn
-for each plant. No seed of training is used: the policy, the terrain model and the tuning have seeds far below
-`FIRST_SEED`, and those from 100 000 on were looked at while the estimator was made.
+A case is a family of runs, a plant and a seed. Commands, route, slope, heading and outage depend on family and
+seed alone, so that all plants drive the same; soils and sensor noise are drawn for each plant. The policy, the
+terrain model and the tuning use seeds far below `FIRST_SEED`; those from 100 000 on served development.
 """
 
 from __future__ import annotations
@@ -31,13 +30,13 @@ FIRST_SEED = 200_000
 PERTURBATION = 0.3
 """Relative error of every soil number of the plant "perturbed"; its sign is drawn."""
 CORRELATED = Variation(strength_sigma=0.3, length_m=4.0)
-"""Ground of the plant "second": 30 % of undrained strength is usual (Phoon and Kulhawy 1999: 10 to 50 %);
-that it changes over a few metres is assumed."""
+"""Ground of the plant "second": a variation of 30 % of the strength is usual (Phoon and Kulhawy 1999: 10 to
+50 %); its length of a few metres is assumed."""
 LEAD_S = (40.0, 50.0)
-"""An outage begins in this span: heading and slip have been seen by then."""
+"""Range of the outage's start: heading and slip are observable by then."""
 TAIL_S = 2.0
 LEG_M, MUD_LEG_M = (12.0, 30.0), (6.0, 12.0)
-"""Length of a ground on the route; mud would hold the robot for good on a longer one."""
+"""Length of a ground on the route; on more mud the robot would get stuck."""
 MUD = "mud"
 
 PLANTS = {
@@ -49,11 +48,11 @@ PLANTS = {
 
 @dataclass(frozen=True)
 class Family:
-    """Drives of one kind.
+    """Runs of one kind.
 
     Attributes:
-        grounds: of the route; one after another where `mixed`, else one of them for the whole drive.
-        outages_s: lengths of the outage, taken in turn by the seeds.
+        grounds: of the route; in random order if `mixed`, else one of them for the whole run.
+        outages_s: lengths of the outage, one a seed in turn.
         slope_deg: range of the slope.
     """
 
@@ -79,12 +78,12 @@ FAMILIES = {
     ),
 }  # fmt: skip
 FIELD = "field"
-"""The family of field logs, see `field`."""
+"""The family of field logs, see `field_logs`."""
 
 
 @dataclass(frozen=True)
 class BenchmarkCase:
-    """One drive of the twin."""
+    """One simulated run."""
 
     family: str
     plant: str
@@ -92,20 +91,20 @@ class BenchmarkCase:
 
     @property
     def key(self) -> str:
-        """Its name, also that of its file."""
+        """Name of the case and of its file."""
         return f"{self.family}-{self.plant}-{self.seed}"
 
     def stream(self, *words: str) -> np.random.Generator:
-        """Random numbers of the seed for one purpose."""
+        """Random numbers of this seed for one purpose."""
         return np.random.default_rng([self.seed, *(zlib.crc32(word.encode()) for word in words)])
 
 
 @dataclass(frozen=True, eq=False)
 class BenchmarkRun:
-    """A recording, the outage in it (None: the whole of it is judged) and its true ground where known.
+    """A recording, its outage (None: the whole run is scored) and its true ground where known.
 
-    `unit` is what is independent of other drives: the seed, or the log that several outages are of. A drive
-    that is not `judged` has nothing to be judged against: it can only diverge.
+    `unit` names the independent unit: the seed, or the log from which several outages are taken. A run without
+    reference is not `judged`: only its divergence is checked.
     """
 
     family: str
@@ -120,7 +119,7 @@ class BenchmarkRun:
 
 
 def simulate_case(case: BenchmarkCase) -> BenchmarkRun:
-    """Simulate a case; the same case gives the same bits."""
+    """Simulate a case, repeatably."""
     family = FAMILIES[case.family]
     rng = case.stream(case.family)
     outage = Outage(
@@ -151,7 +150,7 @@ def simulate_case(case: BenchmarkCase) -> BenchmarkRun:
 
 
 def soils_of(case: BenchmarkCase, names: set[str]) -> dict[str, SoilParams]:
-    """The case's own soils: scattered as in training, or every number off by `PERTURBATION`."""
+    """Soils of a case: scattered as in training, or every parameter off by `PERTURBATION`."""
     rng = case.stream(case.family, case.plant, "soil")
     with tempfile.TemporaryDirectory() as folder:
         scattered = {n: load_soil(scattered_soil(n, rng, Path(folder))) for n in sorted(names)}
@@ -159,7 +158,7 @@ def soils_of(case: BenchmarkCase, names: set[str]) -> dict[str, SoilParams]:
 
 
 def perturbed(soil: SoilParams, rng: np.random.Generator) -> SoilParams:
-    """The soil with each number that training scatters `PERTURBATION` higher or lower."""
+    """The soil with each parameter that training scatters `PERTURBATION` higher or lower."""
     changed = {}
     for section, keys in SOIL_SCATTER.items():
         part = getattr(soil, section)
@@ -169,7 +168,7 @@ def perturbed(soil: SoilParams, rng: np.random.Generator) -> SoilParams:
 
 
 def _route(family: Family, seconds: float, rng: np.random.Generator) -> tuple[RouteLeg, ...]:
-    """Grounds in random order, never the same twice running, for longer than the drive can be."""
+    """Grounds in random order without repetition, longer than the robot can drive."""
     ground = str(rng.choice(family.grounds))
     if not family.mixed:
         return (RouteLeg(ground),)
@@ -182,7 +181,7 @@ def _route(family: Family, seconds: float, rng: np.random.Generator) -> tuple[Ro
 
 
 def _wander(seconds: float, rng: np.random.Generator) -> tuple[DriveSegment, ...]:
-    """A rest, a straight that shows the heading, then straights, weaving, turns and short stops."""
+    """A stop, a straight (to observe the heading), then straights, weaving, turns and short stops."""
     segments = [DriveSegment(3.0), DriveSegment(12.0, 1.0)]
     while sum(s.duration_s for s in segments) < seconds:
         speed = float(rng.uniform(0.7, 1.2))

@@ -24,7 +24,7 @@ from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
 from terrafusion.fusion.benchmark.plan import BenchmarkPlan
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run import BenchmarkResult
-from terrafusion.fusion.benchmark.targets import nees_cells, targets
+from terrafusion.fusion.benchmark.targets import pooled_nees, targets
 from terrafusion.fusion.benchmark.twin_runs import FIELD
 from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 from terrafusion.fusion.noise.modes import load_modes
@@ -143,7 +143,7 @@ def _content(found: BenchmarkResult, origin: Mapping[str, str]) -> dict[str, Any
         "shares": [dataclasses.asdict(s) for s in shares(rows)],
         "targets": [dataclasses.asdict(t) | {"verdict": t.verdict()} for t in targets(rows)],
         "reasons": [dataclasses.asdict(r) | {"blame": r.blame()} for r in reasons(rows)],
-        "consistency": [_cell(c) for c in nees_cells(rows)],
+        "consistency": [_cell(c) for c in pooled_nees(rows)],
         "refused": [dataclasses.asdict(one) for one in found.refused],
         "rows": [dataclasses.asdict(row) for row in rows],
     }

@@ -20,9 +20,9 @@ from terrafusion.fusion.benchmark.compare import (
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, METHODS
 from terrafusion.fusion.benchmark.reasons import Reason, reasons, recognised
 from terrafusion.fusion.benchmark.run_score import RunScore
-from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, nees_cells, targets
+from terrafusion.fusion.benchmark.targets import IN_OUTAGE, INSIDE, Target, pooled_nees, targets
 from terrafusion.fusion.benchmark.twin_runs import FAMILIES, FIELD, PLANTS
-from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
+from terrafusion.fusion.metrics.pooled_consistency import VERDICT_SIGNS, PooledConsistency
 
 Cells = list[str]
 
@@ -41,7 +41,7 @@ def tables(rows: Sequence[RunScore]) -> list[Table]:
     """All tables, the main one first; those without rows are left out."""
     made = (
         _main(rows), _targets(targets(rows)), _reasons(reasons(rows)), _wins(contrasts(rows)), _shares(rows),
-        _nees(nees_cells(rows)), _field(rows), _failures(rows), _arms(),
+        _nees(pooled_nees(rows)), _field(rows), _failures(rows), _arms(),
     )  # fmt: skip
     return [table for table in made if table.rows]
 

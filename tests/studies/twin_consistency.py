@@ -27,7 +27,7 @@ from terrafusion.fusion.metrics.consistency import (
     summarise,
     whitened_series,
 )
-from terrafusion.fusion.metrics.pooled_consistency import IN_OUTAGE, PooledConsistency, pool
+from terrafusion.fusion.metrics.pooled_consistency import IN_OUTAGE, VERDICT_SIGNS, PooledConsistency, pool
 
 MODES = ("adaptive", "fixed")
 SCENARIO = "waypoints"

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from terrafusion.fusion.benchmark.compare import contrasts, median_interval, shares
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run_score import GroundScore, RunScore, switch_delay_s
-from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, nees_cells, targets
+from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, pooled_nees, targets
 from terrafusion.fusion.reports.benchmark_tables import markdown, tables
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
@@ -200,7 +200,7 @@ def test_targets_of_a_benchmark_that_reaches_them() -> None:
         "mixed, twin: share of the oracle's gain": REACHED,
         "mixed, twin: shuffled over fixed": MISSED,
         "firm, twin: adaptive over fixed": REACHED,
-        "firm, twin: drift of adaptive in 120 s, % of the way": REACHED,
+        "firm, twin: drift of adaptive in 120 s, % of the distance": REACHED,
     }
 
 
@@ -223,7 +223,7 @@ def test_a_lost_family_names_detector_ground_and_error() -> None:
 
 
 def test_consistency_pools_the_drives_of_a_ground() -> None:
-    cells = nees_cells(rows("adaptive", [1.0] * 6, grounds=(ground("mud", 0.1),)))
+    cells = pooled_nees(rows("adaptive", [1.0] * 6, grounds=(ground("mud", 0.1),)))
     assert {(c.terrain, c.mode, c.drives, c.mean) for c in cells} == {("mud", "twin, adaptive", 6, 1.0)}
     assert {c.verdict() for c in cells} == {"consistent"}
 

@@ -12,7 +12,7 @@ import pytest
 from terrafusion.datasets.core.channels import Imu, Terrain, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark import field_logs
-from terrafusion.fusion.benchmark.field_logs import check_log, each_drive, ground_of, outages_of, reference_of
+from terrafusion.fusion.benchmark.field_logs import check_log, each_run, ground_of, outages_of, reference_of
 from terrafusion.fusion.benchmark.outage_plan import (
     aided_by_truth,
 )
@@ -53,7 +53,7 @@ def test_reference_is_truth_before_fixes(drive: Callable[..., Any]) -> None:
     assert reference_of(made.recording) == "truth"
     without = dataclasses.replace(made.recording, truth=None)
     assert reference_of(without) == "none"
-    assert reference_of(dataclasses.replace(without, gnss=made.fixes)) == "fixes kept back"
+    assert reference_of(dataclasses.replace(without, gnss=made.fixes)) == "held-out fixes"
     speed_only = dataclasses.replace(made.recording, truth_channels=("velocity",))
     assert reference_of(speed_only) == "none"
 
@@ -75,7 +75,7 @@ def test_a_log_is_read_once_for_methods_that_follow_each_other(
     field_logs.read_runs.cache_clear()
     monkeypatch.setattr(field_logs, "open_recordings", opened)
     for log in ("one", "one", "two"):
-        (refusal,) = each_drive(log, checked)
+        (refusal,) = each_run(log, checked)
         assert isinstance(refusal, field_logs.Refusal)
         assert refusal.log == log
         assert "no wheels" in refusal.why

@@ -1,4 +1,4 @@
-"""Arms, and the labels that are told to some of them."""
+"""Methods, and the ground labels that some of them are given."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ import dataclasses
 import pytest
 
 from terrafusion.fusion.benchmark.methods import (
+    DATA_SHEET_NOISE,
     METHODS,
-    SHEET,
     known_labels,
     misleading,
     most_foreign,
@@ -33,22 +33,22 @@ def two_grounds():
     return simulate(short, seed=1)
 
 
-def test_every_arm_is_a_mode_with_its_own_name() -> None:
-    assert len({arm.name for arm in METHODS}) == len(METHODS) == 8
-    for arm in METHODS:
-        options = replay_options(arm, LABELS, seed=3)
+def test_every_method_is_a_mode_with_its_own_name() -> None:
+    assert len({method.name for method in METHODS}) == len(METHODS) == 8
+    for method in METHODS:
+        options = replay_options(method, LABELS, seed=3)
         assert options is not None
-        assert options["mode"] == arm.mode
+        assert options["mode"] == method.mode
 
 
 def test_arms_that_need_labels_have_none_without_them() -> None:
-    without = {arm.name for arm in METHODS if replay_options(arm, None, seed=3) is None}
+    without = {method.name for method in METHODS if replay_options(method, None, seed=3) is None}
     assert without == {"oracle", "shuffled", "adversarial"}
 
 
 def test_ground_that_the_policy_does_not_know_has_no_adversary() -> None:
     snow = GroundLabels((START_NS,), ("snow",))
-    without = {arm.name for arm in METHODS if replay_options(arm, snow, seed=3) is None}
+    without = {method.name for method in METHODS if replay_options(method, snow, seed=3) is None}
     assert without == {"adversarial"}
 
 
@@ -56,7 +56,7 @@ def test_the_data_sheet_knows_no_slip_and_no_tuning() -> None:
     options = replay_options(METHODS[0], None, seed=0)
     assert options is not None
     row = options["policy"].fixed
-    assert {name: getattr(row, name) for name in SHEET} == SHEET
+    assert {name: getattr(row, name) for name in DATA_SHEET_NOISE} == DATA_SHEET_NOISE
     assert options["settings"]["tuning"].fixed.of(row) == row
 
 

@@ -211,7 +211,7 @@ def test_plans() -> None:
     ]  # fmt: skip
     full = BenchmarkPlan({"mixed": None, "firm": None}, seeds=3).jobs()
     assert len({job.key for job in full}) == len(full) == 2 * 3 * 3
-    assert {job.arms for job in full} == {tuple(arm.name for arm in METHODS)}
+    assert {job.methods for job in full} == {tuple(method.name for method in METHODS)}
     with pytest.raises(ConfigError, match="0 seeds"):
         BenchmarkPlan({"mixed": None}, seeds=0)
     with pytest.raises(ConfigError, match="field logs have no seeds"):
@@ -230,7 +230,7 @@ def test_families_by_name_with_seeds_of_their_own() -> None:
 
 
 def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(plan, "logs_at_hand", lambda starts: [])
+    monkeypatch.setattr(plan, "present_logs", lambda starts: [])
     with pytest.raises(TerrafusionError, match="no field log is at hand"):
         run_benchmark(BenchmarkPlan({"field": None}), tmp_path)
 

@@ -1,7 +1,7 @@
 """`python -m tests.studies.field_table.table --out DIR`: every field log in every mode.
 
 Each log with wheels and IMU is replayed whole, and once for each simulated
-outage (`outage_plan`), scored on its truth or on fixes kept back and never
+outage (`outage_plan`), scored on its truth or on held-out fixes and never
 realigned after the start. A log with truth but no receiver is dead reckoning
 when replayed whole; for outages it gets fixes made from its truth. A log
 without any reference is only checked for divergence (`health`).
@@ -34,7 +34,7 @@ from terrafusion.fusion.benchmark.field_logs import (
     Refusal,
     catalogued,
     check_log,
-    each_drive,
+    each_run,
     ground_of,
     outages_of,
     reference_of,
@@ -57,7 +57,7 @@ class Run:
     outage ("outage 60 s" from `start_s`); on the `drive`th drive of the log, made fixes with noise of `seed`.
 
     `error_m` is, whole and aided: the root mean square against truth, or the median
-    distance from fixes kept back; in an outage: the error at its end.
+    distance from held-out fixes; in an outage: the error at its end.
     """
 
     log: str
@@ -164,9 +164,7 @@ def collect(tasks: Sequence[Task], out: Path) -> tuple[list[Run], list[Refusal],
 
 def run_task(task: Task) -> tuple[Task, list[Run | Refusal]]:
     """The task, and all runs of its log in its mode; what stops one becomes a line that says so."""
-    return task, each_drive(
-        task.log, lambda log, n, drive: _runs(dataclasses.replace(task, log=log), n, drive)
-    )
+    return task, each_run(task.log, lambda log, n, drive: _runs(dataclasses.replace(task, log=log), n, drive))
 
 
 def _runs(task: Task, drive: int, recording: Recording) -> Iterator[Run | Refusal]:
