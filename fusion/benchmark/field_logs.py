@@ -22,7 +22,7 @@ from terrafusion.fusion.benchmark.outage_plan import aided_by_truth, lead_s, pla
 from terrafusion.fusion.benchmark.twin_runs import FIELD, BenchmarkRun
 from terrafusion.fusion.metrics.health import rolled_until_m
 from terrafusion.fusion.metrics.scores import Outage
-from terrafusion.fusion.replay import choose_vehicle
+from terrafusion.twin.model.choose import choose_vehicle
 
 AID_SEED = 1
 """Of the noise of fixes simulated from truth."""

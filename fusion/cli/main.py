@@ -22,6 +22,7 @@ from terrafusion.fusion.cli import (
     gap,
     gap_blind,
     inspect,
+    live,
     policy,
     replay,
     simulate,
@@ -68,6 +69,7 @@ app.command("gap")(gap.gap)
 app.command("gap-blind")(gap_blind.gap_blind)
 app.command("study")(study.study)
 app.command("replay")(replay.replay)
+app.command("live")(live.live)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")
 

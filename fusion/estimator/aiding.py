@@ -46,7 +46,7 @@ class AidingSensors:
         t_ns = chain.nodes[-1].t_ns
         if gnss.local:
             self.heading.forget_north()
-        placed = gnss.placed is not None
+        placed = gnss.alignment is not None
         height = self.height.active and self.height.update(chain, t_ns, newest_ns, before, after, placed)
         turned = gnss.turned + placed
         heading = self.heading.active and self.heading.update(chain, t_ns, newest_ns, before, after, turned)

@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.frames import GRAVITY_MPS2, gtsam_to_ros_covariance
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
@@ -37,16 +37,21 @@ from terrafusion.fusion.estimator.alignment import (
 from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate
 from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
+from terrafusion.fusion.estimator.key_states import state_fields
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
-from terrafusion.fusion.estimator.stationarity import StationarityDetector, drop_before_start, hold
+from terrafusion.fusion.estimator.stationarity import (
+    StationarityDetector,
+    add_zero_velocity,
+    drop_before_start,
+)
 from terrafusion.fusion.graph import slow_states
-from terrafusion.fusion.graph.body_twist import bias_sigma, gyro_sigma_radps, twist_covariance
+from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, wheel_increment
-from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
+from terrafusion.fusion.graph.key_state import SLIP, VELOCITY, KeyState
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
@@ -86,8 +91,8 @@ class Estimator:
         self.wheels = WheelStream()
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
-        self._slide = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.note))
-        self.gnss = GnssUpdater(config, self._report, self.weights.single, self._slide)
+        self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.note))
+        self.gnss = GnssUpdater(config, self._report, self.weights.single, self._skid)
         self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
@@ -101,7 +106,7 @@ class Estimator:
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
         self._silent = False
-        self._rest = StationarityDetector(config.rig)
+        self._stationarity = StationarityDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
         self._propagator = Propagator(self._preintegrator)
 
@@ -313,7 +318,7 @@ class Estimator:
         if self.config.inputs.planar:
             segments = with_centripetal_force(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
-        segments, wheels = self._slide.dragged(t_ns, dt, segments, wheels, before, self._covariance)
+        segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
@@ -382,7 +387,7 @@ class Estimator:
         increment = wheel_increment(
             travelled, segments, bias_z, rig.track_m, quantum_m, noise, change, surging
         )
-        increment = self._slide.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
+        increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(
@@ -416,42 +421,27 @@ class Estimator:
         known = self.gnss.last_used_ns is not None and (t_ns - self.gnss.last_used_ns) * 1e-9 <= OUTAGE_S
         sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
         biases = before.bias.gyroscope(), before.bias.accelerometer()
-        if self._rest.stands(
+        if self._stationarity.is_stationary(
             t_ns, self.imu, self.wheels, *biases, float(np.linalg.norm(before.velocity)), sigma
         ):
-            hold(self.chain, k, link)
+            add_zero_velocity(self.chain, k, link)
 
     def _emitted(self, t_ns: int, gyro: Array) -> State:
-        key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
-        P = self._covariance
-        R = key.pose.rotation().matrix()
-        silent = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
-        status = "no_gnss" if self.gnss.local else ("outage" if silent else "running")
+        key, wheels, noise = (
+            self.chain.state(self.chain.last),
+            self.chain.nodes[-1].wheels,
+            self.weights.noise,
+        )
+        outage = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
+        gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, noise)
         state = self._state = State(
             t_ns=t_ns,
-            position_m=np.asarray(key.pose.translation()),
-            quaternion=quaternion_of(key.pose),
-            velocity_mps=key.velocity,
-            angular_velocity_radps=key.rate(gyro),
-            gyro_bias_radps=np.asarray(key.bias.gyroscope()),
-            accel_bias_mps2=np.asarray(key.bias.accelerometer()),
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
-            linear=key.linear,
-            linear_sigma=linear_sigma(P),
-            slip_sigma=float(np.sqrt(P[SLIP, SLIP])),
-            covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
-            velocity_covariance=P[VELOCITY, VELOCITY].copy(),
-            twist_covariance=twist_covariance(
-                P,
-                R,
-                key.velocity,
-                gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, self.weights.noise),
-            ),
-            bias_sigma=bias_sigma(P),
             terrain=self.weights.posterior(),
-            status=status,
+            status="no_gnss" if self.gnss.local else ("outage" if outage else "running"),
             slipping=self.monitor.slipping,
             immobilised=self.monitor.immobilised,
+            **state_fields(key, self._covariance, gyro, gyro_sigma),
         )
         if self._on_state is not None and not self._silent:
             self._on_state(state)

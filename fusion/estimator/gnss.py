@@ -18,7 +18,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
-from terrafusion.fusion.estimator.map_alignment import MapAlignment, place
+from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
@@ -49,7 +49,7 @@ OPTIMISM = 3.0
 """A stand-alone receiver may claim so many times less than its data sheet and drift all the same; one
 that claims even less has fixes of a better class (RTK), which drift in proportion to what they claim."""
 LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
-"""Claims of a receiver outside this range are no sigma; that of its class of fix takes their place."""
+"""Claims of a receiver outside this range are no sigma; that of its class of fix takes their align_to_map."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
 """What is left of the doubt in a heading after it was turned onto the motion (assumed)."""
 
@@ -61,7 +61,7 @@ class GnssUpdater:
     Attributes:
         waiting: fixes not yet used, oldest first.
         local: the graph was started without GNSS, and no fixes have told yet how it lies on the map.
-        placed: how they did, once they have; unplaced: how many came until then.
+        alignment: how they did, once they have; unaligned: how many came until then.
         rejected, too_late: how many fixes the gate refused, or came after their keyframe was dropped.
         turned: how often the heading was set right from the motion.
         scale: how many times more than it claims the receiver is seen to scatter, 1 for an honest one.
@@ -74,7 +74,7 @@ class GnssUpdater:
         config: EstimatorConfig,
         report: Callable[[Innovation], None],
         weighting: Weighting | None = None,
-        slide: SkidDetector | None = None,
+        skid: SkidDetector | None = None,
     ) -> None:
         self.weighting = weighting or Weighting()
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
@@ -83,7 +83,7 @@ class GnssUpdater:
         spec = config.rig.sensors.gnss
         self.track = DeadReckoning(self.antenna_m)
         self.turned = 0
-        self.slide = slide or SkidDetector()
+        self.skid = skid or SkidDetector()
         self.scale, self.white = 1.0, WHITE_SHARE
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._best = best_fix(spec)
@@ -98,8 +98,8 @@ class GnssUpdater:
         self._height_factor = float(np.sqrt(1.0 + 2.0 * spec.correlation_time_s * spec.rate_hz))
         self.waiting: list[GnssFix] = []
         self.local = False
-        self.placed: MapAlignment | None = None
-        self.unplaced = 0
+        self.alignment: MapAlignment | None = None
+        self.unaligned = 0
         self.rejected = 0
         self.too_late = 0
         self.last_used_ns: int | None = None
@@ -134,14 +134,14 @@ class GnssUpdater:
             if k is None:
                 self.too_late += 1
             elif self.local:
-                self.unplaced += 1
+                self.unaligned += 1
                 self.track.add(fix)
                 used |= self._place(chain, fix)
             else:
                 self.track.add(fix)
-                self._hear(self.track.scatter(), self.track.news())
-                if self.slide.grip is not None:
-                    self.slide.grip.seen(fix, self.scale)
+                self._update_scale(self.track.scatter(), self.track.news())
+                if self.skid.friction is not None:
+                    self.skid.friction.score_fix(fix, self.scale)
                 renewed = self._change_class(chain, k, fix)
                 if renewed or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
@@ -154,13 +154,13 @@ class GnssUpdater:
 
     def _place(self, chain: Chain, fix: GnssFix) -> bool:
         """Lay a path that was begun without fixes onto the map; True once they tell how."""
-        self.placed = place(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
-        if self.placed is None:
+        self.alignment = align_to_map(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
+        if self.alignment is None:
             return False
         self.local, self.last_used_ns = False, fix.t_ns
         return True
 
-    def _hear(self, scatter: float, news: float) -> None:
+    def _update_scale(self, scatter: float, news: float) -> None:
         """Take in how the fixes scatter about the path, and how much of that is new at every fix, over what
         they claim."""
         self.scale = scatter if scatter > LIE else 1.0
@@ -214,8 +214,8 @@ class GnssUpdater:
         chain.turn(turn, antenna, np.append(fix.enu_m[:2], antenna[2]))
         chain.smooth(len(chain.nodes))
         self.track.restart()
-        if self.slide.grip is not None:
-            self.slide.grip.restart()
+        if self.skid.friction is not None:
+            self.skid.friction.restart()
         self.turned += 1
         return True
 
@@ -245,7 +245,7 @@ class GnssUpdater:
         verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
         if verdict is GateDecision.REJECT and nis <= self.weighting.passed_nis:
             verdict = GateDecision.ACCEPT
-        if verdict is GateDecision.REJECT and not again and self._slid(chain, k, fix, noise):
+        if verdict is GateDecision.REJECT and not again and self._test_wheels(chain, k, fix, noise):
             return self._add(chain, k, fix, chain.covariance_at(k), noise, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not GateDecision.REACQUIRE:
@@ -264,10 +264,10 @@ class GnssUpdater:
         self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not GateDecision.REJECT))
         if verdict is GateDecision.REJECT:
             if again:
-                self.slide.put_back(chain)
+                self.skid.undo(chain)
             self.rejected += 1
             return False
-        self.slide.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
+        self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
         P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
         cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
@@ -297,13 +297,13 @@ class GnssUpdater:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
 
-    def _slid(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
+    def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just refused show that the wheels did not roll where the robot went."""
         refused = [off for off, _ in self.gate.rejected]
         sigma_m = float(np.max(fix.sigma_m[:2]))
         if not self.track.smooth_at(fix.t_ns):
             return False
-        if not self.slide.refuted(chain, k, self.last_used_ns, refused, sigma_m, noise):
+        if not self.skid.test_wheels(chain, k, self.last_used_ns, refused, sigma_m, noise):
             return False
         self.gate.rejected.pop()  # it is tested again
         return True

@@ -1,4 +1,4 @@
-"""Collects the states of a drive into an `Estimate`."""
+"""The states of a run, collected, smoothed, and turned into an `Estimate`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,19 @@ import numpy as np
 
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate, Innovation, State, WeightChange
+from terrafusion.fusion.estimator.key_states import key_state_of, smoothed
+from terrafusion.fusion.estimator.map_alignment import MapAlignment
+from terrafusion.fusion.graph.batch import BatchSmoother
+from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
+from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.noise.policy import SensorNoise
 
 
 class History:
-    """Give `add` and `innovations.append` to an `Estimator`, then ask for the `estimate`."""
+    """States and innovations of a run; `add` and `innovations.append` are callbacks of an `Estimator`."""
 
     def __init__(self) -> None:
         self.states: list[State] = []
@@ -24,10 +30,44 @@ class History:
         self.changes: list[WeightChange] = []
 
     def add(self, state: State, noise: SensorNoise, changes: Iterable[WeightChange] = ()) -> None:
-        """One more keyframe, the noise noise it was made with, and the changes of weights before it."""
+        """A keyframe, the sensor noise it was made with, and the changes of weights before it."""
         self.states.append(state)
         self.noises.append(noise)
         self.changes.extend(changes)
+
+    def align(self, alignment: MapAlignment | None, batch: bool) -> tuple[str, ...]:
+        """Move the local states before the first fixes onto the map; gives a note where there are any."""
+        local = [i for i, state in enumerate(self.states) if state.status == "no_gnss"]
+        if alignment is None or not local:
+            return ()
+        for i in local:
+            self.states[i] = alignment.moved(self.states[i])
+        begun = (alignment.t_ns - self.states[0].t_ns) * 1e-9
+        note = f"{begun:.1f} s after the start GNSS laid the path onto the map, turned by "
+        note += f"{np.degrees(alignment.yaw_rad):.0f} degrees"
+        return (note if batch else f"{note}; live, all before was in a local frame: it is not scored",)
+
+    def smooth(self, archive: Chain, config: EstimatorConfig, aligned: bool) -> None:
+        """Replace the live states by the batch solution over the whole run, which starts from them.
+
+        Where fixes have `aligned` the path with the map, no state of it is local any more.
+        """
+        batch = BatchSmoother(archive, [key_state_of(state) for state in self.states])
+        batch.optimise()
+        keys, covariances = batch.states(), batch.covariances()
+        offset = len(keys) - len(self.states)
+        imu, keyframe_s = config.rig.sensors.imu, config.keyframe_s
+        self.states = [
+            smoothed(state, key, P, gyro_sigma_radps(imu, keyframe_s, noise))
+            for state, key, P, noise in zip(
+                self.states, keys[offset:], covariances[offset:], self.noises, strict=True
+            )
+        ]
+        if aligned:
+            self.states = [
+                dataclasses.replace(state, status="outage") if state.status == "no_gnss" else state
+                for state in self.states
+            ]
 
     def estimate(
         self, classes: tuple[str, ...], changes: list[WeightChange], notes: tuple[str, ...]

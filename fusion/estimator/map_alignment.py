@@ -61,7 +61,7 @@ class MapAlignment:
         )
 
 
-def place(
+def align_to_map(
     chain: Chain,
     track: DeadReckoning,
     fix: GnssFix,

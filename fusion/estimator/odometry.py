@@ -25,10 +25,9 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.graph.body_twist import bias_sigma, twist_covariance
-from terrafusion.fusion.graph.key_state import DIM, NAV, POSE, VELOCITY, KeyState, quaternion_of
+from terrafusion.fusion.estimator.key_states import covariance_fields, key_state_of
+from terrafusion.fusion.graph.key_state import DIM, NAV, quaternion_of
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -74,15 +73,12 @@ class Propagator:
         return bisect.bisect_right(imu.t_ns, self._until_ns) - bisect.bisect_right(imu.t_ns, self._state.t_ns)
 
     def _begin(self, state: State, covariance: Array, noise: SensorNoise) -> None:
-        x, y, z, w = state.quaternion
-        pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
         self._state, self._until_ns = state, state.t_ns
-        self._from = gtsam.NavState(pose, state.velocity_mps)
-        self._R = pose.rotation().matrix()
-        self._bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
-        self._key = KeyState(pose, state.velocity_mps, self._bias, state.linear)
+        self._key = key = key_state_of(state)
+        self._from = gtsam.NavState(key.pose, key.velocity)
+        self._R = key.pose.rotation().matrix()
         self._covariance, self._count, self._readings = covariance, 0, np.zeros((2, 3))
-        self._measured = self._preintegrator.integrate([], self._bias, noise)
+        self._measured = self._preintegrator.integrate([], key.bias, noise)
 
     def _carried(self, state: State, gyro_radps: Array, gyro_sigma_radps: Array) -> State:
         measured = self._measured
@@ -101,10 +97,7 @@ class Propagator:
             quaternion=quaternion_of(now.pose()),
             velocity_mps=velocity,
             angular_velocity_radps=self._key.rate(gyro_radps),
-            covariance=gtsam_to_ros_covariance(P[POSE, POSE], R),
-            velocity_covariance=P[VELOCITY, VELOCITY].copy(),
-            twist_covariance=twist_covariance(P, R, velocity, gyro_sigma_radps),
-            bias_sigma=bias_sigma(P),
+            **covariance_fields(P, R, velocity, gyro_sigma_radps),
         )
 
 

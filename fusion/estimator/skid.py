@@ -1,13 +1,11 @@
-"""Wheels that fixes refute: a robot that slides goes where its wheels do not roll.
+"""Skid detector: GNSS fixes that contradict the wheels inflate the variance of the wheels' displacement.
 
-On ice, or in a skid, slip and side-slip leave what the ground's noise allows within a second. The wheels
-then keep good fixes out, and after each that is let in lead the estimate astray again. But how far a robot
-can have slid is known: no further than its wheels rolled and its speed carried it since the last fix that
-was used. Fixes that are refused, lie on one side of the estimate and no further off than that, refute
-the wheels, not the receiver: the wheels' way since then is taken to be as wrong as the fixes say, and how
-fast it goes wrong (a random walk, m2 a second of driving) is remembered, as the noise of an adaptive
-filter (Mehra 1972, IEEE T-AC 17(5)), until accepted fixes tell that they are to be
-trusted again.
+In a skid, slip and side-slip exceed what the noise of the ground allows within a second: the wheels keep
+good fixes out and lead the estimate astray again after each that is let in. But a robot can have skidded
+no further than its wheels rolled and its speed carried it since the last used fix. Rejected fixes that lie
+on one side of the estimate and within that reach refute the wheels, not the receiver. The variance that
+explains them (a random walk, m2 per second of driving) is kept and adapted by the innovations of accepted
+fixes (Mehra 1972, IEEE T-AC 17(5)).
 """
 
 from __future__ import annotations
@@ -28,17 +26,17 @@ from terrafusion.fusion.noise.policy import SensorNoise
 Array = NDArray[np.float64]
 
 SAME_SIDE = 0.5
-"""Cosine between the offsets of two refused fixes from which they lie on one side."""
+"""Least cosine between the offsets of two rejected fixes that lie on one side."""
 REACH_SIGMA = 3.0
 """Sigmas of a fix by which it may lie beyond the robot's reach."""
 LEAST_M2PS = 1e-4
-"""A centimetre after a second: a slide is over."""
+"""Rate below which a skid is over: a centimetre after a second."""
 MEMORY_S = 10.0
-"""How long a slide is remembered while the robot drives and fixes are accepted (assumed: a few turns)."""
+"""Time constant of the variance rate while the robot drives and fixes are accepted (assumed: a few turns)."""
 FORGOTTEN_S = 20.0
-"""How long it is remembered without fixes (assumed: the next ground is another one)."""
+"""Time constant without fixes (assumed: the next ground is another one)."""
 DRIVING_MPS = 0.3
-"""At this speed, of the robot or its wheels, half a second counts as driven in a second; at rest none."""
+"""Speed, of the robot or its wheels, at which half of the time counts as driven; at rest none does."""
 
 _Passed = tuple[int, WheelIncrement | None, gtsam.NonlinearFactorGraph]
 
@@ -47,13 +45,13 @@ class SkidDetector:
     """How wrong the wheels are beyond their noise.
 
     Attributes:
-        grip: what friction leaves of the wheels' way, where that is heard.
-        rate_m2ps: variance of the wheels' way, each axis, per second of driving.
+        friction: friction estimator, where there is one.
+        rate_m2ps: variance of the wheels' displacement, each axis, per second of driving.
         refutations: how often fixes refuted the wheels.
     """
 
-    def __init__(self, grip: FrictionEstimator | None = None) -> None:
-        self.grip = grip
+    def __init__(self, friction: FrictionEstimator | None = None) -> None:
+        self.friction = friction
         self.rate_m2ps = 0.0
         self.refutations = 0
         self._before: tuple[float, list[_Passed]] = (0.0, [])
@@ -61,7 +59,7 @@ class SkidDetector:
         self._before_m = np.zeros(2)
         self._last_ns: int | None = None
 
-    def refuted(
+    def test_wheels(
         self,
         chain: Chain,
         k: int,
@@ -70,17 +68,17 @@ class SkidDetector:
         sigma_m: float,
         noise: SensorNoise,
     ) -> bool:
-        """Whether refused fixes, the last at keyframe k, refute the wheels; loosens them if so.
+        """Whether rejected fixes, the last at keyframe k, refute the wheels; inflates their variance if so.
 
-        It takes two refused fixes in a row, in a slide one.
+        It takes two rejected fixes in a row, in a skid one.
 
         Args:
-            chain: as it is; its wheels from `since_ns` to k are with_extra_variance.
-            k: keyframe of the newest refused fix.
+            chain: its wheel increments from `since_ns` to k are inflated.
+            k: keyframe of the newest rejected fix.
             since_ns: time of the last fix used.
-            refused: offsets (2,), m, of the fixes refused in a row from the estimate.
+            refused: offsets (2,), m, of the consecutive rejected fixes from the estimate.
             sigma_m: 1 sigma of the newest fix.
-            noise: noise of the ground.
+            noise: of the ground.
         """
         if since_ns is None or len(refused) < (1 if self.rate_m2ps else 2) or not _on_one_side(refused[-2:]):
             return False
@@ -108,20 +106,20 @@ class SkidDetector:
         self.refutations += 1
         for i, node, driven in zip(passed, nodes, driven_s, strict=True):
             if node.wheels is not None:
-                loose = self.grip.loose_link(chain, i, more_m2ps, noise) if self.grip else None
-                chain.revise(i, wheels=node.wheels.with_extra_variance(more_m2ps * driven), link=loose)
+                inflated = self.friction.inflated_link(chain, i, more_m2ps, noise) if self.friction else None
+                chain.revise(i, wheels=node.wheels.with_extra_variance(more_m2ps * driven), link=inflated)
         chain.smooth(chain.last - begin + 1)
         return True
 
-    def put_back(self, chain: Chain) -> None:
-        """Undo the last refutation: with looser wheels, too, the estimate does not lead to the fix."""
+    def undo(self, chain: Chain) -> None:
+        """Undo the last refutation: inflated wheels do not lead to the fix either."""
         self.rate_m2ps, passed = self._before
         self.refutations -= 1
         for i, wheels, link in passed:
             chain.revise(i, wheels=wheels, link=link)
 
     def with_extra_variance(self, wheels: WheelIncrement, before: KeyState, dt_s: float) -> WheelIncrement:
-        """An increment over `dt_s` as it counts in the slide; on ground that holds the same."""
+        """The increment over `dt_s` with the variance of the skid; unchanged where there is none."""
         driven_s = dt_s * driving(before, wheels, dt_s)
         self._driven_s += driven_s
         if not self.rate_m2ps:
@@ -129,7 +127,7 @@ class SkidDetector:
         self.rate_m2ps *= math.exp(-driven_s / FORGOTTEN_S)
         return wheels.with_extra_variance(self.rate_m2ps * driven_s)
 
-    def dragged(
+    def friction_link(
         self,
         t_ns: int,
         dt_s: float,
@@ -138,16 +136,16 @@ class SkidDetector:
         before: KeyState,
         covariance: Array,
     ) -> tuple[list[ImuSegment], WheelIncrement | None]:
-        """What links a keyframe, as friction has it where fixes have shown that; see `FrictionEstimator.step`."""
-        if self.grip is None:
+        """Segments and wheel increment of a keyframe's link; see `FrictionEstimator.step`."""
+        if self.friction is None:
             return segments, wheels
-        return self.grip.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)
+        return self.friction.step(t_ns, dt_s, segments, wheels, before, covariance, self.rate_m2ps)
 
     def accepted(self, t_ns: int, innovation_m: Array, predicted_m2: Array) -> None:
-        """Learn from a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.
+        """Adapt the rate to a fix that is used: `innovation_m` (2,) and the variances (2,) predicted for it.
 
-        Wheels that are still trusted too much leave innovations on one side, fix after fix; what is new at
-        every fix is the receiver's (Mehra: the innovations of the right filter are white).
+        Wheels that are trusted too much leave innovations on one side; the innovations of the right filter
+        are white.
         """
         before_ns = self._last_ns
         if before_ns is not None and t_ns <= before_ns:

@@ -96,7 +96,7 @@ class StationarityDetector:
         self.still_m = max(1.001 * quantum_m, PARKED_MPS * self.window_s)
         self._imu_spec = rig.sensors.imu
 
-    def stands(
+    def is_stationary(
         self,
         t_ns: int,
         imu: ImuStream,
@@ -148,7 +148,7 @@ def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix])
     return True
 
 
-def hold(chain: Chain, k: int, link: gtsam.NonlinearFactorGraph) -> None:
+def add_zero_velocity(chain: Chain, k: int, link: gtsam.NonlinearFactorGraph) -> None:
     """Zero velocity at keyframe k, and in its `link` no motion since the one before."""
     link.add(no_motion_factor(k))
     chain.add(k, gtsam.PriorFactorVector(gtsam.symbol("v", k), np.zeros(3), _STOPPED), "V")

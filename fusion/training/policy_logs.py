@@ -139,7 +139,7 @@ def motion_of(recording: Recording, vehicle: str | None = None) -> MeasuredMotio
     Raises:
         DataError: no wheels of both sides, or no truth of the body with position and yaw.
     """
-    from terrafusion.fusion.replay import choose_vehicle
+    from terrafusion.twin.model.choose import choose_vehicle
 
     wheels, truth = recording.wheels, recording.truth
     if wheels is None or not wheels.has_sides():

@@ -91,7 +91,7 @@ def signals_of(recording: Recording) -> Signals:
     Raises:
         DataError: no IMU, or no wheels of two sides.
     """
-    from terrafusion.fusion.replay import choose_vehicle
+    from terrafusion.twin.model.choose import choose_vehicle
 
     imu, wheels, motor = recording.imu, recording.wheels, recording.motor
     if imu is None or wheels is None or not wheels.has_sides():

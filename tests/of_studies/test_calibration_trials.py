@@ -18,7 +18,7 @@ from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, residual, slip_of
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.fusion.replay import choose_vehicle
+from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.simulate import simulate
 from tests.studies.calibration_trials import (

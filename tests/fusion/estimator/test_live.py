@@ -19,7 +19,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.odometry import transition
-from terrafusion.fusion.live import main, messages, repeated, run
+from terrafusion.fusion.live import run
 from terrafusion.fusion.replay import replay
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.run_recording import DATUM
@@ -44,7 +44,7 @@ def odometry(drive: Recording) -> tuple[list[State], list[bool]]:
         states.append(state)
         keyframes.append(estimator.latest())
 
-    run(estimator, messages(drive, estimator.config.rig.wheel_radius_m), publish)
+    run(estimator, drive.messages(), publish)
     fresh = [a is not b for a, b in zip(keyframes[1:], keyframes[:-1], strict=True)]
     return states, fresh
 
@@ -65,7 +65,7 @@ def test_live_gives_what_replay_gives(drive: Recording) -> None:
     config = EstimatorConfig(load_vehicle("elevate").rig(), "elevate")
     states: list[State] = []
     estimator = Estimator(config, on_state=states.append)
-    run(estimator, messages(drive, config.rig.wheel_radius_m), lambda _: None)
+    run(estimator, drive.messages(), lambda _: None)
     estimator.finish()
     np.testing.assert_array_equal(first.t_ns, [s.t_ns for s in states])
     np.testing.assert_array_equal(first.position_m, [s.position_m for s in states])
@@ -116,22 +116,6 @@ def test_the_transition_is_the_derivative_of_the_motion() -> None:
         (Ra, pa, va), (Rb, pb, vb) = end(step), end(-step)
         column = [gtsam.Rot3.Logmap(Rb.between(Ra)), R_j.matrix().T @ (pa - pb), va - vb]
         np.testing.assert_allclose(F[:9, i], np.concatenate(column) / 2e-6, atol=1e-6)
-
-
-def test_a_repeated_drive_goes_on_where_it_ended(drive: Recording) -> None:
-    again = repeated(drive)
-    first, second = next(again), next(again)
-    assert first.gnss is not None
-    assert second.gnss is not None
-    assert second.gnss.t_ns[0] >= first.gnss.t_ns[-1]
-    assert np.linalg.norm((second.gnss.enu_m[0] - first.gnss.enu_m[-1])[:2]) < 10.0
-    steps = [np.linalg.norm(np.diff(r.gnss.enu_m[:, :2], axis=0), axis=1) for r in (first, second)]  # type: ignore[union-attr]
-    np.testing.assert_allclose(steps[0], steps[1], atol=1e-9)
-
-
-def test_a_log_that_is_not_there_is_told_in_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["no-such-log"]) == 1
-    assert capsys.readouterr().out.startswith("error: ")
 
 
 class Anything(types.SimpleNamespace):
@@ -248,7 +232,7 @@ def test_the_ros_node_publishes_what_the_estimator_says(drive: Recording, node: 
         node.heard[topic](message)
     node.second()
     estimator, states = Estimator.for_vehicle("elevate"), list[State]()
-    run(estimator, messages(heard(drive), estimator.config.rig.wheel_radius_m), states.append)
+    run(estimator, heard(drive).messages(), states.append)
     published = node.told["odometry/terrafusion"]
     assert len(published) == len(states)
     assert drive.gnss is not None

@@ -15,8 +15,10 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.feed import split_fixes
 from terrafusion.fusion.metrics.scores import Outage
-from terrafusion.fusion.replay import choose_vehicle, replay, split_fixes
+from terrafusion.fusion.replay import replay
+from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate

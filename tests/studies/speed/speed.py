@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError, TerrafusionError
+from terrafusion.datasets.core.messages import ImuSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
@@ -25,7 +26,6 @@ from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.live import messages
 from tests.studies.speed import gtsam_graph as speed_gtsam
 from tests.studies.speed.gtsam_graph import Graph
 
@@ -75,14 +75,14 @@ def live(recording: Recording, config: EstimatorConfig, keep: bool = False) -> L
     taken = Live(archive=Chain(calibrate=config.calibrate) if keep else None)
     estimator = Estimator(config, on_state=taken.states.append, archive=taken.archive)
     fresh = False
-    for _, kind, give in messages(recording, config.rig.wheel_radius_m):
+    for message in recording.messages():
         before, wall, cpu = len(taken.states), time.perf_counter(), time.thread_time()
-        give(estimator)
+        estimator.add(message)
         wall, cpu = time.perf_counter() - wall, time.thread_time() - cpu
         taken.seconds += wall
         taken.cpu_s += cpu
         if len(taken.states) == before:
-            if fresh and kind == "imu":
+            if fresh and isinstance(message, ImuSample):
                 taken.upkeep_ms.append(cpu * 1e3)
                 fresh = False
             continue
@@ -106,7 +106,7 @@ def timed(call: Callable[[], object]) -> tuple[float, float]:
 
 def initial(taken: Live) -> list[KeyState]:
     """States to start a batch from, one a keyframe: the live ones; before them the predictions."""
-    from terrafusion.fusion.replay import key_state_of
+    from terrafusion.fusion.estimator.key_states import key_state_of
 
     assert taken.archive is not None
     nodes = taken.archive.nodes
@@ -212,7 +212,7 @@ def _recordings(logs: list[str]) -> Iterator[Recording]:
 
 
 def _report(recording: Recording, vehicle: str | None, with_profile: bool) -> None:
-    from terrafusion.fusion.replay import choose_vehicle
+    from terrafusion.twin.model.choose import choose_vehicle
 
     robot, _ = choose_vehicle(recording, vehicle)
     config = EstimatorConfig(robot.rig(), robot.name)

@@ -10,20 +10,21 @@ import gtsam
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core.messages import GnssSample
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.outage_plan import aided_by_truth
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig, sensor_config_of
 from terrafusion.fusion.estimate.estimate import WeightChange
-from terrafusion.fusion.estimator import friction as grips
+from terrafusion.fusion.estimator import friction
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.friction import FrictionEstimator, friction_estimator
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
-from terrafusion.fusion.live import messages
 from terrafusion.fusion.metrics.scores import Outage
-from terrafusion.fusion.replay import ReplayResult, choose_vehicle, replay
+from terrafusion.fusion.replay import ReplayResult, replay
+from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate_run
 
@@ -94,17 +95,17 @@ def config_of(recording: Recording) -> EstimatorConfig:
 def followed(recording: Recording, until_s: float = np.inf) -> tuple[list[float], list[bool], Estimator]:
     """FrictionEstimator and whether the robot slides after every fix, of a live estimator."""
     estimator = Estimator(config_of(recording))
-    grip = estimator.gnss.slide.grip
+    grip = estimator.gnss.skid.friction
     assert grip is not None
-    found, slides = [], []
-    for t_ns, channel, give in messages(recording, estimator.config.rig.wheel_radius_m):
-        if t_ns > recording.start_ns + until_s * 1e9:
+    found, leads = [], []
+    for message in recording.messages():
+        if message.t_ns > recording.start_ns + until_s * 1e9:
             break
-        give(estimator)
-        if channel == "gnss":
+        estimator.add(message)
+        if isinstance(message, GnssSample):
             found.append(grip.mps2)
-            slides.append(grip.slides)
-    return found, slides, estimator
+            leads.append(grip.leads)
+    return found, leads, estimator
 
 
 def test_the_grip_of_ice_is_found(ice: Recording) -> None:
@@ -162,7 +163,7 @@ def test_slip_of_a_slide_is_told(ice: Recording) -> None:
 
 
 def test_a_change_of_the_wheels_worth_is_told_with_its_reason(ice: Recording) -> None:
-    told = [c for c in replay(ice).estimate.changes if c.reason.startswith("grip: friction")]
+    told = [c for c in replay(ice).estimate.changes if c.reason.startswith("friction: friction")]
     assert told
     assert told[0].before == np.inf
     assert all(change.unit == "m/s2" for change in told)
@@ -171,11 +172,11 @@ def test_a_change_of_the_wheels_worth_is_told_with_its_reason(ice: Recording) ->
 def test_a_dump_in_a_slide_goes_on_with_the_same_bits(ice: Recording) -> None:
     config = config_of(ice)
     one, other = Estimator(config), None
-    for k, (_, _, give) in enumerate(messages(ice, config.rig.wheel_radius_m)):
-        give(one)
+    for k, message in enumerate(ice.messages()):
+        one.add(message)
         if other is not None:
-            give(other)
-        elif k > 1000 and one.gnss.slide.grip is not None and one.gnss.slide.grip.slides:
+            other.add(message)
+        elif k > 1000 and one.gnss.skid.friction is not None and one.gnss.skid.friction.leads:
             other = Estimator.restore(config, one.dump())
     assert other is not None
     state, same = one.latest(), other.latest()
@@ -216,7 +217,7 @@ class Straight:
             config, config.inputs.preintegrator(config.rig.sensors.imu), self.told.append
         )
         assert grip is not None
-        self.grip: FrictionEstimator = grip
+        self.friction: FrictionEstimator = grip
         self.heading = gtsam.Rot3.Rz(heading_rad)
         self.at = np.array([*origin_m, 0.0]) + self.heading.matrix() @ grip.antenna_m
         self.k = 0
@@ -237,12 +238,12 @@ class Straight:
                 np.zeros(len(LINEAR)),
             )
             segments = [ImuSegment(0.1, np.zeros(3), np.array([0.0, 0.0, 9.81]))]
-            self.grip.step(self.k * 10**8, 0.1, segments, wheels, state, np.eye(21) * 1e-4, 0.0)
+            self.friction.step(self.k * 10**8, 0.1, segments, wheels, state, np.eye(21) * 1e-4, 0.0)
             self.at = self.at + R @ np.array([0.1 * speed_mps + 0.005 * acceleration_mps2, 0.0, 0.0])
             speed_mps = min(speed_mps + 0.1 * acceleration_mps2, 3.0)
             if self.k % 5 == 0:
                 jump = jump_m if self.k == 20 else 0.0
-                self.grip.seen(
+                self.friction.score_fix(
                     GnssFix(self.k * 10**8, self.at + jump * np.array([1.0, 1.0, 0.0]), np.full(3, 0.05))
                 )
         return speed_mps
@@ -252,74 +253,74 @@ class Straight:
 def test_the_grip_of_a_robot_that_speeds_up(true_mps2: float) -> None:
     robot = Straight()
     robot.drive(2.6, 0.1, true_mps2)
-    assert robot.grip.slides
-    assert robot.grip.mps2 == pytest.approx(true_mps2, rel=0.3)
+    assert robot.friction.leads
+    assert robot.friction.mps2 == pytest.approx(true_mps2, rel=0.3)
     assert robot.told[0].before == np.inf
-    assert robot.told[-1].after == pytest.approx(robot.grip.mps2, rel=grips.TELL_STEP)
+    assert robot.told[-1].after == pytest.approx(robot.friction.mps2, rel=friction.REPORT_STEP)
 
 
 def test_heading_and_place_do_not_matter() -> None:
     here, there = Straight(), Straight(2.3, (-400.0, 1200.0))
     for robot in (here, there):
         robot.drive(2.6, 0.1, 1.0)
-    assert there.grip.mps2 == pytest.approx(here.grip.mps2, rel=1e-6)
+    assert there.friction.mps2 == pytest.approx(here.friction.mps2, rel=1e-6)
 
 
 def test_one_wild_fix_makes_no_slide() -> None:
     robot = Straight()
     robot.drive(6.0, 3.0, jump_m=4.0)
-    assert not robot.grip.slides
+    assert not robot.friction.leads
     assert not robot.told
 
 
 def test_what_is_heard_is_forgotten_on_the_way() -> None:
     robot = Straight()
     speed = robot.drive(2.6, 0.1, 1.0)
-    assert robot.grip.slides
+    assert robot.friction.leads
     robot.drive(30.0, 3.0 if speed > 2.6 else speed)
-    assert not robot.grip.slides
+    assert not robot.friction.leads
     assert robot.told[-1].after == np.inf
 
 
 def test_silent_wheels_begin_the_ways_anew() -> None:
     robot = Straight()
     robot.drive(2.6, 0.1, 1.0)
-    before = robot.grip.mps2
+    before = robot.friction.mps2
     state = KeyState(gtsam.Pose3(), np.zeros(3), gtsam.imuBias.ConstantBias(), np.zeros(len(LINEAR)))
     segments = [ImuSegment(0.1, np.zeros(3), np.array([0.0, 0.0, 9.81]))]
-    assert robot.grip.step(10**10, 0.1, segments, None, state, np.eye(21), 0.0) == (segments, None)
-    robot.grip.seen(GnssFix(10**10, np.array([50.0, 0.0, 0.0]), np.full(3, 0.05)))
-    assert robot.grip.mps2 == before
+    assert robot.friction.step(10**10, 0.1, segments, None, state, np.eye(21), 0.0) == (segments, None)
+    robot.friction.score_fix(GnssFix(10**10, np.array([50.0, 0.0, 0.0]), np.full(3, 0.05)))
+    assert robot.friction.mps2 == before
 
 
 def test_a_refuted_slide_loosens_its_links_and_has_them_back(ice: Recording) -> None:
     _, _, estimator = followed(ice, until_s=34.0)
-    chain, slide = estimator.chain, estimator.gnss.slide
+    chain, skid = estimator.chain, estimator.gnss.skid
     nodes = chain.nodes[-8:]
     links, sure = [node.link for node in nodes], chain.covariance()
     since, ahead = nodes[0].t_ns, [np.array([0.5, 0.0]), np.array([0.6, 0.0])]
-    assert slide.refuted(chain, chain.last, since, ahead, 0.1, estimator.weights.noise)
+    assert skid.test_wheels(chain, chain.last, since, ahead, 0.1, estimator.weights.noise)
     assert all(node.link is not link for node, link in zip(nodes[1:], links[1:], strict=True))
     assert (np.diag(chain.covariance())[3:8] > 1.2 * np.diag(sure)[3:8]).any()
-    slide.put_back(chain)
+    skid.undo(chain)
     assert all(node.link is link for node, link in zip(nodes, links, strict=True))
 
 
 def test_a_receiver_known_to_scatter_more_than_it_claims_says_less() -> None:
     honest, liar = Straight(), Straight()
-    liar.grip.seen = functools.partial(liar.grip.seen, scale=20.0)  # type: ignore[method-assign]
+    liar.friction.score_fix = functools.partial(liar.friction.score_fix, scale=20.0)  # type: ignore[method-assign]
     for robot in (honest, liar):
         robot.drive(2.6, 0.1, 1.0)
-    assert honest.grip.slides
-    assert not liar.grip.slides
+    assert honest.friction.leads
+    assert not liar.friction.leads
 
 
 def test_a_fix_that_comes_after_a_newer_one_judges_nothing() -> None:
     robot = Straight()
     robot.drive(2.0, 0.1, 1.0)
-    before = robot.grip.mps2
-    robot.grip.seen(GnssFix(19 * 10**8, np.array([40.0, 9.0, 0.0]), np.full(3, 0.05)))
-    assert robot.grip.mps2 == before
+    before = robot.friction.mps2
+    robot.friction.score_fix(GnssFix(19 * 10**8, np.array([40.0, 9.0, 0.0]), np.full(3, 0.05)))
+    assert robot.friction.mps2 == before
 
 
 @pytest.mark.parametrize(
@@ -330,9 +331,9 @@ def test_on_dry_ground_friction_leads_only_where_it_is_sure(
     best_mps2: float | None, lead: float, leads: bool
 ) -> None:
     """`lead` is the logarithm of how much better one grip, or rolling, told the way than all others."""
-    grip = Straight().grip
-    i = -1 if best_mps2 is None else int(np.flatnonzero(best_mps2 == grips.FRICTION_MPS2)[0])
+    grip = Straight().friction
+    i = -1 if best_mps2 is None else int(np.flatnonzero(best_mps2 == friction.FRICTION_MPS2)[0])
     grip._score[i] += lead
-    assert grip.slides == leads
+    assert grip.leads == leads
     if leads:
         assert grip.mps2 == pytest.approx(best_mps2, rel=0.1)

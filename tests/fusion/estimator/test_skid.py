@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterator
 
 import gtsam
 import numpy as np
@@ -18,7 +17,6 @@ from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.key_state import LINEAR, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix
-from terrafusion.fusion.live import messages
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.simulate import simulate, simulate_run
@@ -37,13 +35,6 @@ def sliding() -> Recording:
     )
     ice = dataclasses.replace(soil, shear=grip)
     return simulate_run("staircase", terrain="asphalt", soils={"asphalt": ice}, seed=3).recording
-
-
-def given(recording: Recording) -> Iterator[Callable[[Estimator], None]]:
-    """All messages in order."""
-    radius_m = Estimator.for_vehicle("elevate").config.rig.wheel_radius_m
-    for _, _, give in messages(recording, radius_m):
-        yield give
 
 
 def thinned(recording: Recording, every: int, planar: bool) -> Recording:
@@ -83,26 +74,26 @@ def test_a_batch_knows_what_was_learnt_of_the_wheels(sliding: Recording) -> None
 def test_a_dump_in_a_slide_goes_on_with_the_same_bits(sliding: Recording) -> None:
     """Until the wheels were refuted, then on: one estimator, and one that is restored from a dump of it."""
     one, other = Estimator.for_vehicle("elevate"), None
-    for give in given(thinned(sliding, 5, False)):
-        give(one)
+    for message in thinned(sliding, 5, False).messages():
+        one.add(message)
         if other is not None:
-            give(other)
-        elif one.gnss.slide.rate_m2ps:
+            other.add(message)
+        elif one.gnss.skid.rate_m2ps:
             other = Estimator.restore(Estimator.for_vehicle("elevate").config, one.dump())
     assert other is not None
     state, same = one.latest(), other.latest()
     assert state is not None
     assert same is not None
     assert state.position_m.tobytes() == same.position_m.tobytes()
-    assert one.gnss.slide.rate_m2ps == other.gnss.slide.rate_m2ps
+    assert one.gnss.skid.rate_m2ps == other.gnss.skid.rate_m2ps
 
 
 def test_nothing_is_learnt_on_ground_that_holds() -> None:
     log = simulate("staircase", terrain="asphalt", seed=3)
     estimator = Estimator.for_vehicle("elevate")
-    for give in given(log):
-        give(estimator)
-        assert estimator.gnss.slide.rate_m2ps == 0.0
+    for message in log.messages():
+        estimator.add(message)
+        assert estimator.gnss.skid.rate_m2ps == 0.0
 
 
 @drawn(variance=st.floats(1e-8, 1e4), sigma=st.floats(1e-4, 1.0), distance=st.floats(-3.0, 3.0))

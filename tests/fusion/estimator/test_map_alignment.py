@@ -147,7 +147,7 @@ def test_a_robot_that_hardly_moves_stays_local() -> None:
     assert any("did not show the heading" in note for note in result.estimate.notes)
 
 
-def test_an_estimator_restored_before_the_fixes_is_placed_with_the_same_bits() -> None:
+def test_an_estimator_restored_before_the_fixes_is_aligned_with_the_same_bits() -> None:
     recording = drive(137.0)
     vehicle = load_vehicle("elevate")
     config = EstimatorConfig(vehicle.rig(), vehicle.name)
@@ -179,7 +179,7 @@ def test_an_estimator_restored_before_the_fixes_is_placed_with_the_same_bits() -
                 estimator.add_wheels(t_ns, *sides[i].tolist())
             else:
                 estimator.add_gnss(t_ns, gnss.enu_m[i], gnss.sigma_enu_m[i], fix=int(gnss.fix[i]))
-        assert estimator.gnss.placed is not None
+        assert estimator.gnss.alignment is not None
         return states
 
     whole, broken = run(None), run(50.3)

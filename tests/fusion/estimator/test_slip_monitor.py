@@ -112,7 +112,7 @@ def streams(quantum_rad: float, wheel_mps: float, gyro=None, accel=None, seed: i
 
 def rests(imu: ImuStream, wheels: WheelStream, quantum_rad: float, **speed: float) -> bool:
     detector = StationarityDetector(rig(quantum_rad, 10.0))
-    return detector.stands(2_000_000_000, imu, wheels, np.zeros(3), np.zeros(3), **speed)
+    return detector.is_stationary(2_000_000_000, imu, wheels, np.zeros(3), np.zeros(3), **speed)
 
 
 @pytest.mark.parametrize("quantum", [2.9e-5, 1e-3, COARSE_RAD])

@@ -18,11 +18,11 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.messages import GnssSample, Message
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.graph.factor_numbers import factor_from, numbers_of
-from terrafusion.fusion.live import Message, messages
 from terrafusion.twin.simulate import simulate
 
 CUTS_S = {"waiting": 0.5, "aligning": 2.0, "running": 14.03, "outage": 30.0, "running again": 42.0}
@@ -33,11 +33,11 @@ def drive() -> Iterator[Message]:
     """Asphalt, standing for the first seconds, without fixes for a while."""
     recording = simulate("figure_eight", terrain="asphalt", seed=5)
     low, high = (recording.start_ns + round(t * 1e9) for t in OUTAGE_S)
-    for t_ns, channel, give in messages(
-        recording, Estimator.for_vehicle("elevate").config.rig.wheel_radius_m
-    ):
-        if (channel != "gnss" or not low < t_ns < high) and t_ns < recording.start_ns + 45e9:
-            yield t_ns, channel, give
+    for message in recording.messages():
+        t_ns = message.t_ns
+        outage = isinstance(message, GnssSample) and low < t_ns < high
+        if not outage and t_ns < recording.start_ns + 45e9:
+            yield message
 
 
 def sha(state: State) -> str:
@@ -50,9 +50,9 @@ def later_states(estimator: Estimator, after_ns: int) -> list[str]:
     """The SHA of every keyframe made of the messages after a time, and of the odometry at the end."""
     seen: list[str] = []
     estimator._on_state = lambda state: seen.append(sha(state))
-    for t_ns, _, give in drive():
-        if t_ns > after_ns:
-            give(estimator)
+    for message in drive():
+        if message.t_ns > after_ns:
+            estimator.add(message)
     odometry = estimator.odometry()
     assert odometry is not None
     return [*seen, sha(odometry)]
@@ -67,13 +67,14 @@ def cut() -> dict[str, tuple[int, bytes, list[str]]]:
     waiting = dict(CUTS_S)
     taken: dict[str, tuple[int, bytes, int]] = {}
     first = None
-    for t_ns, _, give in drive():
+    for message in drive():
+        t_ns = message.t_ns
         first = t_ns if first is None else first
         for name in [n for n, s in waiting.items() if t_ns > first + s * 1e9]:
             assert estimator.status == name.split()[0]
             taken[name] = (t_ns - 1, estimator.dump(), len(seen))
             del waiting[name]
-        give(estimator)
+        estimator.add(message)
     odometry = estimator.odometry()
     assert odometry is not None
     return {k: (t, data, [*seen[n:], sha(odometry)]) for k, (t, data, n) in taken.items()}

@@ -1,0 +1,64 @@
+"""Between the state of a keyframe in the graph and the `State` that is reported."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.graph.body_twist import bias_sigma, twist_covariance
+from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
+
+Array = NDArray[np.float64]
+
+
+def key_state_of(state: State) -> KeyState:
+    """The keyframe's state in the graph behind a reported one."""
+    x, y, z, w = state.quaternion
+    pose = gtsam.Pose3(gtsam.Rot3.Quaternion(w, x, y, z), state.position_m)
+    bias = gtsam.imuBias.ConstantBias(state.accel_bias_mps2, state.gyro_bias_radps)
+    return KeyState(pose, state.velocity_mps, bias, state.linear)
+
+
+def covariance_fields(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: Array) -> dict[str, Any]:
+    """Fields of a `State` that follow from the covariance P (dim, dim) of its tangent.
+
+    Args:
+        R: (3, 3) body to world.
+        velocity_mps: (3,) world.
+        gyro_sigma_radps: (3,) white noise of the rates.
+    """
+    return {
+        "covariance": gtsam_to_ros_covariance(P[POSE, POSE], R),
+        "velocity_covariance": P[VELOCITY, VELOCITY].copy(),
+        "twist_covariance": twist_covariance(P, R, velocity_mps, gyro_sigma_radps),
+        "bias_sigma": bias_sigma(P),
+    }
+
+
+def state_fields(key: KeyState, P: Array, gyro_radps: Array, gyro_sigma_radps: Array) -> dict[str, Any]:
+    """Fields of a `State` that follow from a keyframe, its covariance P and the gyro's reading (3,)."""
+    return {
+        "position_m": np.asarray(key.pose.translation()),
+        "quaternion": quaternion_of(key.pose),
+        "velocity_mps": key.velocity,
+        "angular_velocity_radps": key.rate(gyro_radps),
+        "gyro_bias_radps": np.asarray(key.bias.gyroscope()),
+        "accel_bias_mps2": np.asarray(key.bias.accelerometer()),
+        "linear": key.linear,
+        "linear_sigma": linear_sigma(P),
+        "slip_sigma": float(np.sqrt(P[SLIP, SLIP])),
+        **covariance_fields(P, key.pose.rotation().matrix(), key.velocity, gyro_sigma_radps),
+    }
+
+
+def smoothed(live: State, key: KeyState, P: Array, gyro_sigma_radps: Array) -> State:
+    """The live state of a keyframe with the batch solution `key` and its covariance P in its place."""
+    gyro = key_state_of(live).reading(live.angular_velocity_radps)
+    slip = key.slip + (live.slip - float(live.linear[0]))
+    return dataclasses.replace(live, slip=slip, **state_fields(key, P, gyro, gyro_sigma_radps))

@@ -1,0 +1,36 @@
+"""What an estimator made of its inputs, in sentences."""
+
+from __future__ import annotations
+
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
+
+
+def notes_of(estimator: Estimator) -> tuple[str, ...]:
+    """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
+    gnss, notes = estimator.gnss, []
+    if gnss.local and not gnss.unaligned:
+        notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
+    elif gnss.local:
+        notes.append(
+            f"{gnss.unaligned} GNSS fixes came after a start without any and did not show the heading: "
+            "the path is local, its start and heading are arbitrary"
+        )
+    if gnss.too_late:
+        notes.append(f"{gnss.too_late} GNSS fixes came before the start or too late for the lag")
+    if gnss.turned:
+        notes.append(f"the heading was wrong and was set right from the motion {gnss.turned} times")
+    if gnss.skid.refutations:
+        notes.append(f"fixes showed {gnss.skid.refutations} times that the robot slid beside its wheels")
+    friction = gnss.skid.friction
+    if friction is not None and friction.leads:
+        notes.append(f"at its end the robot slid, with a grip of {friction.mps2:.1f} m/s2")
+    if estimator.imu.spikes:
+        notes.append(
+            f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "
+            "believed: the mean of those before stands for each"
+        )
+    for stream in (estimator.imu.late, estimator.wheels.late):
+        if stream.too_late:
+            notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
+    return (*notes, *estimator.aids.notes())
