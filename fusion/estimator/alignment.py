@@ -5,11 +5,17 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
+import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.sensors import ImuSpec
+from terrafusion.fusion.graph import slow_states
+from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
+from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
@@ -86,6 +92,29 @@ def level_start(imu: ImuStream, wheels: WheelStream, t_ns: int) -> Start:
 def _mean_speed_mps(wheels: WheelStream, start_ns: int, end_ns: int) -> float:
     rolled = wheels.travelled(start_ns, end_ns)
     return 0.0 if rolled is None else 0.5 * sum(rolled) / ((end_ns - start_ns) * 1e-9)
+
+
+def initial_state(
+    start: Start, noise: SensorNoise, imu: ImuSpec, drift_sigma_m: float, from_fixes: bool
+) -> tuple[KeyState, Array]:
+    """State of the first keyframe and its prior 1 sigmas (DIM,).
+
+    `from_fixes`: the heading came from fixes that enter the graph, too, and is given a wider prior.
+    """
+    rotation = gtsam.Rot3.RzRyRx(start.roll_rad, start.pitch_rad, start.yaw_rad)
+    gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
+    linear, linear_sigma = slow_states.prior(noise, float(rotation.matrix()[2, 0]), drift_sigma_m)
+    state = KeyState(
+        gtsam.Pose3(rotation, start.position_m),
+        rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
+        gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
+        linear,
+    )
+    level = float(np.hypot(start.level_sigma_rad, imu.accel_bias_sigma_mps2 / GRAVITY_MPS2))
+    yaw = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
+    sigmas = [level, level, yaw, *[start.position_sigma_m] * 3, *[0.1 + 0.3 * abs(start.speed_mps)] * 3]
+    sigmas += [imu.accel_bias_sigma_mps2 + 1e-6] * 3 + [imu.gyro_bias_sigma_radps + 1e-6] * 3
+    return state, np.array([*sigmas, *linear_sigma.tolist()])
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,7 +20,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
@@ -32,10 +31,11 @@ from terrafusion.fusion.estimator.alignment import (
     Start,
     checked_start,
     heading_from_motion,
+    initial_state,
     level_start,
 )
 from terrafusion.fusion.estimator.friction import friction_estimator
-from terrafusion.fusion.estimator.gates import WheelGate
+from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
 from terrafusion.fusion.estimator.key_states import state_fields
 from terrafusion.fusion.estimator.messages import add_message
@@ -51,7 +51,7 @@ from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, wheel_increment
-from terrafusion.fusion.graph.key_state import SLIP, VELOCITY, KeyState
+from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
@@ -66,15 +66,17 @@ SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 SEEN_LATE_NS, SWITCHED = 1_000_000_000, 0.1
-"""A change of ground is seen a second after it (`docs/terrain.md`); less of a shift is none."""
+"""Detection latency of a change of ground (`docs/terrain.md`); smaller shifts of probability are ignored."""
+KEPT_NS = 2_000_000_000
+"""Samples are kept for so long after their keyframe."""
 UNKNOWN = np.full(3, np.nan)
 
 
 class Estimator:
     """Fixed-lag factor-graph estimator over wheels, IMU and GNSS.
 
-    Samples may come late and out of order (see `streams.Lateness`); keyframes are made as soon as the
-    IMU (and the wheels, or their waiting time) cover them. `on_state` is called with every new `State`,
+    Samples may come late and out of order (see `streams.Lateness`); keyframes are made as soon as the IMU
+    and the wheels (or their waiting time) cover them. `on_state` is called with every new `State`,
     `on_innovation` with every tested measurement; `archive` keeps all factors for a batch solution.
     """
 
@@ -126,7 +128,9 @@ class Estimator:
         Where `config.inputs` declares no more than gyro z, all but the yaw rate may be NaN.
         """
         if self.config.inputs.imu == "none":
-            raise DataError("the estimator was told to expect no IMU", channel="imu", remedy="mend `inputs`")
+            raise DataError(
+                "the estimator is configured without an IMU", channel="imu", remedy="mend `inputs`"
+            )
         self.imu.add(t_ns, gyro_radps, accel_mps2)
         self._advance()
 
@@ -153,9 +157,9 @@ class Estimator:
         sigma_v_mps: float = float("nan"),
         fix: Fix | int | str | None = None,
     ) -> None:
-        """Antenna position and 1 sigma (3,), ENU m (a NaN height is unknown); velocity (3,) ENU if known.
+        """Antenna position and 1 sigma (3,), ENU m (NaN height: unknown); velocity (3,) ENU m/s if known.
 
-        `fix` is the class of fix ("single" to "fixed"); without a sensible sigma that of the class counts.
+        `fix` is the class of fix ("single" to "fixed"); it gives the sigma where none is sensible.
         """
         taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
         if taken is not None:
@@ -170,24 +174,24 @@ class Estimator:
     ) -> None:
         """Start at a known position (3,) and heading, ENU, with 1 sigmas, instead of waiting for motion.
 
-        A heading that proves wrong is set right from the motion. Must come before the start.
+        A wrong heading is corrected from the motion. Must come before the start.
         """
         self._given = checked_start(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
 
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
-        """Class probabilities of an external source, such as a camera, fused with the own detector's."""
+        """Class probabilities of an external source, such as a camera, fused with those of the detector."""
         self.weights.external(t_ns, probabilities)
 
     def add_command(self, t_ns: int, v_mps: float) -> None:
-        """Commanded forward speed: it tells a robot that is kept from moving from one that waits."""
+        """Commanded forward speed, which tells a stalled robot from a waiting one."""
         self.monitor.command(t_ns, v_mps)
 
     def add_pressure(self, t_ns: int, pressure_pa: float) -> None:
-        """Static pressure of a barometer, Pa: it holds the height that GNSS, or the start, has told."""
+        """Static pressure of a barometer, Pa; it holds the height of GNSS or of the start."""
         self.aids.height.add(t_ns, pressure_pa)
 
     def add_magnetic_field(self, t_ns: int, field_t: ArrayLike) -> None:
-        """Magnetic flux density (3,), body axes, tesla: heading, see `inputs.magnetometer`."""
+        """Magnetic flux density (3,), body axes, tesla; see `magnetometer`."""
         self.aids.heading.add(t_ns, field_t)
 
     def latest(self) -> State | None:
@@ -206,18 +210,18 @@ class Estimator:
 
     @classmethod
     def restore(cls, config: EstimatorConfig, data: bytes, **callbacks: Any) -> Estimator:
-        """An estimator that goes on where `dump` was called, with the same bits; see `snapshot.restore`."""
+        """An estimator that continues from `dump` with the same bits; see `snapshot.restore`."""
         return snapshot.restore(cls(config, **callbacks), data)
 
     @property
     def status(self) -> str:
-        """A key of `STATUS`: what the estimator is doing now, also before the first state."""
+        """A key of `STATUS`, also before the first state."""
         if self._state is not None:
             return self._state.status
         return "waiting" if self._level is None else "aligning"
 
     def finish(self) -> None:
-        """Tell that no more data come: keyframes no longer wait for late samples."""
+        """No more data come: keyframes no longer wait for late samples."""
         self.imu.late.wait_ns = self.wheels.late.wait_ns = 0
         self._advance(last=True)
 
@@ -238,7 +242,7 @@ class Estimator:
         return last or self.wheels.covers(t_ns) or self.imu.covers(waited)
 
     def _try_start(self, last: bool) -> bool:
-        """Start the graph once heading is known, or once it is clear that GNSS will not come."""
+        """Start the graph once heading is known, or once GNSS has been waited for long enough."""
         if not self.imu.t_ns or not self.wheels.t_ns:
             return False
         begin = max(self.imu.t_ns[0], self.wheels.t_ns[0])
@@ -267,39 +271,18 @@ class Estimator:
 
     def _begin(self, start: Start) -> None:
         self._start = start
-        rotation = gtsam.Rot3.RzRyRx(start.roll_rad, start.pitch_rad, start.yaw_rad)
-        spec = self.config.rig.sensors.imu
-        gyro_bias = start.gyro_bias_radps if start.gyro_bias_radps is not None else np.zeros(3)
-        grade = float(rotation.matrix()[2, 0])
-        linear, sigma = slow_states.prior(self.weights.noise, grade, self.gnss.drift_sigma_m)
-        point = KeyState(
-            gtsam.Pose3(rotation, start.position_m),
-            rotation.matrix() @ np.array([start.speed_mps, 0.0, 0.0]),
-            gtsam.imuBias.ConstantBias(np.zeros(3), gyro_bias),
-            linear,
-        )
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         from_fixes = not self.gnss.local and self._given is None
-        yaw_sigma = max(0.3, 2.0 * start.yaw_sigma_rad) if from_fixes else start.yaw_sigma_rad
-        level = float(np.hypot(start.level_sigma_rad, spec.accel_bias_sigma_mps2 / GRAVITY_MPS2))
-        gyro_sigma = spec.gyro_bias_sigma_radps + 1e-6
-        sigmas = [
-            level,
-            level,
-            yaw_sigma,
-            *[start.position_sigma_m] * 3,
-            *[0.1 + 0.3 * abs(start.speed_mps)] * 3,
-        ]
-        sigmas += [spec.accel_bias_sigma_mps2 + 1e-6] * 3 + [gyro_sigma] * 3 + sigma.tolist()
-        self.chain.append(start.t_ns, point, gyro_radps=gyro_bias)
-        self.chain.set_prior(np.array(sigmas[: self.chain.dim]))
+        spec, drift_m = self.config.rig.sensors.imu, self.gnss.drift_sigma_m
+        point, sigmas = initial_state(start, self.weights.noise, spec, drift_m, from_fixes)
+        self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))
+        self.chain.set_prior(sigmas[: self.chain.dim])
         if self.chain.archive is not None:
-            self.chain.archive.set_prior(np.array(sigmas[: self.chain.dim]))
-        self.chain.solve(SMOOTH_WINDOW)
-        self._covariance = self.chain.covariance()
+            self.chain.archive.set_prior(sigmas[: self.chain.dim])
+        self._solve()
         self.weights.begin(start.t_ns)
         newest = min(s.t_ns[-1] - s.late.wait_ns for s in (self.imu, self.wheels))
-        # Live, what lies before the start has no estimate; a batch has one from the first keyframe on.
+        # Live, keyframes before the start are not reported; in a batch they are.
         self._silent = self.chain.archive is None
         while self.chain.nodes[-1].t_ns + 2 * self._step_ns <= newest:
             self._keyframe(self.chain.nodes[-1].t_ns + self._step_ns)
@@ -331,7 +314,7 @@ class Estimator:
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
             link.add(imu_factor(k, measured))
-            if not self.config.inputs.planar:  # the planar link is no witness against the wheels
+            if not self.config.inputs.planar:  # the planar link does not test the wheels
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, switch)
         up = before.pose.rotation().matrix()[2]
@@ -344,25 +327,27 @@ class Estimator:
         self._finish_keyframe(t_ns, gyro, rolled.distance_m if rolled else None)
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
-        chain = self.chain
-        chain.solve(SMOOTH_WINDOW)
-        before = self._covariance = chain.covariance()
-        if self.gnss.update(chain, self._covariance, self.weights.noise):
-            chain.solve(SMOOTH_WINDOW)
-            self._covariance = chain.covariance()
+        chain, before = self.chain, self._solve()
+        if self.gnss.update(chain, before, self.weights.noise):
+            self._solve()
         if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
-            chain.solve(SMOOTH_WINDOW)
-            self._covariance = chain.covariance()
+            self._solve()
         chain.forget(self._keep)
-        self.imu.forget(t_ns - 2_000_000_000)
-        self.wheels.forget(t_ns - 2_000_000_000)
+        self.imu.forget(t_ns - KEPT_NS)
+        self.wheels.forget(t_ns - KEPT_NS)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         self._fresh = self._emitted(t_ns, gyro)
 
-    def _upkeep(self) -> None:
-        """What no state waits for: the heading's second opinion, smoothing, the ground.
+    def _solve(self) -> Array:
+        self.chain.solve(SMOOTH_WINDOW)
+        self._covariance = self.chain.covariance()
+        return self._covariance
 
-        Done in the call after a keyframe's, at the latest before the next keyframe: no call takes long.
+    def _upkeep(self) -> None:
+        """Heading check, smoothing and terrain: what no state waits for.
+
+        Done in the call after a keyframe's, at the latest before the next keyframe, so that no call takes
+        long.
         """
         state, self._fresh = self._fresh, None
         if state is None:
@@ -397,18 +382,10 @@ class Estimator:
             return None
         gate, dt = self._wheel_gate, self._step_ns * 1e-9
         wheels = gate.rejoined(wheels, dt)
-        moved = before.pose.rotation().matrix().T @ (point.pose.translation() - before.pose.translation())
-        d = wheels.displacement_m
-        innovation = float(moved[0] - before.rolling * d[0])
-        P, noise = self._covariance, self.weights.noise
-        forward = before.pose.rotation().matrix()[:, 0]
-        variance = (
-            wheels.sigma[0] ** 2
-            + d[0] ** 2 * (P[SLIP, SLIP] + noise.slip_sigma**2 * (2.0 * dt / noise.slip_time_s + switch))
-            + dt**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
-            + (0.5 * GRAVITY_MPS2 * dt**2) ** 2 * P[1, 1]
+        innovation, variance = wheel_innovation(
+            wheels, before, point, self._covariance, self.weights.noise, dt, switch
         )
-        robot = float(forward @ before.velocity), float(point.pose.rotation().matrix()[:, 0] @ point.velocity)
+        robot = before.forward_mps, point.forward_mps
         accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
@@ -417,7 +394,7 @@ class Estimator:
         return wheels.doubted(variance, gate.doubt(nis))
 
     def _zero_velocity(self, k: int, t_ns: int, before: KeyState, link: gtsam.NonlinearFactorGraph) -> None:
-        """Zero velocity and rate where the robot has stood for a window."""
+        """Zero-velocity update where the robot has stood for a window."""
         known = self.gnss.last_used_ns is not None and (t_ns - self.gnss.last_used_ns) * 1e-9 <= OUTAGE_S
         sigma = float(np.sqrt(self._covariance[VELOCITY, VELOCITY].trace())) if known else np.inf
         biases = before.bias.gyroscope(), before.bias.accelerometer()

@@ -9,7 +9,10 @@ from enum import Enum
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.fusion.graph.key_state import SLIP, VELOCITY, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
 
@@ -140,3 +143,30 @@ class WheelGate:
     def doubt(self, nis: float) -> float:
         """Factor on the variance of the increment just tested and not believed, from 1 at the limit."""
         return np.inf if self.faulty else float(np.sqrt(nis)) / self.limit_sigma
+
+
+def wheel_innovation(
+    wheels: WheelIncrement,
+    before: KeyState,
+    point: KeyState,
+    P: Array,
+    noise: SensorNoise,
+    dt_s: float,
+    switch: float,
+) -> tuple[float, float]:
+    """Displacement along body x by the IMU less that by the wheels, m, and its variance, m2.
+
+    Args:
+        before, point: the last keyframe with its covariance P (dim, dim), and the IMU's prediction from it.
+        switch: share of the ground that has just changed.
+    """
+    R, d = before.pose.rotation().matrix(), wheels.displacement_m
+    forward = R[:, 0]
+    moved = R.T @ (point.pose.translation() - before.pose.translation())
+    variance = (
+        wheels.sigma[0] ** 2
+        + d[0] ** 2 * (P[SLIP, SLIP] + noise.slip_sigma**2 * (2.0 * dt_s / noise.slip_time_s + switch))
+        + dt_s**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
+        + (0.5 * GRAVITY_MPS2 * dt_s**2) ** 2 * P[1, 1]
+    )
+    return float(moved[0] - before.rolling * d[0]), float(variance)

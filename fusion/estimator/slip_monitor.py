@@ -104,7 +104,7 @@ class MotionMonitor:
         """`update` from a keyframe's state and the covariance (3, 3) of its velocity, world axes."""
         forward = key.pose.rotation().matrix()[:, 0]
         sigma = math.sqrt(float(forward @ velocity_covariance @ forward))
-        self.update(t_ns, rolled_m, float(forward @ key.velocity), sigma)
+        self.update(t_ns, rolled_m, key.forward_mps, sigma)
 
     def update(self, t_ns: int, rolled_m: float | None, speed_mps: float, sigma_mps: float) -> None:
         """One keyframe: wheel travel since the last, before any gate; forward speed and its sigma."""

@@ -75,6 +75,11 @@ class KeyState:
         return float(self.linear[0])
 
     @property
+    def forward_mps(self) -> float:
+        """Speed along body x, m/s."""
+        return float(self.pose.rotation().matrix()[:, 0] @ self.velocity)
+
+    @property
     def rolling(self) -> float:
         """Distance over what the wheels say, longitudinally: of slip and radius."""
         return float((1.0 - self.linear[0]) * (1.0 + self.linear[RADIUS - NAV.stop]))

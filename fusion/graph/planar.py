@@ -57,7 +57,7 @@ def level_factor(k: int) -> gtsam.NonlinearFactor:
 
 def with_centripetal_force(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
     """The segments of a level robot that keeps its forward speed: centripetal force v omega is added."""
-    speed = float(before.pose.rotation().matrix()[:, 0] @ before.velocity)
+    speed = before.forward_mps
     bias = float(before.bias.gyroscope()[2])
     return [
         dataclasses.replace(
