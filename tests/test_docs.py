@@ -15,7 +15,7 @@ from terrafusion.fusion.cli.main import app
 from terrafusion.twin.effects import catalogue
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").glob("*.md")])
+DOCUMENTS = sorted([ROOT / "README.md", ROOT / "CHANGELOG.md", *(ROOT / "docs").rglob("*.md")])
 
 SLOW = ("terrain train", "terrain eval", "policy fit")
 """Commands that take longer than a test should: only their options are checked."""
@@ -67,6 +67,7 @@ def test_readme(folder: Path) -> None:
         if language == "python":
             run_python(ROOT / "README.md", line, text, session)
     assert session["result"].scores.ate_m < 5.0
+    assert (folder / "out" / "metrics.json").is_file()
     assert session["state"].status in ("running", "outage")
     assert (folder / "results" / "metrics.json").is_file()
 
@@ -86,7 +87,9 @@ def test_tutorial(folder: Path) -> None:
     assert abs(session["state"].slip) < 1.0
 
 
-@pytest.mark.parametrize("document", [d for d in DOCUMENTS if d.parent.name == "docs"], ids=lambda d: d.name)
+@pytest.mark.parametrize(
+    "document", [d for d in DOCUMENTS if d.is_relative_to(ROOT / "docs")], ids=lambda d: d.name
+)
 def test_python_of_the_other_documents(document: Path, folder: Path) -> None:
     """Every block that a reader sees as Python is run; the tutorial has a test of its own."""
     session: dict[str, Any] = {"__name__": document.stem}

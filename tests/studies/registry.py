@@ -93,7 +93,13 @@ STUDIES = (
         "Does the wheel model predict forces on a measured wheel that it was not fitted to?",
         _module("twin_field.single_wheel", f"{DATA}/cmu_single_wheel/all_smooth_data.mat", "--out", OUT),
         1,
-        picture="single_wheel.png",
+        {
+            "along": r"halves +fitted +R2 ([\d.]+)",
+            "across": r"halves +fitted +R2 [\d.]+ from .*? R2 ([\d.]+)",
+            "linear_along": r"halves +linear +R2 ([\d.]+)",
+            "linear_across": r"halves +linear +R2 [\d.]+ from .*? R2 ([\d.]+)",
+        },
+        "single_wheel.png",
     ),
     Study(
         "twin_field",
