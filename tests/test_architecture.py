@@ -7,6 +7,7 @@ import statistics
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
 
 from tests.architecture import PAGE, ROOT, drawn, imports, modules
 
