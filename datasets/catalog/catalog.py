@@ -50,7 +50,7 @@ class CatalogFile:
 
 
 @dataclass(frozen=True)
-class Case:
+class SetVariant:
     """What holds for some recordings of a set only."""
 
     conventions: dict[str, Any] = field(default_factory=dict)
@@ -77,7 +77,7 @@ class DataSet:
     homepage: str
     format: str
     conventions: dict[str, Any]
-    cases: dict[str, Case]
+    cases: dict[str, SetVariant]
 
     def conventions_of(self, recording: str = "") -> Conventions:
         """The conventions of one recording, or of an unknown one of the same kind."""
@@ -174,7 +174,7 @@ def _read_sets(path: Path) -> dict[str, DataSet]:
                 remedy="a case has conventions and note",
             )
         cases = {
-            str(p): Case(c.get("conventions") or {}, c.get("note", ""))
+            str(p): SetVariant(c.get("conventions") or {}, c.get("note", ""))
             for p, c in (raw.get("cases") or {}).items()
         }
         sets[name] = DataSet(name=name, **texts, conventions=raw.get("conventions") or {}, cases=cases)

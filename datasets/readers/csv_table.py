@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import difflib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import ClockError, DataError
-from terrafusion.datasets.readers.delimited import TextLayout, head_lines, read_columns, read_text, split
+from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
 
 Array = NDArray[np.float64]
 
@@ -88,7 +89,10 @@ def read_table(
 def _header(
     path: Path, data: bytes, known: list[str], texts: Sequence[str], prefixes: Sequence[str]
 ) -> list[str]:
-    header = split(next((line for _, line in head_lines(data, 1)), ""), ",")
+    try:
+        header = [name.strip() for name in next(csv.reader([data.split(b"\n", 1)[0].decode()]), [])]
+    except csv.Error as error:
+        raise not_a_table(path, 1, error) from None
     allowed = ["t_s", *known, *texts]
     for name in header:
         if name in allowed or any(name.startswith(p) and name != p for p in prefixes):

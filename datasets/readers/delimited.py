@@ -103,7 +103,7 @@ class TextTable:
 
     def bad_cell(self, name: str, row: int, remedy: str) -> DataError:
         """The error for column `name` of data row `row` (from 0)."""
-        line, cells = next(islice(_rows(self.data, self.layout), row, None), (0, []))
+        line, cells = next(islice(_rows(self.path, self.data, self.layout), row, None), (0, []))
         cell = dict(zip(self.layout.names, cells, strict=False)).get(name, "")
         what = f"line {line} has no '{name}'" if not cell.strip() else _cell_is(name, cell, line)
         return _line_error(self.path, self.data, self.layout, what, cells, remedy)
@@ -126,7 +126,7 @@ def read_text(path: Path) -> bytes:
         raise DataError(what, file=path, remedy=remedy)
     data = data.removeprefix(BOM)
     if not data or data.isspace():
-        raise DataError("the file is empty", file=path, remedy="record or copy it again")
+        raise DataError("the file is empty", file=path, remedy="copy it again; a table has at least a header")
     try:
         data.isascii() or data.decode("utf-8")
     except UnicodeDecodeError as error:
@@ -226,7 +226,7 @@ def _line_error(
     path: Path, data: bytes, layout: TextLayout, what: str, cells: Sequence[str], remedy: str
 ) -> DataError:
     """An error about a line of these cells, with its time where that can be read."""
-    first = [] if layout.strict or not layout.time else next(_rows(data, layout), (0, []))[1]
+    first = [] if layout.strict or not layout.time else next(_rows(path, data, layout), (0, []))[1]
     time_s, origin_s = layout.seconds(cells), 0.0 if layout.strict else layout.seconds(first)
     known = time_s is not None and origin_s is not None
     return DataError(what, file=path, time_s=time_s - origin_s if known else None, remedy=remedy)
@@ -260,12 +260,9 @@ def _misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
 
 
 def _quoted_misfits(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
-    try:
-        for line, cells in _rows(data, layout):
-            if len(cells) != len(layout.names):
-                yield line, layout.separator.join(cells) or ".", len(cells)
-    except csv.Error as error:
-        raise DataError(f"not a table: {error}", file=path, remedy="write plain separated numbers") from None
+    for line, cells in _rows(path, data, layout):
+        if len(cells) != len(layout.names):
+            yield line, layout.separator.join(cells) or ".", len(cells)
 
 
 def _parse(
@@ -317,14 +314,14 @@ def _is_suspect(
 def _check_cells(path: Path, data: bytes, layout: TextLayout, numbers: set[str]) -> None:
     """Raise for the first cell of a numeric column that is neither finite nor missing."""
     remedy = "give a finite number, or leave the cell empty where the value is missing"
-    for line, cells in _rows(data, layout):
+    for line, cells in _rows(path, data, layout):
         for name, cell in zip(layout.names, cells, strict=False):
             missing = not cell if layout.strict else cell.strip() in MISSING
             if name in numbers and not missing and not _is_finite(cell):
                 raise _line_error(path, data, layout, _cell_is(name, cell, line), cells, remedy)
 
 
-def _rows(data: bytes, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
+def _rows(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
     """Line number and cells of every row."""
     text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", newline="")
     if layout.separator == BLANKS:
@@ -336,9 +333,20 @@ def _rows(data: bytes, layout: TextLayout) -> Iterator[tuple[int, list[str]]]:
         text.readline()
     lines = ("\n" if layout.comment and line.startswith(layout.comment) else line for line in text)
     reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=not layout.strict)
-    for cells in reader:
-        if len(cells) > 1 or "".join(cells).strip():
-            yield reader.line_num + layout.first_line - 1, cells
+    line = layout.first_line
+    try:
+        for cells in reader:
+            line = reader.line_num + layout.first_line
+            if len(cells) > 1 or "".join(cells).strip():
+                yield line - 1, cells
+    except csv.Error as error:
+        raise not_a_table(path, line, error) from None
+
+
+def not_a_table(path: Path, line: int, error: csv.Error) -> DataError:
+    """The error for a line that the csv module refuses."""
+    what = f"line {line} is not a line of a table: {error}"
+    return DataError(what, file=path, remedy="write plain separated numbers, without quotes")
 
 
 def _is_finite(cell: str) -> bool:

@@ -20,7 +20,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
-from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
+from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of, writing
 
 BLOCK_ROWS = 100_000
 """Rows that are turned into text at a time, which bounds the memory."""
@@ -101,7 +101,7 @@ def _check_wheels(wheels: Wheels | None, folder: Path) -> None:
         )
 
 
-def _check_table(table: Columns, start_ns: int, folder: Path, channel: str) -> None:
+def _check_table(table: OutputTable, start_ns: int, folder: Path, channel: str) -> None:
     """Refuse what the reader would refuse."""
     for name, column in table.columns.items():
         if column.dtype.kind == "f":
@@ -124,7 +124,7 @@ def _check_table(table: Columns, start_ns: int, folder: Path, channel: str) -> N
         )
 
 
-def _write_table(path: Path, start_ns: int, table: Columns) -> None:
+def _write_table(path: Path, start_ns: int, table: OutputTable) -> None:
     with path.open("w", encoding="utf-8", newline="") as out:
         out.write(",".join(["t_s", *_quoted(list(table.columns))]) + "\n")
         for first in range(0, len(table.t_ns), BLOCK_ROWS):

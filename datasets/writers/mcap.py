@@ -20,7 +20,7 @@ from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.writers import ros_messages as ros
 from terrafusion.datasets.writers.mcap_estimate import WrittenEstimate
 from terrafusion.datasets.writers.mcap_file import Definition, TopicMessages, write_mcap_file
-from terrafusion.datasets.writers.tables import Columns, meta_of, tables_of, writing
+from terrafusion.datasets.writers.tables import OutputTable, meta_of, tables_of, writing
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.sensors import Rig
@@ -187,7 +187,7 @@ class _Parts:
         for name in sorted(self.only_here):
             yield ros.table(name, self.tables[name].t_ns, self._numbers(self.tables[name]))
 
-    def _numbers(self, table: Columns) -> dict[str, NDArray[np.float64]]:
+    def _numbers(self, table: OutputTable) -> dict[str, NDArray[np.float64]]:
         """The columns as doubles: a text is its place among the words."""
         codes = {name: {word: k for k, word in enumerate(words)} for name, words in self.words.items()}
         return {

@@ -48,7 +48,7 @@ def writing(path: Path) -> Iterator[None]:
 
 
 @dataclass(frozen=True, eq=False)
-class Columns:
+class OutputTable:
     """The table of one channel: times (N,) int64 ns, and its columns (N,) by name, texts among them."""
 
     t_ns: NDArray[np.int64]
@@ -64,7 +64,7 @@ class Columns:
         return len(held) > 0 and bool(held.all())
 
 
-def tables_of(recording: Recording) -> dict[str, Columns]:
+def tables_of(recording: Recording) -> dict[str, OutputTable]:
     """The table of every channel that is there, empty ones too, and of the truth.
 
     Raises:
@@ -75,12 +75,12 @@ def tables_of(recording: Recording) -> dict[str, Columns]:
         channel = getattr(recording, name)
         if channel is not None:
             columns = _all_axes(channel) if isinstance(channel, Imu) else channel.columns()
-            tables[name] = Columns(channel.t_ns, columns)
+            tables[name] = OutputTable(channel.t_ns, columns)
     if recording.truth is not None:
         q = recording.truth.quaternion
         if q is not None and (np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01).any():
             raise DataError("quaternions are not of norm 1", channel="truth", remedy="normalise them")
-        tables["truth"] = Columns(recording.truth.t_ns, truth_columns(recording.truth))
+        tables["truth"] = OutputTable(recording.truth.t_ns, truth_columns(recording.truth))
     return tables
 
 

@@ -15,7 +15,7 @@ ROS1 = get_typestore(Stores.ROS1_NOETIC)
 ROS2 = get_typestore(Stores.ROS2_HUMBLE)
 T0 = 1_600_000_000_000_000_000
 Message = tuple[str, str, int, Any]
-"""Topic, type, receipt time ns, message."""
+"""BagTopic, type, receipt time ns, message."""
 
 
 class Make:

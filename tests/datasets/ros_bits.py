@@ -9,9 +9,9 @@ import numpy as np
 from hypothesis import strategies as st
 from rosbags.typesys import Stores, get_typestore
 
-from terrafusion.datasets.readers.ros.layout import Decoder
+from terrafusion.datasets.readers.ros.layout import MessageDecoder
 from terrafusion.datasets.readers.ros.messages import Stream
-from terrafusion.datasets.readers.ros.raw import Batch
+from terrafusion.datasets.readers.ros.raw import MessageBatch
 
 ROS1, ROS2 = get_typestore(Stores.ROS1_NOETIC), get_typestore(Stores.ROS2_HUMBLE)
 T0 = 1_600_000_000_000_000_000
@@ -92,10 +92,12 @@ def leaves(store: Any, message: Any, msgtype: str, path: str = "") -> Iterator[t
             yield inner, value
 
 
-def batch_of(raws: Sequence[bytes]) -> Batch:
+def batch_of(raws: Sequence[bytes]) -> MessageBatch:
     sizes = np.array([len(raw) for raw in raws], dtype=np.int64)
     data = np.frombuffer(b"\7" + b"".join(raws), dtype=np.uint8)  # begins at an odd place
-    return Batch(0, data, 1 + np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes, np.arange(len(raws)))
+    return MessageBatch(
+        0, data, 1 + np.concatenate([[0], np.cumsum(sizes)[:-1]]), sizes, np.arange(len(raws))
+    )
 
 
 def types_of(store: Any) -> dict[str, Any]:
@@ -103,7 +105,7 @@ def types_of(store: Any) -> dict[str, Any]:
 
 
 def stream_of(store: Any, msgtype: str, raws: Sequence[bytes], wanted: Sequence[str] = ()) -> Stream:
-    decoder = Decoder(msgtype, types_of(store), wanted, store is not ROS1)
+    decoder = MessageDecoder(msgtype, types_of(store), wanted, store is not ROS1)
     half = len(raws) // 2
     for part in (raws[:half], raws[half:]):
         if part:

@@ -6,28 +6,25 @@ import functools
 from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.ros.channels import Builder
+from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.exact import META, restore
 from terrafusion.datasets.readers.ros.joints import joint_names, wheel_joints
 from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
-from terrafusion.datasets.readers.ros.raw import BagError, Container
+from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
-from terrafusion.datasets.readers.ros.times import Timing, timing_of
-from terrafusion.datasets.readers.ros.topics import JOINTS, Topic, choose_topics, said_joints
-
-if TYPE_CHECKING:
-    from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
+from terrafusion.datasets.readers.ros.topics import JOINTS, BagTopic, choose_topics, said_joints
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
 
 
-def read_bag(request: Request, open_container: Callable[[Path], Container], remedy: str) -> Recording:
+def read_bag(request: Request, open_container: Callable[[Path], BagContainer], remedy: str) -> Recording:
     """Read a bag of either ROS.
 
     Args:
@@ -51,7 +48,7 @@ def read_bag(request: Request, open_container: Callable[[Path], Container], reme
         raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
 
 
-def _assemble(container: Container, request: Request) -> Recording:
+def _assemble(container: BagContainer, request: Request) -> Recording:
     path, rig = request.path, request.rig
     there = {(source.topic, source.msgtype) for source in container.sources if source.count}
     if META in there and not request.topics and request.stamps == "header":
@@ -83,11 +80,11 @@ def _assemble(container: Container, request: Request) -> Recording:
     datum = streams.pop("datum", None)
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock, file=path)
     start_ns = min(int(t[0]) for t in timing.times.values())
-    builder = Builder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
+    builder = ChannelBuilder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
     return _build(builder, timing, datum)
 
 
-def _build(builder: Builder, timing: Timing, datum_stream: Stream | None) -> Recording:
+def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | None) -> Recording:
     """One channel after the other; the order matters where one looks at another."""
     streams, t = timing.streams, timing.times
     imu = builder.imu(streams["imu"], t["imu"]) if "imu" in streams else None
@@ -134,21 +131,21 @@ def _usual_frame(stream: Stream) -> str:
     return str(names.most_common(1)[0][0]) if names else ""
 
 
-def _topics_of(container: Container) -> list[Topic]:
+def _topics_of(container: BagContainer) -> list[BagTopic]:
     counts: Counter[tuple[str, str]] = Counter()
     for source in container.sources:
         counts[source.topic, source.msgtype] += source.count
-    return [Topic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items()) if count]
+    return [BagTopic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items()) if count]
 
 
-def _has_wheels(container: Container, topic: str, joints: dict[str, str]) -> bool:
+def _has_wheels(container: BagContainer, topic: str, joints: dict[str, str]) -> bool:
     """Whether the first messages of a JointState topic name wheels."""
     key = topic, JOINTS
     stream = read_streams(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
     return bool(wheel_joints(joint_names(stream), joints))
 
 
-def _streams(container: Container, chosen: Mapping[str, Topic]) -> dict[str, Stream]:
+def _streams(container: BagContainer, chosen: Mapping[str, BagTopic]) -> dict[str, Stream]:
     """The streams of the chosen topics that do hold messages, by channel."""
     asked: dict[Key, tuple[str, ...]] = {}
     for kind, topic in chosen.items():

@@ -41,7 +41,7 @@ MOVING_MPS = 0.05
 
 
 @dataclass
-class Builder:
+class ChannelBuilder:
     """Turns streams into channels; `notes` gathers what a user should know.
 
     `known` are the conventions of a catalogued bag: its track makes the side speeds where there is

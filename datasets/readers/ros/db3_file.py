@@ -8,7 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from terrafusion.datasets.readers.ros.raw import BagError, Batch, Groups, Source, grouped, normal_type
+from terrafusion.datasets.readers.ros.raw import (
+    BagError,
+    BagSource,
+    Groups,
+    MessageBatch,
+    grouped,
+    normal_type,
+)
 
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
 BLOCK_BYTES, MAX_ROWS = 1 << 21, 8192
@@ -39,7 +46,7 @@ class Db3File:
     def close(self) -> None:
         self._database.close()
 
-    def _sources(self, known_counts: Mapping[str, int] | None) -> list[Source]:
+    def _sources(self, known_counts: Mapping[str, int] | None) -> list[BagSource]:
         run = self._database.execute
         tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
         if not {"topics", "messages"} <= tables:
@@ -57,11 +64,11 @@ class Db3File:
             known = LANGUAGES.get(language, "msg")
             count = int(counts.get(number, 0) if known_counts is None else known_counts.get(topic, 0))
             sources.append(
-                Source(int(number), str(topic), normal_type(str(name)), text, known, str(encoding), count)
+                BagSource(int(number), str(topic), normal_type(str(name)), text, known, str(encoding), count)
             )
         return sources
 
-    def batches(self, wanted: Groups) -> Iterator[Batch]:
+    def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of topics, in the order in which they were written."""
         topics = tuple(number for ids in wanted for number in ids)
         marks = ", ".join("?" * len(topics))
@@ -76,7 +83,7 @@ class Db3File:
             count = int(np.clip(BLOCK_BYTES * len(sizes) // max(int(sizes.sum()), 1), 1, MAX_ROWS))
             data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
             for group, mine in grouped(ids, wanted):
-                yield Batch(group, data, starts[mine], sizes[mine], receipt_ns[mine])
+                yield MessageBatch(group, data, starts[mine], sizes[mine], receipt_ns[mine])
 
 
 def _refuse_cut(path: Path) -> None:

@@ -26,7 +26,7 @@ from terrafusion.datasets.readers.channel_tables import ChannelReader, Layouts
 from terrafusion.datasets.readers.csv_table import ChannelTable
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
-from terrafusion.datasets.readers.ros.channels import Builder
+from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.topics import (
     FIELD,
@@ -96,7 +96,7 @@ def restore(
     found = read(asked)
     streams = {name: found[key] for name, key in keys.items() if key in there}
     tables = ChannelReader(_BagTables(saved, file, streams), saved.meta, LAYOUTS)
-    builder = Builder(file, None, Conventions(), saved.meta.start_ns, {})
+    builder = ChannelBuilder(file, None, Conventions(), saved.meta.start_ns, {})
     channels = {
         name: getattr(tables, name)()
         if name in saved.tables
@@ -124,7 +124,7 @@ def _parse(stream: Stream, file: Path) -> Saved:
     )
 
 
-def _standard(builder: Builder, name: str, stream: Stream | None, shift_ns: int) -> Any:
+def _standard(builder: ChannelBuilder, name: str, stream: Stream | None, shift_ns: int) -> Any:
     """A channel from its standard messages, whose stamps are its times."""
     if stream is None or not len(stream) or stream.header_ns is None:
         return None

@@ -1,8 +1,8 @@
 """Messages of one kind as arrays, many at a time.
 
-Where all strings and sequences of two messages have the same lengths, their numbers lie at the same places.
-Such a `Layout` is worked out once, from one message and its definition; all messages that share it, in the
-lengths and thus in everything but values, are then read by one structured dtype, bit for bit.
+Where all strings and sequences of two messages have the same lengths, their numbers are at the same places.
+Such a `MessageLayout` is derived once, from one message and its definition; all messages that share it are
+then read by one structured dtype, bit for bit.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.readers.ros.raw import BagError, Batch, Bytes, rows_at
+from terrafusion.datasets.readers.ros.raw import BagError, Bytes, MessageBatch, rows_at
 
 Fields = Sequence[tuple[str, Any]]
 """Name and descriptor of each field of a type, as rosbags' type system has them."""
@@ -30,7 +30,7 @@ CODES = {
 
 
 @dataclass(frozen=True)
-class Layout:
+class MessageLayout:
     """Where things lie in messages of `size` bytes.
 
     Attributes:
@@ -68,7 +68,7 @@ class _Walk:
             self.position = self.origin = 4
             self.fixed.append((0, 2))
 
-    def layout(self, msgtype: str) -> Layout:
+    def layout(self, msgtype: str) -> MessageLayout:
         self.message("", msgtype, 0)
         surplus = len(self.raw) - self.position
         if surplus < 0 or surplus > (3 if self.cdr else 0):
@@ -83,7 +83,7 @@ class _Walk:
             }
         )
         fixed = tuple((at, self.raw[at : at + size]) for at, size in self.fixed)
-        return Layout(len(self.raw), dtype, fixed, self.words)
+        return MessageLayout(len(self.raw), dtype, fixed, self.words)
 
     def message(self, path: str, msgtype: str, depth: int) -> None:
         if msgtype not in self.types:
@@ -177,7 +177,7 @@ Columns = dict[str, NDArray[Any]]
 
 
 @dataclass
-class Block:
+class MessageBlock:
     """Messages whose columns have one shape.
 
     Attributes:
@@ -190,7 +190,7 @@ class Block:
 
 
 @dataclass
-class Decoder:
+class MessageDecoder:
     """Gathers the messages of one topic as arrays.
 
     Attributes:
@@ -205,12 +205,12 @@ class Decoder:
     wanted: Sequence[str]
     cdr: bool
     count: int = 0
-    _layouts: dict[int, list[Layout]] = field(default_factory=dict)
-    _pieces: dict[Any, list[Block]] = field(default_factory=dict)
+    _layouts: dict[int, list[MessageLayout]] = field(default_factory=dict)
+    _pieces: dict[Any, list[MessageBlock]] = field(default_factory=dict)
     _receipts: list[NDArray[np.int64]] = field(default_factory=list)
     _known_words: dict[bytes, str] = field(default_factory=dict)
 
-    def add(self, batch: Batch) -> None:
+    def add(self, batch: MessageBatch) -> None:
         """Take in messages.
 
         Raises:
@@ -242,11 +242,11 @@ class Decoder:
                 raw, rows = raw[~same], rows[~same]
             tried += 1
 
-    def _refuse_chaos(self, layouts: list[Layout]) -> None:
+    def _refuse_chaos(self, layouts: list[MessageLayout]) -> None:
         if len(layouts) > MAX_LAYOUTS_OF_A_SIZE or sum(map(len, self._layouts.values())) > MAX_LAYOUTS:
             raise BagError("hardly two messages have strings and lists of the same lengths")
 
-    def _keep(self, layout: Layout, raw: Bytes, rows: NDArray[np.int64]) -> None:
+    def _keep(self, layout: MessageLayout, raw: Bytes, rows: NDArray[np.int64]) -> None:
         records: NDArray[Any] = raw.view(layout.dtype)[:, 0] if layout.dtype.names else raw
         columns: Columns = {}
         for name in layout.dtype.names or ():
@@ -256,7 +256,7 @@ class Decoder:
             words = [self._words(raw[:, at : at + size]) for at, size in places]
             columns[path] = _listed(words, len(raw)) if listed else words[0]
         shape = tuple((path, column.dtype, column.shape[1:]) for path, column in columns.items())
-        self._pieces.setdefault(shape, []).append(Block(rows, columns))
+        self._pieces.setdefault(shape, []).append(MessageBlock(rows, columns))
 
     def _words(self, raw: Bytes) -> NDArray[Any]:
         """Strings (n,) of their bytes (n, size)."""
@@ -278,7 +278,7 @@ class Decoder:
                 raise BagError("a string is not valid UTF-8") from None
         return self._known_words[word]
 
-    def result(self) -> tuple[NDArray[np.int64], tuple[Block, ...]]:
+    def result(self) -> tuple[NDArray[np.int64], tuple[MessageBlock, ...]]:
         """Receipt times (N,) of all messages, and blocks that together hold them; empties the decoder."""
         receipt_ns = np.concatenate([np.zeros(0, dtype=np.int64), *self._receipts])
         blocks = tuple(_joined(self._pieces.pop(shape)) for shape in list(self._pieces))
@@ -289,10 +289,10 @@ def _listed(words: list[NDArray[Any]], n: int) -> NDArray[Any]:
     return np.stack(words, axis=1) if words else np.empty((n, 0), dtype=object)
 
 
-def _joined(pieces: list[Block]) -> Block:
+def _joined(pieces: list[MessageBlock]) -> MessageBlock:
     """One block of many; column by column, so that no more than one column exists twice."""
     rows = np.concatenate([piece.rows for piece in pieces])
     columns: Columns = {}
     for path in list(pieces[0].columns):
         columns[path] = np.concatenate([piece.columns.pop(path) for piece in pieces])
-    return Block(rows, columns)
+    return MessageBlock(rows, columns)

@@ -22,10 +22,10 @@ from mcap.writer import MCAP0_MAGIC
 from terrafusion.datasets.readers.ros.raw import (
     MAX_CHUNK_BYTES,
     BagError,
-    Batch,
+    BagSource,
     Groups,
+    MessageBatch,
     Places,
-    Source,
     decompress,
     grouped,
     normal_type,
@@ -150,14 +150,16 @@ class McapFile:
         for batch in self.batches([[number] for number in channels]):
             self._counts[channels[batch.group]] += len(batch.starts)
 
-    def _source(self, number: int) -> Source:
+    def _source(self, number: int) -> BagSource:
         channel = self._channels[number]
         schema = self._schemas.get(channel.schema_id, Schema(0, b"", "", ""))
         definition, language = schema.data.decode(errors="replace"), LANGUAGES.get(schema.encoding, "msg")
         count, msgtype = self._counts.get(number, 0), normal_type(schema.name)
-        return Source(number, channel.topic, msgtype, definition, language, channel.message_encoding, count)
+        return BagSource(
+            number, channel.topic, msgtype, definition, language, channel.message_encoding, count
+        )
 
-    def batches(self, wanted: Groups) -> Iterator[Batch]:
+    def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of channels, block by block."""
         for data in self._unpacked(wanted):
             yield from _split(data, np.array(self._messages(data), dtype=np.int64), wanted)
@@ -211,7 +213,7 @@ class McapFile:
         return starts
 
 
-def _split(block: bytes, places: Places, wanted: Groups) -> Iterator[Batch]:
+def _split(block: bytes, places: Places, wanted: Groups) -> Iterator[MessageBatch]:
     """The messages of a block, whose records begin at `places`, by channel."""
     data = np.frombuffer(block, dtype=np.uint8)
     sizes = numbers_at(data, places + 1, "<u8").astype(np.int64) - (MESSAGE_HEAD - RECORD_HEAD)
@@ -220,4 +222,4 @@ def _split(block: bytes, places: Places, wanted: Groups) -> Iterator[Batch]:
     if (sizes < 0).any() or (receipt_ns < 0).any():
         raise BagError("a message record is broken")
     for group, rows in grouped(channels, wanted):
-        yield Batch(group, data, places[rows] + MESSAGE_HEAD, sizes[rows], receipt_ns[rows])
+        yield MessageBatch(group, data, places[rows] + MESSAGE_HEAD, sizes[rows], receipt_ns[rows])

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.readers.ros import topics
-from terrafusion.datasets.readers.ros.layout import Block
+from terrafusion.datasets.readers.ros.layout import MessageBlock
 from terrafusion.datasets.readers.ros.raw import BagError
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Stream:
     topic: str
     msgtype: str
     receipt_ns: TimesNs
-    blocks: tuple[Block, ...]
+    blocks: tuple[MessageBlock, ...]
 
     def __len__(self) -> int:
         return len(self.receipt_ns)
@@ -137,7 +137,7 @@ class Stream:
             order = order[new[block.rows][order] >= 0]
             if order.size:
                 columns = {path: column[order] for path, column in block.columns.items()}
-                blocks.append(Block(new[block.rows[order]], columns))
+                blocks.append(MessageBlock(new[block.rows[order]], columns))
         return Stream(self.topic, self.msgtype, self.receipt_ns[index], tuple(blocks))
 
 

@@ -1,7 +1,7 @@
-"""Raw messages of a bag, whatever its container: who sent them, and where their bytes lie.
+"""Raw messages of a bag, whatever its container: their sources, and where their bytes are.
 
-A container (`ros1_file`, `mcap_file`, `db3_file`) gives its `Source`s and yields `Batch`es: the bytes of a
-chunk and the places of one source's messages in it. No message becomes a Python object of its own.
+A container (`ros1`, `mcap_file`, `db3_file`) lists its `BagSource`s and yields `MessageBatch`es: the bytes
+of a chunk and the places of one source's messages in it. No message becomes a Python object.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class BagError(Exception):
 
 
 @dataclass(frozen=True)
-class Source:
+class BagSource:
     """Who sent messages of one kind: a connection (ROS 1) or a channel (MCAP).
 
     Attributes:
@@ -58,7 +58,7 @@ class Source:
     count: int
 
 
-class Batch(NamedTuple):
+class MessageBatch(NamedTuple):
     """Some messages of a group of sources, in the order of the file.
 
     Attributes:
@@ -75,12 +75,12 @@ class Batch(NamedTuple):
     receipt_ns: NDArray[np.int64]
 
 
-class Container(Protocol):
+class BagContainer(Protocol):
     """An open bag file."""
 
-    sources: list[Source]
+    sources: list[BagSource]
 
-    def batches(self, wanted: Groups) -> Iterator[Batch]:
+    def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of sources."""
         ...
 

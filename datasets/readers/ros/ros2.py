@@ -1,13 +1,36 @@
-"""ROS 2 bags: a folder with `metadata.yaml`, or a lone `.mcap` or `.db3` file."""
+"""ROS 2 bags: a folder with `metadata.yaml` and the files that it names, or one `.mcap` or `.db3` file."""
 
 from __future__ import annotations
 
-from pathlib import Path
+import dataclasses
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros.bag import read_bag
-from terrafusion.datasets.readers.ros.raw import Container
+from terrafusion.datasets.readers.ros.db3_file import Db3File
+from terrafusion.datasets.readers.ros.mcap_file import McapFile
+from terrafusion.datasets.readers.ros.raw import (
+    MAX_CHUNK_BYTES,
+    BagContainer,
+    BagError,
+    BagSource,
+    Groups,
+    MessageBatch,
+    decompress,
+    zstd,
+)
+
+MAX_METADATA_BYTES = 1 << 24
+MAX_EXPANSION = 100
+"""A file that grows more than this when unpacked is no recording."""
+STORAGES: dict[str, type[McapFile] | type[Db3File]] = {"mcap": McapFile, "sqlite3": Db3File}
+
 
 REMEDY = "copy it again, or mend it with `ros2 bag reindex` (MCAP: `mcap recover`)"
 
@@ -20,21 +43,134 @@ def claims(path: Path, head: bytes) -> bool:
 def read(request: Request) -> list[Recording]:
     """The one recording of a ROS 2 bag.
 
-    Bags that carry no message definitions (SQLite before ROS 2 Iron) are read with those of Humble.
+    Bags without message definitions (SQLite before ROS 2 Iron) are read with those of Humble.
     """
     return [read_bag(request, open_container, REMEDY)]
 
 
-def open_container(path: Path) -> Container:
-    """The container of a ROS 2 bag.
-
-    Raises:
-        BagError: it is broken.
-    """
-    from terrafusion.datasets.readers.ros.db3_file import Db3File
-    from terrafusion.datasets.readers.ros.mcap_file import McapFile
-    from terrafusion.datasets.readers.ros.ros2_folder import Ros2Folder
-
+def open_container(path: Path) -> BagContainer:
+    """The container of a ROS 2 bag; BagError where it is broken."""
     if path.is_dir():
         return Ros2Folder(path)
     return McapFile(path) if path.suffix == ".mcap" else Db3File(path)
+
+
+class Ros2Folder:
+    """An open ROS 2 bag of one or several files, one after the other.
+
+    Raises:
+        BagError: metadata that cannot be used, a missing or broken file.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._files: list[BagContainer] = []
+        self._ids: list[dict[int, int]] = []
+        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self.sources: list[BagSource] = []
+        said = _metadata(folder / "metadata.yaml")
+        storage = STORAGES.get(str(said.get("storage_identifier")))
+        names = said.get("relative_file_paths")
+        if storage is None or not isinstance(names, list) or not names:
+            raise BagError("metadata.yaml names no storage and files that could be read")
+        mode = str(said.get("compression_mode") or "none").lower()
+        if mode not in ("none", "file", "message") or (
+            mode != "none" and said.get("compression_format") != "zstd"
+        ):
+            raise BagError(f"compression '{mode}' by '{said.get('compression_format')}' is not supported")
+        self._packed = mode == "message"
+        try:
+            for name in names:
+                path = folder / PurePosixPath(str(name)).name
+                if not path.is_file():
+                    raise BagError(f"the file {path.name} is missing")
+                path = self._unpacked(path) if mode == "file" else path
+                alone = storage is Db3File and len(names) == 1
+                self._add(Db3File(path, _counts(said)) if alone else storage(path))
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        for file in self._files:
+            file.close()
+        if self._scratch is not None:
+            self._scratch.cleanup()
+
+    def _add(self, file: BagContainer) -> None:
+        self._files.append(file)
+        ids: dict[int, int] = {}
+        for source in file.sources:
+            same = [
+                s
+                for s in self.sources
+                if (s.topic, s.msgtype, s.definition) == (source.topic, source.msgtype, source.definition)
+            ]
+            if same:
+                merged = dataclasses.replace(same[0], count=same[0].count + source.count)
+                self.sources[merged.id] = merged
+                ids[source.id] = merged.id
+            else:
+                ids[source.id] = len(self.sources)
+                self.sources.append(dataclasses.replace(source, id=len(self.sources)))
+        self._ids.append(ids)
+
+    def _unpacked(self, path: Path) -> Path:
+        """A file without its zstd compression, in a scratch folder."""
+        if self._scratch is None:
+            self._scratch = tempfile.TemporaryDirectory()
+        target = Path(self._scratch.name) / path.stem
+        room = MAX_EXPANSION * path.stat().st_size
+        with zstd().open(path, "rb") as packed, target.open("wb") as out:
+            while block := packed.read(1 << 20):
+                room -= len(block)
+                if room < 0:
+                    raise BagError(f"{path.name} unpacks to more than {MAX_EXPANSION} times its size")
+                out.write(block)
+        return target
+
+    def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
+        """The messages of the wanted groups of sources, file by file."""
+        for file, ids in zip(self._files, self._ids, strict=True):
+            mine = [[own for own, number in ids.items() if number in group] for group in wanted]
+            here = [group for group, own in enumerate(mine) if own]
+            for batch in file.batches([mine[group] for group in here]) if here else ():
+                found = batch._replace(group=here[batch.group])
+                yield _unpacked_messages(found) if self._packed else found
+
+
+def _unpacked_messages(batch: MessageBatch) -> MessageBatch:
+    """Messages that were compressed one by one."""
+    messages = []
+    for start, size in zip(batch.starts.tolist(), batch.sizes.tolist(), strict=True):
+        packed = batch.data[start : start + size].tobytes()
+        size = zstd().get_frame_info(packed).decompressed_size
+        messages.append(decompress(packed, "zstd", MAX_CHUNK_BYTES + 1 if size is None else size))
+    sizes = np.array([len(m) for m in messages], dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
+    return batch._replace(data=np.frombuffer(b"".join(messages), dtype=np.uint8), starts=starts, sizes=sizes)
+
+
+def _counts(said: dict[str, Any]) -> dict[str, int] | None:
+    """Numbers of messages by topic, as the metadata tell them; None where they tell of none on a topic."""
+    try:
+        topics = said["topics_with_message_count"]
+        found = {str(t["topic_metadata"]["name"]): int(t["message_count"]) for t in topics}
+        return found if found and all(count > 0 for count in found.values()) else None
+    except (KeyError, TypeError, ValueError):
+        return None
+
+
+def _metadata(path: Path) -> dict[str, Any]:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.error import YAMLError
+
+    if path.stat().st_size > MAX_METADATA_BYTES:
+        raise BagError(f"metadata.yaml has {path.stat().st_size} bytes")
+    try:
+        told = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+    except YAMLError as error:
+        raise BagError(f"metadata.yaml is not valid YAML: {str(error).splitlines()[0]}") from None
+    said = told.get("rosbag2_bagfile_information") if isinstance(told, dict) else None
+    if not isinstance(said, dict):
+        raise BagError("metadata.yaml holds no rosbag2_bagfile_information")
+    return said

@@ -1,19 +1,20 @@
-"""Topics of a bag as streams: the messages of a container, decoded in one go over the file."""
+"""Topics of a bag as streams: the messages of a container, decoded in one pass over the file."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from functools import cache
 
 import numpy as np
 
-from terrafusion.datasets.readers.ros.layout import Block, Decoder
+from terrafusion.datasets.readers.ros.layout import Fields, MessageBlock, MessageDecoder
 from terrafusion.datasets.readers.ros.messages import Stream
-from terrafusion.datasets.readers.ros.raw import BagError, Container, Source
-from terrafusion.datasets.readers.ros.types import types_of
+from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, BagSource
 
 Key = tuple[str, str]
 """Name and type of a topic."""
+_RULE = "=" * 80 + "\n"
 
 
 @contextmanager
@@ -26,7 +27,7 @@ def foreign(topic: str | None = None) -> Iterator[None]:
 
 
 def read_streams(
-    container: Container, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
+    container: BagContainer, asked: Mapping[Key, tuple[str, ...]], enough: int | None = None
 ) -> dict[Key, Stream]:
     """The streams of topics, in one go over the file.
 
@@ -35,16 +36,18 @@ def read_streams(
         asked: paths of the wanted fields by topic and type.
         enough: stop when one topic has so many messages.
     """
-    decoders: list[tuple[Key, Decoder]] = []
+    decoders: list[tuple[Key, MessageDecoder]] = []
     groups: list[list[int]] = []
     for key, fields in asked.items():
-        alike: dict[tuple[str, str, str], list[Source]] = {}
+        alike: dict[tuple[str, str, str], list[BagSource]] = {}
         for source in container.sources:
             if (source.topic, source.msgtype) == key:
                 alike.setdefault((source.definition, source.language, source.encoding), []).append(source)
         for sources in alike.values():
             with foreign(key[0]):
-                decoders.append((key, Decoder(key[1], types_of(sources[0]), fields, _is_cdr(sources[0]))))
+                decoders.append(
+                    (key, MessageDecoder(key[1], types_of(sources[0]), fields, _is_cdr(sources[0])))
+                )
             groups.append([source.id for source in sources])
     batches = container.batches(groups)
     while True:
@@ -60,20 +63,51 @@ def read_streams(
     return {key: _stream(key, [decoder for other, decoder in decoders if other == key]) for key in asked}
 
 
-def _is_cdr(source: Source) -> bool:
+def _is_cdr(source: BagSource) -> bool:
     if source.encoding not in ("ros1", "cdr"):
         raise BagError(f"its messages are encoded as '{source.encoding[:20]}', which is not supported")
     return source.encoding == "cdr"
 
 
-def _stream(key: Key, decoders: list[Decoder]) -> Stream:
+def _stream(key: Key, decoders: list[MessageDecoder]) -> Stream:
     """What the decoders of one topic gathered; there are several where its definition changes."""
     receipts, blocks = [], []
     count = 0
     for decoder in decoders:
         receipt_ns, found = decoder.result()
         receipts.append(receipt_ns)
-        blocks += [Block(block.rows + count, block.columns) for block in found]
+        blocks += [MessageBlock(block.rows + count, block.columns) for block in found]
         count += len(receipt_ns)
     stream = Stream(*key, np.concatenate(receipts), tuple(blocks))
     return stream if len(decoders) == 1 else stream.select(np.argsort(stream.receipt_ns, kind="stable"))
+
+
+def types_of(source: BagSource) -> Mapping[str, Fields]:
+    """Fields of a source's type and of those it is made of.
+
+    What the bag does not define is taken from ROS 1 Noetic or ROS 2 Humble: SQLite bags before
+    ROS 2 Iron carry no definitions.
+    """
+    return _released(source.encoding) | (_parsed(source) if source.definition else {})
+
+
+@cache
+def _released(encoding: str) -> dict[str, Fields]:
+    from rosbags.typesys import Stores, get_typestore
+
+    release = get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+    return {name: fields for name, (_, fields) in release.fielddefs.items()}
+
+
+def _parsed(source: BagSource) -> dict[str, Fields]:
+    from rosbags.typesys import get_types_from_idl, get_types_from_msg
+
+    if source.language == "msg":
+        found = dict(get_types_from_msg(source.definition, source.msgtype))
+    elif source.definition.startswith(f"{_RULE}IDL: "):
+        found = {}
+        for part in source.definition.split(_RULE)[1:]:
+            found |= get_types_from_idl(part.split("\n", 1)[1])
+    else:
+        found = dict(get_types_from_idl(source.definition))
+    return {name: fields for name, (_, fields) in found.items()}

@@ -27,7 +27,7 @@ RECEIPT = "read with stamps='receipt' (--stamps receipt)"
 
 
 @dataclass
-class Timing:
+class StreamTimes:
     """Streams in order of time and their times, both by channel; and what was done for it."""
 
     streams: dict[str, Stream]
@@ -36,7 +36,7 @@ class Timing:
     jumps: tuple[ClockJump, ...] = ()
 
 
-def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool, file: Path) -> Timing:
+def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool, file: Path) -> StreamTimes:
     """Times of every stream on one clock.
 
     Header stamps are used unless `stamps` is "receipt", or they are all zero, or the topics'
@@ -52,7 +52,7 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool,
     Raises:
         DataError: stamps that run backwards, or header stamps that are zero in part.
     """
-    timing = Timing({kind: _in_file_order(stream) for kind, stream in streams.items()})
+    timing = StreamTimes({kind: _in_file_order(stream) for kind, stream in streams.items()})
     receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
     received_jumps: tuple[ClockJump, ...] = ()
     if repair_clock:
@@ -87,7 +87,7 @@ def _in_file_order(stream: Stream) -> Stream:
     return stream.select(order) if cuts <= 3 * backwards else stream
 
 
-def _headed(timing: Timing, stamps: str) -> Times:
+def _headed(timing: StreamTimes, stamps: str) -> Times:
     """Header stamps of the streams that have some, unless receipt stamps are asked for."""
     found = {kind: t for kind, s in timing.streams.items() if (t := s.header_ns) is not None}
     headed = {kind: t for kind, t in found.items() if t.any()}
@@ -104,7 +104,7 @@ def _headed(timing: Timing, stamps: str) -> Times:
 
 
 def _on_one_clock(
-    timing: Timing, headed: Times, receipt: Times, repair_clock: bool, file: Path
+    timing: StreamTimes, headed: Times, receipt: Times, repair_clock: bool, file: Path
 ) -> tuple[Times, tuple[ClockJump, ...]]:
     """Header stamps that can be used together, repaired where that is asked for; none where they differ."""
     if not headed:
@@ -227,7 +227,7 @@ def _onto(headed: Times, receipt: Times, others: Times) -> Times:
     return out
 
 
-def _latencies(timing: Timing, headed: Times, receipt: Times) -> str:
+def _latencies(timing: StreamTimes, headed: Times, receipt: Times) -> str:
     """What was measured of receipt against header stamps, in words."""
     told = []
     for kind, t_ns in headed.items():
@@ -241,7 +241,7 @@ def _latencies(timing: Timing, headed: Times, receipt: Times) -> str:
     return f"received later by (median, 95 %): {', '.join(told)}" if told else ""
 
 
-def _sort(timing: Timing) -> None:
+def _sort(timing: StreamTimes) -> None:
     """Bring messages into the order of their times; a note tells which were not."""
     for kind, order in _disorders(timing.times):
         moved = int((order != np.arange(len(order))).sum())

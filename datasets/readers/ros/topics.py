@@ -69,7 +69,7 @@ _PREFERRED_WHEEL = re.compile(r"wheel|encoder|velocity_controller|diff_?drive|jo
 
 
 @dataclass(frozen=True)
-class Topic:
+class BagTopic:
     """A topic of the bag: name, normalised type, number of messages."""
 
     name: str
@@ -78,13 +78,13 @@ class Topic:
 
 
 def choose_topics(
-    bag: list[Topic],
+    bag: list[BagTopic],
     *,
     file: Path,
     user: Mapping[str, str] | None = None,
     usual: Mapping[str, str] | None = None,
     is_wheel_joints: Callable[[str], bool] = lambda topic: True,
-) -> tuple[dict[str, Topic], list[str]]:
+) -> tuple[dict[str, BagTopic], list[str]]:
     """The topic of each channel, and notes telling what was taken and what was left.
 
     The user's word goes first and must hold; then the vehicle's usual topics where the bag has
@@ -101,7 +101,7 @@ def choose_topics(
     Raises:
         DataError: an unknown channel, a topic that is not in the bag or has an unfit type.
     """
-    chosen: dict[str, Topic] = {}
+    chosen: dict[str, BagTopic] = {}
     notes: list[str] = []
     for kind, name in _wanted(user or {}, file).items():
         chosen[kind] = _asked_for(bag, kind, name, file)
@@ -156,7 +156,7 @@ def _wanted(topics: Mapping[str, str], file: Path) -> dict[str, str]:
     return wanted
 
 
-def _asked_for(bag: list[Topic], kind: str, name: str, file: Path) -> Topic:
+def _asked_for(bag: list[BagTopic], kind: str, name: str, file: Path) -> BagTopic:
     named = [t for t in bag if t.name == name]
     fits = [t for t in named if t.msgtype in TYPES[kind]]
     if fits:
@@ -170,13 +170,13 @@ def _asked_for(bag: list[Topic], kind: str, name: str, file: Path) -> Topic:
     raise DataError(what, file=file, channel=kind, remedy=remedy)
 
 
-def _is_fused(kind: str, topic: Topic) -> bool:
+def _is_fused(kind: str, topic: BagTopic) -> bool:
     if kind == "gnss":
         return bool(re.search(r"filter|fused|ekf", topic.name, re.IGNORECASE))
     return topic.msgtype != JOINTS and bool(_FUSED.search(topic.name)) and not _TRUTH.search(topic.name)
 
 
-def _fits(kind: str, topic: Topic, is_wheel_joints: Callable[[str], bool]) -> bool:
+def _fits(kind: str, topic: BagTopic, is_wheel_joints: Callable[[str], bool]) -> bool:
     name = topic.name
     if kind == "truth":
         return bool(_TRUTH.search(name))
@@ -201,7 +201,7 @@ def _fits(kind: str, topic: Topic, is_wheel_joints: Callable[[str], bool]) -> bo
     return True
 
 
-def _rank(kind: str, topic: Topic) -> tuple[int, bool, bool, int, str]:
+def _rank(kind: str, topic: BagTopic) -> tuple[int, bool, bool, int, str]:
     order = TYPES[kind].index(topic.msgtype)
     unpreferred = kind == "wheels" and not _PREFERRED_WHEEL.search(topic.name)
     return order, unpreferred, bool(_RAW.search(topic.name)), -topic.count, topic.name

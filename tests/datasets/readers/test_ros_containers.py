@@ -18,8 +18,8 @@ from rosbags.rosbag2 import Writer as Writer2
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.readers import open_recording
-from terrafusion.datasets.readers.ros.raw import BagError, Container, decompress, zstd
-from terrafusion.datasets.readers.ros.ros1_file import Ros1File
+from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, decompress, zstd
+from terrafusion.datasets.readers.ros.ros1 import Ros1File
 from terrafusion.datasets.readers.ros.ros2 import open_container
 from terrafusion.datasets.readers.ros.streams import read_streams
 from tests.datasets.ros_bits import ROS1, ROS2, T0, assert_same, imu, serialized
@@ -123,7 +123,7 @@ KINDS = ("bag", "bag BZ2", "bag LZ4", "folder mcap", "folder mcap STORAGE", "fol
          "mcap bare", "mcap bare unchunked", "mcap ros1")  # fmt: skip
 
 
-def opened(path: Path) -> Container:
+def opened(path: Path) -> BagContainer:
     return Ros1File(path) if path.suffix == ".bag" else open_container(path)
 
 
@@ -231,7 +231,7 @@ def test_a_chunk_of_nothing_is_refused_in_time(
 ) -> None:
     """Zeros are records without content, as many as there are: not one of them is gone through."""
     path = make(tmp_path, kind)
-    module = "ros1_file" if kind.startswith("bag") else "mcap_file"
+    module = "ros1" if kind.startswith("bag") else "mcap_file"
     monkeypatch.setattr(
         f"terrafusion.datasets.readers.ros.{module}.decompress", lambda *_: bytes(200_000_000)
     )

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from terrafusion.datasets.readers.ros.layout import Decoder
+from terrafusion.datasets.readers.ros.layout import MessageDecoder
 from terrafusion.datasets.readers.ros.raw import BagError
 from tests.datasets.ros_bits import (
     ROS1,
@@ -114,7 +114,7 @@ def test_messages_without_any_order_are_refused_in_time() -> None:
 def test_memory_is_that_of_the_arrays(imu_raws: list[bytes]) -> None:
     """100 000 messages of 328 bytes: what is kept of each is 64 bytes, and little is held beside."""
     wanted = ("header.stamp", "header.frame_id", "angular_velocity", "linear_acceleration")
-    decoder = Decoder("sensor_msgs/msg/Imu", types_of(ROS2), wanted, True)
+    decoder = MessageDecoder("sensor_msgs/msg/Imu", types_of(ROS2), wanted, True)
     batch = batch_of(imu_raws[:1000])
     decoder.add(batch)
     tracemalloc.start()
@@ -136,7 +136,7 @@ def test_far_faster_than_message_by_message(imu_raws: list[bytes]) -> None:
         ROS2.deserialize_cdr(raw, "sensor_msgs/msg/Imu")
     one_by_one = time.process_time() - start
     batch = batch_of(raws)
-    decoder = Decoder("sensor_msgs/msg/Imu", types_of(ROS2), (), True)
+    decoder = MessageDecoder("sensor_msgs/msg/Imu", types_of(ROS2), (), True)
     start = time.process_time()
     decoder.add(batch)
     decoder.result()
