@@ -8,8 +8,8 @@
     answer = tf.diagnose(runs, references=normal)       # robot against twin -> Diagnosis
 
 Frames follow REP-103 and REP-105: world ENU, body x forward, y left, z up. Times are int64 nanoseconds;
-every other unit stands in the name (`_m`, `_mps`, `_rad`, ...). A vehicle is a name, a YAML file or a `Vehicle`.
-Names are loaded when they are first used, so that importing the package is quick.
+every other unit stands in the name (`_m`, `_mps`, `_rad`, ...). A vehicle is a name, a YAML file or a
+`Vehicle`. Names are loaded when they are first used, so that importing the package is quick.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ _HOMES = {
     "sweep": "fusion.api.studies:sweep",
 }
 
-__all__ = [  # noqa: PLE0604
+__all__ = [
     "ConfigError", "DataError", "Diagnosis", "Estimate", "Estimator", "EstimatorConfig", "Recording",
     "Replay", "TerrafusionError", "Vehicle", "__version__", "benchmark", "calibrate", "diagnose", "open",
     "policy", "replay", "simulate", "sweep",

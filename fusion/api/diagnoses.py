@@ -68,7 +68,7 @@ def diagnose(
         runs: one log or several: the robot as it is now.
         references: logs that count as normal; none: replicates of the twin stand in for them.
         vehicle: the twin's vehicle: name, YAML file or `Vehicle`.
-        terrain: the ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
+        terrain: ground of all logs, or grounds by the logs' labels; None: each label's soil of the library.
         effects: candidates by name; None: the whole catalogue.
         significance: threshold of the test for a gap.
         seed: of the permutations and replicates.
