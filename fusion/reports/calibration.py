@@ -49,7 +49,7 @@ def write_report(path: Path, c: Calibration, provenance: Mapping[str, object] | 
 
 
 def _head(title: str, c: Calibration) -> str:
-    told = len(c.fitted) - len(c.untold())
+    told = len(c.fitted) - len(c.unidentified())
     lead = (
         f"{told} of {len(c.fitted)} numbers are told by {len(c.sensor_errors)} log(s), "
         f"{c.seconds_of_data:.0f} s in all. The search {c.sentence}."

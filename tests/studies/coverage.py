@@ -20,7 +20,7 @@ import numpy as np
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.calibrate import calibrate
-from terrafusion.twin.calibrate.identifiability import TOLD, UNTOLD
+from terrafusion.twin.calibrate.identifiability import IDENTIFIED, NOT_IDENTIFIED
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -116,10 +116,12 @@ def table(found: Sequence[Outcome]) -> list[str]:
     ]
     names = list(dict.fromkeys(o.name for o in found))
     for name in [*names, "all"]:
-        mine = [o for o in found if name in ("all", o.name) and o.status == TOLD]
+        mine = [o for o in found if name in ("all", o.name) and o.status == IDENTIFIED]
         lines.append(_row(name, mine))
-    lines.append(_row("all, only in combination", [o for o in found if o.status not in (TOLD, UNTOLD)]))
-    lines.append(_row("all, not told", [o for o in found if o.status == UNTOLD]))
+    lines.append(
+        _row("all, only in combination", [o for o in found if o.status not in (IDENTIFIED, NOT_IDENTIFIED)])
+    )
+    lines.append(_row("all, not told", [o for o in found if o.status == NOT_IDENTIFIED]))
     return lines
 
 
@@ -154,7 +156,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             continue
         found += mine
         if given.verbose:
-            scores = " ".join(f"{o.score:6.2f}{'' if o.status == TOLD else '*'}" for o in mine)
+            scores = " ".join(f"{o.score:6.2f}{'' if o.status == IDENTIFIED else '*'}" for o in mine)
             print(f"{number:4d} {case.soil:12s} {case.drive:13s} {scores}", flush=True)
     seconds = time.perf_counter() - begun
     print(f"seed {given.seed}, {given.cases} cases of {SECONDS:g} s, {failed} failed, {seconds:.0f} s")

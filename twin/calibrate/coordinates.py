@@ -1,4 +1,4 @@
-"""The numbers as the solver sees them: scaled by what was known of them before the log."""
+"""Parameters as the solver sees them: scaled by their priors."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PRIOR_SHARE = 0.05
 
 @dataclass(frozen=True)
 class Prior:
-    """What was known of a number before the log: value and 1 sigma, in its unit."""
+    """Prior of a parameter: value and 1 sigma, in its unit."""
 
     value: float
     sigma: float
@@ -25,10 +25,9 @@ class Prior:
 
 @dataclass(frozen=True)
 class Coordinate:
-    """A number as the solver sees it: w = 0 at the prior, 1 at one prior sigma.
+    """A parameter as the solver sees it: w = 0 at the prior, 1 at one prior sigma.
 
-    A positive number moves by its logarithm, any other one linearly; so neither its unit nor the
-    order of the parameters matters to the solver.
+    A positive number moves by its logarithm, any other one linearly: the solver does not depend on units.
 
     Attributes:
         name: dotted name.

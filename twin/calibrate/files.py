@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.files import write_atomically
+from terrafusion.twin.calibrate.identifiability import IDENTIFIED
 from terrafusion.twin.calibrate.result import Calibration, FittedParameter
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.soil_table import is_published, published_soil
@@ -64,7 +65,7 @@ def _updated(
 
 
 def _entry(before: Any, value: Any, source: str) -> dict[str, Any]:
-    """A number in the place of an entry; a range `valid` that it lies outside of is left to its source."""
+    """A number in the place of an entry; its range `valid` is dropped where the number lies outside."""
     valid = before.get("valid") if isinstance(before, dict) else None
     if valid is None:
         return {"value": value, "source": source}
@@ -74,13 +75,13 @@ def _entry(before: Any, value: Any, source: str) -> dict[str, Any]:
 
 
 def _source(f: FittedParameter, logs: str) -> str:
-    if f.status == "told":
+    if f.status == IDENTIFIED:
         return f"calibrated from {logs}: 1 sigma {f.sigma:.3g}"
     return f"{f.status} by the calibration from {logs} (1 sigma {f.sigma:.3g}); before: {f.start:.6g}"
 
 
 def _overridden(raw: dict[str, Any], values: Any) -> None:
-    """Numbers that the log itself gave go before those of the file."""
+    """Numbers that the log itself gave replace those of the file."""
     for name, entry in list(raw.items()):
         value = getattr(values, name, None)
         if not isinstance(entry, dict) or value is None:
@@ -93,7 +94,7 @@ def _overridden(raw: dict[str, Any], values: Any) -> None:
 
 
 def mark_measured(vehicle: dict[str, Any], *names: str) -> None:
-    """Note in a vehicle's file that numbers of it were found for this robot (`VehicleParams.measured`)."""
+    """Mark numbers of a vehicle's file as estimated for this robot (`VehicleParams.measured`)."""
     if names:
         vehicle["measured"] = sorted({*vehicle.get("measured", ()), *names})
 

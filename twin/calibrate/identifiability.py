@@ -1,7 +1,7 @@
-"""What the data can tell: the information matrix in units of the prior, its weak directions, in words.
+"""What the data identify: the information matrix in units of the prior, and its weak directions.
 
-All numbers are counted in their prior sigmas, so that a direction's posterior sigma is 1 where the log says
-nothing about it and towards 0 where it says all. Offsets and poses are marginalised beforehand.
+Parameters are scaled by their prior sigmas, so that the posterior sigma along a direction is 1 where the log
+holds no information on it. Sensor errors and poses are marginalised beforehand.
 """
 
 from __future__ import annotations
@@ -14,22 +14,23 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-TOLD_RATIO = 0.5
-"""A number counts as told when the log at least halves its prior sigma."""
+IDENTIFIED_RATIO = 0.5
+"""A parameter is identified when the log at least halves its prior sigma."""
 MEMBER = 0.3
-"""A number belongs to a direction when its weight in the unit vector is at least this."""
+"""A parameter belongs to a direction when its weight in the unit vector is at least this."""
 
-TOLD, COMBINED, UNTOLD = "told", "only in combination", "not told"
+IDENTIFIED, COMBINED, NOT_IDENTIFIED = "told", "only in combination", "not told"
+"""Values of `status` in calibration.json."""
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of numbers that the data do not tell.
+    """A combination of parameters that the data do not identify.
 
     Attributes:
         weights: by name, in prior sigmas, of the members.
         ratio: posterior over prior sigma along it.
-        sentence: what that means.
+        sentence: in words.
     """
 
     weights: dict[str, float]
@@ -39,13 +40,15 @@ class Direction:
 
 @dataclass(frozen=True, eq=False)
 class Identifiability:
-    """Attributes:
-    ratio: (P,) posterior over prior sigma.
-    alone: (P,) the same if all other numbers were known.
-    status: (P,) `TOLD`, `COMBINED` or `UNTOLD`.
-    eigenvalues: (P,) of the data's information in units of the prior's, falling.
-    eigenvectors: (P, P) in columns.
-    weak: the directions the data do not tell.
+    """What the data say of P parameters.
+
+    Attributes:
+        ratio: (P,) posterior over prior sigma.
+        alone: (P,) the same if all other parameters were known.
+        status: (P,) `IDENTIFIED`, `COMBINED` or `NOT_IDENTIFIED`.
+        eigenvalues: (P,) of the data's information in units of the prior's, falling.
+        eigenvectors: (P, P) in columns.
+        weak: the directions that are not identified.
     """
 
     ratio: Array
@@ -61,7 +64,11 @@ def examine(names: Sequence[str], covariance: Array) -> Identifiability:
     precision = np.linalg.inv(covariance)
     ratio, alone = np.sqrt(np.diag(covariance)), 1.0 / np.sqrt(np.diag(precision))
     status = tuple(
-        TOLD if whole <= TOLD_RATIO else COMBINED if single <= TOLD_RATIO else UNTOLD
+        IDENTIFIED
+        if whole <= IDENTIFIED_RATIO
+        else COMBINED
+        if single <= IDENTIFIED_RATIO
+        else NOT_IDENTIFIED
         for whole, single in zip(ratio, alone, strict=True)
     )
     values, vectors = np.linalg.eigh(precision - np.eye(len(names)))
@@ -69,7 +76,7 @@ def examine(names: Sequence[str], covariance: Array) -> Identifiability:
     weak = [
         _direction(names, vectors[:, i], 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)))
         for i in range(len(names))
-        if 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)) > TOLD_RATIO
+        if 1.0 / np.sqrt(max(1.0 + values[i], 1e-12)) > IDENTIFIED_RATIO
     ]
     return Identifiability(ratio, alone, status, np.maximum(values, 0.0), vectors, tuple(weak))
 
@@ -79,11 +86,11 @@ def _direction(names: Sequence[str], vector: Array, ratio: float) -> Direction:
     members = [int(i) for i in order if abs(vector[i]) >= MEMBER] or [int(order[0])]
     sign = 1.0 if vector[members[0]] >= 0.0 else -1.0
     weights = {names[i]: round(sign * float(vector[i]), 3) for i in members}
-    left = f"the log leaves {100.0 * ratio:.0f} % of what was unknown"
+    left = f"the log leaves {100.0 * ratio:.0f} % of the prior sigma"
     if len(members) == 1:
-        return Direction(weights, ratio, f"{names[members[0]]} is not told by this data ({left})")
+        return Direction(weights, ratio, f"{names[members[0]]} is not identified by this data ({left})")
     moves = " and ".join(f"{name} {'up' if weight > 0.0 else 'down'}" for name, weight in weights.items())
     listed = ", ".join(list(weights)[:-1]) + f" and {list(weights)[-1]}"
     return Direction(
-        weights, ratio, f"{listed} are told only in combination: {moves} looks the same ({left})"
+        weights, ratio, f"{listed} are identified only in combination: {moves} looks the same ({left})"
     )

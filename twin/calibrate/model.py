@@ -1,7 +1,7 @@
-"""What is calibrated: a vehicle, its grounds and optional effects, and the numbers in them by dotted name.
+"""What is calibrated: a vehicle, its grounds and optional effects, and their parameters by dotted name.
 
 `vehicle.body.mass_kg` and `soil.shear.friction_cap` are the names of the dataclasses in
-`twin.vehicle` and `twin.soil`; `loose_sand.shear.friction_cap` is that of one ground of several;
+`model.vehicle` and `model.soil`; `loose_sand.shear.friction_cap` is that of one ground of several;
 `effects.NAME` is an optional effect. A name carries its unit, its range comes with its field.
 """
 
@@ -27,10 +27,8 @@ from terrafusion.twin.physics.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS
 Array = NDArray[np.float64]
 
 STEP = 1e-6
-"""Relative step of the central differences that turn a named number into parameters of the graph.
-
-These maps (a tangent, a few products) are all but linear: the difference is right to about 1e-10.
-"""
+"""Relative step of the central differences from a named number to parameters of the graph: these maps (a
+tangent, a few products) are almost linear, so that the difference is right to about 1e-10."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +39,7 @@ class Model:
         vehicle: the robot.
         soils: grounds by name.
         effects: values of optional effects by name.
-        slope_rad, aspect_rad, payload_kg: as for `layout.vehicle_vector`.
+        slope_rad, aspect_rad, payload_kg: as for `vectors.vehicle_vector`.
     """
 
     vehicle: VehicleParams
@@ -67,6 +65,11 @@ class Model:
             found = getattr(found, part)
         return float(found)
 
+    def full_names(self, name: str) -> list[str]:
+        """The dotted names that a name stands for: `soil.` is every ground."""
+        path = name.removeprefix("soil.")
+        return [f"{soil}.{path}" for soil in self.soils] if name.startswith("soil.") else [name]
+
     def replaced(self, values: Mapping[str, float]) -> Model:
         """The model with other numbers, by dotted name."""
         vehicle, soils, effects = self.vehicle, dict(self.soils), dict(self.effects)
@@ -83,7 +86,7 @@ class Model:
     def vehicle_change(self, name: str) -> Array:
         """(V,) derivative of `vehicle_vector` by the named number.
 
-        Commands arrive late already (`drive.told`): the dead time enters by its own entry only.
+        The dead time enters by its own entry only: it is applied to the inputs (`commands.delayed_inputs`).
         """
         if not name.startswith("vehicle."):
             return np.zeros(len(VEHICLE_PARAMETERS))
@@ -111,7 +114,7 @@ def _replaced(parent: Any, path: list[str], value: float) -> Any:
 
 
 def resolve(names: tuple[str, ...], model: Model) -> dict[str, Quantity]:
-    """The numbers that the names stand for, `soil.` spelt out for every ground, in the order given.
+    """The numbers that the names stand for (see `Model.full_names`), in the order given.
 
     Raises:
         ConfigError: a name that is unknown, given twice, or that no motion of the twin depends on.
@@ -122,9 +125,7 @@ def resolve(names: tuple[str, ...], model: Model) -> dict[str, Quantity]:
     known |= {f"effects.{k}": Quantity(p.unit, p.low, p.high) for k, (_, p) in parameters().items()}
     found: dict[str, Quantity] = {}
     for name in names:
-        path = name.removeprefix("soil.")
-        spelt = [f"{s}.{path}" for s in model.soils] if name.startswith("soil.") else [name]
-        for one in spelt:
+        for one in model.full_names(name):
             if one not in known:
                 options = [*vehicle, *(f"soil.{k}" for k in soil), *(k for k in known if k not in vehicle)]
                 raise _unknown(name, options)
@@ -132,7 +133,7 @@ def resolve(names: tuple[str, ...], model: Model) -> dict[str, Quantity]:
                 raise ConfigError(f"parameter '{one}' is given twice", remedy="give it once")
             if not _moves(one, model):
                 raise ConfigError(
-                    f"parameter '{one}' does not enter the twin's motion, so that no log can tell it",
+                    f"parameter '{one}' does not enter the twin's motion, so that no log can identify it",
                     remedy="leave it out",
                 )
             found[one] = known[one]

@@ -1,9 +1,9 @@
 """The least-squares problem: residuals of all logs and windows, and its normal equations.
 
-Unknown are the parameters (as `coordinates.Coordinate`), constant errors of the sensors a log,
-and the pose at the start of each window. All have Gaussian priors and are counted in units of their prior
-sigma, so that the normal matrix is never singular. The poses are eliminated window by window (Schur
-complement), which marginalises them.
+Unknown are the parameters (as `coordinates.Coordinate`), constant errors of the sensors of each log, and the
+pose at the start of each window. All have Gaussian priors and are scaled by their prior sigma, so that the
+normal matrix is never singular. The poses are eliminated window by window (Schur complement), which
+marginalises them.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
-from terrafusion.twin.calibrate.predict import POSE, Prediction, predict
+from terrafusion.twin.calibrate.predict import POSE, predict
 from terrafusion.twin.calibrate.sensor_offsets import sensor_errors
 
 Array = NDArray[np.float64]
@@ -33,11 +33,13 @@ HUBER = 2.5
 
 Key = tuple[int, int]
 """Log and channel, by number."""
+NoiseModel = dict[Key, ResidualNoise]
+"""Noise of each log's channels."""
 
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """Where the solver stands: w (P,), sensor errors (L, B), poses (W, 3) a log; all in prior sigmas."""
+    """Estimates of the solver: w (P,), sensor errors (L, B), poses (W, 3) a log; all in prior sigmas."""
 
     w: Array
     errors: Array
@@ -54,10 +56,10 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class ResidualBlock:
-    """Residuals (twin less log) of one channel in one window, and their derivatives by what is local to it.
+    """Residuals (twin less log) of one channel in one window, with their derivatives.
 
     Attributes:
-        log, channel, window: where it belongs.
+        log, channel, window: by number.
         rows: (n,) its rows in the channel.
         residual: (n,).
         change: (n, P + B + 3) by parameters, sensor errors of the log and pose of the window.
@@ -72,10 +74,12 @@ class ResidualBlock:
 
 
 @dataclass(frozen=True, eq=False)
-class Eliminated:
+class EliminatedPose:
     """The pose (3,) of one window: its step is -own - by @ d[at] for a step d (G,) of the others.
 
-    `information` (3, 3) and `gradient` (3,) are its own, with the others fixed.
+    Attributes:
+        at: the parameters and sensor errors that the window's residuals depend on.
+        information, gradient: (3, 3) and (3,) of the pose alone, with the others fixed.
     """
 
     at: NDArray[np.int64]
@@ -84,29 +88,33 @@ class Eliminated:
     information: Array
     gradient: Array
 
+    def reduced(self, J: Array) -> Array:
+        """Derivatives (n, P + B) of residuals with the pose eliminated, from those (n, P + B + 3) with it."""
+        return np.asarray(J[:, : len(self.at)] - J[:, len(self.at) :] @ self.by)
+
 
 @dataclass(frozen=True, eq=False)
 class Normal:
-    """Normal equations of parameters and offsets (G,), the poses eliminated.
+    """Normal equations of parameters and sensor errors (G,), the poses eliminated.
 
     Attributes:
         H, g: (G, G) and (G,).
         cost: half the sum of squares, in nats.
-        poses: how to get those of a log's window back.
+        poses: eliminated poses by log and window.
     """
 
     H: Array
     g: Array
     cost: float
-    poses: dict[Key, Eliminated]
+    poses: dict[Key, EliminatedPose]
 
     def pose_gain(self) -> float:
-        """By how much the poses' own steps lower the cost, to first order."""
+        """By how much the steps of the poses alone lower the cost, to first order."""
         return 0.5 * sum(float(e.gradient @ e.own) for e in self.poses.values())
 
 
 class Problem:
-    """Logs, a model and the coordinates of what is unknown."""
+    """Logs, a model and the coordinates of its unknown parameters."""
 
     def __init__(
         self, logs: Sequence[PreparedLog], model: Model, coordinates: Sequence[Coordinate], *, robust: bool
@@ -117,35 +125,27 @@ class Problem:
         self.windows = [[window_of(o, log.windows) for o in log.observed] for log in self.logs]
 
     def start(self) -> Point:
-        """At the model's own numbers, without offsets, at the guessed poses."""
+        """At the parameters of the model, without sensor errors, at the guessed poses."""
         w = np.array([c.at(c.start) for c in self.coordinates])
-        return Point(
-            w,
-            np.zeros((len(self.logs), len(self.errors))),
-            tuple(np.zeros_like(log.start) for log in self.logs),
-        )
-
-    def values(self, w: Array) -> dict[str, float]:
-        """The numbers by name."""
-        return {c.name: c.value(float(x)) for c, x in zip(self.coordinates, w, strict=True)}
+        errors = np.zeros((len(self.logs), len(self.errors)))
+        return Point(w, errors, tuple(np.zeros_like(log.start) for log in self.logs))
 
     def model_at(self, w: Array) -> Model:
-        """The model with the numbers at w."""
-        return self.model.replaced(self.values(w))
-
-    def predictions(self, point: Point) -> list[list[Prediction]]:
-        """Every log's channels, without offsets; raises TerrafusionError where the twin diverges."""
-        model = self.model_at(point.w)
-        return [
-            predict(log, model, self.names, log.start + pose * self.pose_sigma(log))
-            for log, pose in zip(self.logs, point.pose, strict=True)
-        ]
+        """The model with the parameters at w."""
+        return self.model.replaced(
+            {c.name: c.value(float(x)) for c, x in zip(self.coordinates, w, strict=True)}
+        )
 
     def blocks(self, point: Point) -> list[ResidualBlock]:
-        """Residuals and derivatives, in a fixed order."""
+        """Residuals and derivatives, in a fixed order.
+
+        Raises:
+            TerrafusionError: the twin diverges.
+        """
         rate = np.array([c.rate(float(x)) for c, x in zip(self.coordinates, point.w, strict=True)])
-        out = []
-        for i, (log, predicted) in enumerate(zip(self.logs, self.predictions(point), strict=True)):
+        model, out = self.model_at(point.w), []
+        for i, (log, pose) in enumerate(zip(self.logs, point.pose, strict=True)):
+            predicted = predict(log, model, self.names, log.start + pose * self.pose_sigma(log))
             for j, (observed, p) in enumerate(zip(log.observed, predicted, strict=True)):
                 gain, by = self._sensor(observed.channel, p.value, point.errors[i])
                 residual = p.value + by @ point.errors[i] - observed.value
@@ -169,8 +169,8 @@ class Problem:
         """Prior sigma (3,) of a window's start, m and rad."""
         return POSE_SIGMA if log.posed else np.array([*POSE_SIGMA[:2], UNPOSED_YAW_SIGMA])
 
-    def whitened(self, block: ResidualBlock, noise: dict[Key, ResidualNoise]) -> tuple[Array, Array]:
-        """Residual (n,) and derivatives with white noise of variance one, outliers weighed down."""
+    def whitened(self, block: ResidualBlock, noise: NoiseModel) -> tuple[Array, Array]:
+        """Residual (n,) and derivatives with white noise of variance one, outliers down-weighted."""
         observed = self.logs[block.log].observed[block.channel]
         columns = np.column_stack([block.residual, block.change])
         white = noise[block.log, block.channel].whiten(
@@ -183,22 +183,22 @@ class Problem:
         return r, J
 
     def cost_of(self, r: Array) -> float:
-        """What weighted residuals add to the cost; those weighed down count by Huber's function."""
+        """Cost of weighted residuals; those down-weighted count by Huber's function."""
         if not self.robust:
             return 0.5 * float(r @ r)
-        # sqrt(HUBER |r|) is what an outlier was weighed down to.
+        # An outlier was down-weighted to sqrt(HUBER |r|).
         outlier = np.abs(r) > HUBER
         return 0.5 * float(np.sum(np.where(outlier, 2.0 * r * r - HUBER**2, r * r)))
 
     def normal(
         self, point: Point, blocks: Sequence[ResidualBlock], noise: dict[Key, ResidualNoise]
     ) -> Normal:
-        """Normal equations of parameters and offsets, priors included."""
+        """Normal equations of parameters and sensor errors, priors included."""
         P, B, Q = len(self.coordinates), len(self.errors), len(POSE)
         size = P + B * len(self.logs)
         H, g = np.eye(size), np.concatenate([point.w, point.errors.ravel()])
         cost = point.prior_cost()
-        poses: dict[Key, Eliminated] = {}
+        poses: dict[Key, EliminatedPose] = {}
         by_window: dict[Key, list[ResidualBlock]] = {}
         for block in blocks:
             by_window.setdefault((block.log, block.window), []).append(block)
@@ -215,11 +215,11 @@ class Problem:
             solved = np.linalg.solve(A, np.column_stack([local[P + B :, : P + B], a]))
             H[np.ix_(at, at)] += local[: P + B, : P + B] - local[: P + B, P + B :] @ solved[:, :-1]
             g[at] += gradient[: P + B] - local[: P + B, P + B :] @ solved[:, -1]
-            poses[i, k] = Eliminated(at, solved[:, :-1], solved[:, -1], A, a)
+            poses[i, k] = EliminatedPose(at, solved[:, :-1], solved[:, -1], A, a)
         return Normal(0.5 * (H + H.T), g, cost, poses)
 
     def step(self, normal: Normal, d: Array) -> tuple[Array, Array, list[Array]]:
-        """Steps of w, offsets and poses that go with a step d (G,) of parameters and offsets."""
+        """Steps of w, sensor errors and poses for a step d (G,) of the normal equations."""
         P = len(self.coordinates)
         pose = [np.zeros_like(log.start) for log in self.logs]
         for (i, k), e in normal.poses.items():

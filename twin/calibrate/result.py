@@ -1,4 +1,4 @@
-"""What a calibration says: numbers with sigma, what could not be told, how well the twin fits now."""
+"""The result of a calibration: parameters with sigma, identifiability, and the fit of each channel."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.calibrate.identifiability import TOLD, Identifiability
+from terrafusion.twin.calibrate.identifiability import IDENTIFIED, Identifiability
 from terrafusion.twin.calibrate.model import Model
 
 Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.calibration/1"
 CONVERGED = ("converged", "at_bound")
-"""Outcomes of a search that came to its end."""
+"""Outcomes of a search that converged."""
 
 
 @dataclass(frozen=True)
 class FittedParameter:
-    """One number.
+    """One parameter.
 
     Attributes:
         name, unit: dotted name and unit.
-        value, sigma: the fit and its 1 sigma, in the unit. One that is not told keeps its prior value.
+        value, sigma: the fit and its 1 sigma, in the unit; the prior value where it is not identified.
         low, high: two sigma about it, by the logarithm where the number moves so.
         start: where the search began; prior, prior_sigma: what was known before.
-        status: one of `identifiability`'s: told, only in combination, not told.
+        status: one of the three of `identifiability`.
         ratio: posterior over prior sigma.
         at_bound: whether it ended at the end of its range.
     """
@@ -56,7 +56,7 @@ class ChannelFit:
             twin with its offsets added and each window's pose fitted. "Before" is with the start values.
         sigma: noise of one row, estimated.
         correlation: autocorrelation of neighbouring rows.
-        left: that of whitened rows, which should be about zero.
+        left: the same of whitened rows, about zero if the noise model holds.
         outliers: share of whitened rows beyond 4.
     """
 
@@ -78,16 +78,16 @@ class ChannelFit:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The answer.
+    """The result.
 
     Attributes:
-        fitted: the numbers, in the order asked for.
+        fitted: the parameters, in the order asked for.
         correlation: (P, P) of their errors; covariance: (P, P) in their units.
-        identifiability: what could be told.
+        identifiability: what the data identify.
         model: vehicle, soils and effects with the numbers in place.
         before: the model at the start.
         channels: how each channel fits.
-        sensor_errors: by log name, channel and kind: the offset or gain that was found, and its sigma.
+        sensor_errors: by log name, channel and kind: the estimated offset or gain, and its sigma.
         outcome, sentence: how the search ended, as a key and in words.
         runs, seconds_of_data: evaluations of the twin, and what they ran over.
         notes: what was assumed.
@@ -108,19 +108,19 @@ class Calibration:
     notes: tuple[str, ...]
 
     def __getitem__(self, name: str) -> FittedParameter:
-        """A number by its name; `soil.` stands for the ground where there is one only."""
+        """A parameter by its name; `soil.` stands for the ground where there is one only."""
         return next(f for f in self.fitted if f.name == name or self._is_soil(name, f.name))
 
     def _is_soil(self, name: str, spelt: str) -> bool:
         return len(self.model.soils) == 1 and f"soil.{spelt.partition('.')[2]}" == name
 
     def converged(self) -> bool:
-        """Whether the search came to its end; if not, values and sigma are not to be trusted."""
+        """Whether the search converged; if not, values and sigma are not valid."""
         return self.outcome in CONVERGED
 
-    def untold(self) -> tuple[FittedParameter, ...]:
-        """Numbers that the data do not tell by themselves."""
-        return tuple(f for f in self.fitted if f.status != TOLD)
+    def unidentified(self) -> tuple[FittedParameter, ...]:
+        """Parameters that the data do not identify one by one."""
+        return tuple(f for f in self.fitted if f.status != IDENTIFIED)
 
     def as_dict(self) -> dict[str, Any]:
         """The content of `calibration.json`."""

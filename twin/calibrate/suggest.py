@@ -1,4 +1,4 @@
-"""Which drive would tell what the logs left open: the twin drives each, and the information is added up."""
+"""Suggests manoeuvres that would identify the unresolved parameters, by their information in the twin."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
 from terrafusion.twin.calibrate.log import prepare
 from terrafusion.twin.calibrate.model import resolve
+from terrafusion.twin.calibrate.noise_learning import first_noise
 from terrafusion.twin.calibrate.problem import Problem
 from terrafusion.twin.calibrate.result import Calibration
-from terrafusion.twin.calibrate.solver import first_noise
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 
@@ -26,12 +26,12 @@ CANDIDATES = (
     ("straight", 0.0), ("straight", 10.0), ("circle", 0.0), ("figure_eight", 10.0), ("spin", 0.0),
     ("staircase", 0.0), ("chirp", 0.0),
 )  # fmt: skip
-"""Scenarios and slopes (deg) that are tried."""
+"""Scenarios and slopes (deg) to choose from."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Suggestion:
-    """A drive and what it would do: posterior over prior sigma of a number, now and with that drive added."""
+    """A manoeuvre, and the posterior over prior sigma of a parameter, now and with that drive added."""
 
     name: str
     scenario: str
@@ -43,20 +43,20 @@ class Suggestion:
         """In words."""
         slope = f" on a slope of {self.slope_deg:g} deg" if self.slope_deg else ""
         return (
-            f"{self.name}: of the drives tried, '{self.scenario}'{slope} tells most; its sigma would be "
-            f"{100.0 * self.ratio_then:.0f} % of the prior's (now {100.0 * self.ratio_now:.0f} %)"
+            f"{self.name}: of the drives tried, '{self.scenario}'{slope} identifies it best; its sigma would "
+            f"be {100.0 * self.ratio_then:.0f} % of the prior's (now {100.0 * self.ratio_now:.0f} %)"
         )
 
 
 def suggest(
     calibration: Calibration, candidates: Sequence[tuple[str, float]] = CANDIDATES
 ) -> list[Suggestion]:
-    """For each number that is not told by itself, the drive of `SECONDS` that would tell it best.
+    """For each parameter that is not identified alone, the drive of `SECONDS` that would identify it best.
 
-    Uses the first ground, the fitted numbers, and noise as in the data sheets (white): a forecast, not a
-    promise. A drive the twin cannot do is left out.
+    A forecast for the first ground, with the fitted parameters and the (white) noise of the data sheets. A
+    drive the twin cannot do is left out.
     """
-    open_ones = calibration.untold()
+    open_ones = calibration.unidentified()
     if not open_ones:
         return []
     names = [f.name for f in calibration.fitted]
@@ -77,7 +77,7 @@ def suggest(
 
 
 def _information(calibration: Calibration, scenario: str, slope_deg: float) -> Array | None:
-    """What a drive would tell (P, P), in units of the priors; None where the twin cannot do it."""
+    """Information (P, P) of a drive in units of the priors; None where the twin cannot do it."""
     model, ground = calibration.model, next(iter(calibration.model.soils))
     planned = dataclasses.replace(load_scenario(scenario), duration_s=SECONDS).with_ground(ground, slope_deg)
     try:

@@ -26,7 +26,7 @@ def test_files_and_words(terrafusion, good_log: Path, tmp_path: Path) -> None:
         out,
     )
     assert done.status == 0, done.err
-    assert "vehicle.body.cg_height_m is not told by this data" in done.out
+    assert "vehicle.body.cg_height_m is not identified by this data" in done.out
     found = json.loads((out / "calibration.json").read_text())
     assert found["schema"] == "terrafusion.calibration/1"
     assert found["outcome"] == "converged"
@@ -76,7 +76,7 @@ def test_pieces_of_a_log(terrafusion, good_log: Path, tmp_path: Path) -> None:
         (("--payload-kg", "nan"), ("'payload_kg' is nan, out of range",)),
         (("--payload-kg", "-1"), ("'payload_kg' is -1.0, out of range",)),
         (("--terrain", "lava=mud"), ("no log drives on 'lava'", "asphalt")),
-        (("--parameters", "vehicle.drive.lag_s", "--input", "wheels"), ("cannot be told",)),
+        (("--parameters", "vehicle.drive.lag_s", "--input", "wheels"), ("cannot be identified",)),
     ],
 )
 def test_one_line_errors(terrafusion, good_log: Path, tmp_path: Path, words: tuple[str, ...], told) -> None:

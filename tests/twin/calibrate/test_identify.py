@@ -176,7 +176,7 @@ def test_driven_by_measured_wheels() -> None:
         assert found[name].value == pytest.approx(TRUTH[name], rel=0.02, abs=4.0 * found[name].sigma)
     assert not any(c.channel.startswith("wheel") for c in found.channels)
     assert any("measured wheel speeds" in note for note in found.notes)
-    with pytest.raises(DataError, match="cannot be told"):
+    with pytest.raises(DataError, match="cannot be identified"):
         calibrate(drive(), "elevate", SOIL, ("vehicle.drive.lag_s",), source="wheels")
 
 
@@ -218,7 +218,7 @@ def test_files_load_again(tmp_path) -> None:
     [
         (("soil.shear.friktion_cap",), "unknown parameter"),
         (("vehicle.body.mass",), "did you mean vehicle.body.mass_kg"),
-        (("soil.vibration.low_hz",), "no log can tell it"),
+        (("soil.vibration.low_hz",), "no log can identify it"),
         (("vehicle.body.mass_kg", "vehicle.body.mass_kg"), "twice"),
         ((), "no parameter"),
     ],

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 
 from terrafusion.datasets.core.config import Quantity
 from terrafusion.twin.calibrate.coordinates import Coordinate
-from terrafusion.twin.calibrate.identifiability import COMBINED, TOLD, UNTOLD, examine
+from terrafusion.twin.calibrate.covariance import long_run_variance
+from terrafusion.twin.calibrate.identifiability import COMBINED, IDENTIFIED, NOT_IDENTIFIED, examine
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.noise import ResidualNoise, autoregressive, gauss_markov
 from terrafusion.twin.calibrate.observations import Observed, binned
 from terrafusion.twin.calibrate.predict import averaging
-from terrafusion.twin.calibrate.sandwich import long_run_variance
 from tests.studies.coverage import Case, interval, outcomes
 
 
@@ -106,9 +106,9 @@ def test_identifiability_in_words() -> None:
     information[0, 0] = 1e4
     information[1:3, 1:3] = 1e4
     found = examine(("a", "b", "c", "d"), np.linalg.inv(information + np.eye(4)))
-    assert found.status == (TOLD, COMBINED, COMBINED, UNTOLD)
+    assert found.status == (IDENTIFIED, COMBINED, COMBINED, NOT_IDENTIFIED)
     said = [direction.sentence for direction in found.weak]
-    assert any("d is not told" in s for s in said)
+    assert any("d is not identified" in s for s in said)
     assert any("b" in s and "c" in s and "only in combination" in s for s in said)
     assert found.ratio[3] == pytest.approx(1.0)
 
@@ -135,7 +135,7 @@ def test_binomial_interval() -> None:
 def test_truth_lies_where_sigma_says(number: int) -> None:
     """A small fixed part of the coverage study (docs/calibration.md has the whole)."""
     case = dataclasses.replace(Case.drawn(number, seed=77), drive="figure_eight")
-    told = [o for o in outcomes(case) if o.status == TOLD]
+    told = [o for o in outcomes(case) if o.status == IDENTIFIED]
     assert len(told) >= 4
     assert np.mean([abs(o.score) <= 2.0 for o in told]) >= 0.6
     assert max(abs(o.score) for o in told) < 4.0

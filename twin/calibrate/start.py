@@ -1,0 +1,101 @@
+"""The model a calibration starts from: vehicle, soils and parameters of all logs."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from terrafusion.datasets.core.config import Quantity
+from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
+from terrafusion.twin.calibrate.log import PreparedLog, grounds
+from terrafusion.twin.calibrate.model import Model, resolve
+from terrafusion.twin.calibrate.predict import FOLLOWING
+from terrafusion.twin.model.soil import SoilParams, load_soil
+from terrafusion.twin.model.vehicle import VehicleParams, reported_geometry, with_overrides
+
+Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
+
+
+def uniquely_named(recordings: Sequence[Recording]) -> tuple[Recording, ...]:
+    """The logs, those of one name numbered: results go by name."""
+    out: list[Recording] = []
+    for recording in recordings:
+        count = sum(r.name == recording.name for r in recordings[: len(out)])
+        name = f"{recording.name} ({count + 1})" if count else recording.name
+        out.append(dataclasses.replace(recording, name=name))
+    return tuple(out)
+
+
+def start_model(
+    recordings: Sequence[Recording], vehicle: VehicleParams, soils: Soils, effects: Mapping[str, float]
+) -> tuple[Model, str | None]:
+    """The model to start from, and the name of the one ground where there is one for all logs.
+
+    Raises:
+        ConfigError: an unknown soil, or one for a ground that no log has.
+        DataError: a ground that is no soil of the library.
+    """
+    robot = with_overrides(vehicle, reported_geometry(recordings))
+    present = {**vehicle.effects, **effects}
+    if soils is not None and not isinstance(soils, Mapping):
+        soil = soils if isinstance(soils, SoilParams) else load_soil(soils)
+        return Model(robot, {soil.name: soil}, present), soil.name
+    given, found = dict(soils or {}), {}
+    for recording in recordings:
+        for label in dict.fromkeys(grounds(recording, recording.start_ns)[0]):
+            if label not in found:
+                found[label] = _soil(given.get(label, label), label, recording)
+    if unmet := sorted(set(given) - set(found)):
+        raise ConfigError(
+            f"no log drives on '{unmet[0]}'", channel="terrain", remedy=f"their grounds: {', '.join(found)}"
+        )
+    return Model(robot, found, present), None
+
+
+def _soil(given: str | Path | SoilParams, label: str, recording: Recording) -> SoilParams:
+    if isinstance(given, SoilParams):
+        return given
+    try:
+        return load_soil(given)
+    except ConfigError:
+        if given != label:
+            raise
+        what = f"its ground '{label}' is no soil of the library" if label else "it does not say its ground"
+        raise DataError(
+            what, file=recording.name, channel="terrain", remedy="name the soil with --terrain"
+        ) from None
+
+
+def coordinates_of(names: Sequence[str], model: Model, priors: Mapping[str, Prior]) -> list[Coordinate]:
+    """The named parameters as the solver sees them, `soil.` standing for every ground.
+
+    Raises:
+        ConfigError: an unknown name, or a prior of a parameter that is not calibrated.
+    """
+    numbers: dict[str, Quantity] = resolve(tuple(names), model)
+    full = {k: v for name, v in priors.items() for k in model.full_names(name)}
+    if unknown := set(full) - set(numbers):
+        raise ConfigError(
+            f"a prior is given for '{min(unknown)}', which is not calibrated", remedy="name it, too"
+        )
+    return [Coordinate.of(n, q, model.value(n), full.get(n)) for n, q in numbers.items()]
+
+
+def refuse_bypassed(coordinates: Sequence[Coordinate], logs: Sequence[PreparedLog]) -> None:
+    """Refuse parameters of motors and speed loop where the twin's wheels follow measured ones in all logs.
+
+    Raises:
+        DataError: naming the first of them.
+    """
+    if not all(log.follows for log in logs):
+        return
+    bypassed = ("speed_loop_p_nms", "speed_loop_i_nm", *FOLLOWING)
+    for name in (c.name for c in coordinates):
+        if name.startswith("vehicle.drive.") and name.rpartition(".")[2] in bypassed:
+            raise DataError(
+                f"'{name}' cannot be identified where the twin follows the measured wheels",
+                file=logs[0].name, remedy="give a log with commands, or leave the parameter out",
+            )  # fmt: skip
