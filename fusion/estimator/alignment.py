@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
@@ -152,27 +153,12 @@ def checked_start(
     return KnownStart(position, float(yaw_rad), position_sigma_m, yaw_sigma_rad)
 
 
-def rotation_between(
-    z: NDArray[np.complex128], g: NDArray[np.complex128], weight: Array
-) -> tuple[complex, float]:
-    """The turn that lays points z onto points g, as a complex number, and its information.
-
-    With complex points in the plane the best turn is the argument of
-    sum w_i conj(z_i - z) (g_i - g) (the planar case of Horn 1987, JOSA A 4(4)), the best
-    scale its size over sum w_i |z_i - z|^2, which is given as information.
-    """
-    share = weight / weight.sum()
-    from_mean = z - share @ z
-    weighted = weight * from_mean.conj()
-    return complex(weighted @ (g - share @ g)), float((weighted @ from_mean).real)
-
-
 def heading_from_motion(
     imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix], level: Start, antenna_m: Array
 ) -> Start | None:
     """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
 
-    Positions and velocities show the same turn, so their sums add up (see `rotation_between`). None while
+    Positions and velocities show the same turn, so their sums add up (see `planar_rotation`). None while
     fewer than three fixes are inside, or while the fixes hardly move though the wheels do.
     """
     times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
@@ -186,7 +172,7 @@ def heading_from_motion(
     z = path_at(t_fix) + lever * heading
     g = np.array([f.enu_m[0] + 1j * f.enu_m[1] for f in inside])
     weight = np.array([1.0 / (f.sigma_m[0] * f.sigma_m[1]) for f in inside])
-    turn, information = rotation_between(z, g, weight)
+    turn, information = planar_rotation(z, g, weight)
     half = 0.1
     z_dot = (path_at(t_fix + half) - path_at(t_fix - half)) / (2.0 * half)
     z_dot = z_dot + lever * (np.exp(1j * yaw_at(t_fix + half)) - np.exp(1j * yaw_at(t_fix - half))) / 0.2

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.fusion.estimator.alignment import rotation_between
+from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.streams import GnssFix
 
@@ -237,7 +237,7 @@ class DeadReckoning:
         weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in self.pairs])
         keep = np.ones(len(z), dtype=bool)
         for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
-            turn, information = rotation_between(z[keep], fix[keep], weight[keep])
+            turn, information = planar_rotation(z[keep], fix[keep], weight[keep])
             if information <= 0.0:
                 return None
             ratio = abs(turn) / information

@@ -8,11 +8,11 @@ stationary standard deviation and a correlation time (Uhlenbeck and Ornstein
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
 
 Array = NDArray[np.float64]
 
@@ -54,16 +54,5 @@ def markov_step(
     """
     means, sigmas = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
     kept = 1.0 - np.clip(np.asarray(forget, dtype=float), 0.0, 1.0)
-    decay = kept * np.exp(-dt_s / np.asarray(time_s, dtype=float))
-    return MarkovStep(decay, means, sigmas * np.sqrt(1.0 - decay * decay))
-
-
-def as_gtsam_factor(step: MarkovStep, key_i: int, key_j: int) -> gtsam.CustomFactor:
-    """The same step between two vector variables, for GTSAM's own optimisers."""
-
-    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        if H is not None:
-            H[0], H[1] = -np.diag(step.decay), np.eye(len(step.decay))
-        return step.residual(values.atVector(key_i), values.atVector(key_j))
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(step.sigma), [key_i, key_j], error)
+    decay = kept * markov_decay(dt_s, time_s)
+    return MarkovStep(decay, means, sigmas * markov_spread(decay))

@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -83,15 +82,3 @@ def rows(fix: GnssPosition, point: KeyState, dim: int) -> Array:
     out[:, POSE], out[:, NAV.stop : dim] = H_pose, H_linear[:, : dim - NAV.stop]
     out[:, dim] = -residual(fix, point.pose, point.linear)
     return out / fix.sigma_m[:, None]
-
-
-def as_gtsam_factor(fix: GnssPosition, pose_key: int, linear_key: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `linear_key` is the vector of the linear states."""
-
-    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        pose, linear = values.atPose3(pose_key), values.atVector(linear_key)
-        if H is not None:
-            H[0], H[1] = jacobians(fix, pose, linear)
-        return residual(fix, pose, linear)
-
-    return gtsam.CustomFactor(gtsam.noiseModel.Diagonal.Sigmas(fix.sigma_m), [pose_key, linear_key], error)

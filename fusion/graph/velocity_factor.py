@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -77,18 +76,3 @@ def rows(told: GnssVelocity, point: KeyState, dim: int) -> Array:
     out[:, POSE], out[:, VELOCITY], out[:, NAV.stop : dim] = H_pose, H_velocity, H_linear[:, : dim - NAV.stop]
     out[:, dim] = -residual(told, point.pose, point.velocity, point.linear)
     return out / told.sigma_mps
-
-
-def as_gtsam_factor(
-    told: GnssVelocity, pose_key: int, velocity_key: int, linear_key: int
-) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `linear_key` is the vector of the linear states."""
-
-    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        pose, linear = values.atPose3(pose_key), values.atVector(linear_key)
-        if H is not None:
-            H[0], H[1], H[2] = jacobians(told, pose, linear)
-        return residual(told, pose, values.atVector(velocity_key), linear)
-
-    noise = gtsam.noiseModel.Isotropic.Sigma(3, told.sigma_mps)
-    return gtsam.CustomFactor(noise, [pose_key, velocity_key, linear_key], error)

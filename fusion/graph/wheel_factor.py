@@ -23,7 +23,6 @@ import dataclasses
 from dataclasses import dataclass
 from typing import Any
 
-import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
@@ -142,16 +141,3 @@ def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -
     H_linear[1, _B], H_linear[1, _I] = -wheels.distance_m, wheels.yaw_rad
     H_linear[3, _K] = -wheels.turn_rad
     return H_i, H_j, H_linear
-
-
-def as_gtsam_factor(wheels: WheelIncrement, pose_i: int, pose_j: int, linear_j: int) -> gtsam.CustomFactor:
-    """The same factor for GTSAM's own optimisers; `linear_j` is the vector of the linear states."""
-
-    def error(_: Any, values: gtsam.Values, H: list[Array] | None) -> Array:
-        a, b, linear = values.atPose3(pose_i), values.atPose3(pose_j), values.atVector(linear_j)
-        if H is not None:
-            H[0], H[1], H[2] = jacobians(a, b, linear, wheels)
-        return residual(a, b, linear, wheels)
-
-    noise = gtsam.noiseModel.Diagonal.Sigmas(wheels.sigma)
-    return gtsam.CustomFactor(noise, [pose_i, pose_j, linear_j], error)

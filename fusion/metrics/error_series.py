@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle, yaw_of
+from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -302,8 +303,7 @@ def align_start(errors: Errors) -> tuple[Errors, str]:
         how = "its first position and the mean heading over its first metre"
     else:
         p0, q0 = p.mean(axis=0), q.mean(axis=0)
-        a, b = (p - p0) @ [1.0, 1j], (q - q0) @ [1.0, 1j]
-        turn = np.sum(np.conj(a) * b) if path[-1] >= 1.0 else np.complex128(1.0)
+        turn = planar_rotation(p @ [1.0, 1j], q @ [1.0, 1j])[0] if path[-1] >= 1.0 else 1.0
         how = f"a least-squares fit over the first {min(ALIGN_M, float(path[-1])):.1f} m"
     angle = float(np.angle(turn))
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

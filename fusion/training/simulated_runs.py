@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.twin.model.library import read_named
@@ -195,14 +196,14 @@ def windows_of(
     mean = samples.sides_mps.mean(axis=1)
     yaw = (samples.sides_mps[:, 1] - samples.sides_mps[:, 0]) / track
     ends = np.arange(WINDOW_S, samples.t_s[-1], UPDATE_S)
-    keep = np.exp(-UPDATE_S / SLIP_ERROR_S)
+    keep = markov_decay(UPDATE_S, SLIP_ERROR_S)
     error = rng.normal() * SLIP_SIGMA
     windows, labels = [], []
     for end in ends:
         rows = slice(*np.searchsorted(samples.t_s, [end - WINDOW_S, end]))
         recent = slice(*np.searchsorted(samples.t_s, [end - UPDATE_S, end]))
         around = slice(*np.searchsorted(imu_t, [end - WINDOW_S, end]))
-        error = keep * error + np.sqrt(1.0 - keep**2) * SLIP_SIGMA * rng.normal()
+        error = keep * error + markov_spread(keep) * SLIP_SIGMA * rng.normal()
         wheel, speed = float(mean[recent].mean()), float(samples.forward_mps[recent].mean())
         slip = 1.0 - speed / wheel + error if slip_observed and abs(wheel) > 1e-3 else None
         span = float(samples.t_s[rows][-1] - samples.t_s[rows][0])

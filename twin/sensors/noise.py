@@ -9,6 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
+
 Array = NDArray[np.float64]
 
 FLICKER_RATIO = math.sqrt(10.0)
@@ -50,9 +52,9 @@ def gauss_markov(rng: np.random.Generator, count: int, interval_s: float, correl
     """First-order Gauss-Markov series (count, 3) of unit variance, stationary from the start."""
     from scipy.signal import lfilter
 
-    keep = math.exp(-interval_s / correlation_s) if correlation_s > 0.0 else 0.0
+    keep = float(markov_decay(interval_s, correlation_s)) if correlation_s > 0.0 else 0.0
     drive = rng.normal(size=(count, 3))
-    drive[1:] *= math.sqrt(1.0 - keep * keep)
+    drive[1:] *= markov_spread(keep)
     return np.asarray(lfilter([1.0], [1.0, -keep], drive, axis=0))
 
 

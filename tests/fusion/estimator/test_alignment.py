@@ -15,7 +15,6 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
-from terrafusion.fusion.estimator.alignment import rotation_between
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -194,14 +193,6 @@ def test_a_right_given_heading_starts_at_once_and_stays() -> None:
 def test_a_start_that_is_none_is_refused(bad: dict[str, float]) -> None:
     with pytest.raises(DataError):
         Estimator.for_vehicle("elevate").set_start(np.zeros(3), **bad)
-
-
-def test_turn_between_is_exact_for_a_turned_and_scaled_path() -> None:
-    z = np.array([0.0, 1.0 + 0.2j, 2.0 - 0.1j, 2.5 + 1.0j])
-    turn, information = rotation_between(
-        z, 5.0 - 3.0j + 0.8 * np.exp(2.1j) * z, np.array([1.0, 2.0, 1.0, 3.0])
-    )
-    assert turn / information == pytest.approx(0.8 * np.exp(2.1j))
 
 
 RATE_RADPS = 0.02

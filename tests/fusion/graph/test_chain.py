@@ -10,8 +10,7 @@ import pytest
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gauss_markov as markov
-from terrafusion.fusion.graph import gnss_factor, velocity_factor, wheel_factor
+from terrafusion.fusion.graph import gnss_factor, velocity_factor
 from terrafusion.fusion.graph.batch import BatchSmoother
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gauss_markov import markov_step
@@ -19,6 +18,7 @@ from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import DIM, IMU_ROTATION, LINEAR, MARKOV, POSE, KeyState
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
+from tests import gtsam_factors
 
 Array = NDArray[np.float64]
 N = len(LINEAR)
@@ -89,19 +89,19 @@ def build(chain: Chain, n: int, seed: int = 1, heading: float = 0.4) -> gtsam.No
         else:
             for i in range(links[k - 1].size()):
                 graph.add(links[k - 1].at(i))
-            graph.add(wheel_factor.as_gtsam_factor(wheels[k - 1], X(k - 1), X(k), M(k)))
-            graph.add(markov.as_gtsam_factor(STEP, M(k - 1), M(k)))
+            graph.add(gtsam_factors.wheel_factor_of(wheels[k - 1], X(k - 1), X(k), M(k)))
+            graph.add(gtsam_factors.markov_factor(STEP, M(k - 1), M(k)))
         if k % 4 == 0:
             fix = GnssPosition(
                 fixes[k], np.array([0.2, 0.0, 0.3]), np.full(3, 0.3), 1.0, np.array([0.9, 0.3, 0.0])
             )
             chain.add_fix(k, fix)
-            graph.add(gnss_factor.as_gtsam_factor(fix, X(k), M(k)))
+            graph.add(gtsam_factors.gnss_position_factor(fix, X(k), M(k)))
             told = GnssVelocity(
                 points[k].velocity, 0.1, np.array([0.2, 0.0, 0.3]), lever_arm_velocity(RATE, -0.05)
             )
             chain.add_velocity(k, told)
-            graph.add(velocity_factor.as_gtsam_factor(told, X(k), V(k), M(k)))
+            graph.add(gtsam_factors.gnss_velocity_factor(told, X(k), V(k), M(k)))
     return graph
 
 

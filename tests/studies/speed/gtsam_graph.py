@@ -17,13 +17,12 @@ import numpy as np
 from gtsam.symbol_shorthand import B, M, V, X
 from numpy.typing import NDArray
 
-from terrafusion.fusion.graph import gauss_markov as markov
-from terrafusion.fusion.graph import gnss_factor, velocity_factor, wheel_factor
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import BIAS, MARKOV, POSE, VELOCITY, KeyState
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from tests import gtsam_factors
 
 Array = NDArray[np.float64]
 
@@ -103,7 +102,7 @@ def factors(chain: Chain, k: int, kind: Graph) -> gtsam.NonlinearFactorGraph:
     if node.wheels is not None:
         graph.add(_wheels(node.wheels, k, kind))
     if node.markov is not None and kind is Graph.FULL:
-        graph.add(markov.as_gtsam_factor(node.markov, M(k - 1), M(k)))
+        graph.add(gtsam_factors.markov_factor(node.markov, M(k - 1), M(k)))
     for fix in node.fixes:
         graph.add(_fix(fix, k, kind))
     for told in node.velocities:
@@ -130,7 +129,7 @@ def _insert(values: gtsam.Values, k: int, state: KeyState, kind: Graph) -> None:
 
 def _wheels(wheels: WheelIncrement, k: int, kind: Graph) -> gtsam.NonlinearFactor:
     if kind is Graph.FULL:
-        return wheel_factor.as_gtsam_factor(wheels, X(k - 1), X(k), M(k))
+        return gtsam_factors.wheel_factor_of(wheels, X(k - 1), X(k), M(k))
     moved = gtsam.Pose3(gtsam.Rot3.Rz(wheels.turn_rad), wheels.displacement_m)
     sigma = np.array([1.0, 1.0, wheels.sigma[3], *wheels.sigma[:3]])
     return gtsam.BetweenFactorPose3(X(k - 1), X(k), moved, gtsam.noiseModel.Diagonal.Sigmas(sigma))
@@ -138,12 +137,12 @@ def _wheels(wheels: WheelIncrement, k: int, kind: Graph) -> gtsam.NonlinearFacto
 
 def _fix(fix: GnssPosition, k: int, kind: Graph) -> gtsam.NonlinearFactor:
     if kind is Graph.FULL:
-        return gnss_factor.as_gtsam_factor(fix, X(k), M(k))
+        return gtsam_factors.gnss_position_factor(fix, X(k), M(k))
     return gtsam.GPSFactorArm(X(k), fix.enu_m, fix.lever_m, gtsam.noiseModel.Diagonal.Sigmas(fix.sigma_m))
 
 
 def _velocity(told: GnssVelocity, k: int, kind: Graph) -> gtsam.NonlinearFactor:
     if kind is Graph.FULL:
-        return velocity_factor.as_gtsam_factor(told, X(k), V(k), M(k))
+        return gtsam_factors.gnss_velocity_factor(told, X(k), V(k), M(k))
     noise = gtsam.noiseModel.Isotropic.Sigma(3, told.sigma_mps)
     return gtsam.PriorFactorVector(V(k), told.velocity_mps, noise)
