@@ -14,6 +14,7 @@ import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli import (
+    allan,
     benchmark,
     calibrate,
     convert,
@@ -67,6 +68,7 @@ app.command("benchmark")(benchmark.benchmark)
 app.command("calibrate")(calibrate.calibrate)
 app.command("gap")(gap.gap)
 app.command("gap-blind")(gap_blind.gap_blind)
+app.command("allan")(allan.allan)
 app.command("study")(study.study)
 app.command("replay")(replay.replay)
 app.command("live")(live.live)

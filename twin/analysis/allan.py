@@ -1,18 +1,18 @@
-"""Overlapping Allan deviation, and the noise parameters read from it (IEEE Std 952-1997, annex C).
-
-`python -m terrafusion.twin.analysis.allan [VEHICLE]` prints the Allan deviation of a vehicle's simulated
-IMU at rest beside the parameters it was made from.
-"""
+"""Overlapping Allan deviation of an IMU, and the noise parameters read from it (IEEE Std 952-1997, annex C)."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.sensors.imu import at_rest
 
 Array = NDArray[np.float64]
 
@@ -20,6 +20,8 @@ CONFIDENCE = 0.95
 REWEIGHTINGS = 5
 SHORT_S, LONG_S = 1.0, 3.0
 """Clusters up to the first show white noise alone, those from the second on the others."""
+LEAST_S = 10.0 * LONG_S
+"""Shorter series have too few long clusters for the bias parameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,14 +127,15 @@ def expected_deviation(tau_s: Array, density: float, walk: float, floor: float) 
     return np.sqrt(density**2 / tau_s + walk**2 * tau_s / 3.0 + floor**2)
 
 
-def main(vehicle: str = "elevate", hours: float = 2.0, seeds: int = 4) -> list[str]:
-    """Lines of a table: the Allan deviation of the simulated IMU at rest, and the parameters read from it."""
-    from terrafusion.twin.model.vehicle import load_vehicle
-    from terrafusion.twin.sensors.imu import at_rest
+def vehicle_lines(vehicle: str, hours: float = 2.0, seeds: int = 4) -> list[str]:
+    """A table of the Allan deviation of a vehicle's simulated IMU at rest, beside the parameters of its file.
 
+    Raises:
+        ConfigError: unknown vehicle.
+    """
     params = load_vehicle(vehicle)
     spec, real = params.sensors.imu, params.realism.imu
-    told = {
+    specified = {
         "gyro": (
             spec.gyro_noise_radps_sqrthz, spec.gyro_bias_walk_radps2_sqrthz, real.gyro_bias_instability_radps
         ),
@@ -141,48 +144,54 @@ def main(vehicle: str = "elevate", hours: float = 2.0, seeds: int = 4) -> list[s
         ),
     }  # fmt: skip
     count = round(3600.0 * hours * spec.rate_hz)
-    series: dict[str, list[Allan]] = {"gyro": [], "accel": []}
+    curves: dict[str, list[Allan]] = {"gyro": [], "accel": []}
     for seed in range(seeds):
-        for name, values in zip(series, at_rest(params, count, seed), strict=True):
-            series[name] += [allan_deviation(column, spec.rate_hz, 1) for column in values.T]
+        for name, values in zip(curves, at_rest(params, count, seed), strict=True):
+            curves[name] += [allan_deviation(column, spec.rate_hz, 1) for column in values.T]
     lines = [f"{vehicle}: IMU at rest, {hours:g} h, {seeds} seeds x 3 axes, mean of the curves"]
-    for name, curves in series.items():
-        mean = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=0))
-        theory = expected_deviation(curves[0].tau_s, *told[name])
-        lines.append(f"{name}: tau s, Allan deviation, expected")
-        rows = zip(curves[0].tau_s, mean, theory, strict=True)
-        lines += [f"  {tau:9.2f}  {value:.3e}  {wanted:.3e}" for tau, value, wanted in rows]
-        found = inertial_noise(curves)
-        for word, made, value, error in zip(
-            ("density", "walk", "floor"),
-            told[name],
-            (found.density, found.walk, found.floor),
-            (found.density_error, found.walk_error, found.floor_error),
-            strict=True,
-        ):
-            lines.append(f"  {word}: made with {made:.3e}, found {value:.3e} +- {error:.1e}")
+    for name, own in curves.items():
+        lines += _table(name, own, specified[name])
     return lines
 
 
-def command(arguments: list[str] | None = None) -> int:
-    """Print the Allan table; 0 when done, 1 for an unknown vehicle."""
-    import argparse
-    import sys
+def recording_lines(recording: Recording) -> list[str]:
+    """A table of the Allan deviation of a recorded IMU, which should be at rest.
 
-    parser = argparse.ArgumentParser(
-        prog="python -m terrafusion.twin.analysis.allan",
-        description="Allan deviation of a vehicle's simulated IMU: 2 h at rest, some seconds of work.",
-        epilog="example: python -m terrafusion.twin.analysis.allan elevate",
+    Raises:
+        DataError: no IMU, or too short a log.
+    """
+    imu = recording.imu
+    seconds = 0.0 if imu is None or len(imu) < 2 else float(imu.t_ns[-1] - imu.t_ns[0]) * 1e-9
+    if imu is None or seconds < LEAST_S:
+        raise DataError(
+            f"{seconds:.1f} s of IMU data are too short for an Allan deviation", file=recording.name,
+            channel="imu", remedy=f"give a log of {LEAST_S:g} s or more with the robot at rest",
+        )  # fmt: skip
+    rate_hz = (len(imu) - 1) / seconds
+    lines = [f"{recording.name}: IMU, {seconds:.0f} s at {rate_hz:.1f} Hz, mean of the axes"]
+    for name, values in (("gyro", imu.gyro_radps), ("accel", imu.accel_mps2)):
+        axes = [column[np.isfinite(column)] for column in values.T]
+        curves = [allan_deviation(column, rate_hz, 1) for column in axes if len(column) == len(imu)]
+        lines += _table(name, curves, None) if curves else [f"{name}: not in the log, or with gaps"]
+    return lines
+
+
+def _table(name: str, curves: list[Allan], specified: Sequence[float] | None) -> list[str]:
+    """Deviation by cluster time and the parameters read from it, beside those specified where given."""
+    tau_s = curves[0].tau_s
+    mean = np.sqrt(np.mean([curve.deviation**2 for curve in curves], axis=0))
+    lines = [f"{name}: tau s, Allan deviation" + (", expected" if specified else "")]
+    theory = expected_deviation(tau_s, *specified) if specified else None
+    for k, (tau, value) in enumerate(zip(tau_s, mean, strict=True)):
+        lines.append(f"  {tau:9.2f}  {value:.3e}" + ("" if theory is None else f"  {theory[k]:.3e}"))
+    fit = inertial_noise(curves)
+    estimates = zip(
+        ("density", "walk", "floor"),
+        (fit.density, fit.walk, fit.floor),
+        (fit.density_error, fit.walk_error, fit.floor_error),
+        strict=True,
     )
-    parser.add_argument("vehicle", nargs="?", default="elevate", help="name, or YAML file")
-    try:
-        lines = main(parser.parse_args(arguments).vehicle)
-    except ConfigError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 1
-    print("\n".join(lines))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(command())
+    for k, (word, value, error) in enumerate(estimates):
+        given = f"specified {specified[k]:.3e}, " if specified else ""
+        lines.append(f"  {word}: {given}estimated {value:.3e} +- {error:.1e}")
+    return lines

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from terrafusion.twin.analysis.allan import allan_deviation, command, expected_deviation, inertial_noise
+from terrafusion.twin.analysis.allan import allan_deviation, expected_deviation, inertial_noise
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
 from terrafusion.twin.sensors.noise import NoiseStreams, flicker, white_and_walk
@@ -70,11 +70,11 @@ def test_the_simulated_imu_has_the_noise_of_its_data_sheet() -> None:
     elevate = load_vehicle("elevate")
     spec, real = elevate.sensors.imu, elevate.realism.imu
     runs = [at_rest(elevate, 720_000, seed) for seed in (1, 2)]
-    told = (
+    specified = (
         (spec.gyro_noise_radps_sqrthz, spec.gyro_bias_walk_radps2_sqrthz, real.gyro_bias_instability_radps),
         (spec.accel_noise_mps2_sqrthz, spec.accel_bias_walk_mps3_sqrthz, real.accel_bias_instability_mps2),
     )
-    for sensor, (density, walk, floor) in enumerate(told):
+    for sensor, (density, walk, floor) in enumerate(specified):
         curves = [allan_deviation(column, spec.rate_hz, 1) for run in runs for column in run[sensor].T]
         found = inertial_noise(curves)
         assert found.density == pytest.approx(density, rel=0.005)
@@ -87,17 +87,6 @@ def test_the_simulated_imu_has_the_noise_of_its_data_sheet() -> None:
         )
 
 
-def test_too_short_a_series_is_told() -> None:
+def test_too_short_a_series_is_refused() -> None:
     with pytest.raises(ValueError, match="9 values are too few"):
         allan_deviation(np.zeros(9), RATE_HZ)
-
-
-def test_the_command_tells_an_unknown_vehicle_in_one_line_and_helps(capsys) -> None:
-    assert command(["nope"]) == 1
-    err = capsys.readouterr().err
-    assert err.startswith("error: unknown vehicle 'nope'; known are ")
-    assert len(err.splitlines()) == 1
-    with pytest.raises(SystemExit) as ended:
-        command(["--help"])
-    assert ended.value.code == 0
-    assert "example: python -m terrafusion.twin.analysis.allan elevate" in capsys.readouterr().out

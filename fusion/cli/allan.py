@@ -1,0 +1,38 @@
+"""`terrafusion allan`: Allan deviation of a simulated or recorded IMU."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+SubjectsArgument = Annotated[
+    list[str] | None,
+    typer.Argument(
+        metavar="[VEHICLE|LOG]...",
+        help="Vehicles, by name or YAML file, whose IMU is simulated at rest; or logs of a robot at rest.",
+    ),
+]
+
+
+def allan(subjects: SubjectsArgument = None) -> None:
+    """Allan deviation of IMUs at rest, and the noise parameters read from it (IEEE Std 952-1997).
+
+    Without an argument: the simulated IMU of the vehicle elevate, beside the parameters it was made from.
+
+    Examples:
+
+    terrafusion allan husky
+
+    terrafusion allan parked.mcap
+    """
+    from terrafusion.fusion.cli.common import opened, reading
+    from terrafusion.twin.analysis.allan import recording_lines, vehicle_lines
+    from terrafusion.twin.model.vehicle import vehicle_names
+
+    for subject in subjects or ["elevate"]:
+        if subject in vehicle_names() or subject.endswith((".yaml", ".yml")):
+            print("\n".join(vehicle_lines(subject)))
+            continue
+        for recording in opened([subject], reading(None, None, "header", None, False), False):
+            print("\n".join(recording_lines(recording)))
