@@ -23,7 +23,7 @@ from terrafusion.twin.physics.layout import INDEX, STATES
 from terrafusion.twin.physics.terramechanics import WheelShape, static_sinkage
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from tests.twin.effect_cases import plant, samples, soil
+from tests.twin.effects.effect_cases import plant, samples, soil
 
 SHORT = dataclasses.replace(load_scenario("figure_eight"), duration_s=20.0)
 

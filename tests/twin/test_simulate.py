@@ -98,7 +98,7 @@ def test_same_seed_same_bits_and_the_motion_knows_no_seed() -> None:
 
 
 def test_an_outage_changes_no_other_sensor_and_no_other_fix() -> None:
-    """Of a receiver that is back at once; see test_sensing for one that has to climb back."""
+    """Of a receiver that is back at once; see sensors/test_data_sheets.py for one that has to climb back."""
     elevate = load_vehicle("elevate")
     prompt = dataclasses.replace(elevate.realism.gnss, reacquire_s=0.0, refix_s=0.0)
     elevate = dataclasses.replace(elevate, realism=dataclasses.replace(elevate.realism, gnss=prompt))

@@ -22,7 +22,7 @@ from terrafusion.twin.physics.layout import (
     state_slice,
 )
 from terrafusion.twin.scenario.commands import delayed_inputs
-from tests.twin.effect_cases import (
+from tests.twin.effects.effect_cases import (
     DT_S,
     ELEVATE,
     FORMS,

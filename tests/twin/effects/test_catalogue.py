@@ -15,7 +15,7 @@ from terrafusion.twin.engine.integrate import MAX_STEP_S
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.measurement import correction, measured, measurement
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS, STATES, VEHICLE_PARAMETERS
-from tests.twin.effect_cases import (
+from tests.twin.effects.effect_cases import (
     FORMS,
     KEYS,
     MOUNTING,
