@@ -1,7 +1,7 @@
-"""The input doctor: what is odd about a recording, with the evidence and what to do about it.
+"""Log checks: inconsistencies of a recording, with the evidence and what to do about them.
 
-Each check is one function from a context to findings; `run_checks.CHECKS` lists them. A clean log has
-no finding. `run_checks` only looks; `repair` makes the repairs that the findings propose.
+Each check is one function from a `CheckContext` to findings; `run.CHECKS` lists them. `run_checks` reports,
+`repair` also applies the repairs that the findings offer.
 """
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding

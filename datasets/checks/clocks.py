@@ -1,4 +1,4 @@
-"""A clock that jumps ahead or drifts, told by the sensors that keep time."""
+"""Clocks that jump ahead or drift, detected by comparison with other sensors."""
 
 from __future__ import annotations
 
@@ -9,18 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding
-from terrafusion.datasets.checks.sensor_pairs import (
-    LEAST_R,
-    Pair,
-    Pairs,
-    clocks_of,
-    near_lag,
-    period_s,
-    retimed,
-    why,
-)
-from terrafusion.datasets.checks.yaw_sources import Signal
+from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, counted, period_s, retimed
+from terrafusion.datasets.checks.motion import Signal
+from terrafusion.datasets.checks.sensor_pairs import LEAST_R, Pair, SensorPairs, near_lag, reason
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
 
@@ -35,8 +26,8 @@ DRIFT_WINDOW_S, DRIFT_ROUNDS = 20.0, 3
 
 
 @dataclass(frozen=True)
-class Jump:
-    """From `row` on the times of a channel are late by `step_ns`."""
+class JumpAhead:
+    """From `row` on the times of a channel are `step_ns` too late."""
 
     row: int
     step_ns: int
@@ -44,7 +35,10 @@ class Jump:
 
 @dataclass(frozen=True)
 class Drift:
-    """True time of a clock: anchor + offset + scale (t - anchor); one without drift has offset 0, scale 1."""
+    """True time of a clock: anchor + offset + scale (t - anchor).
+
+    `spread` is half the 95 % interval of the drift rate, `r` the correlation of the signals.
+    """
 
     anchor_ns: int
     offset_s: float
@@ -52,7 +46,7 @@ class Drift:
     spread: float
     r: float
 
-    def undone(self, t_ns: TimesNs) -> TimesNs:
+    def corrected(self, t_ns: TimesNs) -> TimesNs:
         """True times of the drifting clock."""
         since = (t_ns - self.anchor_ns) * self.scale + self.offset_s * 1e9
         return np.asarray(self.anchor_ns + np.rint(since).astype(np.int64))
@@ -62,21 +56,24 @@ class Drift:
         return Drift(self.anchor_ns, -self.offset_s / self.scale, 1.0 / self.scale, self.spread, self.r)
 
 
-def clock_jumps(recording: Recording, pairs: Pairs) -> dict[str, list[Jump]]:
-    """Leaps ahead of single clocks, by channel. A gap is one where what comes after it fits the others
-    only when shifted back; where nothing can be compared, where the channel ends that much late."""
+def clock_jumps(recording: Recording, pairs: SensorPairs) -> dict[str, list[JumpAhead]]:
+    """Jumps ahead of single clocks, by channel.
+
+    A gap is a jump if the samples after it fit the other channels only when shifted back or, where
+    nothing can be compared, if the channel ends that much late.
+    """
     found = {}
     for name, t_ns in clocks_of(recording).items():
-        leaps = _leaps(t_ns)
-        if not leaps:
+        candidates = _candidates(t_ns)
+        if not candidates:
             continue
         own = [(pair.index(name), signals) for pair, signals in pairs.items() if name in pair]
-        ends_late = _ends_late(recording, name, sum(leap.step_ns for leap in leaps))
-        jumps: list[Jump] = []
-        for leap, after in zip(leaps, [*leaps[1:], Jump(len(t_ns), 0)], strict=True):
+        ends_late = _ends_late(recording, name, sum(leap.step_ns for leap in candidates))
+        jumps: list[JumpAhead] = []
+        for leap, after in zip(candidates, [*candidates[1:], JumpAhead(len(t_ns), 0)], strict=True):
             rows, moved_ns = slice(leap.row, after.row), sum(jump.step_ns for jump in jumps)
-            said = (_moved(i, signals, rows, moved_ns, leap) for i, signals in own)
-            moved = next((answer for answer in said if answer is not None), None)
+            answers = (_fits_moved_back(i, signals, rows, moved_ns, leap) for i, signals in own)
+            moved = next((answer for answer in answers if answer is not None), None)
             if moved or (moved is None and ends_late and leap.step_ns > SURE_JUMP_S * 1e9):
                 jumps.append(leap)
         if jumps:
@@ -84,13 +81,13 @@ def clock_jumps(recording: Recording, pairs: Pairs) -> dict[str, list[Jump]]:
     return found
 
 
-def jump_findings(context: CheckContext, jumps: dict[str, list[Jump]]) -> Iterator[Finding]:
-    """What is to be said of leaps ahead."""
+def jump_findings(context: CheckContext, jumps: dict[str, list[JumpAhead]]) -> Iterator[Finding]:
+    """One finding a channel that jumps."""
     for name, leaps in jumps.items():
         at_s = context.since_start_s(clocks_of(context.recording)[name][leaps[0].row])
         total_s = sum(leap.step_ns for leap in leaps) * 1e-9
 
-        def repair(recording: Recording, name: str = name, leaps: list[Jump] = leaps) -> Recording:
+        def repair(recording: Recording, name: str = name, leaps: list[JumpAhead] = leaps) -> Recording:
             t_ns = getattr(recording, name).t_ns.copy()
             for leap in leaps:
                 t_ns[leap.row :] -= leap.step_ns
@@ -100,27 +97,29 @@ def jump_findings(context: CheckContext, jumps: dict[str, list[Jump]]) -> Iterat
             "clock-jump",
             "error",
             name,
-            f"its clock jumps ahead {len(leaps)} time{'s' if len(leaps) > 1 else ''}",
-            f"by {total_s:.2f} s in all, first at t = {at_s:.2f} s; the other channels go on meanwhile, "
-            "and what comes after fits them only when moved back",
-            "move what comes after back",
+            f"its clock jumps ahead {counted(len(leaps), 'time')}",
+            f"by {total_s:.2f} s in all, first at t = {at_s:.2f} s; the other channels continue meanwhile, "
+            "and the samples after it fit them only when moved back",
+            "move the samples after it back",
             repair,
         )
 
 
-def _leaps(t_ns: TimesNs) -> list[Jump]:
-    """Gaps that could be leaps, in order of time: the longest few."""
+def _candidates(t_ns: TimesNs) -> list[JumpAhead]:
+    """Gaps that could be jumps, in order of time: the longest few."""
     steps = np.diff(t_ns)
     if len(steps) < 20:
         return []
     period_ns = round(period_s(t_ns) * 1e9)
     rows = np.flatnonzero(steps > max(JUMP_PERIODS * period_ns, LEAST_JUMP_S * 1e9))
     rows = np.sort(rows[np.argsort(-steps[rows], kind="stable")[:MOST_JUMPS]])
-    return [Jump(int(row) + 1, int(steps[row]) - period_ns) for row in rows]
+    return [JumpAhead(int(row) + 1, int(steps[row]) - period_ns) for row in rows]
 
 
-def _moved(own: int, signals: tuple[Signal, Signal], rows: slice, moved_ns: int, leap: Jump) -> bool | None:
-    """Whether the rows after a leap fit the other signal when shifted back; None where nothing fits."""
+def _fits_moved_back(
+    own: int, signals: tuple[Signal, Signal], rows: slice, moved_ns: int, leap: JumpAhead
+) -> bool | None:
+    """Whether the rows after a jump fit the other signal only when shifted back; None where nothing fits."""
     other, (t_ns, values) = signals[1 - own], signals[own]
     before = near_lag(other, (t_ns[: leap.row], values[: leap.row]))
     usual_s = before.seconds if before is not None and before.r > LEAST_R and not moved_ns else 0.0
@@ -131,7 +130,7 @@ def _moved(own: int, signals: tuple[Signal, Signal], rows: slice, moved_ns: int,
 
 
 def _fit(lag: Lag | None, usual_s: float, step_s: float) -> float:
-    """Correlation of a lag whose change is small beside the step; 0 where it is not."""
+    """Correlation of a lag whose change is small compared with the step; 0 where it is not."""
     return lag.r if lag is not None and abs(lag.seconds - usual_s) < 0.4 * step_s else 0.0
 
 
@@ -147,8 +146,8 @@ def _ends_late(recording: Recording, name: str, step_ns: int) -> bool:
     return abs(own[0] - start_ns) < slack_ns and abs(own[-1] - end_ns - step_ns) < slack_ns
 
 
-def clock_drifts(recording: Recording, pairs: Pairs) -> dict[Pair, Drift]:
-    """Drifts of the second clock of a pair against the first: durations differ, and lags grow alike."""
+def clock_drifts(recording: Recording, pairs: SensorPairs) -> dict[Pair, Drift]:
+    """Drifts of the second clock of a pair against the first: durations and growing lags agree on it."""
     clocks, found = clocks_of(recording), {}
     for pair, signals in pairs.items():
         spans = [float(clocks[name][-1]) - float(clocks[name][0]) for name in pair]
@@ -163,20 +162,20 @@ def clock_drifts(recording: Recording, pairs: Pairs) -> dict[Pair, Drift]:
 def _drift(one: Signal, other: Signal, rate: float) -> Drift | None:
     """The drift of the second clock by the lags at both ends of the log, where they agree with `rate`.
 
-    The lags are measured on the clock as mended so far, so that they are not blurred by the drift.
+    The lags are measured on the clock as corrected so far, so that the drift does not blur them.
     """
     anchor = int(other[0][0])
     drift = Drift(anchor, 0.0, 1.0 / (1.0 + rate), 0.0, 1.0)
     for _ in range(DRIFT_ROUNDS):
-        line = _growing_lag(one, (drift.undone(other[0]), other[1]), anchor)
+        line = _growing_lag(one, (drift.corrected(other[0]), other[1]), anchor)
         if line is None:
             return None
         at_anchor_s, slope, spread, r = line
         drift = Drift(
             anchor, drift.offset_s * (1.0 - slope) - at_anchor_s, drift.scale * (1.0 - slope), spread, r
         )
-        found = 1.0 / drift.scale - 1.0
-        if abs(found - rate) > DRIFT_SHARE * abs(rate) or spread > 0.5 * abs(found):
+        estimated = 1.0 / drift.scale - 1.0
+        if abs(estimated - rate) > DRIFT_SHARE * abs(rate) or spread > 0.5 * abs(estimated):
             return None
     return drift
 
@@ -210,15 +209,15 @@ def _odd_duration(recording: Recording, names: set[str]) -> str:
 
 
 def drift_finding(recording: Recording, drifts: dict[Pair, Drift]) -> Finding:
-    """What is to be said of the clock that drifts."""
+    """The finding on the clock that drifts."""
     name = _odd_duration(recording, {name for pair in drifts for name in pair})
     pair = min((p for p in drifts if name in p), key=lambda p: drifts[p].spread)
     drift = drifts[pair] if name == pair[1] else drifts[pair].reversed()
-    scaled = dataclasses.replace(drift, offset_s=0.0)  # an offset is for the next look
+    scaled = dataclasses.replace(drift, offset_s=0.0)  # an offset is a later finding
     rate, against = 1.0 / drift.scale - 1.0, pair[0] if name == pair[1] else pair[1]
 
     def repair(recording: Recording) -> Recording:
-        return retimed(recording, name, scaled.undone(getattr(recording, name).t_ns))
+        return retimed(recording, name, scaled.corrected(getattr(recording, name).t_ns))
 
     return Finding(
         "clock-drift",
@@ -226,7 +225,7 @@ def drift_finding(recording: Recording, drifts: dict[Pair, Drift]) -> Finding:
         name,
         f"its clock runs {abs(rate):.2%} too {'fast' if rate > 0 else 'slow'}",
         f"{rate:+.3%} +- {drift.spread:.3%} against {against} by the lags at both ends of the log "
-        f"(correlation {drift.r:.2f}); their durations differ alike",
-        f"scale the times of {name} about its first; {why(name, set(drifts))}",
+        f"(correlation {drift.r:.2f}); their durations differ by the same rate",
+        f"scale the times of {name} about its first; {reason(name, set(drifts))}",
         repair,
     )

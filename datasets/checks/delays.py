@@ -1,4 +1,4 @@
-"""Clocks beside each other: gaps, jumps, drifts, and what one sensor tells later than another."""
+"""Clocks compared with each other: gaps, jumps, drifts, and constant delays between sensors."""
 
 from __future__ import annotations
 
@@ -9,40 +9,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
-from terrafusion.datasets.checks.finding import CheckContext, Finding
+from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed
+from terrafusion.datasets.checks.motion import Array, Signal
 from terrafusion.datasets.checks.sensor_pairs import (
     LEAST_R,
     SPEED_PAIRS,
     YAW_PAIRS,
     Pair,
-    Pairs,
+    SensorPairs,
     far_lag,
     odd_one,
-    period_s,
-    retimed,
+    reason,
     signal_pairs,
-    why,
 )
 from terrafusion.datasets.checks.signals import without_stuck
 from terrafusion.datasets.checks.timing import gap_findings
-from terrafusion.datasets.checks.yaw_sources import Signal
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
 
-Array = NDArray[np.float64]
-
 LEAST_LAG_S = dict.fromkeys(YAW_PAIRS, 0.1) | dict.fromkeys(SPEED_PAIRS, 0.2)
-"""Smaller lags are no finding; slip bends the speed of wheels, so that theirs may be larger."""
+"""Smaller lags are no finding; slip distorts the speed of wheels, so that theirs may be larger."""
 SURELY_S = 0.5
 """An interval that is all beyond this is an error."""
 SLIDING_S = 2.0
-"""The same where the others tell of the motion later than the wheels: so it is where a robot slides. With a
-grip of 1 m/s2 it takes 3 s until it goes at 3 m/s, and is half of that late on the mean."""
+"""The same where the others lag behind the wheels, as they do where a robot skids: at 1 m/s2 of traction it
+takes 3 s to reach 3 m/s, a mean delay of half of that."""
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
 
 
 def check_clocks(context: CheckContext) -> Iterator[Finding]:
-    """Clocks beside each other. A jump hides a drift, either hides an offset: the first is told."""
+    """Clocks compared with each other. A jump hides a drift, either hides an offset: the first counts."""
     pairs = signal_pairs(CheckContext(without_stuck(context.recording), context.rig))
     jumps = clock_jumps(context.recording, pairs)
     yield from gap_findings(context, {name: [jump.row for jump in found] for name, found in jumps.items()})
@@ -54,28 +50,29 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
         yield from _offset_findings(context.recording, pairs)
 
 
-def _offset_findings(recording: Recording, pairs: Pairs) -> Iterator[Finding]:
-    """Sensors must tell of the same motion at the same time."""
-    told = {}
+def _offset_findings(recording: Recording, pairs: SensorPairs) -> Iterator[Finding]:
+    """Sensors must report the same motion at the same time."""
+    lags = {}
     for pair, signals in pairs.items():
         lag = far_lag(*signals)
         if lag is None or lag.r < LEAST_R:
             continue
         suspect = _matters(pair, lag, *signals)
         if not suspect or not opposed(lag, *signals):
-            smooth = suspect and pair[1] == "wheels"
-            told[pair] = _without_smoothing(lag, *signals) if smooth else lag
-    off = {pair: lag for pair, lag in told.items() if _matters(pair, lag, *pairs[pair])}
-    sure = {pair for pair, lag in told.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[pair]}
+            lags[pair] = _without_smoothing(lag, *signals) if suspect and pair[1] == "wheels" else lag
+    off = {pair: lag for pair, lag in lags.items() if _matters(pair, lag, *pairs[pair])}
+    precise = {pair for pair, lag in lags.items() if lag.high_s - lag.low_s < 2.0 * LEAST_LAG_S[pair]}
     if off:
-        yield _finding(recording, off, sure | set(off))
+        yield offset_finding(recording, off, precise | set(off))
 
 
-def _finding(recording: Recording, off: dict[Pair, Lag], told: set[Pair]) -> Finding:
-    name = odd_one(recording, set(off), told)
+def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pair]) -> Finding:
+    """The finding on the channel that disagrees with most others, of those that could be compared."""
+    name = odd_one(recording, set(off), measured)
     pair = min((p for p in off if name in p), key=lambda p: off[p].high_s - off[p].low_s)
-    lag = off[pair] if name == pair[1] else _reversed(off[pair])
-    against = pair[0] if name == pair[1] else pair[1]
+    lag, against = off[pair], pair[0] if name == pair[1] else pair[1]
+    if name == pair[0]:
+        lag = Lag(-lag.seconds, -lag.high_s, -lag.low_s, lag.r)
     ahead = name if lag.seconds < 0.0 else against
 
     def repair(recording: Recording) -> Recording:
@@ -83,49 +80,44 @@ def _finding(recording: Recording, off: dict[Pair, Lag], told: set[Pair]) -> Fin
 
     return Finding(
         "clock-offset",
-        "error" if _clear_s(lag) > (SLIDING_S if ahead == "wheels" else SURELY_S) else "warning",
+        "error" if _distance_to_zero_s(lag) > (SLIDING_S if ahead == "wheels" else SURELY_S) else "warning",
         name,
-        f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} beside {against}",
+        f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} against {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",
-        f"move the times of {name} by {-lag.seconds:+.3f} s; {why(name, set(off))}",
+        f"move the times of {name} by {-lag.seconds:+.3f} s; {reason(name, set(off))}",
         repair,
     )
 
 
-def _reversed(lag: Lag) -> Lag:
-    return Lag(-lag.seconds, -lag.high_s, -lag.low_s, lag.r)
-
-
 def _matters(pair: Pair, lag: Lag, one: Signal, other: Signal) -> bool:
-    """Whether a lag is large, and its interval clear of what half a sample and slip may do."""
+    """Whether a lag is large, and its interval clear of what half a sample and slip may cause."""
     least = LEAST_LAG_S[pair]
     sample_s = max(period_s(one[0]), period_s(other[0]))
-    return abs(lag.seconds) >= least and _clear_s(lag) > 0.5 * max(sample_s, least)
+    return abs(lag.seconds) >= least and _distance_to_zero_s(lag) > 0.5 * max(sample_s, least)
 
 
-def _clear_s(lag: Lag) -> float:
-    """How far its interval keeps from zero."""
+def _distance_to_zero_s(lag: Lag) -> float:
+    """Distance of its interval from zero."""
     return min(abs(lag.low_s), abs(lag.high_s)) if lag.low_s * lag.high_s > 0.0 else 0.0
 
 
 def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
-    """The lag less that of a moving mean which the second signal shows: its filter is not its clock.
+    """The lag less that of a moving average in the second signal: a filter is not a clock.
 
-    Odometry often averages its last samples, which delays it by half the time they span. The mean is
-    that which makes the first signal most like the second. Where the second is not averaged, averaging
-    both makes them more alike still, since it only takes noise away.
+    Odometry often averages its last samples, which delays it by half their span. The length is that
+    which makes the first signal most like the second. Where the second is not averaged, averaging
+    both makes them more alike still, since it only removes noise.
     """
     from scipy.ndimage import uniform_filter1d
 
-    start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
-    grid = np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S)
-    a, a_known = _on(grid, one, start)
-    b, b_known = _on(grid + lag.seconds, other, start)
+    grid, start = _common_grid(one, other)
+    a, a_known = _resampled(grid, one, start)
+    b, b_known = _resampled(grid + lag.seconds, other, start)
     known = a_known & b_known
     sizes = range(1, round(LONGEST_MEAN_S / GRID_S), 4)
-    r = [_r(uniform_filter1d(a, size)[known], b[known]) for size in sizes]
+    r = [_correlation(uniform_filter1d(a, size)[known], b[known]) for size in sizes]
     size = sizes[int(np.argmax(r))]
-    both = _r(uniform_filter1d(a, size)[known], uniform_filter1d(b, size)[known])
+    both = _correlation(uniform_filter1d(a, size)[known], uniform_filter1d(b, size)[known])
     if size == 1 or max(r) < both or 1.0 - max(r) > 0.6 * (1.0 - r[0]):
         return lag
     delay_s = max(0.5 * (size * GRID_S - period_s(other[0])), 0.0)
@@ -135,21 +127,26 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
 
 
 def opposed(lag: Lag, one: Signal, other: Signal) -> bool:
-    """Whether the two agree about as well where they stand, with one of them reversed: a sign, no clock."""
+    """Whether the two agree about as well without the lag but with one sign changed: a sign, no clock."""
     from scipy.ndimage import uniform_filter1d
 
-    start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
-    grid = np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S)
+    grid, start = _common_grid(one, other)
     if len(grid) < 2:
         return False
     width = round(0.5 / GRID_S)
-    here = uniform_filter1d(_on(grid, one, start)[0], width)
-    there = [uniform_filter1d(_on(grid + s, other, start)[0], width) for s in (0.0, lag.seconds)]
-    return -_r(here, there[0]) > _r(here, there[1]) - 0.1
+    here = uniform_filter1d(_resampled(grid, one, start)[0], width)
+    there = [uniform_filter1d(_resampled(grid + s, other, start)[0], width) for s in (0.0, lag.seconds)]
+    return -_correlation(here, there[0]) > _correlation(here, there[1]) - 0.1
 
 
-def _on(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, NDArray[np.bool_]]:
-    """A signal on other times, and whether it is known there: away from its gaps."""
+def _common_grid(one: Signal, other: Signal) -> tuple[Array, np.int64]:
+    """A grid (s) over the common time of two signals, from its start (ns)."""
+    start, end = max(one[0][0], other[0][0]), min(one[0][-1], other[0][-1])
+    return np.arange(0.0, min(float(end - start) * 1e-9, LONGEST_S), GRID_S), start
+
+
+def _resampled(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, NDArray[np.bool_]]:
+    """A signal at other times, and whether it is known there: away from its gaps."""
     known = np.isfinite(signal[1])
     t_s, values = (signal[0][known] - origin_ns) * 1e-9, signal[1][known]
     after = np.clip(np.searchsorted(t_s, grid_s), 1, len(t_s) - 1)
@@ -157,5 +154,5 @@ def _on(grid_s: Array, signal: Signal, origin_ns: np.int64) -> tuple[Array, NDAr
     return np.interp(grid_s, t_s, values), np.asarray(near)
 
 
-def _r(a: Array, b: Array) -> float:
+def _correlation(a: Array, b: Array) -> float:
     return float(np.corrcoef(a, b)[0, 1]) if len(a) and min(a.std(), b.std()) > 1e-9 else 0.0

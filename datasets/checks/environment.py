@@ -1,14 +1,14 @@
-"""Barometer and magnetometer: units, range, hard iron. None is an error: the others do without them."""
+"""Barometer and magnetometer: units, range, hard iron. No finding is an error: both are optional."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator, Mapping
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields, without_rows
 from terrafusion.datasets.core.recording import Recording
 
 Array = NDArray[np.float64]
@@ -24,7 +24,7 @@ NORMALISED = (0.85, 1.25)
 """Lengths of fields that were divided by the local field's size, as Xsens devices give them."""
 LEAST_ROWS = 20
 LEAST_COVER = 0.75
-"""Share of the directions, in sectors of 30 deg, that must be seen to tell an offset from a heading."""
+"""Share of the directions, in sectors of 30 deg, that must be seen to distinguish offset and heading."""
 HARD_IRON = 0.1
 """Horizontal offset over the horizontal field from which the heading errs by up to 6 deg."""
 
@@ -47,15 +47,15 @@ def check_pressure(context: CheckContext) -> Iterator[Finding]:
             "pressure-range",
             "warning",
             "barometer",
-            f"{int(beyond.sum())} of {len(known)} pressures are none of the atmosphere",
+            f"{int(beyond.sum())} of {len(known)} pressures are outside the atmosphere's range",
             f"from {known.min():.6g} to {known.max():.6g} Pa",
             "leave these rows out",
-            _without_rows,
+            _within_range,
         )
 
 
 def check_field(context: CheckContext) -> Iterator[Finding]:
-    """Fields must be as long as Earth's, in tesla, and turn about zero when the robot turns."""
+    """Fields must be as strong as Earth's, in tesla, and turn about zero when the robot turns."""
     magnetometer = context.recording.magnetometer
     if magnetometer is None:
         return
@@ -67,9 +67,9 @@ def check_field(context: CheckContext) -> Iterator[Finding]:
     fix = (
         "give the field in tesla: only its direction is known" if normalised else "name the unit of the field"
     )
-    found = list(_range("magnetometer", "field", size, FIELD_T, FIELD_UNITS, "T", fix))
-    yield from found
-    if not found:
+    findings = list(_range("magnetometer", "field", size, FIELD_T, FIELD_UNITS, "T", fix))
+    yield from findings
+    if not findings:
         yield from _hard_iron(field)
 
 
@@ -89,29 +89,24 @@ def _range(
         CODES[channel],
         "warning",
         channel,
-        f"the {quantity} looks like {meant}, not {unit}" if meant else f"the {quantity} is none of Earth's",
+        f"the {quantity} looks like {meant}, not {unit}"
+        if meant
+        else f"the {quantity} is outside Earth's range",
         f"median size {size:.4g}; possible are {limits[0]:g} to {limits[1]:g} {unit}",
         f"multiply by {units[meant]:g}" if meant else fix,
-        _scaled(channel, units[meant]) if meant else None,
+        partial(_scaled, channel=channel, factor=units[meant]) if meant else None,
     )
 
 
-def _scaled(channel: str, factor: float) -> Repair:
-    name = {"barometer": "pressure_pa", "magnetometer": "field_t"}[channel]
-
-    def repair(recording: Recording) -> Recording:
-        own = getattr(recording, channel)
-        scaled = dataclasses.replace(own, **{name: getattr(own, name) * factor})
-        return dataclasses.replace(recording, **{channel: scaled})
-
-    return repair
+def _scaled(recording: Recording, channel: str, factor: float) -> Recording:
+    field = {"barometer": "pressure_pa", "magnetometer": "field_t"}[channel]
+    return with_fields(recording, channel, **{field: getattr(getattr(recording, channel), field) * factor})
 
 
-def _without_rows(recording: Recording) -> Recording:
+def _within_range(recording: Recording) -> Recording:
     assert recording.barometer is not None
     p = recording.barometer.pressure_pa
-    kept = recording.barometer.select((p >= PRESSURE_PA[0]) & (p <= PRESSURE_PA[1]))
-    return dataclasses.replace(recording, barometer=kept)
+    return without_rows("barometer", ~((p >= PRESSURE_PA[0]) & (p <= PRESSURE_PA[1])))(recording)
 
 
 def _hard_iron(field: Array) -> Iterator[Finding]:
@@ -126,18 +121,17 @@ def _hard_iron(field: Array) -> Iterator[Finding]:
 
     def repair(recording: Recording) -> Recording:
         assert recording.magnetometer is not None
-        own = recording.magnetometer
-        mended = dataclasses.replace(own, field_t=own.field_t - np.append(centre, 0.0))
-        return dataclasses.replace(recording, magnetometer=mended)
+        field_t = recording.magnetometer.field_t - np.append(centre, 0.0)
+        return with_fields(recording, "magnetometer", field_t=field_t)
 
     yield Finding(
         "hard-iron",
         "warning",
         "magnetometer",
         f"the robot's own iron turns the compass by up to {worst:.0f} deg",
-        f"over the turns of the drive the horizontal field circles ({centre[0] * 1e6:.1f}, "
+        f"over the turns of the run the horizontal field circles ({centre[0] * 1e6:.1f}, "
         f"{centre[1] * 1e6:.1f}) uT at a radius of {radius * 1e6:.1f} uT",
-        "subtract that offset, taking the drive for level",
+        "subtract that offset, assuming level ground",
         repair,
     )
 

@@ -1,30 +1,34 @@
-"""What the checks of the input doctor take and give."""
+"""Types shared by the log checks, and building blocks of their repairs."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
+TimesNs = NDArray[np.int64]
 Repair = Callable[[Recording], Recording]
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One oddity.
+    """One inconsistency of a log.
 
     Attributes:
-        code: stable name of the kind, such as "imu-axes".
-        severity: "error" (results would be wrong) or "warning" (results suffer).
-        channel: the channel it was found on.
-        what: the oddity, in words.
-        evidence: the numbers it was found by.
+        code: stable name of its kind, such as "imu-axes".
+        severity: "error" (results would be wrong) or "warning" (results are less accurate).
+        channel: the affected channel.
+        what: a description.
+        evidence: the numbers behind it.
         fix: what to do about it.
-        repair: does that to a recording; None where nobody can know the true numbers.
+        repair: function that does so; None where the correct numbers cannot be inferred.
     """
 
     code: str
@@ -43,18 +47,59 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckContext:
-    """What a check looks at: the recording, and the robot's geometry where known."""
+    """Input of a check: the recording, and the robot's geometry where known."""
 
     recording: Recording
     rig: Rig | None
 
     def wheel_radius_m(self) -> float | None:
-        """Wheel radius of the log, else of the rig; 1 where speeds are in m/s already."""
+        """Wheel radius of the log, else of the rig; 1 where wheel speeds are in m/s."""
         wheels = self.recording.wheels
-        if wheels is not None and wheels.unit == "mps":
-            return 1.0
+        return 1.0 if wheels is not None and wheels.unit == "mps" else self.true_radius_m()
+
+    def true_radius_m(self) -> float | None:
+        """Wheel radius of the log, else of the rig, whatever the unit of the wheel speeds."""
         return self.recording.overrides.wheel_radius_m or (self.rig.wheel_radius_m if self.rig else None)
 
-    def since_start_s(self, t_ns: np.int64) -> float:
+    def since_start_s(self, t_ns: np.int64 | int) -> float:
         """Seconds from the start of the recording."""
-        return (int(t_ns) - self.recording.start_ns) * 1e-9  # int: far times overflow int64
+        return (int(t_ns) - self.recording.start_ns) * 1e-9  # Python integers: int64 could overflow
+
+
+def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:
+    """The recording with some fields of one channel (or of "truth") replaced."""
+    changed = dataclasses.replace(getattr(recording, channel), **fields)
+    return dataclasses.replace(recording, **{channel: changed})
+
+
+def without_rows(channel: str, rows: NDArray[np.bool_]) -> Repair:
+    """A repair that drops the rows of a mask."""
+    return lambda recording: dataclasses.replace(
+        recording, **{channel: getattr(recording, channel).select(~rows)}
+    )
+
+
+def retimed(recording: Recording, name: str, t_ns: TimesNs) -> Recording:
+    """The recording with other times for one channel (or "truth"); it starts no later than they do."""
+    start_ns = min(recording.start_ns, int(t_ns[0])) if len(t_ns) else recording.start_ns
+    return dataclasses.replace(with_fields(recording, name, t_ns=t_ns), start_ns=start_ns)
+
+
+def clocks_of(recording: Recording) -> dict[str, TimesNs]:
+    """Times of all sampled channels, and of the truth."""
+    clocks = {name: channel.t_ns for name, channel in recording.channels().items() if name != "terrain"}
+    if recording.truth is not None and len(recording.truth):
+        clocks["truth"] = recording.truth.t_ns
+    return clocks
+
+
+def period_s(t_ns: TimesNs) -> float:
+    """Median of the intervals that are not zero; 1 where there is none."""
+    steps = np.diff(t_ns)
+    steps = steps[steps > 0]
+    return float(np.median(steps)) * 1e-9 if steps.size else 1.0
+
+
+def counted(count: int, noun: str) -> str:
+    """Such as "1 gap", "3 gaps"."""
+    return f"{count} {noun}{'s' if count > 1 else ''}"

@@ -1,4 +1,4 @@
-"""What the fixes are given in: metres or degrees, and velocities beside the positions."""
+"""The frame and unit of the fixes: metres or degrees, and velocities against differenced positions."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
-from terrafusion.datasets.checks.path import compare, places
-from terrafusion.datasets.checks.yaw_signals import account, course_agreement, seconds, typical_sigma
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
+from terrafusion.datasets.checks.motion import (
+    course_agreement,
+    cumulative,
+    gyro_angle,
+    on_plane,
+    seconds,
+    typical_sigma,
+)
+from terrafusion.datasets.checks.path import fit_windows, path_by
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.recording import Recording
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
 
 DEGREE_RATIO, RADIAN_RATIO = (6e-6, 5e-5), (1e-7, 9e-7)
 """Spread of the fixes over that of the wheels' path: 1 m is 9e-6 deg or 1.6e-7 rad, more on a parallel."""
@@ -29,15 +32,14 @@ CHORD_S = (0.5, 10.0)
 
 def check_degrees(context: CheckContext) -> Iterator[Finding]:
     """Positions must be metres, not latitude and longitude."""
-    gnss = context.recording.gnss
-    true = next((one for one in places(context.recording) if one.source == "gnss"), None)
-    if gnss is None or true is None:
+    gnss, path = context.recording.gnss, path_by(context.recording, "gnss")
+    if gnss is None or path is None:
         return
-    largest = float(max(np.abs(true.place.real).max(), np.abs(true.place.imag).max()))
-    windows = compare(context, dataclasses.replace(true, sigma_m=0.0)) if largest <= 180.0 else None
-    if windows is None:
+    largest = float(max(np.abs(path.place.real).max(), np.abs(path.place.imag).max()))
+    fits = fit_windows(context, dataclasses.replace(path, sigma_m=0.0)) if largest <= 180.0 else None
+    if fits is None:
         return
-    ratio = float(np.median(windows.span_ratio))
+    ratio = float(np.median(fits.span_ratio))
     for unit, to_degrees, (low, high) in (
         ("degrees", 1.0, DEGREE_RATIO),
         ("radians", 180.0 / np.pi, RADIAN_RATIO),
@@ -50,8 +52,8 @@ def check_degrees(context: CheckContext) -> Iterator[Finding]:
                 "gnss",
                 f"positions look like latitude and longitude in {unit}, not metres",
                 f"they spread {ratio:.2g} times as far as the path of the wheels",
-                f"convert to east and north about the first fix, taking "
-                f"{'east' if swapped else 'north'} for the latitude{' (assumed)' if assumed else ''}",
+                f"convert to east and north about the first fix, using {'east' if swapped else 'north'} "
+                f"as the latitude{' (assumed)' if assumed else ''}",
                 partial(_to_metres, to_degrees=to_degrees, swapped=swapped),
             )
             return
@@ -62,12 +64,11 @@ def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tupl
     known = np.abs(gnss.enu_m[np.isfinite(gnss.enu_m[:, :2]).all(axis=1), :2]) * to_degrees
     if known.max(axis=0).max() > 90.0:
         return bool(known[:, 1].max() > 90.0), False
-    imu = context.recording.imu
-    turned = None if imu is None else account(context.recording.start_ns, imu.t_ns, imu.gyro_radps[:, 2])
-    if turned is None:
-        return False, True
+    yaw = gyro_angle(context.recording)
     metric = _to_metres(context.recording, to_degrees, swapped=False).gnss
-    both = course_agreement(turned, metric, context.recording.start_ns) if metric is not None else None
+    if yaw is None or metric is None:
+        return False, True
+    both = course_agreement(yaw, metric, context.recording.start_ns)
     if both is None or abs(both.r) < SURE_R:
         return False, True
     return both.r < 0.0, False
@@ -76,34 +77,46 @@ def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tupl
 def _to_metres(recording: Recording, to_degrees: float, *, swapped: bool) -> Recording:
     gnss = recording.gnss
     assert gnss is not None
-    order = [0, 1] if swapped else [1, 0]
-    place = gnss.enu_m[:, order] * to_degrees
-    first = int(np.flatnonzero(np.isfinite(place).all(axis=1))[0])
+    place = gnss.enu_m[:, [0, 1] if swapped else [1, 0]] * to_degrees
+    first = int(np.argmax(np.isfinite(place).all(axis=1)))
     height = gnss.enu_m[:, 2]
     base = float(height[first]) if np.isfinite(height[first]) else 0.0
     datum = (float(place[first, 0]), float(place[first, 1]), base)
     enu = geodetic_to_enu(np.column_stack([place, np.nan_to_num(height, nan=base)]), datum)
     enu[~np.isfinite(height), 2] = np.nan
-    return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, enu_m=enu), datum=datum)
+    return dataclasses.replace(with_fields(recording, "gnss", enu_m=enu), datum=datum)
 
 
 @dataclass(frozen=True)
 class VelocityFit:
-    """Velocities by least squares from differenced positions: a factor on them, or on their mirror image
-    (east - i north), each with its correlation."""
+    """Least squares of velocities on differenced positions: complex factor, correlation, and the same
+    with the positions mirrored (east - i north)."""
 
     factor: complex
     r: float
     mirrored: complex
     mirrored_r: float
 
+    def reflection(self) -> str | None:
+        """Which reflection of the positions fits the velocities clearly better than none."""
+        if not self.mirrored_r > max(SURE_R, self.r + 0.02):
+            return None
+        angle = float(np.angle(self.mirrored))
+        if abs(angle) < ANGLE_ERROR:
+            return "north"
+        if abs(angle) > np.pi - ANGLE_ERROR:
+            return "east"
+        return "swap" if abs(angle - 0.5 * np.pi) < ANGLE_ERROR else None
+
+
+SIGNS = {"north": (1.0, -1.0), "east": (-1.0, 1.0), "swap": (1.0, 1.0)}
+
 
 def velocity_fit(gnss: Gnss) -> VelocityFit | None:
-    """The receiver's velocities beside its positions; None where it gives none, or hardly moves."""
+    """The receiver's velocities against its positions; None where it gives none, or hardly moves."""
     if gnss.velocity_enu_mps is None:
         return None
-    velocity = gnss.velocity_enu_mps[:, 0] + 1j * gnss.velocity_enu_mps[:, 1]
-    place = gnss.enu_m[:, 0] + 1j * gnss.enu_m[:, 1]
+    velocity, place = on_plane(gnss.velocity_enu_mps), on_plane(gnss.enu_m)
     known = np.isfinite(velocity) & np.isfinite(place) & (gnss.fix > 0)
     if known.sum() < 20:
         return None
@@ -112,13 +125,11 @@ def velocity_fit(gnss: Gnss) -> VelocityFit | None:
         return None
     sigma = typical_sigma(gnss)
     spread = float(np.abs(place - place.mean()).max())
-    pace = spread / (t[-1] - t[0])
-    chord_s = float(np.clip(10.0 * sigma / max(pace, 1e-3), *CHORD_S))
     if spread < max(2.0, 10.0 * sigma):
         return None
-    grid = np.arange(t[0], t[-1], chord_s)
-    integral = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(t))])
-    u, v = np.diff(np.interp(grid, t, place)), np.diff(np.interp(grid, t, integral))
+    pace = spread / (t[-1] - t[0])
+    grid = np.arange(t[0], t[-1], float(np.clip(10.0 * sigma / max(pace, 1e-3), *CHORD_S)))
+    u, v = np.diff(np.interp(grid, t, place)), np.diff(np.interp(grid, t, cumulative(t, velocity)))
     uu, vv = float(np.sum(np.abs(u) ** 2)), float(np.sum(np.abs(v) ** 2))
     if len(u) < 8 or np.sqrt(uu / len(u)) < max(0.05, 5.0 * sigma):
         return None
@@ -131,90 +142,84 @@ def check_velocity(context: CheckContext) -> Iterator[Finding]:
     """The receiver's velocities must be the rate of its positions."""
     gnss = context.recording.gnss
     fit = velocity_fit(gnss) if gnss is not None else None
-    if gnss is None or fit is None or _mirrored(context, gnss):
+    if gnss is None or fit is None or _positions_mirrored(context, gnss):
         return
     found = _velocity_fault(fit)
     if found is None:
         return
     what, fix, repair = found
-    size, turn = abs(fit.factor), np.degrees(np.angle(fit.factor))
     evidence = (
-        f"beside differenced positions: factor {size:.2f} at {turn:.0f} deg, correlation {fit.r:.2f}; "
+        f"against differenced positions: factor {abs(fit.factor):.2f} at "
+        f"{np.degrees(np.angle(fit.factor)):.0f} deg, correlation {fit.r:.2f}; "
         f"{fit.mirrored_r:.2f} if mirrored"
     )
     yield Finding("gnss-velocity", "warning", "gnss", f"velocities {what}", evidence, fix, repair)
 
 
-def _mirrored(context: CheckContext, gnss: Gnss) -> bool:
-    """Whether it is the positions that turn the wrong way, by the gyro: see turns.check_turns."""
-    imu, start = context.recording.imu, context.recording.start_ns
-    turned = None if imu is None else account(start, imu.t_ns, imu.gyro_radps[:, 2])
-    both = course_agreement(turned, gnss, start) if turned is not None else None
+def _positions_mirrored(context: CheckContext, gnss: Gnss) -> bool:
+    """Whether it is the positions that turn the wrong way, by the gyro: see yaw_agreement.check_turns."""
+    yaw = gyro_angle(context.recording)
+    both = course_agreement(yaw, gnss, context.recording.start_ns) if yaw is not None else None
     return both is not None and both.r < -0.5
 
 
 def _velocity_fault(fit: VelocityFit) -> tuple[str, str, Repair] | None:
-    turn, flip = float(np.angle(fit.factor)), float(np.angle(fit.mirrored))
+    size, turn = abs(fit.factor), float(np.angle(fit.factor))
     if fit.r > SURE_R and abs(turn) < ANGLE_ERROR:
-        size = abs(fit.factor)
         for unit, factor in SPEED_UNITS.items():
             if abs(size / factor - 1.0) < UNIT_ERROR:
-                return f"look like {unit}", f"divide by {factor:g}", _velocities(scale=1.0 / factor)
+                repair = partial(_velocities, scale=1.0 / factor)
+                return f"look like {unit}", f"divide by {factor:g}", repair
         if 0.5 < size < 1.5:
             return None
-    if fit.mirrored_r > max(SURE_R, fit.r + 0.02) and 0.5 < abs(fit.mirrored) < 1.5:
-        if abs(flip - 0.5 * np.pi) < ANGLE_ERROR:
-            return "have east and north swapped", "swap them", _velocities(swap=True)
-        if abs(flip) < ANGLE_ERROR:
-            return "have the wrong sign of north", "change the sign of north", _velocities(signs=(1.0, -1.0))
-        if abs(flip) > np.pi - ANGLE_ERROR:
-            return "have the wrong sign of east", "change the sign of east", _velocities(signs=(-1.0, 1.0))
-    if fit.r > fit.mirrored_r + 0.02 and abs(turn) > np.pi - ANGLE_ERROR and 0.5 < abs(fit.factor) < 1.5:
-        return "have the wrong sign", "change the sign of east and north", _velocities(signs=(-1.0, -1.0))
+    reflection = fit.reflection() if 0.5 < abs(fit.mirrored) < 1.5 else None
+    if reflection == "swap":
+        return "have east and north swapped", "swap them", partial(_velocities, swap=True)
+    if reflection is not None:
+        repair = partial(_velocities, signs=SIGNS[reflection])
+        return f"have the wrong sign of {reflection}", f"change the sign of {reflection}", repair
+    if fit.r > fit.mirrored_r + 0.02 and abs(turn) > np.pi - ANGLE_ERROR and 0.5 < size < 1.5:
+        repair = partial(_velocities, signs=(-1.0, -1.0))
+        return "have the wrong sign", "change the sign of east and north", repair
     return "do not follow the positions", "leave the velocities out", _without_velocities
 
 
-def _velocities(*, scale: float = 1.0, swap: bool = False, signs: tuple[float, float] = (1.0, 1.0)) -> Repair:
-    def mended(recording: Recording) -> Recording:
-        gnss = recording.gnss
-        assert gnss is not None
-        assert gnss.velocity_enu_mps is not None
-        velocity = gnss.velocity_enu_mps[:, [1, 0, 2]] if swap else gnss.velocity_enu_mps
-        velocity = velocity * (scale * signs[0], scale * signs[1], scale)
-        sigma = None if gnss.sigma_v_mps is None else gnss.sigma_v_mps * scale
-        changed = dataclasses.replace(gnss, velocity_enu_mps=velocity, sigma_v_mps=sigma)
-        return dataclasses.replace(recording, gnss=changed)
-
-    return mended
+def _velocities(
+    recording: Recording,
+    *,
+    scale: float = 1.0,
+    swap: bool = False,
+    signs: tuple[float, float] = (1.0, 1.0),
+) -> Recording:
+    gnss = recording.gnss
+    assert gnss is not None
+    assert gnss.velocity_enu_mps is not None
+    velocity = gnss.velocity_enu_mps[:, [1, 0, 2]] if swap else gnss.velocity_enu_mps
+    velocity = velocity * (scale * signs[0], scale * signs[1], scale)
+    sigma = None if gnss.sigma_v_mps is None else gnss.sigma_v_mps * scale
+    return with_fields(recording, "gnss", velocity_enu_mps=velocity, sigma_v_mps=sigma)
 
 
 def _without_velocities(recording: Recording) -> Recording:
-    assert recording.gnss is not None
-    bare = dataclasses.replace(recording.gnss, velocity_enu_mps=None, sigma_v_mps=None)
-    return dataclasses.replace(recording, gnss=bare)
+    return with_fields(recording, "gnss", velocity_enu_mps=None, sigma_v_mps=None)
 
 
 def reflection(recording: Recording) -> tuple[str, Repair]:
     """What undoes mirrored positions: what the velocities show, else a swap of east and north."""
+    fit = velocity_fit(recording.gnss) if recording.gnss is not None else None
+    axis = fit.reflection() if fit is not None else None
+    if axis is None:
+        fix = "swap east and north (assumed: one of them may have the wrong sign instead, turning the map)"
+    elif axis == "swap":
+        fix = "swap east and north, as the velocities show"
+    else:
+        fix = f"change the sign of {axis}, as the velocities show"
+    return fix, partial(_positions, swap=axis in (None, "swap"), signs=SIGNS[axis or "swap"])
+
+
+def _positions(recording: Recording, swap: bool, signs: tuple[float, float]) -> Recording:
     gnss = recording.gnss
-    fit = velocity_fit(gnss) if gnss is not None else None
-    if fit is not None and fit.mirrored_r > max(SURE_R, fit.r + 0.02):
-        flip = float(np.angle(fit.mirrored))
-        if abs(flip) < ANGLE_ERROR:
-            return "change the sign of north, as the velocities say", _places([0, 1, 2], (1.0, -1.0, 1.0))
-        if abs(flip) > np.pi - ANGLE_ERROR:
-            return "change the sign of east, as the velocities say", _places([0, 1, 2], (-1.0, 1.0, 1.0))
-        if abs(flip - 0.5 * np.pi) < ANGLE_ERROR:
-            return "swap east and north, as the velocities say", _places([1, 0, 2], (1.0, 1.0, 1.0))
-    said = "swap east and north (assumed: one of them may have the wrong sign instead, which turns the map)"
-    return said, _places([1, 0, 2], (1.0, 1.0, 1.0))
-
-
-def _places(order: list[int], signs: tuple[float, float, float]) -> Repair:
-    def mended(recording: Recording) -> Recording:
-        gnss = recording.gnss
-        assert gnss is not None
-        enu, sigma = gnss.enu_m[:, order] * signs, gnss.sigma_enu_m[:, order]
-        return dataclasses.replace(recording, gnss=dataclasses.replace(gnss, enu_m=enu, sigma_enu_m=sigma))
-
-    return mended
+    assert gnss is not None
+    order = [1, 0, 2] if swap else [0, 1, 2]
+    enu, sigma = gnss.enu_m[:, order] * (*signs, 1.0), gnss.sigma_enu_m[:, order]
+    return with_fields(recording, "gnss", enu_m=enu, sigma_enu_m=sigma)

@@ -1,68 +1,59 @@
-"""Single numbers that a sensor cannot have measured: clipped values and spikes."""
+"""Single values that a sensor cannot have measured: saturation and spikes."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
-from terrafusion.datasets.checks.signals import Group, groups_of, stuck_cells
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.checks.finding import CheckContext, Finding, counted, without_rows
+from terrafusion.datasets.checks.motion import ANY_RADIUS_M, Array
+from terrafusion.datasets.checks.signals import SensorAxes, sensors_of, stuck_cells, without_cells
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 CLIPPED_SHARE, CLIPPED_ROWS, PILE = 0.002, 10, 5.0
-"""So many values are exactly the extreme one, and so many times more than on each value next to it."""
+"""Share and number of values exactly at the extreme, and how many times more than at the values beside it."""
 LEAST_STEPS = 50
-"""Signals of fewer distinct values are too coarse to tell."""
+"""Signals of fewer distinct values are too coarse to decide."""
 FAR_SPIKE = 6.0
-"""A spike stands so many times further out than anything near it."""
+"""A spike stands this many times further out than anything near it."""
 NEAR_ROWS = 12
 MOST_SPIKES = 0.02
 FLOORS = {"gyro_radps": (0.5, 30.0), "accel_mps2": (150.0, 0.0), "speed": (0.5, 15.0)}
-"""Least size of a spike, and what a robot reaches a second at most: rad/s, m/s2 and m/s. A stone under a
+"""Least size of a spike, and the largest change a second of a robot: rad/s, m/s2 and m/s. A stone under a
 wheel shakes a Husky by 100 m/s2 for one sample of 100 Hz (BorealTC)."""
 
 
 def check_saturated(context: CheckContext) -> Iterator[Finding]:
     """Inertial sensors must not stand at the end of their range."""
-    found = []
-    for group in groups_of(context.recording):
-        mask = _clipped(group) if group.channel == "imu" else np.zeros(0, dtype=bool)
-        if mask.any():
-            found.append((group, mask))
+    masks = [(s, _clipped(s)) for s in sensors_of(context.recording) if s.channel == "imu"]
+    found = [(sensor, mask) for sensor, mask in masks if mask.any()]
     if not found:
         return
-    said = [
-        f"{group.names[k]} {int(mask[:, k].sum())} times at {_extremes(group.values[mask[:, k], k])}"
-        for group, mask in found
-        for k in np.flatnonzero(mask.any(axis=0))
-    ]
+    evidence = []
+    for sensor, mask in found:
+        for k in np.flatnonzero(mask.any(axis=0)).tolist():
+            extremes = " and ".join(f"{value:.4g}" for value in np.unique(sensor.values[mask[:, k], k]))
+            evidence.append(f"{sensor.names[k]} {int(mask[:, k].sum())} times at {extremes}")
     yield Finding(
         "saturated",
         "warning",
         "imu",
         "values stand at the end of a range",
-        f"{'; '.join(said)}; nothing lies beyond",
-        "empty these cells: the true values are larger, nobody knows by how much",
-        _emptied([(group.field, mask) for group, mask in found]),
+        f"{'; '.join(evidence)}; nothing lies beyond",
+        "empty these cells: the true values are larger by an unknown amount",
+        without_cells([(sensor.field, mask) for sensor, mask in found], "imu"),
     )
 
 
-def _extremes(values: Array) -> str:
-    return " and ".join(f"{value:.4g}" for value in np.unique(values))
-
-
-def _clipped(group: Group) -> Mask:
+def _clipped(sensor: SensorAxes) -> Mask:
     """Mask (N, 3) of the cells at the extreme of an axis where many are exactly there."""
-    mask = np.zeros(group.values.shape, dtype=bool)
-    stuck = stuck_cells(group)
-    for k in group.known():
-        values = np.where(stuck[:, k], np.nan, group.values[:, k])
+    mask = np.zeros(sensor.values.shape, dtype=bool)
+    stuck = stuck_cells(sensor)
+    for k in sensor.known():
+        values = np.where(stuck[:, k], np.nan, sensor.values[:, k])
         if not np.isfinite(values).any():
             continue
         size = float(np.nanmax(np.abs(values)))
@@ -78,59 +69,45 @@ def _clipped(group: Group) -> Mask:
 def _piles_up(values: Array, top: float, count: int) -> bool:
     """Whether values stand at the top far more often than next to it, in a signal that is fine enough."""
     below = values[values < top]
-    near, counts = (
-        np.unique(below[below >= np.quantile(below, 0.9)], return_counts=True) if below.size else ((), ())
-    )
+    if not below.size:
+        return False
+    near, counts = np.unique(below[below >= np.quantile(below, 0.9)], return_counts=True)
     if len(near) < 5 or len(np.unique(below[:: max(len(below) // 2000, 1)])) < LEAST_STEPS:
         return False
     return count > PILE * float(np.mean(counts[-5:]))
 
 
-def _emptied(cells: list[tuple[str, Mask]]) -> Repair:
-    def repair(recording: Recording) -> Recording:
-        assert recording.imu is not None
-        emptied = {field: np.where(mask, np.nan, getattr(recording.imu, field)) for field, mask in cells}
-        return dataclasses.replace(recording, imu=dataclasses.replace(recording.imu, **emptied))
-
-    return repair
-
-
 def check_spikes(context: CheckContext) -> Iterator[Finding]:
     """Single samples far from those before and after."""
-    found: dict[str, Mask] = {}
+    masks: dict[str, Mask] = {}
     largest: dict[str, tuple[float, str, int]] = {}
-    for group in groups_of(context.recording):
-        if len(group.t_ns) < 4 * NEAR_ROWS:
+    for sensor in sensors_of(context.recording):
+        if len(sensor.t_ns) < 4 * NEAR_ROWS:
             continue
-        unit = (context.wheel_radius_m() or 0.15) if group.field == "speed" else 1.0
-        least, rate = FLOORS[group.field]
-        floor = max(least, rate * float(np.median(np.diff(group.t_ns))) * 1e-9) / unit
-        for k in group.known():
-            size = _spike_sizes(group.values[:, k], floor)
+        unit = (context.wheel_radius_m() or ANY_RADIUS_M) if sensor.field == "speed" else 1.0
+        least, rate = FLOORS[sensor.field]
+        floor = max(least, rate * float(np.median(np.diff(sensor.t_ns))) * 1e-9) / unit
+        for k in sensor.known():
+            size = _spike_sizes(sensor.values[:, k], floor)
             if not size.any():
                 continue
             row = int(np.argmax(size))
-            found[group.channel] = found.get(group.channel, np.zeros(len(size), dtype=bool)) | (size > 0.0)
-            if size[row] > largest.get(group.channel, (0.0, "", 0))[0]:
-                largest[group.channel] = float(size[row]), group.names[k], row
-    for channel, mask in found.items():
+            masks[sensor.channel] = masks.get(sensor.channel, np.zeros(len(size), dtype=bool)) | (size > 0.0)
+            if size[row] > largest.get(sensor.channel, (0.0, "", 0))[0]:
+                largest[sensor.channel] = float(size[row]), sensor.names[k], row
+    for channel, mask in masks.items():
         if mask.mean() > MOST_SPIKES:
             continue
-        size_, name, row = largest[channel]
-        count = int(mask.sum())
+        worst, name, row = largest[channel]
         at_s = context.since_start_s(getattr(context.recording, channel).t_ns[row])
-
-        def repair(recording: Recording, channel: str = channel, mask: Mask = mask) -> Recording:
-            return dataclasses.replace(recording, **{channel: getattr(recording, channel).select(~mask)})
-
         yield Finding(
             "spikes",
             "warning",
             channel,
-            f"{count} spike{'s' if count > 1 else ''} of one sample",
-            f"largest {size_:.3g} off its neighbours, {name} at t = {at_s:.2f} s",
+            f"{counted(int(mask.sum()), 'spike')} of one sample",
+            f"largest {worst:.3g} off its neighbours, {name} at t = {at_s:.2f} s",
             "leave these samples out",
-            repair,
+            without_rows(channel, mask),
         )
 
 

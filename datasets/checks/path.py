@@ -1,8 +1,8 @@
-"""The path by wheels and gyro beside the path by positions (GNSS, truth): its scale and its shape.
+"""The dead-reckoned path (wheels and gyro) compared with measured positions (GNSS, truth).
 
-Over windows of some metres the dead-reckoned path is turned, scaled and moved onto the positions by
-least squares (in the plane as complex numbers, one factor for scale and turn). Slip, a wrong radius
-and wrong units show in the scale; a wrong sign of the yaw rate shows where the mirrored path fits better.
+Over windows of some metres the dead-reckoned path is rotated, scaled and shifted onto the positions by
+least squares, in the plane as complex numbers with one factor for scale and rotation. The scale shows
+slip, a wrong radius and wrong units.
 """
 
 from __future__ import annotations
@@ -13,31 +13,35 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext
-from terrafusion.datasets.checks.yaw_signals import account, seconds, typical_sigma
+from terrafusion.datasets.checks.motion import (
+    Array,
+    Complex,
+    cumulative,
+    gyro_angle,
+    on_plane,
+    seconds,
+    typical_sigma,
+    wheel_speed,
+)
 from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-
 SHORTEST_M, SIGMAS, LONGEST_S = 6.0, 20.0, 60.0
-"""A window is so long that the wheels roll the first in it, and that many sigma, where the drive is long
-enough; but no longer than the last, since the gyro drifts."""
+"""A window spans this path of the wheels and this many sigma, where the run is long enough, but at most
+this time, since the gyro drifts."""
 LEAST_FIXES, LEAST_WINDOWS = 5, 5
 LEAST_COHERENCE = 0.9
-"""Correlation of the two paths in a window below which its scale means nothing."""
+"""Correlation of the two paths in a window below which its scale is not used."""
 WHEEL_UNITS = (5e-4, 50.0)
-"""From speeds in mm/s to speeds taken for rates; beyond these it is the positions that have another unit."""
+"""From speeds in mm/s to speeds taken for rates; beyond these the positions have another unit."""
 BENDS = 6.0
 """Variance of the second difference of white noise over its own."""
 RESAMPLES, SEED = 400, 20_240_811
-ANY_RADIUS_M = 0.15
-"""Where the radius is unknown and only the shape of the speed matters."""
 
 
 @dataclass(frozen=True)
-class Places:
-    """Horizontal positions `place` (N,) east + i north, m, at `t_s` since the start; `sigma_m` of one."""
+class MeasuredPath:
+    """Positions `place` (N,), east + i north, m, at `t_s` since the start; their 1 sigma `sigma_m`."""
 
     source: str
     t_s: Array
@@ -46,15 +50,15 @@ class Places:
 
 
 @dataclass(frozen=True)
-class Windows:
-    """The fit in each window, (N,) each.
+class PathFits:
+    """The fit of each window, (N,) each.
 
     Attributes:
-        scale: true path over dead-reckoned path.
+        scale: measured path over dead-reckoned path.
         coherence: correlation of the two.
         weight: spread of the dead-reckoned path, m2, summed over the fixes.
-        span_ratio: spread of the true path over that of the dead-reckoned one, whatever their shapes.
-        scatter_m: 1 sigma of a position along one axis, from second differences of what the fit leaves:
+        span_ratio: spread of the measured path over that of the dead-reckoned one, whatever their shapes.
+        scatter_m: 1 sigma of a position along one axis, from second differences of the residuals:
             slow errors do not count.
     """
 
@@ -66,8 +70,8 @@ class Windows:
 
 
 @dataclass(frozen=True)
-class Scale:
-    """True path over dead-reckoned path, its 95 % interval, and what it was found from."""
+class PathScale:
+    """Measured path over dead-reckoned path, its 95 % interval, number of windows, source of positions."""
 
     ratio: float
     low: float
@@ -76,82 +80,72 @@ class Scale:
     source: str
 
 
-def places(recording: Recording) -> list[Places]:
-    """Positions by GNSS and by the truth, where there are any."""
+def measured_paths(recording: Recording) -> list[MeasuredPath]:
+    """Positions by GNSS and by the truth, where there are enough."""
     found, start = [], recording.start_ns
     gnss, truth = recording.gnss, recording.truth
     if gnss is not None:
-        known = np.isfinite(gnss.enu_m[:, :2]).all(axis=1) & (gnss.fix > 0)
-        place = gnss.enu_m[known, 0] + 1j * gnss.enu_m[known, 1]
-        found.append(Places("gnss", seconds(gnss.t_ns[known], start), place, typical_sigma(gnss)))
+        known = np.asarray(np.isfinite(gnss.enu_m[:, :2]).all(axis=1) & (gnss.fix > 0))
+        t_s = seconds(gnss.t_ns[known], start)
+        found.append(MeasuredPath("gnss", t_s, on_plane(gnss.enu_m[known]), typical_sigma(gnss)))
     if truth is not None and len(truth):
-        held = np.isfinite(truth.position_m[:, :2]).all(axis=1)
-        place = truth.position_m[held, 0] + 1j * truth.position_m[held, 1]
-        found.append(Places("truth", seconds(truth.t_ns[held], start), place, 0.0))
-    return [one for one in found if len(one.t_s) >= 2 * LEAST_FIXES]
+        known = np.asarray(np.isfinite(truth.position_m[:, :2]).all(axis=1))
+        t_s = seconds(truth.t_ns[known], start)
+        found.append(MeasuredPath("truth", t_s, on_plane(truth.position_m[known]), 0.0))
+    return [path for path in found if len(path.t_s) >= 2 * LEAST_FIXES]
 
 
-def wheel_speed(context: CheckContext, radius_m: float | None) -> tuple[Array, Array] | None:
-    """Times (N,) s since the start and mean speed (N,) m/s of both sides; None where it is not known."""
-    wheels = context.recording.wheels
-    if wheels is None or radius_m is None:
-        return None
-    speed = wheels.side_speeds_mps(radius_m).mean(axis=1)
-    known = np.isfinite(speed)
-    if known.sum() < 10:
-        return None
-    return seconds(wheels.t_ns[known], context.recording.start_ns), speed[known]
+def path_by(recording: Recording, source: str) -> MeasuredPath | None:
+    """Positions by one source, "gnss" or "truth"; None where it has too few."""
+    return next((path for path in measured_paths(recording) if path.source == source), None)
 
 
 def dead_reckoned(context: CheckContext, point_m: complex = 0j) -> tuple[Array, Array, Complex] | None:
-    """The way by wheels and gyro z; straight ahead without a gyro.
+    """The path by wheels and gyro z; straight without a gyro.
 
     Args:
-        context: the recording and what is known of its wheels.
-        point_m: place in the body (forward + i left) whose path is wanted.
+        context: the recording and its wheel radius.
+        point_m: position in the body (forward + i left) whose path is wanted.
 
     Returns:
-        Times (N,) s since the start, way rolled (N,) m, and positions (N,) m, east + i north, of a
-        robot that starts eastwards; None where wheels or their radius lack.
+        Times (N,) s since the start, distance rolled (N,) m, and positions (N,) m, east + i north, of
+        a robot that starts eastwards; None where wheels or their radius are unknown.
     """
-    imu, driven = context.recording.imu, wheel_speed(context, context.wheel_radius_m())
+    driven, yaw = wheel_speed(context, metric=True), gyro_angle(context.recording)
     if driven is None:
         return None
     t, v = driven
-    turned = None if imu is None else account(context.recording.start_ns, imu.t_ns, imu.gyro_radps[:, 2])
     heading = np.zeros(len(t))
-    if turned is not None:
-        within = (t >= turned.t_s[0]) & (t <= turned.t_s[-1])
+    if yaw is not None:
+        within = (t >= yaw.t_s[0]) & (t <= yaw.t_s[-1])
         t, v = t[within], v[within]
-        heading = np.interp(t, turned.t_s, turned.angle)
+        heading = np.interp(t, yaw.t_s, yaw.value)
     if len(t) < 10:
         return None
     ahead = np.exp(1j * heading)
-    rolled = np.concatenate([[0.0], np.cumsum(0.5 * np.abs(v[1:] + v[:-1]) * np.diff(t))])
-    steps = 0.5 * (v[1:] * ahead[1:] + v[:-1] * ahead[:-1]) * np.diff(t)
-    return t, rolled, np.concatenate([[0.0], np.cumsum(steps)]) + point_m * ahead
+    return t, cumulative(t, v, unsigned=True), cumulative(t, v * ahead) + point_m * ahead
 
 
-def compare(context: CheckContext, true: Places) -> Windows | None:
-    """Fit the dead-reckoned path to the positions window by window; None where too few can be used."""
-    reckoned = dead_reckoned(context, _antenna(context) if true.source == "gnss" else 0j)
+def fit_windows(context: CheckContext, measured: MeasuredPath) -> PathFits | None:
+    """Fit the dead-reckoned path to the positions window by window; None where too few are usable."""
+    reckoned = dead_reckoned(context, antenna(context) if measured.source == "gnss" else 0j)
     if reckoned is None:
         return None
     t, rolled, path = reckoned
-    inside = (true.t_s >= t[0]) & (true.t_s <= t[-1])
-    t_fix, g = true.t_s[inside], true.place[inside]
+    inside = (measured.t_s >= t[0]) & (measured.t_s <= t[-1])
+    t_fix, g = measured.t_s[inside], measured.place[inside]
     if len(t_fix) < 2 * LEAST_FIXES:
         return None
-    way = rolled * _crude_scale(t, rolled, t_fix, g)
-    longest_m = max(SHORTEST_M, float(way[-1]) / (LEAST_WINDOWS + 1))
-    length_m = float(np.clip(SIGMAS * true.sigma_m, SHORTEST_M, longest_m))
-    passed = np.maximum(np.diff(way) / length_m, np.diff(t) / LONGEST_S)
+    distance = rolled * _crude_scale(t, rolled, t_fix, g)
+    longest_m = max(SHORTEST_M, float(distance[-1]) / (LEAST_WINDOWS + 1))
+    length_m = float(np.clip(SIGMAS * measured.sigma_m, SHORTEST_M, longest_m))
+    passed = np.maximum(np.diff(distance) / length_m, np.diff(t) / LONGEST_S)
     window = np.interp(t_fix, t, np.concatenate([[0.0], np.cumsum(passed)])).astype(int)
-    return _fit(window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * true.sigma_m))
+    return _fit(window, np.interp(t_fix, t, path), g, max(1.0, 3.0 * measured.sigma_m))
 
 
 def _crude_scale(t: Array, rolled: Array, t_fix: Array, g: Complex) -> float:
-    """Way of the positions over way rolled, if it may be that of a unit: windows are the same in any unit."""
+    """Measured path over distance rolled, if it may be a unit: windows are the same in any unit."""
     grid = np.arange(t_fix[0], t_fix[-1], 5.0)
     total = float(rolled[-1])
     if len(grid) < 2 or total <= 0.0:
@@ -160,14 +154,15 @@ def _crude_scale(t: Array, rolled: Array, t_fix: Array, g: Complex) -> float:
     return ratio if WHEEL_UNITS[0] < ratio < WHEEL_UNITS[1] else 1.0
 
 
-def _antenna(context: CheckContext) -> complex:
+def antenna(context: CheckContext) -> complex:
+    """Position of the antenna in the body, forward + i left, m; 0 where unknown."""
     rig = context.rig
     arm = context.recording.overrides.antenna_m or (rig.sensors.gnss.antenna_m if rig else None)
     return complex(arm[0], arm[1]) if arm is not None else 0j
 
 
-def _fit(window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: float) -> Windows | None:
-    """The fits in the windows in which the robot gets about; `window` (N,) rises."""
+def _fit(window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: float) -> PathFits | None:
+    """The fits in the windows in which the robot moves enough; `window` (N,) rises."""
     starts = np.flatnonzero(np.diff(window, prepend=-1))
     n = np.diff(np.append(starts, len(window)))
     p = p - np.repeat(np.add.reduceat(p, starts) / n, n)
@@ -178,36 +173,39 @@ def _fit(window: NDArray[np.int64], p: Complex, g: Complex, least_spread_m: floa
     use = far & (n >= LEAST_FIXES) & (pp > 0.0) & (gg > 0.0)
     if use.sum() < LEAST_WINDOWS:
         return None
-    left = g - np.repeat(pg / np.where(pp > 0.0, pp, 1.0), n) * p
-    bend = np.zeros(len(left))
-    bend[1:-1] = np.abs(left[2:] - 2.0 * left[1:-1] + left[:-2]) ** 2
+    residual = g - np.repeat(pg / np.where(pp > 0.0, pp, 1.0), n) * p
+    bend = np.zeros(len(residual))
+    bend[1:-1] = np.abs(residual[2:] - 2.0 * residual[1:-1] + residual[:-2]) ** 2
     bend[starts] = bend[starts + n - 1] = 0.0  # these reach into the neighbouring windows
     scatter = np.sqrt(np.add.reduceat(bend, starts) / (2 * BENDS) / np.maximum(n - 2, 1))
     pp, gg, pg = pp[use], gg[use], np.abs(pg[use])
-    return Windows(pg / pp, pg / np.sqrt(pp * gg), pp, np.sqrt(gg / pp), scatter[use])
+    return PathFits(pg / pp, pg / np.sqrt(pp * gg), pp, np.sqrt(gg / pp), scatter[use])
 
 
-def scale_of(windows: Windows, source: str) -> Scale | None:
-    """The scale of all coherent windows together, with its interval by bootstrap over windows.
+def scale_of(fits: PathFits, source: str) -> PathScale | None:
+    """The scale over all coherent windows, with its interval by bootstrap over windows.
 
     None where most windows are not coherent: then slip, jumps or a wrong gyro bend one of the paths.
     """
-    use = windows.coherence > LEAST_COHERENCE
+    use = fits.coherence > LEAST_COHERENCE
     if use.sum() < max(LEAST_WINDOWS, 0.5 * len(use)):
         return None
-    weight, scale = windows.weight[use], windows.scale[use]
+    weight, scale = fits.weight[use], fits.scale[use]
     draws = resampled_rows(len(scale), RESAMPLES, SEED)
     drawn = (weight * scale)[draws].sum(axis=1) / weight[draws].sum(axis=1)
     low, high = percentile_interval(drawn)
-    return Scale(float(np.sum(weight * scale) / weight.sum()), low, high, int(use.sum()), source)
+    return PathScale(float(np.sum(weight * scale) / weight.sum()), low, high, int(use.sum()), source)
 
 
-def scales(context: CheckContext) -> list[tuple[Scale, Windows]]:
+def scales(context: CheckContext) -> list[tuple[PathScale, PathFits]]:
     """The scale by every source of positions that allows one."""
-    found = []
-    for true in places(context.recording):
-        windows = compare(context, true)
-        scale = scale_of(windows, true.source) if windows is not None else None
-        if windows is not None and scale is not None:
-            found.append((scale, windows))
-    return found
+    fits = [(fit_windows(context, path), path.source) for path in measured_paths(context.recording)]
+    found = [(scale_of(fit, source), fit) for fit, source in fits if fit is not None]
+    return [(scale, fit) for scale, fit in found if scale is not None]
+
+
+def scatter_m(context: CheckContext) -> float | None:
+    """Scatter of the fixes about the dead-reckoned path, 1 sigma along one axis, without slow errors."""
+    path = path_by(context.recording, "gnss")
+    fits = fit_windows(context, path) if path is not None else None
+    return float(np.median(fits.scatter_m)) if fits is not None else None

@@ -1,26 +1,23 @@
-"""Numbers that nothing on a ground robot reaches."""
+"""Values and durations that no ground robot reaches: a wrong unit, or corrupt data."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, without_rows
 from terrafusion.datasets.core.recording import Recording
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 TimesNs = NDArray[np.int64]
 
 MOST_ROWS = 0.2
 """Where a larger share of the rows is impossible, the unit is wrong rather than some rows."""
 
 LONGEST_DAYS = 30.0
-"""No drive lasts longer; grids over such a time would not fit into memory either."""
+"""No run lasts longer; grids over such a time would not fit into memory either."""
 LIMITS = {
     ("command", "_mps"): 100.0,
     ("command", "_radps"): 100.0,
@@ -39,73 +36,58 @@ LIMITS = {
 
 
 def check_magnitude(context: CheckContext) -> Iterator[Finding]:
-    """Numbers that no robot reaches: a wrong unit, or memory read as numbers."""
-    yield from _check_duration(context)
-    for name, (t_ns, bad) in _beyond(context.recording).items():
-        if not bad:
+    """Values beyond `LIMITS` and durations beyond `LONGEST_DAYS`."""
+    tables = _tables(context.recording)
+    for name, (t_ns, _) in tables.items():
+        yield from _check_duration(context, name, t_ns)
+    for name, (t_ns, columns) in tables.items():
+        limits = {column: LIMITS.get((name, _unit(column)), np.inf) for column in columns}
+        limited = {column: values for column, values in columns.items() if np.isfinite(limits[column])}
+        beyond = {column: np.abs(values) > limits[column] for column, values in limited.items()}
+        beyond = {column: mask for column, mask in beyond.items() if mask.any()}
+        if not beyond:
             continue
-        rows = np.logical_or.reduce([over for _, over, _ in bad])
-        values, over, column = bad[0]
-        first, limit = int(np.flatnonzero(over)[0]), LIMITS[name, _unit(column)]
+        column, mask = next(iter(beyond.items()))
+        rows = np.logical_or.reduce(list(beyond.values()))
+        first = int(np.argmax(mask))
         few = rows.sum() < MOST_ROWS * len(rows)
         yield Finding(
             "impossible-value",
             "error",
             name,
-            f"{column} is {values[first]:g}, beyond anything possible",
-            f"at t = {context.since_start_s(t_ns[first]):.3f} s; {int(over.sum())} of {len(over)} values "
-            f"beyond {limit:g}" + (f", {int(rows.sum())} rows in all" if len(bad) > 1 else ""),
+            f"{column} is {columns[column][first]:g}, beyond anything possible",
+            f"at t = {context.since_start_s(t_ns[first]):.3f} s; {int(mask.sum())} of {len(mask)} values "
+            f"beyond {limits[column]:g}" + (f", {int(rows.sum())} rows in all" if len(beyond) > 1 else ""),
             "leave these rows out" if few else "is the unit right? too many rows are wrong to leave them out",
-            _without_rows(name) if few else None,
+            without_rows(name, rows) if few else None,
         )
 
 
-def _check_duration(context: CheckContext) -> Iterator[Finding]:
-    """A channel that lasts longer than any drive has a leap in its times, or another unit of them."""
-    clocks = {name: channel.t_ns for name, channel in context.recording.channels().items()}
-    if context.recording.truth is not None and len(context.recording.truth):
-        clocks["truth"] = context.recording.truth.t_ns
-    for name, t_ns in clocks.items():
-        days = (float(t_ns[-1]) - float(t_ns[0])) * 1e-9 / 86400.0
-        if days > LONGEST_DAYS:
-            row = int(np.argmax(np.diff(t_ns)))
-            leap_s = (float(t_ns[row + 1]) - float(t_ns[row])) * 1e-9
-            yield Finding(
-                "impossible-time",
-                "error",
-                name,
-                f"its times span {days:.0f} days",
-                f"longest interval {leap_s:.3g} s after t = {context.since_start_s(t_ns[row]):.3f} s",
-                "is the unit of time right? split the log where the clock leaps",
-            )
+def _check_duration(context: CheckContext, name: str, t_ns: TimesNs) -> Iterator[Finding]:
+    days = (float(t_ns[-1]) - float(t_ns[0])) * 1e-9 / 86400.0
+    if days > LONGEST_DAYS:
+        row = int(np.argmax(np.diff(t_ns)))
+        leap_s = (float(t_ns[row + 1]) - float(t_ns[row])) * 1e-9
+        yield Finding(
+            "impossible-time",
+            "error",
+            name,
+            f"its times span {days:.0f} days",
+            f"longest interval {leap_s:.3g} s after t = {context.since_start_s(t_ns[row]):.3f} s",
+            "is the unit of time right? split the log where the clock jumps",
+        )
 
 
-def _beyond(recording: Recording) -> dict[str, tuple[TimesNs, list[tuple[Array, Mask, str]]]]:
-    """Times by channel, and its columns with values beyond the limits: values, where, name."""
+def _tables(recording: Recording) -> dict[str, tuple[TimesNs, dict[str, NDArray[Any]]]]:
+    """Times and columns by channel, with the positions of the truth."""
     tables: dict[str, tuple[TimesNs, dict[str, NDArray[Any]]]] = {
         name: (channel.t_ns, channel.columns()) for name, channel in recording.channels().items()
     }
     if recording.truth is not None and len(recording.truth):
         position = dict(zip(("x_m", "y_m", "z_m"), recording.truth.position_m.T, strict=True))
         tables["truth"] = recording.truth.t_ns, position
-    found = {}
-    for name, (t_ns, columns) in tables.items():
-        limited = [(v, LIMITS[name, _unit(c)], c) for c, v in columns.items() if (name, _unit(c)) in LIMITS]
-        over = [(values, np.abs(values) > limit, column) for values, limit, column in limited]
-        found[name] = t_ns, [one for one in over if one[1].any()]
-    return found
+    return tables
 
 
 def _unit(column: str) -> str:
     return column[column.rindex("_") :] if "_" in column else ""
-
-
-def _without_rows(name: str) -> Repair:
-    def repair(recording: Recording) -> Recording:
-        t_ns, bad = _beyond(recording)[name]
-        wrong = np.zeros(len(t_ns), dtype=bool)
-        for _, over, _ in bad:
-            wrong |= over
-        return dataclasses.replace(recording, **{name: getattr(recording, name).select(~wrong)})
-
-    return repair

@@ -1,4 +1,4 @@
-"""`run_checks` a recording, and `repair` what it finds."""
+"""Run all checks on a recording, and apply the repairs they offer."""
 
 from __future__ import annotations
 
@@ -6,22 +6,21 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from terrafusion.datasets.checks import delays as offsets
 from terrafusion.datasets.checks import (
-    dilution,
+    delays,
     environment,
     gnss,
     gnss_frame,
-    inertial,
-    mounting,
+    gnss_sigma,
+    imu,
     outliers,
     scale,
     signals,
     timing,
     truth,
     wheels,
+    yaw_agreement,
 )
-from terrafusion.datasets.checks import yaw_agreement as turns
 from terrafusion.datasets.checks.finding import CheckContext, Finding
 from terrafusion.datasets.checks.plausibility import check_magnitude
 from terrafusion.datasets.core.recording import Recording
@@ -41,24 +40,24 @@ CHECKS: tuple[Check, ...] = (
     signals.check_missing,
     outliers.check_saturated,
     outliers.check_spikes,
-    offsets.check_clocks,
-    inertial.check_gravity,
+    delays.check_clocks,
+    imu.check_gravity,
     wheels.check_each_wheel,
     wheels.check_wheel_signs,
-    mounting.check_axes,
+    imu.check_axes,
     wheels.check_direction,
-    turns.check_gyro_unit,
-    turns.check_turns,
-    turns.check_unrelated,
-    inertial.check_bias,
+    yaw_agreement.check_gyro_unit,
+    yaw_agreement.check_turns,
+    yaw_agreement.check_unrelated,
+    imu.check_bias,
     gnss_frame.check_degrees,
     gnss.check_classes,
-    gnss.check_sigma,
-    gnss.check_velocity_sigma,
+    gnss_sigma.check_sigma,
+    gnss_sigma.check_velocity_sigma,
     gnss.check_frozen,
     gnss.check_jumps,
-    gnss.check_scatter,
-    dilution.check_dilution,
+    gnss_sigma.check_scatter,
+    gnss_sigma.check_dilution,
     gnss_frame.check_velocity,
     truth.check_unit,
     truth.check_yaw,
@@ -67,20 +66,21 @@ CHECKS: tuple[Check, ...] = (
     environment.check_field,
 )
 
-UNIT_CHECKS: tuple[Check, ...] = (turns.check_gyro_unit, scale.check_speed_scale)
+UNIT_CHECKS: tuple[Check, ...] = (yaw_agreement.check_gyro_unit, scale.check_speed_scale)
 UNIT_CODES = ("gyro-in-degrees", "wheel-unit")
 LARGEST = 1e6
-"""Numbers up to this may be small units (mm/s, deg/s); larger ones are not computed with."""
+"""Numbers up to this may be in small units (mm/s, deg/s); larger ones are not computed with."""
 
 MAX_ROUNDS = 20
 SEVERAL = ("wheel-odd", "clock-jump")
+"""Codes of which one channel can have several findings, identified by their description."""
 
 
 def run_checks(recording: Recording, rig: Rig | None = None) -> list[Finding]:
     """All findings of all checks, errors first.
 
     Args:
-        recording: the drive.
+        recording: the log.
         rig: geometry of the robot; without it wheel rates (rad/s) are not compared with GNSS speed.
     """
     context = CheckContext(recording, rig)
@@ -96,36 +96,33 @@ def run_checks(recording: Recording, rig: Rig | None = None) -> list[Finding]:
 
 def _may_be_units(recording: Recording, impossible: list[Finding]) -> bool:
     """Whether impossible numbers are those of wheels and IMU only, and no larger than a unit makes them."""
-    told = [] if recording.wheels is None else [recording.wheels.speed]
-    told += [] if recording.imu is None else [recording.imu.gyro_radps, recording.imu.accel_mps2]
-    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in told), default=0.0)
-    explicable = {(f.channel, f.code) for f in impossible} <= {
-        (c, "impossible-value") for c in ("wheels", "imu")
-    }
-    return explicable and largest < LARGEST
-
-
-def _fault(finding: Finding) -> tuple[str, str, str]:
-    """What is mended once; of some kinds a channel can have several, which are told apart by their words."""
-    return finding.code, finding.channel, finding.what if finding.code in SEVERAL else ""
+    values = [] if recording.wheels is None else [recording.wheels.speed]
+    values += [] if recording.imu is None else [recording.imu.gyro_radps, recording.imu.accel_mps2]
+    largest = max((float(np.nanmax(np.abs(v), initial=0.0)) for v in values), default=0.0)
+    kinds = {(finding.channel, finding.code) for finding in impossible}
+    return kinds <= {(c, "impossible-value") for c in ("wheels", "imu")} and largest < LARGEST
 
 
 def repair(recording: Recording, rig: Rig | None = None) -> tuple[Recording, list[Finding]]:
-    """Make the repairs that the findings propose, one after the other, looking again after each.
+    """Apply the repairs that the findings offer, one at a time, running the checks again after each.
 
     Returns:
-        The mended recording, with a note for every repair, and the findings that were mended, in
-        the order of their repairs. What `run_checks` still finds afterwards nobody could mend.
+        The repaired recording, with a note for every repair, and the repaired findings in the order
+        of their repairs. What `run_checks` still finds afterwards cannot be repaired.
     """
-    mended: list[Finding] = []
+    repaired: list[Finding] = []
     for _ in range(MAX_ROUNDS):
-        done = {_fault(finding) for finding in mended}
-        open_findings = [f for f in run_checks(recording, rig) if f.repair and _fault(f) not in done]
-        if not open_findings:
+        done = {_identity(finding) for finding in repaired}
+        repairable = (f for f in run_checks(recording, rig) if f.repair and _identity(f) not in done)
+        first = next(repairable, None)
+        if first is None or first.repair is None:
             break
-        first = open_findings[0]
-        assert first.repair is not None
         note = f"repaired: {first.channel}: {first.what} ({first.evidence}); {first.fix}"
         recording = first.repair(recording).with_notes(note)
-        mended.append(first)
-    return recording, mended
+        repaired.append(first)
+    return recording, repaired
+
+
+def _identity(finding: Finding) -> tuple[str, str, str]:
+    """A finding with the same identity is repaired only once."""
+    return finding.code, finding.channel, finding.what if finding.code in SEVERAL else ""

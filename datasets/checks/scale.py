@@ -1,28 +1,28 @@
-"""The wheels' way beside the way over ground: units, radius, slip."""
+"""Wheel speed compared with the speed over ground: unit, radius, slip."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
-from terrafusion.datasets.checks.path import Scale, scales, wheel_speed
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
+from terrafusion.datasets.checks.motion import wheel_speed
+from terrafusion.datasets.checks.path import PathScale, scales
 from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
 
 MOST_SLIP_FREE, SURELY_MORE = 1.04, 1.02
-"""Driven wheels never go slower than the ground: a ratio above the first whose interval excludes the
-second is no slip, but a wheel larger than said."""
+"""Driven wheels are never slower than the ground: a ratio above the first whose interval excludes the
+second is no slip, but a wheel larger than stated."""
 LARGEST_RADIUS_ERROR = 2.2
-SMALL, WIDE = 0.8, 1.2
-"""Ratios beyond which wheels and ground are told apart on firm ground."""
+SMALL = 0.8
+"""Ratio below which wheel and ground speed differ too much for firm ground."""
 SOFT = ("medium_sand", "loose_sand", "ploughed_soil", "mud", "snow", "ice")
-"""Grounds on which such slip is no surprise."""
+"""Grounds on which such slip is usual."""
 UNIT_ERROR = 0.1
 FAST_MPS, EVEN = 3.0, 0.1
 """A robot that crawls on spinning wheels does so at their usual speeds and unevenly; a unit does neither."""
@@ -31,33 +31,36 @@ STEEPEST = 0.05
 
 
 @dataclass(frozen=True)
-class Unit:
-    """A unit that speeds may be in, and what they are multiplied by to be in that of their column."""
+class SpeedUnit:
+    """A unit that speeds may be in, and the factor that converts them to that of their column."""
 
     name: str
     factor: float
 
 
 UNITS = {
-    "radps": (Unit("rev/min", 2.0 * np.pi / 60.0), Unit("deg/s", np.pi / 180.0), Unit("rev/s", 2.0 * np.pi)),
-    "mps": (Unit("km/h", 1.0 / 3.6), Unit("cm/s", 0.01), Unit("mm/s", 0.001)),
+    "radps": (
+        SpeedUnit("rev/min", 2.0 * np.pi / 60.0),
+        SpeedUnit("deg/s", np.pi / 180.0),
+        SpeedUnit("rev/s", 2.0 * np.pi),
+    ),
+    "mps": (SpeedUnit("km/h", 1.0 / 3.6), SpeedUnit("cm/s", 0.01), SpeedUnit("mm/s", 0.001)),
 }
 
 
 def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
-    """Wheel speed against the speed over ground: a unit, a radius, or slip."""
+    """Wheel speed against the speed over ground."""
     wheels, radius = context.recording.wheels, context.wheel_radius_m()
     found = scales(context)
     if wheels is None or radius is None or not found:
         return
-    scale, windows = min(found, key=lambda both: both[0].high - both[0].low)
+    scale, fits = min(found, key=lambda both: both[0].high - both[0].low)
     evidence = (
         f"{scale.low:.3f} to {scale.high:.3f} (95 %) in {scale.windows} stretches by the {scale.source}"
     )
     if scale.source == "truth":
         evidence += "; scores against this truth are then not independent of it"
-    commanded = command_ratio(context)
-    units = _units(context, scale, float(np.std(windows.scale) / np.median(windows.scale)), commanded)
+    units = _fitting_units(context, scale, float(np.std(fits.scale) / np.median(fits.scale)))
     if units:
         factor = units[0].factor
         names = " or ".join(unit.name for unit in units)
@@ -65,13 +68,13 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
             "wheel-unit",
             "error",
             "wheels",
-            f"the speeds look like {names}: the ground goes {scale.ratio:.3g} times as fast",
+            f"the speeds look like {names}: the ground speed is {scale.ratio:.3g} times as large",
             evidence,
-            f"multiply them by {factor:.6g}" if len(units) == 1 else "say which it is",
+            f"multiply them by {factor:.6g}" if len(units) == 1 else "give the unit: more than one fits",
             partial(_scaled, factor=factor) if len(units) == 1 else None,
         )
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
-        yield _too_small(context, scale, evidence, wheels.unit, radius)
+        yield _too_slow(context, scale, evidence, wheels.unit, radius)
     elif scale.ratio < SMALL and is_firm(context.recording):
         yield Finding(
             "wheel-scale",
@@ -83,54 +86,52 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
         )
 
 
-def _too_small(context: CheckContext, scale: Scale, evidence: str, unit: str, radius: float) -> Finding:
+def _too_slow(context: CheckContext, scale: PathScale, evidence: str, unit: str, radius: float) -> Finding:
     downhill = _descent(context.recording) > STEEPEST
-    mended = radius * scale.ratio
+    fitting = radius * scale.ratio
+    repair: Repair | None = None
     if scale.ratio > LARGEST_RADIUS_ERROR or downhill:
-        repair: Repair | None = None
-        fix = "check wheel radius and unit" + (
-            ", or did it roll downhill on braked wheels?" if downhill else ""
-        )
+        fix = "check wheel radius and unit"
+        fix += ", or did it roll downhill on braked wheels?" if downhill else ""
     elif unit == "mps":
         repair = partial(_scaled, factor=scale.ratio)
         fix = f"multiply the speeds by {scale.ratio:.3f}"
     else:
-        repair = partial(apply, conventions=Conventions(wheel_radius_m=mended))
-        fix = f"take {mended:.4f} m for the wheel radius instead of {radius:.4f} m"
+        repair = partial(apply, conventions=Conventions(wheel_radius_m=fitting))
+        fix = f"use a wheel radius of {fitting:.4f} m instead of {radius:.4f} m"
     what = f"ground speed is {scale.ratio:.3f} times the wheel speed, which slip does not explain"
     return Finding("wheel-radius", "warning", "wheels", what, evidence, fix, repair)
 
 
 def command_ratio(context: CheckContext) -> float | None:
-    """Commanded speed over wheel speed, by least squares; None without a command they follow."""
-    driven, command = wheel_speed(context, context.wheel_radius_m()), context.recording.command
+    """Commanded speed over wheel speed, by least squares; None without a command that they follow."""
+    driven, command = wheel_speed(context, metric=True), context.recording.command
     if driven is None or command is None:
         return None
     known = np.isfinite(command.v_mps)
     if known.sum() < 10:
         return None
     t, v = driven
-    asked = np.interp(t, (command.t_ns[known] - context.recording.start_ns) * 1e-9, command.v_mps[known])
-    power = float(np.sum(v**2)), float(np.sum(asked**2))
+    commanded = np.interp(t, (command.t_ns[known] - context.recording.start_ns) * 1e-9, command.v_mps[known])
+    power = float(np.sum(v**2)), float(np.sum(commanded**2))
     if min(power) <= 0.0:
         return None
-    r = float(np.sum(asked * v)) / np.sqrt(power[0] * power[1])
+    r = float(np.sum(commanded * v)) / np.sqrt(power[0] * power[1])
     return float(np.sqrt(power[1] / power[0])) if r > 0.8 else None
 
 
-def _units(context: CheckContext, scale: Scale, spread: float, commanded: float | None) -> list[Unit]:
+def _fitting_units(context: CheckContext, scale: PathScale, spread: float) -> list[SpeedUnit]:
     """The units that explain the ratio, where slip does not."""
     wheels, radius = context.recording.wheels, context.wheel_radius_m()
     assert wheels is not None
     assert radius is not None
     units = list(UNITS[wheels.unit])
     if wheels.unit == "radps":
-        units.append(Unit("m/s", 1.0 / radius))
-    else:
-        rig = context.rig
-        own = context.recording.overrides.wheel_radius_m or (rig.wheel_radius_m if rig else None)
-        units += [Unit("rad/s", own)] if own is not None else []
+        units.append(SpeedUnit("m/s", 1.0 / radius))
+    elif (true_radius := context.true_radius_m()) is not None:
+        units.append(SpeedUnit("rad/s", true_radius))
     fitting = [unit for unit in units if abs(scale.ratio / unit.factor - 1.0) < UNIT_ERROR]
+    commanded = command_ratio(context)
     if commanded is not None:
         return [unit for unit in fitting if abs(commanded / unit.factor - 1.0) < 2.0 * UNIT_ERROR]
     rated = float(np.nanpercentile(np.abs(wheels.side_speeds_mps(radius)), 95))
@@ -138,21 +139,20 @@ def _units(context: CheckContext, scale: Scale, spread: float, commanded: float 
 
 
 def _scaled(recording: Recording, factor: float) -> Recording:
-    wheels = recording.wheels
-    assert wheels is not None
-    return dataclasses.replace(recording, wheels=dataclasses.replace(wheels, speed=wheels.speed * factor))
+    assert recording.wheels is not None
+    return with_fields(recording, "wheels", speed=recording.wheels.speed * factor)
 
 
 def _descent(recording: Recording) -> float:
-    """Height lost over horizontal way, between the ends of the fixes; 0 where heights are unknown."""
+    """Height lost over horizontal distance, between the first and last fix; 0 where heights are unknown."""
     gnss = recording.gnss
     if gnss is None:
         return 0.0
     enu = gnss.enu_m[np.isfinite(gnss.enu_m).all(axis=1)]
     if len(enu) < 2:
         return 0.0
-    way = float(np.hypot(*(enu[-1] - enu[0])[:2]))
-    return float(enu[0, 2] - enu[-1, 2]) / way if way > 1.0 else 0.0
+    distance = float(np.hypot(*(enu[-1] - enu[0])[:2]))
+    return float(enu[0, 2] - enu[-1, 2]) / distance if distance > 1.0 else 0.0
 
 
 def is_firm(recording: Recording) -> bool:

@@ -1,4 +1,4 @@
-"""Signals that a sensor cannot have made: held values, axes that are stuck or dead, missing cells."""
+"""Signals that a sensor cannot have produced: held values, stuck or dead axes, missing cells."""
 
 from __future__ import annotations
 
@@ -9,31 +9,31 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
-from terrafusion.datasets.checks.yaw_sources import yaw_rates
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields, without_rows
+from terrafusion.datasets.checks.motion import ANY_RADIUS_M, Array, runs, yaw_rates
 from terrafusion.datasets.core.channels import Channel, Imu, Wheels
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
 from terrafusion.datasets.core.recording import Recording
 
-Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 TimesNs = NDArray[np.int64]
 
 HELD_SHARE, LEAST_UPDATES = 0.5, 10
 STUCK_S, STUCK_ZERO_S, STUCK_ROWS = 2.0, 5.0, 20
-"""A value that stays for so long, and so many updates, is stuck; wheels may well stand a while."""
+"""A value that stays for so long, and so many updates, is stuck; wheels may stand for a while."""
 CLIPPED_ROWS = 10
-"""A value at the end of the range that is met so often elsewhere is the end of the sensor's."""
+"""A value at the end of the range that occurs this often elsewhere is the sensor's limit."""
 LIVELY = 0.1
-"""Spread of the other axes beside their usual one from which on they move."""
+"""Standard deviation of the other axes over their usual one above which they move."""
 LEAST_TURN_RADPS, LEAST_EXTENT_M = 0.05, 5.0
 MISSING_SHARE = 0.05
+LONGEST_RUNS = 20
 
 
 @dataclass(frozen=True)
-class Group:
-    """Axes of one sensor: `values` (N, k) in the field `field` of a channel."""
+class SensorAxes:
+    """Axes of one sensor: `values` (N, k) of a channel's field `field`."""
 
     channel: str
     field: str
@@ -46,33 +46,33 @@ class Group:
         return [k for k in range(self.values.shape[1]) if np.isfinite(self.values[:, k]).any()]
 
 
-def groups_of(recording: Recording) -> list[Group]:
-    """Gyro, accelerometer and wheels, where they are there."""
+def sensors_of(recording: Recording) -> list[SensorAxes]:
+    """Gyro, accelerometer and wheels, where present."""
     found = []
     imu, wheels = recording.imu, recording.wheels
     if imu is not None and len(imu):
-        found.append(Group("imu", "gyro_radps", ("gyro x", "gyro y", "gyro z"), imu.t_ns, imu.gyro_radps))
-        found.append(Group("imu", "accel_mps2", ("accel x", "accel y", "accel z"), imu.t_ns, imu.accel_mps2))
+        for sensor, field in (("gyro", "gyro_radps"), ("accel", "accel_mps2")):
+            names = tuple(f"{sensor} {axis}" for axis in "xyz")
+            found.append(SensorAxes("imu", field, names, imu.t_ns, getattr(imu, field)))
     if wheels is not None and len(wheels):
         names = tuple(name.replace("_", " ") for name in wheels.names)
-        found.append(Group("wheels", "speed", names, wheels.t_ns, wheels.speed))
+        found.append(SensorAxes("wheels", "speed", names, wheels.t_ns, wheels.speed))
     return found
 
 
 def check_held(context: CheckContext) -> Iterator[Finding]:
     """Values repeated between true samples: the rate of the log is not the rate of the sensor."""
     for name, channel in context.recording.channels().items():
-        values = _sensed(channel)
+        values = _measured(channel)
         share, run = _held_share(channel.t_ns, values)
         rows = held_rows(values)
-        if share <= HELD_SHARE or rows == 1:  # runs of any length are those of a coarse signal
+        if share <= HELD_SHARE or rows == 1:  # runs of varying length are those of a coarse signal
             continue
 
         def repair(recording: Recording, name: str = name, rows: int = rows) -> Recording:
             channel = getattr(recording, name)
-            return dataclasses.replace(
-                recording, **{name: channel.select(true_updates(_sensed(channel), rows))}
-            )
+            updates = true_updates(_measured(channel), rows)
+            return dataclasses.replace(recording, **{name: channel.select(updates)})
 
         yield Finding(
             "held-values",
@@ -81,13 +81,13 @@ def check_held(context: CheckContext) -> Iterator[Finding]:
             "values are held",
             f"{share:.0%} of the samples repeat the one before while the signal changes; "
             f"a new value comes every {run:.1f} samples",
-            "keep the true updates: the first row of each run, and every so many rows where nothing changes",
+            f"keep the true updates: the first row of each run, and every {rows} rows where nothing changes",
             repair,
         )
 
 
-def _sensed(channel: Channel) -> Array:
-    """What a channel measured (N, k), without the axes that it lacks; none for other channels."""
+def _measured(channel: Channel) -> Array:
+    """What a channel measured (N, k), without the axes that it lacks; (N, 0) for other channels."""
     values = np.zeros((len(channel), 0))
     if isinstance(channel, Imu):
         values = np.hstack([channel.gyro_radps, channel.accel_mps2])
@@ -117,65 +117,59 @@ def _held_share(t_ns: TimesNs, values: Array) -> tuple[float, float]:
 
 def check_stuck(context: CheckContext) -> Iterator[Finding]:
     """Axes that keep one value while the others of their sensor move."""
-    stuck: dict[str, list[tuple[Group, Mask]]] = {}
-    for group in groups_of(context.recording):
-        mask = stuck_cells(group)
+    stuck: dict[str, list[tuple[SensorAxes, Mask]]] = {}
+    for sensor in sensors_of(context.recording):
+        mask = stuck_cells(sensor)
         if mask.any():
-            stuck.setdefault(group.channel, []).append((group, mask))
+            stuck.setdefault(sensor.channel, []).append((sensor, mask))
     for channel, found in stuck.items():
-        said = [
-            _told(context, group, mask, k)
-            for group, mask in found
-            for k in np.flatnonzero(mask.any(axis=0)).tolist()
-        ]
+        names, evidence = [], []
+        for sensor, mask in found:
+            for k in np.flatnonzero(mask.any(axis=0)).tolist():
+                rows = np.flatnonzero(mask[:, k])
+                first, last = (context.since_start_s(sensor.t_ns[row]) for row in (rows[0], rows[-1]))
+                value = sensor.values[rows[0], k]
+                names.append(sensor.names[k])
+                evidence.append(f"{sensor.names[k]} is {value:.4g} from {first:.2f} to {last:.2f} s")
         yield Finding(
             "stuck",
             "error",
             channel,
-            f"{' and '.join(name for name, _ in said)} {'keeps' if len(said) == 1 else 'keep'} one value",
-            "; ".join(evidence for _, evidence in said) + "; the other axes move meanwhile",
-            "leave these rows out" if channel == "wheels" else "empty these cells: nobody knows what it was",
-            _without([(group.field, mask) for group, mask in found], channel),
+            f"{' and '.join(names)} {'keeps' if len(names) == 1 else 'keep'} one value",
+            "; ".join(evidence) + "; the other axes move meanwhile",
+            "leave these rows out" if channel == "wheels" else "empty these cells: their values are unknown",
+            without_cells([(sensor.field, mask) for sensor, mask in found], channel),
         )
-
-
-def _told(context: CheckContext, group: Group, mask: Mask, k: int) -> tuple[str, str]:
-    rows = np.flatnonzero(mask[:, k])
-    first, last = (context.since_start_s(group.t_ns[row]) for row in (rows[0], rows[-1]))
-    return group.names[
-        k
-    ], f"{group.names[k]} is {group.values[rows[0], k]:.4g} from {first:.2f} to {last:.2f} s"
 
 
 def without_stuck(recording: Recording) -> Recording:
     """The recording with the cells of stuck axes empty."""
-    for group in groups_of(recording):
-        mask = stuck_cells(group)
+    for sensor in sensors_of(recording):
+        mask = stuck_cells(sensor)
         if mask.any():
-            channel = getattr(recording, group.channel)
-            emptied = dataclasses.replace(channel, **{group.field: np.where(mask, np.nan, group.values)})
-            recording = dataclasses.replace(recording, **{group.channel: emptied})
+            emptied = {sensor.field: np.where(mask, np.nan, sensor.values)}
+            recording = with_fields(recording, sensor.channel, **emptied)
     return recording
 
 
-def stuck_cells(group: Group) -> Mask:
+def stuck_cells(sensor: SensorAxes) -> Mask:
     """Mask (N, k) of the cells of stuck axes."""
-    mask = np.zeros(group.values.shape, dtype=bool)
-    known = group.known()
-    if len(known) < 2 or len(group.values) < 2 * STUCK_ROWS:
+    mask = np.zeros(sensor.values.shape, dtype=bool)
+    known = sensor.known()
+    if len(known) < 2 or len(sensor.values) < 2 * STUCK_ROWS:
         return mask
-    keep = np.flatnonzero(true_updates(group.values[:, known], held_rows(group.values[:, known])))
-    t_s, values = (group.t_ns[keep] - group.t_ns[0]) * 1e-9, group.values[keep]
+    keep = np.flatnonzero(true_updates(sensor.values[:, known], held_rows(sensor.values[:, known])))
+    t_s, values = (sensor.t_ns[keep] - sensor.t_ns[0]) * 1e-9, sensor.values[keep]
     same = values[1:] == values[:-1]
     usual = _spreads(values)
     moving = [k for k in known if same[:, k].mean() < 0.5]
-    whole = [k for k in known if same[:, k].all()]
+    constant = [k for k in known if same[:, k].all()]
     for k in known:
         others = [o for o in moving if o != k]
-        if k in whole:
-            mask[:, k] = _is_odd(group, k, whole, others)
+        if k in constant:
+            mask[:, k] = _is_stuck_throughout(sensor, k, constant, others)
             continue
-        for first, last in _runs(same[:, k]):
+        for first, last in _longest_runs(same[:, k]):
             long = t_s[last] - t_s[first] >= (STUCK_S if values[first, k] else STUCK_ZERO_S)
             if not long or last - first < STUCK_ROWS or not others or _is_clipped(values[:, k], first, last):
                 continue
@@ -189,7 +183,7 @@ def stuck_cells(group: Group) -> Mask:
 
 
 def _is_clipped(values: Array, first: int, last: int) -> bool:
-    """Whether a run stands at the end of a range that the signal reaches at other times too."""
+    """Whether a run is at the end of a range that the signal reaches at other times too."""
     value, known = values[first], values[np.isfinite(values)]
     elsewhere = int((known == value).sum()) - (last - first + 1)
     return elsewhere >= CLIPPED_ROWS and value in (known.min(), known.max())
@@ -203,69 +197,65 @@ def _spreads(values: Array) -> Array:
     return np.asarray(np.sqrt(np.where(known, (values - mean) ** 2, 0.0).sum(axis=0) / count))
 
 
-def _is_odd(group: Group, k: int, whole: list[int], moving: list[int]) -> bool:
-    """Whether an axis that is constant all along is stuck: of three one, which no planar log leaves out."""
-    if group.channel == "wheels" or len(group.known()) < 3:
+def _is_stuck_throughout(sensor: SensorAxes, k: int, constant: list[int], moving: list[int]) -> bool:
+    """Whether a constant axis is stuck: one of three, and not one that planar logs leave out."""
+    if sensor.channel == "wheels" or len(sensor.known()) < 3:
         return False
-    return len(whole) == 1 and len(moving) == 2 and not (group.field == "accel_mps2" and k == 2)
+    return len(constant) == 1 and len(moving) == 2 and not (sensor.field == "accel_mps2" and k == 2)
 
 
-def _runs(same: Mask) -> list[tuple[int, int]]:
-    """First and last row of the longest runs of equal values."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
-    begins, ends = edges[::2], edges[1::2]
-    longest = np.sort(np.argsort(begins - ends, kind="stable")[:20])
+def _longest_runs(same: Mask) -> list[tuple[int, int]]:
+    """First and last row of the longest runs of equal values, in order of time."""
+    begins, ends = runs(same)
+    longest = np.sort(np.argsort(begins - ends, kind="stable")[:LONGEST_RUNS])
     return [(int(begins[i]), int(ends[i])) for i in longest]
 
 
-def _without(cells: list[tuple[str, Mask]], channel: str) -> Repair:
-    """A repair that empties cells of an IMU, and leaves out such rows of the wheels."""
+def without_cells(cells: list[tuple[str, Mask]], channel: str) -> Repair:
+    """A repair that empties cells of an IMU, or drops such rows of the wheels."""
+    if channel == "wheels":
+        return without_rows(channel, np.logical_or.reduce([mask.any(axis=1) for _, mask in cells]))
 
-    def repair(recording: Recording) -> Recording:
-        before = getattr(recording, channel)
-        if channel == "wheels":
-            return dataclasses.replace(recording, wheels=before.select(~cells[0][1].any(axis=1)))
-        emptied = {field: np.where(mask, np.nan, getattr(before, field)) for field, mask in cells}
-        return dataclasses.replace(recording, **{channel: dataclasses.replace(before, **emptied)})
+    def emptied(recording: Recording) -> Recording:
+        imu = recording.imu
+        return with_fields(
+            recording, "imu", **{field: np.where(mask, np.nan, getattr(imu, field)) for field, mask in cells}
+        )
 
-    return repair
+    return emptied
 
 
 def check_dead(context: CheckContext) -> Iterator[Finding]:
-    """Sensors that say nothing all along while the robot moves."""
+    """Wheels that stand while the robot moves, a gyro that is constant while it turns."""
     recording = context.recording
     imu, wheels = recording.imu, recording.wheels
-    if wheels is not None and len(wheels) >= STUCK_ROWS and not np.nan_to_num(wheels.speed).any():
-        extent_m = _extent_m(recording)
-        if extent_m > LEAST_EXTENT_M:
-            yield Finding(
-                "dead",
-                "error",
-                "wheels",
-                "the wheels stand all along",
-                f"every speed is zero on a way over {extent_m:.0f} m",
-                "leave the wheels out",
-                lambda recording: dataclasses.replace(recording, wheels=None),
-            )
+    standing = wheels is not None and not np.nan_to_num(wheels.speed).any()
+    extent_m = _extent_m(recording) if standing else 0.0
+    if wheels is not None and len(wheels) >= STUCK_ROWS and standing and extent_m > LEAST_EXTENT_M:
+        yield Finding(
+            "dead",
+            "error",
+            "wheels",
+            "the wheels stand throughout",
+            f"every speed is zero while the robot covers {extent_m:.0f} m",
+            "leave the wheels out",
+            lambda recording: dataclasses.replace(recording, wheels=None),
+        )
     if imu is None or len(imu) < STUCK_ROWS or np.isnan(imu.gyro_radps[:, 2]).all():
         return
     constant = [bool((v[1:] == v[:-1]).all()) for v in imu.gyro_radps.T if np.isfinite(v).any()]
     lively = [bool((v[1:] != v[:-1]).mean() > 0.5) for v in imu.accel_mps2.T if np.isfinite(v).any()]
-    turn = _turn_radps(context)
-    still = (
-        wheels is not None
-        and not np.nan_to_num(wheels.speed).any()
-        and _extent_m(recording) <= LEAST_EXTENT_M
-    )
-    if all(constant) and not still and (turn > LEAST_TURN_RADPS or (len(lively) == 3 and all(lively))):
+    still = standing and extent_m <= LEAST_EXTENT_M
+    shaking = len(lively) == 3 and all(lively)
+    if all(constant) and not still and (shaking or _turn_radps(context) > LEAST_TURN_RADPS):
         yield Finding(
             "dead",
             "error",
             "imu",
-            "the gyro says nothing",
-            f"gyro z is {imu.gyro_radps[0, 2]:g} rad/s all along, while the robot drives",
+            "the gyro is constant",
+            f"gyro z is {imu.gyro_radps[0, 2]:g} rad/s throughout, while the robot drives",
             "leave the gyro out",
-            _without([("gyro_radps", np.ones((len(imu), 3), dtype=bool))], "imu"),
+            without_cells([("gyro_radps", np.ones((len(imu), 3), dtype=bool))], "imu"),
         )
 
 
@@ -276,7 +266,8 @@ def _extent_m(recording: Recording) -> float:
     if gnss is not None:
         sigma = gnss.sigma_enu_m[:, :2]
         noise = float(np.median(sigma[np.isfinite(sigma)])) if np.isfinite(sigma).any() else np.inf
-        extents.append(_diagonal_m(gnss.enu_m) if _diagonal_m(gnss.enu_m) > 10.0 * noise else 0.0)
+        diagonal = _diagonal_m(gnss.enu_m)
+        extents.append(diagonal if diagonal > 10.0 * noise else 0.0)
     if truth is not None:
         extents.append(_diagonal_m(truth.position_m))
     return max(extents)
@@ -288,14 +279,14 @@ def _diagonal_m(position_m: Array) -> float:
 
 
 def _turn_radps(context: CheckContext) -> float:
-    """Root mean square of the yaw rate that truth, or wheels on a track of 1 m, tell; 0 where none does."""
-    accounts = yaw_rates(context.recording, context.wheel_radius_m() or 0.15)
-    told = [accounts[name][1] for name in ("truth", "wheels") if name in accounts]
-    return float(np.sqrt(np.nanmean(told[0] ** 2))) if told else 0.0
+    """Root mean square yaw rate of truth, or of wheels on a track of 1 m; 0 where neither has one."""
+    rates = yaw_rates(context.recording, context.wheel_radius_m() or ANY_RADIUS_M)
+    known = [rates[name][1] for name in ("truth", "wheels") if name in rates]
+    return float(np.sqrt(np.nanmean(known[0] ** 2))) if known else 0.0
 
 
 def check_missing(context: CheckContext) -> Iterator[Finding]:
-    """Cells without a number in columns that have some."""
+    """Empty cells in columns that have values."""
     for name, channel in context.recording.channels().items():
         if name not in ("command", "wheels", "imu", "motor") or len(channel) < STUCK_ROWS:
             continue
@@ -306,18 +297,12 @@ def check_missing(context: CheckContext) -> Iterator[Finding]:
         worst = max(share, key=lambda column: share[column])
         empty = np.all([columns[column] for column in share], axis=0)
         whole_rows = empty.mean() >= max(share.values())
-
-        def repair(recording: Recording, name: str = name, empty: Mask = empty) -> Recording:
-            return dataclasses.replace(recording, **{name: getattr(recording, name).select(~empty)})
-
         yield Finding(
             "missing-values",
             "warning",
             name,
             f"{share[worst]:.0%} of {worst} is missing",
             f"{sum(value > 0 for value in share.values())} of {len(share)} columns have empty cells",
-            "leave the empty rows out"
-            if whole_rows
-            else "expect larger uncertainty there: nobody knows them",
-            repair if whole_rows else None,
+            "leave the empty rows out" if whole_rows else "expect larger uncertainty there",
+            without_rows(name, empty) if whole_rows else None,
         )

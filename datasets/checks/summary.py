@@ -1,7 +1,6 @@
-"""What recordings hold, as plain data: the content of `terrafusion inspect`, and of its `--json`.
+"""Contents, measures and findings of recordings as plain data: what `terrafusion inspect --json` prints.
 
-Numbers are in the unit of their key; None (null) stands for unknown. The keys are described in
-docs/conventions.md.
+Numbers are in the unit of their key; None (null) is unknown. The keys are described in docs/conventions.md.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from terrafusion.datasets.checks.finding import Finding
 from terrafusion.datasets.checks.measures import Measures
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
 from terrafusion.datasets.core.channels import Channel
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 
 TimesNs = NDArray[np.int64]
@@ -38,7 +38,7 @@ def summarise(recording: Recording, measures: Measures, findings: Sequence[Findi
         "source": recording.source or None,
         "datum": recording.datum,
         "channels": _channels(recording),
-        "measured": _plain(measures),
+        "measured": finite(dataclasses.asdict(measures)),
         "notes": list(recording.notes),
         "findings": [finding.to_dict() for finding in findings],
     }
@@ -47,7 +47,7 @@ def summarise(recording: Recording, measures: Measures, findings: Sequence[Findi
 def summarise_all(
     name: str, recordings: Sequence[Recording], measures: Measures, findings: Sequence[Sequence[Finding]]
 ) -> dict[str, Any]:
-    """Several recordings of one file, pooled; `findings` are those of each recording."""
+    """Several recordings of one file, pooled; `findings` are those of each."""
     durations = [r.duration_s() for r in recordings]
     return {
         "name": name,
@@ -58,7 +58,7 @@ def summarise_all(
         "licence": _common(r.licence for r in recordings),
         "source": _common(r.source for r in recordings),
         "channels": _pooled([_channels(r) for r in recordings]),
-        "measured": _plain(measures),
+        "measured": finite(dataclasses.asdict(measures)),
         "notes": _grouped_notes([r.notes for r in recordings]),
         "findings": _grouped_findings(findings),
     }
@@ -72,7 +72,7 @@ def _channels(recording: Recording) -> dict[str, dict[str, Any]]:
     }
     truth = recording.truth
     if truth is not None and len(truth):
-        with np.errstate(over="ignore"):  # huge numbers are a finding, not a crash
+        with np.errstate(over="ignore"):  # huge numbers are a finding
             path_m = truth.path_length_m()
         found["truth"] = _clock(start_ns, truth.t_ns) | {
             "holds": list(recording.truth_channels),
@@ -96,7 +96,7 @@ def _clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
 
 
 def _ranges(channel: Channel) -> dict[str, Any]:
-    """Least and greatest number of a column, or how often it holds each word."""
+    """Smallest and largest number of a column, or the count of each word."""
     ranges: dict[str, Any] = {}
     for column, values in channel.columns().items():
         if values.dtype == object:
@@ -146,7 +146,7 @@ def _pooled_ranges(each: Sequence[dict[str, Any]]) -> dict[str, Any]:
 
 
 def _grouped_findings(each: Sequence[Sequence[Finding]]) -> list[dict[str, Any]]:
-    """One entry a code and channel: the first such finding, in how many recordings, and in which first."""
+    """One entry per code and channel: the first such finding, the number of recordings, the first of them."""
     groups: dict[tuple[str, str], dict[str, Any]] = {}
     for number, findings in enumerate(each):
         seen = set()
@@ -159,7 +159,7 @@ def _grouped_findings(each: Sequence[Sequence[Finding]]) -> list[dict[str, Any]]
 
 
 def _grouped_notes(each: Iterable[Sequence[str]]) -> list[dict[str, Any]]:
-    """Notes that differ by numbers alone count as one; the first stands for all."""
+    """Notes that differ only in numbers count as one; the first represents all."""
     groups: dict[str, dict[str, Any]] = {}
     for notes in each:
         for key, note in {re.sub(r"\d+(\.\d+)?", "#", note): note for note in notes}.items():
@@ -178,20 +178,6 @@ def _counted(words: Iterable[str | None]) -> dict[str, int]:
 
 
 def _common(words: Iterable[str]) -> str | None:
-    """The word that all have, or None."""
+    """The word that all share, or None."""
     found = set(words)
     return found.pop() or None if len(found) == 1 else None
-
-
-def _plain(measures: Measures) -> dict[str, Any]:
-    plain: dict[str, Any] = _finite(dataclasses.asdict(measures))
-    return plain
-
-
-def _finite(value: Any) -> Any:
-    """The same without numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: _finite(one) for key, one in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(one) for one in value]
-    return None if isinstance(value, float) and not np.isfinite(value) else value

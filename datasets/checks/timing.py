@@ -1,4 +1,4 @@
-"""Each clock by itself: spans, coarse stamps, jitter, gaps, repeats, steps taken out on reading."""
+"""Each clock by itself: span, coarse stamps, jitter, gaps, repeats, steps removed on reading."""
 
 from __future__ import annotations
 
@@ -9,8 +9,15 @@ from collections.abc import Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
-from terrafusion.datasets.checks.sensor_pairs import clocks_of, period_s, retimed
+from terrafusion.datasets.checks.finding import (
+    CheckContext,
+    Finding,
+    Repair,
+    clocks_of,
+    counted,
+    period_s,
+    retimed,
+)
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.recording import Recording
 
@@ -18,7 +25,7 @@ Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
-"""Channels that should tick evenly; terrain labels come when they come."""
+"""Channels that are sampled evenly; terrain labels are not."""
 GAP_PERIODS, GAP_S = 5.0, 0.2
 MISSING_SHARE = 0.05
 JITTER_SHARE = 0.2
@@ -29,7 +36,7 @@ SAME_SPAN = 0.1
 
 
 def check_spans(context: CheckContext) -> Iterator[Finding]:
-    """Channels must share a stretch of time."""
+    """Channels must overlap in time."""
     clocks = {name: t for name, t in clocks_of(context.recording).items() if name in (*CLOCKED, "truth")}
     apart = {
         name: [o for o, t in clocks.items() if t[0] > own[-1] or t[-1] < own[0]]
@@ -50,9 +57,9 @@ def check_spans(context: CheckContext) -> Iterator[Finding]:
         f"it runs from {context.since_start_s(own[0]):.2f} to {context.since_start_s(own[-1]):.2f} s, "
         f"the others from {context.since_start_s(np.int64(begins)):.2f} "
         f"to {context.since_start_s(np.int64(ends)):.2f} s",
-        "let it start with the others: they last equally long; correlation finds what is left"
+        "let it start with the others: they last equally long; correlation finds the remaining offset"
         if alike
-        else "bring the channels onto one clock; their durations differ, so nobody knows how",
+        else "bring the channels onto one clock; their durations differ, so the offset is unknown",
         _moved(lonely, begins - int(own[0])) if alike else None,
     )
 
@@ -69,7 +76,7 @@ def _moved(name: str, by_ns: int) -> Repair:
 
 
 def check_steps(context: CheckContext) -> Iterator[Finding]:
-    """Steps of a clock that the reader had to take out."""
+    """Steps of a clock that the reader removed."""
     jumps = context.recording.clock_jumps
     for name in dict.fromkeys(jump.channel for jump in jumps):
         own = [jump for jump in jumps if jump.channel == name]
@@ -83,9 +90,9 @@ def check_steps(context: CheckContext) -> Iterator[Finding]:
             "clock-jump",
             "error",
             name,
-            f"its clock was set {len(own)} time{'s' if len(own) > 1 else ''}",
+            f"its clock was set {counted(len(own), 'time')}",
             f"largest step {worst.step_s:+.3f} s at t = {context.since_start_s(np.int64(worst.t_ns)):.2f} s",
-            "keep the times as they were mended on reading: good to a sampling period",
+            "keep the times as repaired on reading: good to a sampling period",
             repair,
         )
 
@@ -119,7 +126,7 @@ def check_coarse(context: CheckContext) -> Iterator[Finding]:
 
 
 def coarse_tick_s(channel: Channel) -> float:
-    """Unit that the times of a channel are rounded to, where it is coarse beside its rate; else 0."""
+    """Unit that the times of a channel are rounded to, where it is coarse for its rate; else 0."""
     dt = np.diff(channel.t_ns) * 1e-9
     if len(dt) < LEAST_ROWS or not (dt > 0).any():
         return 0.0
@@ -140,7 +147,7 @@ def coarse_tick_s(channel: Channel) -> float:
 
 
 def _same_rows(channel: Channel) -> NDArray[np.bool_]:
-    """Whether each row but the first tells what the one before does."""
+    """Whether each row but the first equals the one before."""
     columns = [v for v in channel.columns().values() if v.dtype.kind == "f"]
     return np.all([(v[1:] == v[:-1]) | (np.isnan(v[1:]) & np.isnan(v[:-1])) for v in columns], axis=0)
 
@@ -160,7 +167,7 @@ def _even(t_ns: TimesNs, gap_s: float) -> TimesNs:
 
 
 def check_jitter(context: CheckContext) -> Iterator[Finding]:
-    """Intervals that scatter: a clock of arrival rather than of measurement."""
+    """Intervals that scatter: times of arrival rather than of measurement."""
     for name, channel in _clocked(context.recording):
         dt = np.diff(channel.t_ns) * 1e-9
         if len(dt) < LEAST_ROWS or coarse_tick_s(channel):
@@ -186,13 +193,13 @@ def check_jitter(context: CheckContext) -> Iterator[Finding]:
             f"{share:.0%} of the intervals are more than half off the median of {period * 1e3:.3g} ms",
             "fit an even clock: the times scatter about one like times of arrival; their mean delay stays"
             if regular
-            else "use the sensor's own time stamps; nothing in the log tells them",
+            else "use the sensor's own time stamps; the log does not have them",
             repair if regular else None,
         )
 
 
 def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
-    """Stretches without samples. `jumps` are rows by channel that a clock jump parts, which are none."""
+    """Stretches without samples, except at the rows `jumps` by channel of a clock jump."""
     for name, channel in _clocked(context.recording):
         dt = np.diff(channel.t_ns) * 1e-9
         dt[np.array(jumps.get(name, ()), dtype=int) - 1] = 0.0
@@ -203,7 +210,7 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
         missing = _missing(dt[dt <= GAP_PERIODS * period] / period) if len(dt) >= LEAST_ROWS else 0
         if gaps.size:
             worst = int(gaps[np.argmax(dt[gaps])])
-            what = f"{gaps.size} gap{'s' if gaps.size > 1 else ''}"
+            what = counted(gaps.size, "gap")
             evidence = (
                 f"longest {dt[worst]:.2f} s from t = {context.since_start_s(channel.t_ns[worst]):.2f} s, "
                 f"{dt[gaps].sum():.2f} s in all"
@@ -213,12 +220,12 @@ def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> I
             evidence = f"intervals of whole multiples of {period * 1e3:.3g} ms, {missing} of which are empty"
         else:
             continue
-        fix = "expect larger uncertainty there, and look for dropped messages: nobody knows what is missing"
+        fix = "expect larger uncertainty there, and look for dropped messages: what is missing is unknown"
         yield Finding("gaps", "warning", name, what, evidence, fix)
 
 
 def _missing(steps: Array) -> int:
-    """Samples missing in intervals told in periods; 0 where the long ones are no whole multiples."""
+    """Samples missing in intervals given in periods; 0 where the long ones are no whole multiples."""
     long = steps[steps > 1.5]
     whole = np.abs(long - np.rint(long)) < 0.25
     return int((np.rint(long) - 1.0).sum()) if long.size and whole.mean() > 0.8 else 0

@@ -1,4 +1,4 @@
-"""The truth against itself and the wheels: its yaw, its unit."""
+"""The truth: its yaw against its own course, its unit against the wheels."""
 
 from __future__ import annotations
 
@@ -7,28 +7,24 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding
-from terrafusion.datasets.checks.path import ANY_RADIUS_M, compare, places, wheel_speed
-from terrafusion.datasets.checks.yaw_signals import seconds
+from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
+from terrafusion.datasets.checks.motion import on_plane, seconds, wheel_speed
+from terrafusion.datasets.checks.path import fit_windows, path_by
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.trajectory import Trajectory
-
-Array = NDArray[np.float64]
 
 CHORD_S, LEAST_CHORD_M = 1.0, 0.2
 LEAST_CHORDS, LEAST_R = 20, 0.95
 """Chords that are needed, and how alike their offsets must be (length of the mean of unit vectors)."""
 LARGE_OFFSET = np.radians(30.0)
-"""Robots that slide across a slope crab by less."""
+"""Robots that side-slip across a slope crab by less."""
 UNITS = {"mm": 1000.0, "cm": 100.0, "feet": 1.0 / 0.3048}
 UNIT_ERROR = 0.1
 
 
 def check_yaw(context: CheckContext) -> Iterator[Finding]:
-    """The truth must face the way it goes, driving forward."""
+    """The truth's yaw must be its course when driving forward."""
     offset = yaw_offset(context)
     if offset is None or abs(offset[0]) < LARGE_OFFSET:
         return
@@ -37,28 +33,28 @@ def check_yaw(context: CheckContext) -> Iterator[Finding]:
         "truth-yaw",
         "warning",
         "truth",
-        f"the truth's yaw is {np.degrees(angle):.0f} deg off the way it goes",
-        f"mean over {chords} chords of {CHORD_S:g} s on which the wheels run; of one mind to {r:.2f}",
+        f"the truth's yaw is {np.degrees(angle):.0f} deg off its course",
+        f"mean over {chords} chords of {CHORD_S:g} s on which the wheels run; resultant length {r:.2f}",
         f"turn its body frame by {-np.degrees(angle):.0f} deg about z",
         partial(_turned, angle=-angle),
     )
 
 
 def yaw_offset(context: CheckContext) -> tuple[float, int, float] | None:
-    """Mean of yaw less course of the truth (rad), the chords it was found from, and how alike they are.
+    """Mean of yaw less course of the truth (rad), number of chords, and how alike they are.
 
-    Where the wheels run backwards the course is taken the other way. None where the truth, or the sign
-    of the wheels' speed, is not known well enough.
+    Where the wheels run backwards the course is reversed. None where the truth, or the sign of the
+    wheels' speed, is not known well enough.
     """
     truth = context.recording.truth
-    driven = wheel_speed(context, context.wheel_radius_m() or ANY_RADIUS_M)
+    driven = wheel_speed(context)
     if truth is None or truth.quaternion is None or driven is None:
         return None
     known = np.isfinite(truth.position_m[:, :2]).all(axis=1) & np.isfinite(truth.quaternion).all(axis=1)
     if known.sum() < 2 * LEAST_CHORDS:
         return None
     t, yaw = seconds(truth.t_ns[known], context.recording.start_ns), np.unwrap(truth.yaw_rad()[known])
-    place = truth.position_m[known, 0] + 1j * truth.position_m[known, 1]
+    place = on_plane(truth.position_m[known])
     t_wheel, v = driven
     grid = np.arange(max(t[0], t_wheel[0]), min(t[-1], t_wheel[-1]), CHORD_S)
     if len(grid) < LEAST_CHORDS:
@@ -88,18 +84,16 @@ def _turned(recording: Recording, angle: float) -> Recording:
     twist = truth.twist_body
     if twist is not None:
         twist = np.hstack([twist[:, :3] @ turn.as_matrix(), twist[:, 3:] @ turn.as_matrix()])
-    return dataclasses.replace(
-        recording, truth=dataclasses.replace(truth, quaternion=quaternion, twist_body=twist)
-    )
+    return with_fields(recording, "truth", quaternion=quaternion, twist_body=twist)
 
 
 def check_unit(context: CheckContext) -> Iterator[Finding]:
     """The truth's positions must be metres."""
-    true = next((one for one in places(context.recording) if one.source == "truth"), None)
-    windows = compare(context, true) if true is not None else None
-    if windows is None:
+    path = path_by(context.recording, "truth")
+    fits = fit_windows(context, path) if path is not None else None
+    if fits is None:
         return
-    ratio = float(np.median(windows.span_ratio))
+    ratio = float(np.median(fits.span_ratio))
     for unit, factor in UNITS.items():
         if abs(ratio / factor - 1.0) < UNIT_ERROR:
             yield Finding(
@@ -115,10 +109,8 @@ def check_unit(context: CheckContext) -> Iterator[Finding]:
 
 
 def _scaled(recording: Recording, factor: float) -> Recording:
-    truth: Trajectory | None = recording.truth
-    assert truth is not None
-    scaled = dataclasses.replace(
-        truth, position_m=truth.position_m * factor, twist_body=None, covariance=None
-    )
-    held = tuple(name for name in recording.truth_channels if name != "velocity")
-    return dataclasses.replace(recording, truth=scaled, truth_channels=held)
+    assert recording.truth is not None
+    position = recording.truth.position_m * factor
+    recording = with_fields(recording, "truth", position_m=position, twist_body=None, covariance=None)
+    remaining = tuple(name for name in recording.truth_channels if name != "velocity")
+    return dataclasses.replace(recording, truth_channels=remaining)

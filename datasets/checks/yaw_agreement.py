@@ -1,32 +1,43 @@
-"""Gyro, wheels, fixes, truth and command must turn alike: who contradicts the others?"""
+"""Consistency of the yaw rates of gyro, wheels, fixes, truth and command.
+
+Where two contradict each other, the smallest set of sources whose reversal makes all agree is at fault.
+"""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Iterator
+from itertools import combinations, product
 
 import numpy as np
 
-from terrafusion.datasets.checks.directions import runs_backwards, sides_opposed
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
 from terrafusion.datasets.checks.gnss_frame import reflection
-from terrafusion.datasets.checks.mounting import heading, stands_up
-from terrafusion.datasets.checks.yaw_signals import (
+from terrafusion.datasets.checks.imu import heading, is_upright
+from terrafusion.datasets.checks.motion import (
+    TRUTH_WINDOW_S,
+    WINDOW_S,
     Agreement,
-    accounts,
-    agreements,
-    contradictors,
-    is_late,
+    Integral,
+    agreement,
+    common_span,
+    course_agreement,
+    yaw_angles,
 )
+from terrafusion.datasets.checks.wheels import runs_backwards, sides_opposed
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording
 
-Pairs = dict[tuple[str, str], Agreement]
+Agreements = dict[tuple[str, str], Agreement]
 Signs = dict[tuple[str, str], float]
+"""By pair of yaw sources 1 where they turn alike, -1 where they turn against each other."""
 
+SUSPECTS = ("gyro", "wheels", "gnss", "truth", "command", "accelerometer")
+"""Yaw sources in the order in which they are suspected where the data leave it open."""
 DEGREES_SLOPE = {"wheels": 15.0, "truth": 30.0, "command": 15.0}
-"""Gyro rate over another's: the inverse track, 0.3 to 4 1/m, for the wheels, else 1; above these in deg/s."""
+"""Limits of gyro rate over another source's. In rad/s it is the inverse track (0.3 to 4 1/m) or 1."""
 UNRELATED_R, LIVELY, MANY = 0.3, 0.05, 40
+FINE_S, REACH_S, LATE_GAIN = 0.1, 5.0, 0.1
+"""Step and reach of the search for a delay; how much better it must correlate than a changed sign."""
 NAMES = {
     "gyro": "gyro z",
     "wheels": "the wheels",
@@ -48,21 +59,17 @@ CODES = {
 
 def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
     """The gyro must be in rad/s."""
-    found = _pairs(context)
+    found = _agreements(context)
     for other, limit in DEGREES_SLOPE.items():
         both = found.get(("gyro", other))
-        if both is None or not both.is_sure() or abs(both.slope) < limit:
+        if both is None or not both.is_significant() or abs(both.slope) < limit:
             continue
-        unit = (
-            "rad/s for each m/s between the sides"
-            if other == "wheels"
-            else f"times the turn of {NAMES[other]}"
-        )
+        unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {NAMES[other]}"
         yield Finding(
             "gyro-in-degrees",
             "error",
             "imu",
-            f"gyro z is far larger than the turn of {NAMES[other]}: it looks like deg/s",
+            f"gyro z is far larger than the turn rate of {NAMES[other]}: it looks like deg/s",
             f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}",
             "multiply by pi / 180",
             _to_radians,
@@ -71,8 +78,8 @@ def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
 
 
 def check_turns(context: CheckContext) -> Iterator[Finding]:
-    """All channels must turn to the same side; the fewest that contradict are at fault."""
-    found = _pairs(context)
+    """All yaw sources must turn to the same side; the fewest that contradict are at fault."""
+    found = _agreements(context)
     signs = _signs(context, found)
     against = [pair for pair, sign in signs.items() if sign < 0.0]
     if not against:
@@ -85,7 +92,7 @@ def check_turns(context: CheckContext) -> Iterator[Finding]:
             "warning",
             "imu",
             f"{NAMES[one]} {_verb(one)} against {NAMES[other]}",
-            _told(against, signs, found) + "; no single sign explains all",
+            _evidence(against, signs, found) + "; no single sign explains all",
             "check the axes and signs of all of them",
         )
         return
@@ -93,76 +100,29 @@ def check_turns(context: CheckContext) -> Iterator[Finding]:
         return  # one fault explains both: see wheels.check_direction
     for name in sorted(blamed[0]):
         pairs = [pair for pair in against if name in pair]
-        if not pairs or (name == "gyro" and not stands_up(context)):
-            continue  # an IMU that does not stand up: see mounting.check_axes
+        if not pairs or (name == "gyro" and not is_upright(context)):
+            continue  # an IMU that is not upright: see imu.check_axes
         fix, repair = _remedy(context, name)
         other = next(one for one in pairs[0] if one != name)
         if len(blamed) > 1:
-            fix += f" (assumed: no third channel tells whether {NAMES[name]} or {NAMES[other]} is wrong)"
+            fix += f" (assumed: no third source shows whether {NAMES[name]} or {NAMES[other]} is wrong)"
         yield Finding(
             CODES[name],
             "error" if name in ("gyro", "wheels", "gnss") else "warning",
             CHANNELS.get(name, name),
             f"{NAMES[name]} {_verb(name)} against {NAMES[other]}",
-            _told(pairs, signs, found),
+            _evidence(pairs, signs, found),
             fix,
             repair,
         )
 
 
-def _signs(context: CheckContext, found: Pairs) -> Signs:
-    """By pair of channels 1 where they surely turn alike, -1 where they turn against each other."""
-    known = accounts(context)
-    signs = {}
-    for (a, b), both in found.items():
-        late = both.r < 0.0 and a in known and b in known and is_late(known[a], known[b], both.r)
-        if both.is_sure() and not late:
-            signs[a, b] = float(np.sign(both.r))
-    pressed = heading(context)
-    if pressed is not None and pressed.turn and ("gyro", "wheels") in signs:
-        signs["gyro", "accelerometer"] = pressed.turn
-    return signs
-
-
-def _verb(name: str) -> str:
-    return "turn" if name == "wheels" else "turns"
-
-
-def _told(pairs: list[tuple[str, str]], signs: Signs, found: Pairs) -> str:
-    parts = [f"correlation {found[p].r:.2f} of {NAMES[p[0]]} and {NAMES[p[1]]}" for p in pairs if p in found]
-    pressed = signs.get(("gyro", "accelerometer"), 0.0)
-    if pressed:
-        parts.append(
-            f"the specific force in turns is {'as' if pressed > 0.0 else 'against what'} gyro z says"
-        )
-    return ", ".join(parts)
-
-
-def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
-    """What to do where one channel turns the wrong way."""
-    if name == "gyro":
-        return "change the sign of gyro z (left turn positive)", _gyro_sign
-    if name == "wheels":
-        return "swap left and right wheels", _swap_sides
-    if name == "gnss":
-        return reflection(context.recording)
-    if name == "truth":
-        return "check the truth's frame: its yaw must grow to the left", None
-    if name == "accelerometer":
-        return "check the accelerometer's axes: x, y and z must make a right-handed frame", None
-    return "change the sign of the commanded yaw rate (left turn positive)", _command_sign
-
-
 def check_unrelated(context: CheckContext) -> Iterator[Finding]:
     """Gyro z must follow the wheels, whatever its sign."""
-    both = _pairs(context).get(("gyro", "wheels"))
-    if (
-        both is None
-        or both.windows < MANY
-        or min(both.spread) < LIVELY
-        or both.is_sure()
-        or both.r > UNRELATED_R
-    ):
+    both = _agreements(context).get(("gyro", "wheels"))
+    if both is None or both.windows < MANY or min(both.spread) < LIVELY:
+        return
+    if both.is_significant() or both.r > UNRELATED_R:
         return
     yield Finding(
         "yaw-unrelated",
@@ -174,18 +134,108 @@ def check_unrelated(context: CheckContext) -> Iterator[Finding]:
     )
 
 
-def _pairs(context: CheckContext) -> Pairs:
-    """What can be compared, without wheels of which one side has the wrong sign: they tell no turn."""
+def _agreements(context: CheckContext) -> Agreements:
+    """What can be compared, without wheels of which one side has the wrong sign: they show no turn."""
     found = agreements(context)
     if any("wheels" in pair for pair in found) and sides_opposed(context) is not None:
         found = {pair: both for pair, both in found.items() if "wheels" not in pair}
     return found
 
 
+def agreements(context: CheckContext) -> Agreements:
+    """Agreement of every pair of yaw sources that can be compared, in the order of `SUSPECTS`."""
+    known = yaw_angles(context)
+    found: dict[tuple[str, str], Agreement | None] = {}
+    for one, other in combinations(SUSPECTS, 2):
+        if one in known and other in known:
+            window_s = TRUTH_WINDOW_S if "truth" in (one, other) else WINDOW_S
+            found[one, other] = agreement(known[one], known[other], window_s)
+    gnss, track_m = context.recording.gnss, context.rig.track_m if context.rig else 1.0
+    if gnss is not None:
+        for name, unit in (("gyro", 1.0), ("wheels", track_m)):
+            if name in known:
+                yaw = Integral(known[name].t_s, known[name].value / unit)
+                found[name, "gnss"] = course_agreement(yaw, gnss, context.recording.start_ns)
+    return {pair: both for pair, both in found.items() if both is not None}
+
+
+def contradictors(signs: Signs) -> list[frozenset[str]]:
+    """The smallest sets of sources whose reversal makes all pairs agree; [] where none does.
+
+    One set: the data determine who is wrong. Several: the first is the most suspect.
+    [frozenset()]: no contradiction.
+    """
+    names = [name for name in SUSPECTS if any(name in pair for pair in signs)]
+    consistent = []
+    for flips in product((1.0, -1.0), repeat=len(names)):
+        sign = dict(zip(names, flips, strict=True))
+        if all(sign[a] * sign[b] == s for (a, b), s in signs.items()):
+            consistent.append(frozenset(name for name in names if sign[name] < 0.0))
+    fewest = min((len(flipped) for flipped in consistent), default=0)
+    smallest = [flipped for flipped in consistent if len(flipped) == fewest]
+    return sorted(smallest, key=lambda flipped: sorted(SUSPECTS.index(name) for name in flipped))
+
+
+def _signs(context: CheckContext, found: Agreements) -> Signs:
+    known = yaw_angles(context)
+    signs = {}
+    for (a, b), both in found.items():
+        delayed = both.r < 0.0 and a in known and b in known and is_delayed(known[a], known[b], both.r)
+        if both.is_significant() and not delayed:
+            signs[a, b] = float(np.sign(both.r))
+    centripetal = heading(context)
+    if centripetal is not None and centripetal.turn and ("gyro", "wheels") in signs:
+        signs["gyro", "accelerometer"] = centripetal.turn
+    return signs
+
+
+def is_delayed(a: Integral, b: Integral, r: float) -> bool:
+    """Whether two rates of negative correlation `r` agree clearly better unchanged but shifted in time."""
+    grid = np.arange(*common_span(a, b), FINE_S)
+    if len(grid) < 3:
+        return False
+    kernel = np.ones(round(WINDOW_S / FINE_S)) * FINE_S / WINDOW_S
+    one, other = (np.convolve(x.rates(grid), kernel, "valid") for x in (a, b))
+    reach = min(round(REACH_S / FINE_S), len(one) // 4)
+    if reach < 1 or min(one.std(), other.std()) <= 0.0:
+        return False
+    one, other = (one - one.mean()) / one.std(), (other - other.mean()) / other.std()
+    middle = one[reach:-reach]
+    best = float(np.correlate(other, middle, "valid").max()) / len(middle)
+    return best > LATE_GAIN - r
+
+
+def _verb(name: str) -> str:
+    return "turn" if name == "wheels" else "turns"
+
+
+def _evidence(pairs: list[tuple[str, str]], signs: Signs, found: Agreements) -> str:
+    parts = [f"correlation {found[p].r:.2f} of {NAMES[p[0]]} and {NAMES[p[1]]}" for p in pairs if p in found]
+    turn = signs.get(("gyro", "accelerometer"), 0.0)
+    if turn:
+        parts.append(f"the specific force in turns {'agrees with' if turn > 0.0 else 'contradicts'} gyro z")
+    return ", ".join(parts)
+
+
+def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
+    """What to do where one source turns the wrong way."""
+    if name == "gnss":
+        return reflection(context.recording)
+    return {
+        "gyro": ("change the sign of gyro z (left turn positive)", _gyro_sign),
+        "wheels": ("swap left and right wheels", _swap_sides),
+        "truth": ("check the truth's frame: its yaw must grow to the left", None),
+        "command": ("change the sign of the commanded yaw rate (left turn positive)", _command_sign),
+        "accelerometer": (
+            "check the accelerometer's axes: x, y and z must make a right-handed frame",
+            None,
+        ),
+    }[name]
+
+
 def _to_radians(recording: Recording) -> Recording:
     assert recording.imu is not None
-    imu = dataclasses.replace(recording.imu, gyro_radps=np.radians(recording.imu.gyro_radps))
-    return dataclasses.replace(recording, imu=imu)
+    return with_fields(recording, "imu", gyro_radps=np.radians(recording.imu.gyro_radps))
 
 
 def _gyro_sign(recording: Recording) -> Recording:
@@ -197,12 +247,9 @@ def _swap_sides(recording: Recording) -> Recording:
     assert wheels is not None
     other = [0] if len(wheels.names) == 1 else [k ^ 1 for k in range(len(wheels.names))]
     angle = None if wheels.angle_rad is None else wheels.angle_rad[:, other]
-    swapped = dataclasses.replace(wheels, speed=wheels.speed[:, other], angle_rad=angle)
-    return dataclasses.replace(recording, wheels=swapped)
+    return with_fields(recording, "wheels", speed=wheels.speed[:, other], angle_rad=angle)
 
 
 def _command_sign(recording: Recording) -> Recording:
-    command = recording.command
-    assert command is not None
-    turned = dataclasses.replace(command, yaw_rate_radps=-command.yaw_rate_radps)
-    return dataclasses.replace(recording, command=turned)
+    assert recording.command is not None
+    return with_fields(recording, "command", yaw_rate_radps=-recording.command.yaw_rate_radps)

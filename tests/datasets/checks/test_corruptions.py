@@ -363,7 +363,7 @@ def test_good_logs_have_no_finding(terrain: str, seed: int, scenario: Scenario, 
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_corruption_is_named_and_mended(name: str, good: Recording, rig: Rig) -> None:
+def test_corruption_is_named_and_repaired(name: str, good: Recording, rig: Rig) -> None:
     """By its finding, and no other error; repaired, or left and still told."""
     case = CASES[name]
     corrupted = case.corrupt(good)
@@ -405,7 +405,7 @@ def assert_like(repaired: Channel, good: Channel, case: Case) -> None:
         assert error.max() <= case.share * np.abs(values).max() + 1e-12, name
 
 
-def test_clock_set_back_is_named_and_mended(good: Recording, rig: Rig, tmp_path: Path) -> None:
+def test_clock_set_back_is_named_and_repaired(good: Recording, rig: Rig, tmp_path: Path) -> None:
     """Times that run back never get into a recording: the reader takes the step out where asked."""
     write_log_folder(good, tmp_path / "log")
     table = tmp_path / "log" / "imu.csv"

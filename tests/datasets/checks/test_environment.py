@@ -123,7 +123,7 @@ def test_a_sound_log_has_no_finding() -> None:
 
 
 @pytest.mark.parametrize(("name", "factor"), [("hPa", 1e-2), ("kPa", 1e-3)])
-def test_pressure_units_are_named_and_mended(name: str, factor: float) -> None:
+def test_pressure_units_are_named_and_repaired(name: str, factor: float) -> None:
     good = turning()
     assert good.barometer is not None
     corrupted = dataclasses.replace(
@@ -141,7 +141,7 @@ def test_pressure_units_are_named_and_mended(name: str, factor: float) -> None:
 @pytest.mark.parametrize(
     ("name", "factor"), [("uT", 1e6), ("gauss", 1e4), ("milligauss", 1e7), ("nT", 1e9), ("", 1.0 / 49.5e-6)]
 )
-def test_field_units_are_named_and_mended(name: str, factor: float) -> None:
+def test_field_units_are_named_and_repaired(name: str, factor: float) -> None:
     """A field divided by its own size (Xsens) cannot be repaired: only its direction is left."""
     good = turning()
     assert good.magnetometer is not None

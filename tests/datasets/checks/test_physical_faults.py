@@ -308,7 +308,7 @@ MENDED: dict[str, tuple[Fault, str, str]] = {
 
 
 @pytest.mark.parametrize("name", MENDED)
-def test_fault_is_found_and_mended(name: str) -> None:
+def test_fault_is_found_and_repaired(name: str) -> None:
     corrupt, code, severity = MENDED[name]
     good = lively_drive()
     corrupted = corrupt(good)
@@ -410,7 +410,7 @@ def test_the_gyro_is_assumed_where_nothing_tells() -> None:
     assert any("assumed" in note for note in repaired.notes)
 
 
-def test_two_faults_of_one_kind_are_both_mended() -> None:
+def test_two_faults_of_one_kind_are_both_repaired() -> None:
     """A second dead wheel must not be taken for a wrong radius."""
     good = four_wheels(lively_drive())
     assert good.wheels is not None

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks import CheckContext, Finding, repair, run_checks
-from terrafusion.datasets.checks.delays import _finding
+from terrafusion.datasets.checks.delays import offset_finding
 from terrafusion.datasets.checks.sensor_pairs import far_lag, signal_pairs
 from terrafusion.datasets.core.channels import Imu, Wheels
 from terrafusion.datasets.core.lag import Lag
@@ -155,7 +155,7 @@ CLOCK_FAULTS: dict[str, tuple[str, str, Spoil, float]] = {
 
 
 @pytest.mark.parametrize("name", CLOCK_FAULTS)
-def test_clock_faults_are_named_and_mended(drive: Recording, name: str) -> None:
+def test_clock_faults_are_named_and_repaired(drive: Recording, name: str) -> None:
     code, channel, corrupt, tolerance_s = CLOCK_FAULTS[name]
     corrupted = corrupt(drive)
     assert [(f.code, f.channel) for f in found_in(corrupted)] == [(code, channel)]
@@ -183,7 +183,7 @@ def test_a_clock_that_is_surely_off_by_half_a_second_is_an_error(
 ) -> None:
     """What is not sure must not stop a replay."""
     pair = ("truth", "wheels")
-    assert _finding(drive, {pair: lag}, {pair}).severity == severity
+    assert offset_finding(drive, {pair: lag}, {pair}).severity == severity
 
 
 VALUE_FAULTS: dict[str, tuple[str, str, Spoil]] = {
@@ -208,7 +208,7 @@ VALUE_FAULTS: dict[str, tuple[str, str, Spoil]] = {
 
 
 @pytest.mark.parametrize("name", VALUE_FAULTS)
-def test_value_faults_are_named_and_mended(drive: Recording, name: str) -> None:
+def test_value_faults_are_named_and_repaired(drive: Recording, name: str) -> None:
     code, channel, corrupt = VALUE_FAULTS[name]
     corrupted = corrupt(drive)
     assert [(f.code, f.channel) for f in found_in(corrupted)] == [(code, channel)]
@@ -251,7 +251,7 @@ def test_what_is_missing_stays_missing(drive: Recording, corrupt: Spoil, words: 
     assert finding.code == "gaps"
     assert words in finding.what
     assert finding.repair is None
-    assert "nobody knows" in finding.fix
+    assert "unknown" in finding.fix
     assert repair(corrupted) == (corrupted, [])
 
 
@@ -260,7 +260,7 @@ def test_a_channel_that_ends_early_has_no_drift_and_no_jump(drive: Recording) ->
         assert found_in(rows(name, lambda t: t < 55.0)(drive)) == []
 
 
-def test_irregular_times_without_a_clock_are_not_mended(drive: Recording) -> None:
+def test_irregular_times_without_a_clock_are_not_repaired(drive: Recording) -> None:
     assert drive.motor is not None
     t_ns = START_NS + np.cumsum(np.random.default_rng(0).exponential(0.05, len(drive.motor)) * 1e9).astype(
         int
@@ -270,7 +270,7 @@ def test_irregular_times_without_a_clock_are_not_mended(drive: Recording) -> Non
     assert finding.repair is None
 
 
-def test_other_clocks_of_other_lengths_are_not_mended(drive: Recording) -> None:
+def test_other_clocks_of_other_lengths_are_not_repaired(drive: Recording) -> None:
     assert drive.gnss is not None
     corrupted = late("gnss", 1000.0)(rows("gnss", lambda t: t < 40.0)(drive))
     (finding,) = found_in(corrupted)

@@ -12,8 +12,8 @@ import pytest
 
 from terrafusion.datasets.catalog.catalog import load_catalog
 from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.imu import heading
 from terrafusion.datasets.checks.measures import measure
-from terrafusion.datasets.checks.mounting import heading
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.lag import lag_between
 from terrafusion.datasets.core.recording import Recording
@@ -115,8 +115,8 @@ def physics(recording: Recording) -> dict[str, bool]:
     if recording.wheels is not None:
         t = recording.truth.t_ns[9:-9]
         rolled = np.interp(t, recording.wheels.t_ns, recording.wheels.speed[:, 0])
-        told = heading(CheckContext(recording, None))
-        angle = told.angle if told is not None and told.angle is not None else np.pi
+        found = heading(CheckContext(recording, None))
+        angle = found.angle if found is not None and found.angle is not None else np.pi
         checks["imu forward"] = abs(angle) < np.radians(15.0)
         checks["wheel sign"] = bool(np.corrcoef(rolled, ahead)[0, 1] > 0.5)
         checks["wheel scale"] = 0.94 < measures.path_m["truth"] / measures.path_m["wheels"] < 1.0

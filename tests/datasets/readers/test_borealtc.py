@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.imu import heading
 from terrafusion.datasets.checks.measures import measure
-from terrafusion.datasets.checks.mounting import heading
 from terrafusion.datasets.core.channels import TERRAINS
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.differences import differences

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import DATA_VARIABLE, CatalogFile, data_folders, load_catalog
 from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.imu import heading
 from terrafusion.datasets.checks.measures import Measures, measure
-from terrafusion.datasets.checks.mounting import heading
+from terrafusion.datasets.checks.motion import yaw_angles
 from terrafusion.datasets.checks.path import dead_reckoned
-from terrafusion.datasets.checks.yaw_signals import accounts
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.lag import lag_between
 from terrafusion.datasets.core.recording import Recording
@@ -234,7 +234,7 @@ def _turn_r(one: str, other: str, *, logged: bool = False) -> Callable[[Drives],
 def _rates_in_common(recordings: Sequence[Recording], one: str, other: str) -> tuple[Array, Array]:
     pairs = []
     for recording in recordings:
-        known = accounts(CheckContext(recording, None))
+        known = yaw_angles(CheckContext(recording, None))
         if one in known and other in known:
             a, b = known[one], known[other]
             grid = np.arange(max(a.t_s[0], b.t_s[0]), min(a.t_s[-1], b.t_s[-1]), TURN_S)
@@ -289,12 +289,12 @@ def _reckoned_rms(*, gyro: bool) -> Callable[[Drives], float | None]:
     def rms(drives: Drives) -> float | None:
         recording = drives.opened[0]
         gnss, track = recording.gnss, recording.overrides.track_m
-        known = accounts(CheckContext(recording, None))
+        known = yaw_angles(CheckContext(recording, None))
         if gnss is None or track is None or "wheels" not in known:
             return None
         if not gyro and recording.imu is not None:
             wheels = known["wheels"]
-            rate = np.gradient(wheels.angle / track, wheels.t_s)
+            rate = np.gradient(wheels.value / track, wheels.t_s)
             turned = recording.imu.gyro_radps.copy()
             turned[:, 2] = np.interp((recording.imu.t_ns - recording.start_ns) * 1e-9, wheels.t_s, rate)
             recording = _with_gyro(recording, turned)
