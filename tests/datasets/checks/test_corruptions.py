@@ -1,4 +1,4 @@
-"""One good log, corrupted in many ways: each is named by its finding, no other error is, and it is repaired."""
+"""One good log, corrupted in many ways: each fault is found under its code, no other error, and is repaired."""
 
 from __future__ import annotations
 
