@@ -1,4 +1,4 @@
-"""Barometer and magnetometer of one estimator; where no samples of theirs come, nothing is done."""
+"""Aiding sensors of an estimator, barometer and magnetometer; without samples they do nothing."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 
 
 class AidingSensors:
-    """Both sensors.
+    """Barometer and magnetometer.
 
     Args:
         rig: the robot; its sensor specifications may lack either.
@@ -38,32 +38,32 @@ class AidingSensors:
         self._antenna_m = np.array(rig.sensors.gnss.antenna_m)
 
     def update(self, chain: Chain, newest_ns: int, before: Array, after: Array, gnss: GnssUpdater) -> bool:
-        """Use what has come up to the newest keyframe; True where factors were added to it.
+        """Use the samples up to the newest keyframe; True where factors were added to it.
 
-        `before` and `after` (n, n) are its covariance without and with its fixes; the IMU has come to
-        `newest_ns`.
+        `before` and `after` (n, n) are its covariance without and with its fixes; the newest IMU sample is
+        at `newest_ns`.
         """
         t_ns = chain.nodes[-1].t_ns
         if gnss.local:
-            self.heading.forget_north()
-        placed = gnss.alignment is not None
-        height = self.height.active and self.height.update(chain, t_ns, newest_ns, before, after, placed)
-        turned = gnss.turned + placed
+            self.heading.forget_declination()
+        aligned = gnss.alignment is not None
+        height = self.height.active and self.height.update(chain, t_ns, newest_ns, before, after, aligned)
+        turned = gnss.turned + aligned
         heading = self.heading.active and self.heading.update(chain, t_ns, newest_ns, before, after, turned)
         return height or heading
 
     def start(self, level: Start, imu: ImuStream, fixes: Sequence[GnssFix]) -> KnownStart | None:
-        """Where a robot at rest stands and where it heads, once a fix and the field have told it."""
+        """Position and heading of a robot at rest, once there are a fix and a field."""
         self.height.forget(imu.t_ns[0])
         self.heading.forget(imu.t_ns[0])
         early = [f for f in fixes if level.t_ns <= f.t_ns <= level.t_ns + WINDOW_NS]
         if not early or not self.heading.ready:
             return None
         tilt = float(np.hypot(level.level_sigma_rad, self._accel_tilt_rad))
-        told = self.heading.stationary_heading(level, tilt)
-        if told is None:
+        heading = self.heading.stationary_heading(level, tilt)
+        if heading is None:
             return None
-        yaw, sigma = told
+        yaw, sigma = heading
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, yaw).matrix()
         best = min(early, key=lambda fix: float(fix.sigma_m[0]))
         position = np.nan_to_num(best.enu_m) - R @ self._antenna_m
@@ -71,5 +71,5 @@ class AidingSensors:
 
     def notes(self) -> tuple[str, ...]:
         """What was made of the samples, in sentences."""
-        told = self.height.note()
-        return (*([told] if told else []), *self.heading.notes())
+        height = self.height.note()
+        return (*([height] if height else []), *self.heading.notes())

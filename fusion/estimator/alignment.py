@@ -25,9 +25,9 @@ STILL_RADPS = 0.05
 WINDOW_NS = 1_000_000_000
 LEVEL_SIGMA_STILL_RAD, LEVEL_SIGMA_MOVING_RAD = 0.02, 0.05
 LEAST_RATIO = 0.3
-"""Driven over dead-reckoned distance below which the robot is taken to be stuck: no heading comes of that."""
+"""Driven over dead-reckoned distance below which the robot is stuck and shows no heading."""
 SLIP_SIGMA = 0.05
-"""Wheel speed over ground speed, beyond what the fixes show (assumed): the sigma of a GNSS velocity's use."""
+"""Relative error of wheel speed against GNSS velocity (assumed)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +49,9 @@ class Start:
 def level_start(imu: ImuStream, wheels: WheelStream, t_ns: int) -> Start:
     """Attitude and gyro bias at the start; position zero and yaw zero (a local frame).
 
-    Over the first second at rest the mean specific force is gravity and the
-    mean rate is bias. A robot already moving has no known bias; what its wheels
-    and its turn add to gravity, dv/dt forward and v r to the left, is taken
-    off the mean force first.
+    Over the first second at rest the mean specific force is gravity and the mean rate is bias. For a
+    moving robot the bias is unknown, and the acceleration by its wheels and its turn, dv/dt forward and v
+    r to the left, is subtracted from the mean force.
     """
     gyro, accel = imu.levelled(t_ns, t_ns + WINDOW_NS)
     rolled = wheels.travelled(t_ns, t_ns + WINDOW_NS)
@@ -120,7 +119,7 @@ def initial_state(
 
 @dataclass(frozen=True, eq=False)
 class KnownStart:
-    """A position (3,) and heading, ENU, that are known beforehand, with their 1 sigmas."""
+    """A known position (3,) and heading, ENU, with 1 sigmas."""
 
     position_m: Array
     yaw_rad: float
@@ -128,7 +127,7 @@ class KnownStart:
     yaw_sigma_rad: float
 
     def at(self, level: Start) -> Start:
-        """The start there; attitude, speed and bias are those of `level`."""
+        """The start there, with attitude, speed and bias of `level`."""
         return dataclasses.replace(level, **vars(self))
 
 
@@ -158,8 +157,8 @@ def heading_from_motion(
 ) -> Start | None:
     """Turn and shift dead reckoning onto the fixes, and its speed onto their velocities, by least squares.
 
-    Positions and velocities show the same turn, so their sums add up (see `planar_rotation`). None while
-    fewer than three fixes are inside, or while the fixes hardly move though the wheels do.
+    Positions and velocities show the same turn, so their sums add up (see `planar_rotation`). None with
+    fewer than three fixes, or while the fixes hardly move though the wheels do.
     """
     times = np.array([t for t in wheels.t_ns if t >= level.t_ns], dtype=np.int64)
     inside = [f for f in fixes if len(times) and level.t_ns <= f.t_ns <= min(times[-1], imu.t_ns[-1])]
@@ -199,7 +198,7 @@ def heading_from_motion(
 def _dead_reckon(imu: ImuStream, wheels: WheelStream, level: Start):  # type: ignore[no-untyped-def]
     """Yaw (rad) and complex horizontal position (m) over seconds from the start, as functions.
 
-    The ground is taken for a plane: the path in it is laid flat by the attitude of the start.
+    The ground is taken for a plane: the path in it is projected by the attitude of the start.
     """
     t, gyro, _ = imu.window(level.t_ns, imu.t_ns[-1] + 1)
     bias = level.gyro_bias_radps[2] if level.gyro_bias_radps is not None else 0.0

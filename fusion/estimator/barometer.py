@@ -1,9 +1,9 @@
 """Barometer: height differences, with a bias that follows the weather.
 
-The pressure becomes a height in the standard atmosphere; the difference to the height about the datum is a
-bias that is not known at the start and wanders with the weather, and a share of every climb, since the air is
-not as warm as the standard's. So a barometer tells nothing of the height itself: it holds the one
-that GNSS has told, or the start's where there is none. The samples of a second count as one.
+The pressure becomes a height in the standard atmosphere. Its difference to the estimated height is a bias
+that is unknown at the start and drifts with the weather, and a share of every climb, since the air is not
+as warm as the standard's. So a barometer does not measure height: it holds that of GNSS, or of the start.
+The samples of a second count as one.
 """
 
 from __future__ import annotations
@@ -19,23 +19,23 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa
 from terrafusion.datasets.core.sensors import BarometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
-from terrafusion.fusion.estimator.slow_bias import SlowBias, split
+from terrafusion.fusion.estimator.slow_bias import SlowBias, split_by_time
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, KeyState
 
 Array = NDArray[np.float64]
 
 GENERIC = BarometerSpec(rate_hz=10.0, noise_pa=10.0, walk_paps_sqrthz=0.5, position_m=(0.0, 0.0, 0.0))
-"""For a vehicle whose file tells nothing of its barometer (assumed: a MEMS sensor outdoors)."""
+"""For a vehicle whose file has no barometer (assumed: a MEMS sensor outdoors)."""
 POSSIBLE_PA = (30e3, 110e3)
-EVERY_NS = 1_000_000_000
-OLDEST_NS = 3_000_000_000
+INTERVAL_NS = 1_000_000_000
+MOST_AGE_NS = 3_000_000_000
 UNKNOWN_M = 1e4
 SCALE_SIGMA = 0.05
-"""Height difference, error over truth: air within 15 K of the standard's (assumed)."""
+"""Relative error of a height difference: air within 15 K of the standard's (assumed)."""
 GATE_SIGMA = 4.0
 PATIENCE = 10
-"""Refused seconds in a row after which the pressure is taken to have jumped: a door, a hatch, a gust."""
+"""Consecutive rejected seconds after which the pressure has jumped: a door, a hatch, a gust."""
 FREE_M = 1e5
 
 
@@ -64,13 +64,13 @@ class BarometerAiding:
         self._due_ns: int | None = None
         self._last_ns = 0
         self._datum_m = 0.0
-        self._placed = False
+        self._aligned = False
         self._slope = 0.0
-        self._row = 0
+        self._refused_in_a_row = 0
         self._on_innovation = report
 
     def add(self, t_ns: int, pressure_pa: float) -> None:
-        """One pressure; what is none of the atmosphere is refused."""
+        """One pressure; impossible values are rejected."""
         if POSSIBLE_PA[0] <= pressure_pa <= POSSIBLE_PA[1]:
             self._samples.append((int(t_ns), float(pressure_pa)))
         else:
@@ -86,42 +86,42 @@ class BarometerAiding:
         return bool(self._samples) or self.bias is not None or self._mean[1] > 0.0
 
     def update(
-        self, chain: Chain, t_ns: int, newest_ns: int, before: Array, after: Array, placed: bool = False
+        self, chain: Chain, t_ns: int, newest_ns: int, before: Array, after: Array, aligned: bool = False
     ) -> bool:
-        """Use what has come up to the newest keyframe; True where a factor was added.
+        """Use the samples up to the newest keyframe; True where a factor was added.
 
         `before` and `after` (n, n) are the newest keyframe's covariance, without and with the other
-        measurements of this keyframe; `placed` tells that a local path was laid onto the map, heights too.
-        The IMU has come to `newest_ns`.
+        measurements of this keyframe; `aligned`: a local path was aligned with the map, heights too. The
+        newest IMU sample is at `newest_ns`.
         """
-        if placed and not self._placed:
-            self._placed, self._mean, self._due_ns = True, [0.0, 0.0], None
+        if aligned and not self._aligned:
+            self._aligned, self._mean, self._due_ns = True, [0.0, 0.0], None
             if self.bias is not None:
                 self.bias.forget(np.array([UNKNOWN_M**2, 0.0]))
         key = chain.state(chain.last)
         lever = np.array(self.spec.position_m)
-        row = height_jacobian(key.pose.rotation().matrix(), lever)
-        was, now = (float(row @ P[POSE, POSE] @ row) for P in (before, after))
+        jacobian = height_jacobian(key.pose.rotation().matrix(), lever)
+        was, now = (float(jacobian @ P[POSE, POSE] @ jacobian) for P in (before, after))
         if self.bias is not None:
-            self.bias.told(was, now)
+            self.bias.state_updated(was, now)
         height = float((key.pose.translation() + key.pose.rotation().matrix() @ lever)[2])
         self._gather(t_ns, newest_ns, height, key)
         if self._due_ns is None:
-            self._due_ns = t_ns + EVERY_NS
+            self._due_ns = t_ns + INTERVAL_NS
         if t_ns < self._due_ns or not self._mean[1]:
             return False
-        self._due_ns = t_ns + EVERY_NS
+        self._due_ns = t_ns + INTERVAL_NS
         return self._measure(chain, t_ns, height, now)
 
     def _gather(self, t_ns: int, newest_ns: int, height_m: float, key: KeyState) -> None:
-        """Sums of pressure height less own height over the samples up to now."""
-        due, self._samples, impossible = split(self._samples, t_ns, newest_ns)
+        """Sums of pressure height less estimated height over the samples up to now."""
+        due, self._samples, impossible = split_by_time(self._samples, t_ns, newest_ns)
         self.refused += impossible
         for at_ns, pressure in due:
-            if t_ns - at_ns > OLDEST_NS:
+            if t_ns - at_ns > MOST_AGE_NS:
                 continue
-            own = height_m - float(key.velocity[2]) * (t_ns - at_ns) * 1e-9
-            self._mean[0] += float(height_of(pressure)) - own
+            relative = height_m - float(key.velocity[2]) * (t_ns - at_ns) * 1e-9
+            self._mean[0] += float(height_of(pressure)) - relative
             self._mean[1] += 1.0
             self._slope = abs(float(height_per_pa(pressure)))
 
@@ -145,27 +145,27 @@ class BarometerAiding:
         self._on_innovation(Innovation(t_ns, "barometer", np.array([innovation]), nis, 1, accepted))
         if not accepted:
             return self._refuse()
-        self._row = 0
+        self._refused_in_a_row = 0
         self.used += 1
-        own = self.bias.measure(innovation, H, variance, noise)
-        if own is None:
+        relative = self.bias.measure(innovation, H, variance, noise)
+        if relative is None:
             return False
         lever = np.array(self.spec.position_m)
-        factor = height_factor(chain.last, height_m + own.innovation, own.sigma, lever)
+        factor = height_factor(chain.last, height_m + relative.innovation, relative.sigma, lever)
         chain.add(chain.last, factor, "X")
         return True
 
     def _refuse(self) -> bool:
         self.refused += 1
-        self._row += 1
-        if self._row >= PATIENCE and self.bias is not None:
+        self._refused_in_a_row += 1
+        if self._refused_in_a_row >= PATIENCE and self.bias is not None:
             self.bias.forget(np.array([UNKNOWN_M**2, 0.0]))
-            self._row = 0
+            self._refused_in_a_row = 0
             self.jumps += 1
         return False
 
     def note(self) -> str | None:
-        """What was made of the pressures, in a sentence."""
+        """How many pressures were used and rejected, in a sentence."""
         if not self.used and not self.refused:
             return None
         jumps = f", taken to have jumped {self.jumps} times" if self.jumps else ""

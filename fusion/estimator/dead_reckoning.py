@@ -1,9 +1,8 @@
-"""Dead reckoning beside the fixes: a second opinion on the heading, and on what a receiver claims.
+"""Dead reckoning beside the filter: an independent check of heading and of the receiver's reported sigma.
 
-The filter believes its own past, so it is slow to see that its heading was wrong, or that a receiver
-lies. Wheels and gyro alone, from any start, trace the shape of the path; held against the fixes of
-the last half minute it tells how far the shape is turned, and how much the fixes scatter about it.
-Neither depends on what the filter made of those fixes.
+The filter is slow to see that its own heading was wrong or that a receiver is optimistic. Wheels and gyro
+alone trace the shape of the path; aligned with the fixes of the last half minute it shows the heading
+error, and how much the fixes scatter about it. Neither depends on what the filter made of those fixes.
 """
 
 from __future__ import annotations
@@ -24,52 +23,50 @@ Array = NDArray[np.float64]
 
 KEPT_S = 30.0
 SCATTER_FIXES = 21
-"""Fixes over which a receiver's scatter is judged; the median bears ten wild ones."""
+"""Fixes over which the scatter is taken; the median bears ten outliers."""
 RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
 """Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
-LEAST_NEWS, MOST_NEWS = 8.0, 300.0
-"""Second differences from which on the share of a fix that is new is known, and how many are remembered
-(assumed)."""
-WILD = 3.0
-"""A second difference whose square is more than so many times what the claims would make counts as so much
-(assumed)."""
+LEAST_DIFFERENCES, MOST_DIFFERENCES = 8.0, 300.0
+"""Second differences from which the white share is known, and how many are remembered (assumed)."""
+CENSORED = 3.0
+"""Squared second differences over their expectation are censored here (assumed)."""
 SLIP_CHANGE = 0.1
-"""How far slip may change from fix to fix and so bend the dead-reckoned path (assumed)."""
+"""Change of slip from fix to fix, which bends the dead-reckoned path (assumed)."""
 LEAST_RATIO, MOST_RATIO = 0.3, 1.7
-"""Driven over dead-reckoned distance between which a path says something about heading."""
+"""Range of driven over dead-reckoned distance in which a path shows the heading."""
 TURN_SIGMA_RAD = 0.15
 LEAST_TURN_RAD = 0.35
 MOST_JERK_MPS3, SMOOTH_SIGMA = 10.0, 3.0
-"""A wheeled robot changes its acceleration no faster than by 2 m/s2 in a fifth of a second (assumed)."""
+"""A wheeled robot changes its acceleration by at most 2 m/s2 in 0.2 s (assumed)."""
 CONFIRMED = 3
-"""Fixes in a row that must show the same wrong heading."""
+"""Consecutive fixes that must show the same heading error."""
 
 
 @dataclass(frozen=True)
 class PathFit:
-    """How the dead-reckoned path lies among the fixes.
+    """The dead-reckoned path aligned with the fixes.
 
     Attributes:
         turn: from the path to the fixes; its size is driven over dead-reckoned distance.
         sigma_rad: 1 sigma of its angle.
-        middle, fix_middle: the middles of both, which are laid onto each other.
-        rest_m: median distance that is left.
+        middle, fix_middle: means of path and fixes, which are laid onto each other.
+        residual_m: median distance that is left.
     """
 
     turn: complex
     sigma_rad: float
     middle: complex
     fix_middle: complex
-    rest_m: float
+    residual_m: float
 
     def at(self, z: complex) -> complex:
-        """Where a point of the path lies on the map."""
+        """A point of the path on the map."""
         return self.fix_middle + self.turn * (z - self.middle)
 
 
 @dataclass(frozen=True, eq=False)
 class FixPair:
-    """A fix (east + i north, m) with its claimed sigma, and the dead-reckoned antenna `z` (m) at its time."""
+    """A fix (east + i north, m) with its reported sigma, and the dead-reckoned antenna `z` (m) at its time."""
 
     t_ns: int
     z: complex
@@ -87,11 +84,11 @@ class DeadReckoning:
         self._yaw: list[float] = []
         self.pairs: list[FixPair] = []
         self._yaw_chain = 0.0
-        self._turned = 0
-        self._told = np.zeros(2)
+        self._confirmed = 0
+        self._forgotten = np.zeros(2)
 
     def step(self, chain: Chain) -> None:
-        """Carry the path to the newest keyframe, by its wheels (or its speed, where they are refused)."""
+        """Extend the path to the newest keyframe by its wheels, or by its velocity where they are rejected."""
         node, state = chain.nodes[-1], chain.state(chain.last)
         R = state.pose.rotation().matrix()
         self._yaw_chain = float(np.arctan2(R[1, 0], R[0, 0]))
@@ -116,12 +113,12 @@ class DeadReckoning:
             del self._t_ns[:old], self._z[:old], self._yaw[:old]
             kept = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
             # The differences that go with them, which their two neighbours complete.
-            self._told += self._tell(self.pairs[: len(self.pairs) - len(kept) + 2])
-            self._told *= min(MOST_NEWS / max(self._told[1], 1.0), 1.0)
+            self._forgotten += self._difference_sums(self.pairs[: len(self.pairs) - len(kept) + 2])
+            self._forgotten *= min(MOST_DIFFERENCES / max(self._forgotten[1], 1.0), 1.0)
             self.pairs = kept
 
     def add(self, fix: GnssFix) -> None:
-        """Set a fix beside the path, in its place in time."""
+        """Pair a fix with the path at its time."""
         if len(self._t_ns) < 2 or fix.t_ns < self._t_ns[0]:
             return
         i = min(bisect.bisect_left(self._t_ns, fix.t_ns, 1), len(self._t_ns) - 1)
@@ -134,55 +131,54 @@ class DeadReckoning:
         bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
 
     def scatter(self) -> float:
-        """How many times what they claim the last fixes scatter about the path; NaN if too few tell.
+        """Scatter of the last fixes about the path over their reported sigma; NaN with too few.
 
-        From second differences of fix minus path: neither an offset, a slow drift, a heading error nor
-        steady slip of the estimate shows in them, white noise of variance s^2 does with 6 s^2.
+        From second differences of fix minus path: an offset, a slow drift, a heading error or steady slip
+        do not show in them, white noise of variance s^2 does with 6 s^2.
         """
         recent = self.pairs[-SCATTER_FIXES:]
         if len(recent) < 8:
             return math.nan
-        seen, bend, claimed = self._second_differences(recent)
-        if len(seen) < 6:
+        squares, bend, reported = self._second_differences(recent)
+        if len(squares) < 6:
             return math.nan
-        return math.sqrt(_median(np.maximum(2.0 * seen / RAYLEIGH_MEDIAN - bend, 0.0) / claimed))
+        return math.sqrt(_median(np.maximum(2.0 * squares / RAYLEIGH_MEDIAN - bend, 0.0) / reported))
 
-    def news(self) -> float:
-        """Variance that is new at every fix, over what the fixes claim; NaN if too few tell.
+    def white_share(self) -> float:
+        """Variance that is white over the reported one; NaN with too few fixes.
 
-        The mean of the second differences (`scatter`), of which many more are remembered. Squares of white
-        noise are exponential, and those beyond `WILD` are censored there, so that wild fixes say no more than
-        others (Epstein and Sobel 1953, J. Am. Stat. Assoc. 48). Where slip may have bent the path by more
-        than the fixes claim, they tell nothing of the receiver.
+        The mean of the second differences, of which many are remembered. Squares of white noise are
+        exponential, and those beyond `CENSORED` are censored there (Epstein and Sobel 1953, J. Am. Stat.
+        Assoc. 48). Where slip may have bent the path by more than the reported sigma, a difference is left
+        out.
         """
-        total, counted = self._told + self._tell(self.pairs)
-        return float(total / counted) if counted >= LEAST_NEWS else math.nan
+        total, counted = self._forgotten + self._difference_sums(self.pairs)
+        return float(total / counted) if counted >= LEAST_DIFFERENCES else math.nan
 
-    def _tell(self, pairs: list[FixPair]) -> Array:
-        """Sum and number (2,) of second differences over the claims, for `news`."""
+    def _difference_sums(self, pairs: list[FixPair]) -> Array:
+        """Sum and number (2,) of squared second differences over the reported variance."""
         if len(pairs) < 3:
             return np.zeros(2)
-        seen, bend, claimed = self._second_differences(pairs)
-        share = (seen / claimed)[bend < claimed]
-        return np.array([np.minimum(share, WILD).sum(), np.count_nonzero(share < WILD)])
+        squares, bend, reported = self._second_differences(pairs)
+        share = (squares / reported)[bend < reported]
+        return np.array([np.minimum(share, CENSORED).sum(), np.count_nonzero(share < CENSORED)])
 
     def _second_differences(self, pairs: list[FixPair]) -> tuple[Array, Array, Array]:
         """Squares (m2, each axis) of second differences of fix minus path where fixes come evenly, what slip
-        may add to them, and what the claims would."""
+        may add to them, and their expectation by the reported sigma.
+        """
         z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
         gap = np.diff(np.array([p.t_ns - pairs[0].t_ns for p in pairs]) * 1e-9)
         even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
-        rest = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
-        seen = 0.5 * np.abs(rest[2:] - 2.0 * rest[1:-1] + rest[:-2]) ** 2
+        left_m = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
+        squares = 0.5 * np.abs(left_m[2:] - 2.0 * left_m[1:-1] + left_m[:-2]) ** 2
         bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
-        claimed = 6.0 * np.array([p.sigma_m for p in pairs])[1:-1] ** 2
-        return seen[even], bend[even], claimed[even]
+        reported = 6.0 * np.array([p.sigma_m for p in pairs])[1:-1] ** 2
+        return squares[even], bend[even], reported[even]
 
     def smooth_at(self, t_ns: int) -> bool:
-        """Whether the fix of `t_ns` lies where the three before it lead, as they claim; False with fewer.
-
-        A parabola through the three is carried on; a robot leaves it by no more than `MOST_JERK_MPS3` makes.
-        Fixes of a receiver that scatters beyond its claims do not follow each other so.
+        """Whether the fix at `t_ns` continues the parabola through the three before it, within reported
+        sigmas and `MOST_JERK_MPS3`; False with fewer.
         """
         last = bisect.bisect_right(self.pairs, t_ns, key=lambda p: p.t_ns)
         recent = self.pairs[max(last - 4, 0) : last]
@@ -197,20 +193,20 @@ class DeadReckoning:
             (t - a) * (t - b) / ((c - a) * (c - b)),
         )
         led = sum(w * p.fix for w, p in zip(weights, recent, strict=False))
-        claimed = [w * p.sigma_m for w, p in zip((*weights, 1.0), recent, strict=True)]
+        reported = [w * p.sigma_m for w, p in zip((*weights, 1.0), recent, strict=True)]
         jerk = MOST_JERK_MPS3 / 6.0 * (t - a) * (t - b) * (t - c)
-        return abs(recent[3].fix - led) <= SMOOTH_SIGMA * math.hypot(*claimed) + jerk
+        return abs(recent[3].fix - led) <= SMOOTH_SIGMA * math.hypot(*reported) + jerk
 
-    def wrong_by(self, yaw_sigma_rad: float, scale: float) -> float | None:
-        """Angle by which the filter's heading must turn to agree with the motion, once that is sure."""
+    def heading_correction(self, yaw_sigma_rad: float, scale: float) -> float | None:
+        """Angle by which the filter's heading must turn to agree with the motion, once confirmed; else None."""
         turn = self._heading_error(yaw_sigma_rad, scale)
-        self._turned = self._turned + 1 if turn is not None else 0
-        return turn if self._turned >= CONFIRMED else None
+        self._confirmed = self._confirmed + 1 if turn is not None else 0
+        return turn if self._confirmed >= CONFIRMED else None
 
     def restart(self) -> None:
-        """Forget the fixes seen so far: the filter has been set right."""
+        """Forget the fixes: the filter has been corrected."""
         self.pairs.clear()
-        self._turned = 0
+        self._confirmed = 0
 
     def _heading_error(self, yaw_sigma_rad: float, scale: float) -> float | None:
         fit = self.fit(scale, TURN_SIGMA_RAD)
@@ -229,27 +225,28 @@ class DeadReckoning:
         return self._z[-1] + self._lever * cmath.exp(1j * self._yaw[-1])
 
     def fit(self, scale: float, yaw_sigma_rad: float) -> PathFit | None:
-        """The path laid onto the fixes, whose claims count `scale` times; None until its turn is known to
-        `yaw_sigma_rad`."""
+        """The path aligned with the fixes, their sigmas times `scale`; None until its turn is known to
+        `yaw_sigma_rad`.
+        """
         if len(self.pairs) < 5:
             return None
         z, fix = np.array([p.z for p in self.pairs]), np.array([p.fix for p in self.pairs])
         weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in self.pairs])
-        keep = np.ones(len(z), dtype=bool)
+        inlier = np.ones(len(z), dtype=bool)
         for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
-            turn, information = planar_rotation(z[keep], fix[keep], weight[keep])
+            turn, information = planar_rotation(z[inlier], fix[inlier], weight[inlier])
             if information <= 0.0:
                 return None
             ratio = abs(turn) / information
-            middle, fix_middle = z[keep].mean(), fix[keep].mean()
-            rest = np.abs((fix - fix_middle) - turn / information * (z - middle))
-            left = _median(rest)
-            keep = rest <= 5.0 * left + 1e-6
-            if np.count_nonzero(keep) < 5:
+            middle, fix_middle = z[inlier].mean(), fix[inlier].mean()
+            left_m = np.abs((fix - fix_middle) - turn / information * (z - middle))
+            left = _median(left_m)
+            inlier = left_m <= 5.0 * left + 1e-6
+            if np.count_nonzero(inlier) < 5:
                 return None
-        kept = z[keep]
+        kept = z[inlier]
         extent = float(np.linalg.norm(kept - kept.mean())) / math.sqrt(len(kept))
-        if extent == 0.0:  # all that is left was seen where the robot stood
+        if extent == 0.0:  # all that is left was squares where the robot stood
             return None
         sigma = 1.0 / (max(ratio, 1e-6) * math.sqrt(information)) + 0.5 * left / extent
         if sigma > yaw_sigma_rad or not LEAST_RATIO < ratio < MOST_RATIO:
@@ -258,5 +255,5 @@ class DeadReckoning:
 
 
 def _median(values: Array) -> float:
-    """The median, of an even number the upper of the two in the middle; a tenth of `np.median`'s time."""
+    """Upper median; a tenth of `np.median`'s time."""
     return float(np.sort(values)[len(values) // 2])

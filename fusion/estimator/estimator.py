@@ -50,9 +50,8 @@ from terrafusion.fusion.estimator.stationarity import (
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import bridge, wheel_increment
+from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, wheel_increment
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
-from terrafusion.fusion.graph.link import carried, imu_factor, mean_rates
 from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
@@ -257,7 +256,7 @@ class Estimator:
             self._given = self.aids.start(self._level, self.imu, self.gnss.waiting)
         if self._given is not None:
             self._begin(self._given.at(self._level))
-        elif self.gnss.waiting and self.gnss.news():
+        elif self.gnss.waiting and self.gnss.have_new():
             antenna = np.array(self.config.rig.sensors.gnss.antenna_m)
             start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
             if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:

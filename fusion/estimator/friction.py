@@ -23,8 +23,8 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.coulomb import skid_motion
+from terrafusion.fusion.graph.factors import imu_factor
 from terrafusion.fusion.graph.key_state import ICR_X, SIDE_SLIP, VELOCITY, KeyState
-from terrafusion.fusion.graph.link import imu_factor
 from terrafusion.fusion.graph.planar import ACCEL_DENSITY_MPS2
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement

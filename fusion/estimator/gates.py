@@ -1,4 +1,4 @@
-"""Tests that keep a wrong measurement out without locking good ones out."""
+"""Gates: tests that keep wrong measurements out without locking good ones out."""
 
 from __future__ import annotations
 
@@ -17,17 +17,15 @@ from terrafusion.fusion.noise.policy import SensorNoise
 Array = NDArray[np.float64]
 
 FAULT = 3.0
-"""An increment of the wheels that is so many limits off is no measurement at all (a counter that jumps)."""
+"""A wheel increment this many limits off is no measurement at all (a counter that jumps)."""
 JUMP_MPS2 = 5.0
-"""Wheels that change their speed by so much more than the robot (assumed): a jump of 5 cm in a keyframe of
-0.1 s. Motors ramp theirs by 1 to 3."""
+"""Change of wheel speed beyond the robot's (assumed): 5 cm in a keyframe of 0.1 s. Motors ramp by 1 to 3."""
 JUMP_LASTS = 2
-"""A jump takes so many keyframes at most, where it falls between them; wheels that keep their new speed for
-longer have it."""
+"""Keyframes a jump takes at most; wheels that keep their new speed for longer have it."""
 
 
 class GateDecision(Enum):
-    """What a gate says of a fix."""
+    """Decision of a gate on a fix."""
 
     ACCEPT = "accept"
     REJECT = "reject"
@@ -38,16 +36,15 @@ class GateDecision(Enum):
 class GnssGate:
     """Chi-square test of a fix against its prediction.
 
-    When enough rejected fixes in a row agree with each other the estimate, not
-    GNSS, is taken to be wrong: `test` answers REACQUIRE. They agree when they lie on
-    a line over time, since an estimate that is wrong moves on, too. Whatever was
-    rejected before, `limit` fixes in a row are the most that can be kept out.
+    When enough consecutive rejected fixes agree with each other the estimate, not GNSS, is taken to be
+    wrong: `test` answers REACQUIRE. They agree when they lie on a line over time, since a wrong estimate
+    moves on, too. After `limit` rejected fixes the next one is used in any case.
 
     Attributes:
         threshold: chi-square quantile of the innovations tested.
-        patience: rejected fixes in a row that must agree with each other.
+        patience: consecutive rejected fixes that must agree with each other.
         agreement_sigma: how well they must agree, in their own sigmas.
-        limit: rejected fixes in a row after which the next is let in, whether they agree or not.
+        limit: consecutive rejected fixes after which the next is used, whether they agree or not.
     """
 
     threshold: float
@@ -57,7 +54,7 @@ class GnssGate:
     rejected: list[tuple[Array, float]] = field(default_factory=list)
 
     def test(self, innovation_m: Array, covariance_m2: Array) -> tuple[GateDecision, float]:
-        """What to do with the fix, and the normalised innovation squared.
+        """Decision on the fix, and the normalised innovation squared.
 
         `innovation_m` (d,) is fix minus prediction, `covariance_m2` (d, d) of it.
         """
@@ -85,22 +82,20 @@ class GnssGate:
 class WheelGate:
     """Test of a wheel increment against the IMU's prediction.
 
-    A burst of slip or a jammed wheel shows as an increment the IMU does not confirm. It counts less
-    (Huber 1964, Ann. Math. Stat. 35(1): what is used must not hang by a hair on what else is known), far
-    beyond the limit not at all; but for at most `patience` keyframes in a row: the IMU alone must not judge
-    for longer than it can.
+    A burst of slip or a jammed wheel shows as an increment that the IMU does not confirm. Beyond the limit
+    it counts less (Huber 1964, Ann. Math. Stat. 35(1)), far beyond not at all; but for at most `patience`
+    consecutive keyframes, as the IMU drifts.
 
-    What does not count at all, because it is so far off or comes so abruptly, is a fault for now, and says
-    nothing of slip either: wheels that change their speed make slip new (`slow_states.step`), and with a
-    new slip the next increments would fit, whatever they say. The first that is believed again tells by how
-    much the wheels have changed their speed since before: not at all where a counter jumped, by all of it
-    where they broke loose.
+    An increment that is far off or abrupt is a fault and says nothing of slip either: a change of wheel
+    speed makes slip new (`slow_states.step`), and with new slip any following increment would fit. The
+    first one believed after a fault has the change of speed since before it: none where a counter jumped,
+    all of it where the wheels broke loose.
 
     Attributes:
         limit_sigma: normalised innovation up to which an increment is believed.
-        patience: keyframes in a row in which an increment may count less.
+        patience: consecutive keyframes in which an increment may count less.
         faulty: the increment just tested is a fault.
-        last_mps: speeds of wheels and robot in the last increment that was none.
+        last_mps: speeds of wheels and robot in the last increment without fault.
     """
 
     limit_sigma: float
@@ -124,10 +119,10 @@ class WheelGate:
         robot_mps: tuple[float, float],
         dt_s: float,
     ) -> tuple[bool, float]:
-        """Believe it or not, and the normalised innovation squared.
+        """Whether to believe an increment, and the normalised innovation squared.
 
-        `wheels` is the increment, `rejoined`, over `dt_s`, `robot_mps` how fast the robot goes forward by the
-        IMU at its start and end.
+        `wheels` is the increment, `rejoined`, over `dt_s`; `robot_mps` the forward speed by the IMU at its
+        start and end.
         """
         since_mps = self.last_mps[1] if self.faulty and self.last_mps is not None else robot_mps[0]
         left_mps = abs(wheels.speed_change_mps - (robot_mps[1] - since_mps))
@@ -141,7 +136,7 @@ class WheelGate:
         return believed, off**2
 
     def doubt(self, nis: float) -> float:
-        """Factor on the variance of the increment just tested and not believed, from 1 at the limit."""
+        """Factor on the variance of the rejected increment just tested, from 1 at the limit."""
         return np.inf if self.faulty else float(np.sqrt(nis)) / self.limit_sigma
 
 

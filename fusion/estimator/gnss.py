@@ -38,34 +38,33 @@ LARGE_TURN_RAD = 0.05
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
-"""Share of a fix's variance that is new at every fix; the rest drifts slowly. More is taken to be new
-where the fixes scatter more about the dead-reckoned path."""
+"""Share of a fix's variance that is white; the rest drifts slowly. More where fixes scatter more about the
+dead-reckoned path."""
 ALL_NEW = 0.75
-"""A share from which on all is taken to be new: the share heard is off by a tenth or two
-(assumed)."""
-LIE = 2.0
-"""Scatter over claim from which a receiver is not taken at its word; honest ones stay below."""
+"""Estimated share from which all is taken for white: the estimate is off by a tenth or two (assumed)."""
+OPTIMISTIC_SCATTER = 2.0
+"""If the scatter of fixes exceeds this many times the reported sigma, sigma is inflated."""
 OPTIMISM = 3.0
-"""A stand-alone receiver may claim so many times less than its data sheet and drift all the same; one
-that claims even less has fixes of a better class (RTK), which drift in proportion to what they claim."""
+"""A stand-alone receiver may report a sigma so many times below its data sheet and still drift; one that
+reports even less has fixes of a better class (RTK), which drift in proportion to their sigma."""
 LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
-"""Claims of a receiver outside this range are no sigma; that of its class of fix takes their align_to_map."""
+"""Reported sigmas outside this range are replaced by that of the class of fix."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
-"""What is left of the doubt in a heading after it was turned onto the motion (assumed)."""
+"""Heading sigma after the heading was corrected from the motion (assumed)."""
 
 
 class GnssUpdater:
-    """Holds fixes until a keyframe has passed them, tests position and height apart (a wrong
-    height must not cost a good position) and adds their factors.
+    """Holds fixes until a keyframe has passed them, gates position and height separately and adds their
+    factors.
 
     Attributes:
         waiting: fixes not yet used, oldest first.
-        local: the graph was started without GNSS, and no fixes have told yet how it lies on the map.
-        alignment: how they did, once they have; unaligned: how many came until then.
-        rejected, too_late: how many fixes the gate refused, or came after their keyframe was dropped.
-        turned: how often the heading was set right from the motion.
-        scale: how many times more than it claims the receiver is seen to scatter, 1 for an honest one.
-        white: share of a fix's variance that is taken to be new at every fix.
+        local: the graph was started without GNSS and is not yet aligned with the map.
+        alignment: with the map, once known; unaligned: how many fixes came until then.
+        rejected, too_late: how many fixes the gate rejected, or came after their keyframe was dropped.
+        turned: how often the heading was corrected from the motion.
+        scale: scatter of the fixes over their reported sigma, 1 where it is below `OPTIMISTIC_SCATTER`.
+        white: share of a fix's variance taken for white.
         last_used_ns: time of the newest fix in the graph.
     """
 
@@ -109,12 +108,12 @@ class GnssUpdater:
         self._seen = 0
 
     def queue(self, fix: GnssFix) -> None:
-        """Take a fix in; order of arrival need not be order of time."""
+        """Take a fix in, in any order of time."""
         self.waiting.append(fix)
         if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
             self.waiting.sort(key=lambda f: f.t_ns)
 
-    def news(self) -> bool:
+    def have_new(self) -> bool:
         """Whether fixes came since the last call."""
         changed = len(self.waiting) != self._seen
         self._seen = len(self.waiting)
@@ -123,8 +122,8 @@ class GnssUpdater:
     def update(self, chain: Chain, covariance: Array, noise: SensorNoise) -> bool:
         """Use every waiting fix that the newest keyframe has passed; True when a factor was added.
 
-        A fix belongs to the first keyframe after it. `covariance` (dim, dim) is
-        that of the newest keyframe.
+        A fix belongs to the first keyframe after it. `covariance` (dim, dim) is that of the newest
+        keyframe.
         """
         used = False
         self.track.step(chain)
@@ -136,49 +135,48 @@ class GnssUpdater:
             elif self.local:
                 self.unaligned += 1
                 self.track.add(fix)
-                used |= self._place(chain, fix)
+                used |= self._align(chain, fix)
             else:
                 self.track.add(fix)
-                self._update_scale(self.track.scatter(), self.track.news())
+                self._update_scale(self.track.scatter(), self.track.white_share())
                 if self.skid.friction is not None:
                     self.skid.friction.score_fix(fix, self.scale)
                 renewed = self._change_class(chain, k, fix)
                 if renewed or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
                     covariance = chain.covariance_at(k)
-                used |= self._add(chain, k, fix, covariance, noise)
+                used |= self._add_fix(chain, k, fix, covariance, noise)
                 self._unchecked = fix
         if used:
             self.weighting.revisit(chain)
         return used
 
-    def _place(self, chain: Chain, fix: GnssFix) -> bool:
-        """Lay a path that was begun without fixes onto the map; True once they tell how."""
+    def _align(self, chain: Chain, fix: GnssFix) -> bool:
+        """Align a path that was begun without fixes with the map; True once they determine how."""
         self.alignment = align_to_map(chain, self.track, fix, self.antenna_m, self.drift_sigma_m)
         if self.alignment is None:
             return False
         self.local, self.last_used_ns = False, fix.t_ns
         return True
 
-    def _update_scale(self, scatter: float, news: float) -> None:
-        """Take in how the fixes scatter about the path, and how much of that is new at every fix, over what
-        they claim."""
-        self.scale = scatter if scatter > LIE else 1.0
-        self.white = WHITE_SHARE if math.isnan(news) else max(news, WHITE_SHARE)
+    def _update_scale(self, scatter: float, white: float) -> None:
+        """Scatter of the fixes about the path, and its white share, over the reported sigma."""
+        self.scale = scatter if scatter > OPTIMISTIC_SCATTER else 1.0
+        self.white = WHITE_SHARE if math.isnan(white) else max(white, WHITE_SHARE)
         if self.white > ALL_NEW:
             self.white = 1.0
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
-        """Let the drift start anew where the class of fix changes; True when it does.
+        """Restart the drift where the class of fix changes; True when it does.
 
-        A worse class than the data sheet's drifts in proportion to what its first fix claims.
+        A worse class than the data sheet's drifts in proportion to what its first fix reports.
         """
         if fix.t_ns < self._newest_ns or (fix.fix == self._class and self._class_scale):
             return False
         self._newest_ns, first, self._class = fix.t_ns, not self._class_scale, fix.fix
         worse = fix.fix is not None and fix.fix < self._best
-        claimed = float(np.max(fix.sigma_m[:2]))
-        self._class_scale[fix.fix] = max(1.0, claimed / self.sheet_sigma_m) if worse else 1.0
+        reported_m = float(np.max(fix.sigma_m[:2]))
+        self._class_scale[fix.fix] = max(1.0, reported_m / self.sheet_sigma_m) if worse else 1.0
         step = chain.nodes[k - chain.first].markov
         if first or step is None:
             return False
@@ -186,15 +184,14 @@ class GnssUpdater:
         return True
 
     def correct_heading(self, chain: Chain, noise: SensorNoise) -> bool:
-        """Turn the whole window where motion and fixes agree on another heading than the filter's.
-
-        Looks only where fixes have been taken since the last call; True when it turned.
+        """Turn the whole window where motion and fixes agree on another heading than the filter's; True when
+        it turned.
         """
         fix, self._unchecked = self._unchecked, None
         if fix is None:
             return False
         yaw_sigma = float(np.sqrt(chain.covariance()[2, 2]))
-        turn = self.track.wrong_by(yaw_sigma, self.scale)
+        turn = self.track.heading_correction(yaw_sigma, self.scale)
         if turn is None:
             return False
         k = chain.at_or_after(fix.t_ns)
@@ -219,7 +216,7 @@ class GnssUpdater:
         self.turned += 1
         return True
 
-    def _add(
+    def _add_fix(
         self, chain: Chain, k: int, fix: GnssFix, covariance: Array, noise: SensorNoise, again: bool = False
     ) -> bool:
         node, state = chain.nodes[k - chain.first], chain.state(k)
@@ -246,7 +243,7 @@ class GnssUpdater:
         if verdict is GateDecision.REJECT and nis <= self.weighting.passed_nis:
             verdict = GateDecision.ACCEPT
         if verdict is GateDecision.REJECT and not again and self._test_wheels(chain, k, fix, noise):
-            return self._add(chain, k, fix, chain.covariance_at(k), noise, again=True)
+            return self._add_fix(chain, k, fix, chain.covariance_at(k), noise, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not GateDecision.REACQUIRE:
             drift_m2 = (share * self.drift_sigma_m) ** 2
@@ -270,7 +267,7 @@ class GnssUpdater:
         self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
         P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
-        cut = self._prepare(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
+        cut = self._cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
         if (
             not known
@@ -298,7 +295,7 @@ class GnssUpdater:
         return True
 
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
-        """Whether the fixes just refused show that the wheels did not roll where the robot went."""
+        """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""
         refused = [off for off, _ in self.gate.rejected]
         sigma_m = float(np.max(fix.sigma_m[:2]))
         if not self.track.smooth_at(fix.t_ns):
@@ -309,21 +306,21 @@ class GnssUpdater:
         return True
 
     def _drift_share(self, fix: GnssFix, inflation: float) -> float:
-        """How much of the drift state is in this fix: 0 to 1, above 1 for classes worse than the sheet's."""
-        claimed = float(np.max(fix.sigma_m[:2])) * inflation
+        """Factor on the drift state in this fix: 0 to 1, above 1 for classes worse than the data sheet's."""
+        reported_m = float(np.max(fix.sigma_m[:2])) * inflation
         slow = math.sqrt((1.0 - self.white) / (1.0 - WHITE_SHARE))
         scale = self._class_scale.get(fix.fix, 1.0)
-        return slow * min(scale, OPTIMISM * claimed / self.sheet_sigma_m)
+        return slow * min(scale, OPTIMISM * reported_m / self.sheet_sigma_m)
 
     def _white_sigma(self, fix: GnssFix, inflation: float, share: float) -> Array:
-        """1 sigma (3,) of what is new in a fix, beyond the drift that is a state."""
+        """1 sigma (3,) of the white part of a fix."""
         reported = fix.sigma_m * inflation
         drift_m = share * self.drift_sigma_m
         level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, self.white * reported[:2] ** 2))
         return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
 
     @staticmethod
-    def _prepare(
+    def _cut_past(
         chain: Chain,
         k: int,
         covariance: Array,
@@ -334,9 +331,8 @@ class GnssUpdater:
     ) -> bool:
         """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
 
-        A fix after a long outage can turn the heading by more than the window's
-        linearisation bears; applied to its keyframe alone it is a Kalman
-        update, which cannot diverge.
+        A fix after a long outage can turn the heading by more than the window's linearisation bears;
+        applied to its keyframe alone it is a Kalman update, which cannot diverge.
         """
         gain = covariance @ jacobian.T @ np.linalg.inv(S)
         doubt = np.zeros(chain.dim)
@@ -349,7 +345,7 @@ class GnssUpdater:
 
 
 def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
-    """The keyframe at or after a fix, once its stamp is corrected by the delay as far as that is known."""
+    """The keyframe at or after a fix, its stamp corrected by the estimated delay."""
     if chain.dim <= GNSS_DELAY:
         return chain.at_or_after(fix.t_ns)
     delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
@@ -364,11 +360,11 @@ def checked_fix(
     sigma_v_mps: float,
     fix: Fix | int | str | None,
 ) -> GnssFix | None:
-    """A fix as the graph takes it; None where the receiver itself says that it has none.
+    """A fix as the graph takes it; None where the receiver reports that it has none.
 
-    Where the receiver claims no sensible sigma (none, not a number, below 1 mm or above 1 km), that of
-    its class of fix is taken (`ASSUMED_SIGMA_M`; up twice as much). A velocity without a positive sigma
-    is left out, a height without one is free.
+    A sigma that is missing, NaN, below 1 mm or above 1 km is replaced by that of the class of fix
+    (`ASSUMED_SIGMA_M`; up twice as much). A velocity without a positive sigma is left out, a height
+    without one is free.
 
     Raises:
         DataError: no east or north, an unknown class of fix, neither sigma nor class, or a velocity of

@@ -1,14 +1,14 @@
-"""Magnetometer: heading, against a declination and the robot's iron that are not known for sure.
+"""Magnetometer: heading, with uncertain declination and hard iron.
 
-The field is levelled by the roll and pitch that the graph has, and never moves them. Its heading errs by
-the declination and by the hard iron left in the horizontal plane of the body, which turns with the robot:
-three biases (rad, T, T) that are estimated beside the graph (`slow_bias`). Where a declination is given the
-heading is absolute, and a robot may start at rest; else the magnetometer holds the heading that GNSS or
-the start has told.
+The field is levelled by the roll and pitch of the graph, and never changes them. Its heading errs by the
+declination and by the hard iron in the horizontal plane of the body, which turns with the robot: three
+biases (rad, T, T) that are estimated beside the graph (`slow_bias`). With a declination the heading is
+absolute, and a robot may start at rest; without, the magnetometer holds the heading of GNSS or of the
+start.
 
-Three tests keep a disturbed field out: its size must be Earth's; size and dip must be those of the drive
-so far; and its heading must be the graph's within the sigmas of both. Where it is refused for long the
-iron is taken to be another one; where that helps no more than `CHANCES` times the sensor is left out.
+Three tests reject a disturbed field: its size must be Earth's, size and dip those of the run so far, and
+its heading that of the graph within the sigmas of both. Where it is rejected for long the biases are
+reset; after more than `CHANCES` resets the sensor is left out.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import MagnetometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.alignment import WINDOW_NS, Start
-from terrafusion.fusion.estimator.slow_bias import SlowBias, split
+from terrafusion.fusion.estimator.slow_bias import SlowBias, split_by_time
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE
 
 Array = NDArray[np.float64]
 
 GENERIC = MagnetometerSpec(rate_hz=10.0, noise_t=3e-7, hard_iron_sigma_t=3e-6)
-"""For a vehicle whose file tells nothing of the magnetometer that its log has (assumed: calibrated once)."""
+"""For a vehicle whose file has no magnetometer (assumed: calibrated once)."""
 EARTH_T = (15e-6, 80e-6)
 VERTICAL_T = 50e-6
 """About the largest vertical field outside the polar regions (World Magnetic Model 2020)."""
-EVERY_NS = 1_000_000_000
-NEAR_NS = 200_000_000
-"""A keyframe takes the mean of the samples so shortly before it."""
+INTERVAL_NS = 1_000_000_000
+AVERAGING_NS = 200_000_000
+"""A keyframe takes the mean of the samples this shortly before it."""
 SITE_SIGMA_RAD = 0.05
 """Heading error by iron of the place, independent from one second to the next (assumed: 3 deg)."""
-GIVEN_SIGMA_RAD = 0.03
-"""Error of a declination that was given (assumed; the World Magnetic Model claims about 0.5 deg)."""
+DECLINATION_SIGMA_RAD = 0.03
+"""Error of a given declination (assumed; the World Magnetic Model claims about 0.5 deg)."""
 UNKNOWN_RAD = math.pi
 WALK = np.array([5e-4, 2e-8, 2e-8])
-"""Random walks of the biases, a square root of a second (assumed: other places, load and motor currents)."""
+"""Random walks of the biases per sqrt(s) (assumed: other places, load and motor currents)."""
 SIZE_SHARE, DIP_RAD = 0.15, 0.15
-"""Size and dip may differ from those of the drive so far by this share, and by 9 deg (assumed)."""
+"""Allowed differences of size (share) and dip (9 deg) from those of the run so far (assumed)."""
 FOLLOW_S = 60.0
 GATE_SIGMA = 3.5
 PATIENCE = 20
 CHANCES = 3
 LEAST_START = 5
-FREE = 1e3
+FREE_SIGMA = 1e3
 ASTRAY_SIGMA = 4.0
 ODD_SHARE = 0.1
 _NORTH_EAST = np.array([math.sqrt(0.5), math.sqrt(0.5), 0.0])
@@ -76,12 +76,12 @@ def yaw_jacobian(R: Array) -> Array:
 def yaw_factor(k: int, R: Array, turn_rad: float, sigma_rad: float) -> gtsam.NonlinearFactor:
     """Heading of keyframe k: that of `R` (3, 3) plus `turn_rad`; roll and pitch stay free.
 
-    A horizontal direction of the world, seen from the body that has turned by so much. The error's
-    second part is its vertical one (GTSAM's basis of a horizontal unit vector), left free.
+    A horizontal direction of the world, seen from the turned body. The error's second part is its vertical
+    one (GTSAM's basis of a horizontal unit vector), left free.
     """
     c, s = math.cos(turn_rad), math.sin(turn_rad)
     seen = R.T @ (np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ _NORTH_EAST)
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, FREE]))
+    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array([sigma_rad, FREE_SIGMA]))
     return gtsam.AttitudeFactorPose3(X(k), gtsam.Unit3(_NORTH_EAST), noise, gtsam.Unit3(seen))
 
 
@@ -97,16 +97,16 @@ def levelled(R: Array) -> Array:
     return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]) @ R
 
 
-class Reference:
-    """Size (T) and dip (rad, down positive) of the undisturbed field, as the drive has shown it."""
+class FieldReference:
+    """Size (T) and dip (rad, down positive) of the undisturbed field in the run so far."""
 
     def __init__(self) -> None:
         self.size_t = 0.0
         self.dip_rad = 0.0
         self._t_ns = 0
 
-    def fits(self, t_ns: int, level_t: Array) -> bool:
-        """Whether a levelled field (3,) is like those before; those that are move the reference slowly."""
+    def accepts(self, t_ns: int, level_t: Array) -> bool:
+        """Whether a levelled field (3,) resembles those before; accepted fields move the reference slowly."""
         size = float(np.linalg.norm(level_t))
         if not EARTH_T[0] <= size <= EARTH_T[1]:
             return False
@@ -122,7 +122,7 @@ class Reference:
         return True
 
     def forget(self) -> None:
-        """The next field is the reference."""
+        """The next field becomes the reference."""
         self.size_t = 0.0
 
 
@@ -133,8 +133,8 @@ class MagnetometerAiding:
         spec: noise and hard iron of the sensor; None for a generic one.
         declination_rad: magnetic north, east of true north; None where it is not known.
         report: called with every tested heading.
-        tilt_rad: how well roll and pitch are known (1 sigma): an accelerometer's bias tilts the vertical
-            field into the horizontal, which looks like hard iron.
+        tilt_rad: 1 sigma of roll and pitch: a tilt turns the vertical field into the horizontal, like
+            hard iron.
     """
 
     def __init__(
@@ -145,21 +145,21 @@ class MagnetometerAiding:
         tilt_rad: float = 0.0,
     ) -> None:
         self.spec = spec or GENERIC
-        self.given_rad = declination_rad
+        self.declination_rad = declination_rad
         iron = [math.hypot(self.spec.hard_iron_sigma_t, tilt_rad * VERTICAL_T)] * 2
-        sigma = UNKNOWN_RAD if declination_rad is None else GIVEN_SIGMA_RAD
+        sigma = UNKNOWN_RAD if declination_rad is None else DECLINATION_SIGMA_RAD
         self.bias = SlowBias.of(np.array([declination_rad or 0.0, 0.0, 0.0]), np.array([sigma, *iron]))
-        self.reference = Reference()
+        self.reference = FieldReference()
         self.used = self.refused = self.renewed = 0
         self._samples: deque[tuple[int, Array]] = deque()
         self._last_ns: int | None = None
-        self._row = 0
-        self._turned = 0
+        self._refused_in_a_row = 0
+        self._corrections = 0
         self._on_innovation = report
 
     @property
-    def off(self) -> bool:
-        """Whether the sensor has been found out."""
+    def disabled(self) -> bool:
+        """Whether the sensor is left out for good."""
         return self.renewed > CHANCES
 
     def add(self, t_ns: int, field_t: ArrayLike) -> None:
@@ -167,7 +167,7 @@ class MagnetometerAiding:
         field = np.asarray(field_t, dtype=float)
         if field.shape != (3,):
             raise DataError(f"a field of shape {field.shape}", channel="magnetometer", remedy="give x, y, z")
-        if not self.off and np.isfinite(field).all():
+        if not self.disabled and np.isfinite(field).all():
             self._samples.append((int(t_ns), field))
 
     def forget(self, before_ns: int) -> None:
@@ -176,89 +176,91 @@ class MagnetometerAiding:
 
     @property
     def ready(self) -> bool:
-        """Whether a declination is known, and samples have come to start from."""
-        return self.given_rad is not None and len(self._samples) >= LEAST_START
+        """Whether a declination is known and there are samples to start from."""
+        return self.declination_rad is not None and len(self._samples) >= LEAST_START
 
     @property
     def active(self) -> bool:
         """Whether a sample has ever come."""
         return bool(self._samples) or self._last_ns is not None
 
-    def forget_north(self) -> None:
-        """The frame is local: its heading has nothing to do with north, whatever declination was given."""
-        if self.given_rad is not None:
-            self.given_rad = None
+    def forget_declination(self) -> None:
+        """The frame is local: its heading is unrelated to north, whatever declination was given."""
+        if self.declination_rad is not None:
+            self.declination_rad = None
             self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
 
     def stationary_heading(self, level: Start, tilt_rad: float) -> tuple[float, float] | None:
         """Heading and its 1 sigma, rad, of a robot at rest whose roll and pitch are known to `tilt_rad`.
 
-        None without a declination, with few samples, or with a field that is not Earth's. From here on the
-        biases are tied to that heading: later samples are no further opinion on it.
+        None without a declination, with few samples, or with a field that is not Earth's. The biases are
+        then correlated with that heading: later samples are no independent measurement of it.
         """
         if not self.ready or level.gyro_bias_radps is None:
             return None
         still = [(t, field) for t, field in self._samples if 0 <= t - level.t_ns <= WINDOW_NS]
-        if len(still) < LEAST_START:  # those of later may be of a robot that turns by now
+        if len(still) < LEAST_START:  # those of later may be of a robot that turns by after_rad2
             return None
         mean = np.mean([field for _, field in still], axis=0)
         R = gtsam.Rot3.RzRyRx(level.roll_rad, level.pitch_rad, 0.0).matrix()
         flat = R @ mean
-        if not self.reference.fits(still[-1][0], flat):
+        if not self.reference.accepts(still[-1][0], flat):
             return None
-        yaw, H = self._told(R, mean)
+        yaw, H = self._heading_of_field(R, mean)
         noise = self._noise(flat, len(still), tilt_rad)
         own = self.bias.covariance @ H
         sigma = math.sqrt(float(H @ own) + noise)
-        self.bias.cross = -own  # heading = told - H b: its error is the biases', turned round
+        self.bias.cross = -own
         self._last_ns = still[-1][0]
         return wrapped(yaw), sigma
 
     def update(
-        self, chain: Chain, t_ns: int, newest_ns: int, before: Array, after: Array, turned: int = 0
+        self, chain: Chain, t_ns: int, newest_ns: int, before: Array, after: Array, corrections: int = 0
     ) -> bool:
-        """Use what has come up to the newest keyframe; True where a factor was added.
+        """Use the samples up to the newest keyframe; True where a factor was added.
 
         `before` and `after` (n, n) are the newest keyframe's covariance, without and with the other
-        measurements of this keyframe; `turned` counts the headings that GNSS has set right. The IMU has come
-        to `newest_ns`.
+        measurements of this keyframe; `corrections` counts the heading corrections by GNSS. The newest IMU
+        sample is at `newest_ns`.
         """
         R = chain.state(chain.last).pose.rotation().matrix()
-        row = yaw_jacobian(R)
-        was, now = (float(row @ P[POSE, POSE][:3, :3] @ row) for P in (before, after))
-        self.bias.told(was, now)
-        if turned != self._turned:
-            self._turned = turned
+        jacobian = yaw_jacobian(R)
+        before_rad2, after_rad2 = (
+            float(jacobian @ P[POSE, POSE][:3, :3] @ jacobian) for P in (before, after)
+        )
+        self.bias.state_updated(before_rad2, after_rad2)
+        if corrections != self._corrections:
+            self._corrections = corrections
             self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
         recent = self._recent(t_ns, newest_ns)
-        if not recent or (self._last_ns is not None and t_ns - self._last_ns < EVERY_NS):
+        if not recent or (self._last_ns is not None and t_ns - self._last_ns < INTERVAL_NS):
             return False
         elapsed = 0.0 if self._last_ns is None else (t_ns - self._last_ns) * 1e-9
         self._last_ns = t_ns
         self.bias.drift(WALK**2 * elapsed)
         tilt = math.sqrt(0.5 * float(after[0, 0] + after[1, 1]))
-        return self._measure(chain, t_ns, R, np.mean(recent, axis=0), len(recent), now, tilt)
+        return self._measure(chain, t_ns, R, np.mean(recent, axis=0), len(recent), after_rad2, tilt)
 
     def _recent(self, t_ns: int, newest_ns: int) -> list[Array]:
-        due, self._samples, impossible = split(self._samples, t_ns, newest_ns)
+        due, self._samples, impossible = split_by_time(self._samples, t_ns, newest_ns)
         self.refused += impossible
-        return [field for at_ns, field in due if t_ns - at_ns <= NEAR_NS]
+        return [field for at_ns, field in due if t_ns - at_ns <= AVERAGING_NS]
 
     def _measure(
         self, chain: Chain, t_ns: int, R: Array, field: Array, count: int, variance: float, tilt: float
     ) -> bool:
         flat = levelled(R) @ field
-        if not self.reference.fits(t_ns, flat):
+        if not self.reference.accepts(t_ns, flat):
             return self._refuse()
-        told, H = self._told(R, field)
-        innovation = wrapped(told - yaw_of(R))
+        heading, H = self._heading_of_field(R, field)
+        innovation = wrapped(heading - yaw_of(R))
         noise = self._noise(flat, count, tilt)
         nis = innovation**2 / self.bias.variance(H, variance, noise)
         accepted = nis <= GATE_SIGMA**2
         self._on_innovation(Innovation(t_ns, "magnetometer", np.array([innovation]), nis, 1, accepted))
         if not accepted:
             return self._refuse()
-        self._row = 0
+        self._refused_in_a_row = 0
         self.used += 1
         own = self.bias.measure(innovation, H, variance, noise)
         if own is None:
@@ -266,8 +268,8 @@ class MagnetometerAiding:
         chain.add(chain.last, yaw_factor(chain.last, R, own.innovation, own.sigma), "X")
         return True
 
-    def _told(self, R: Array, field: Array) -> tuple[float, Array]:
-        """Heading that a field tells, rad, and by how much (3,) errors of the biases put it too high.
+    def _heading_of_field(self, R: Array, field: Array) -> tuple[float, Array]:
+        """Heading by a field, rad, and its derivative (3,) by the errors of the biases, negated.
 
         With D the declination, north lies at pi/2 - D; the field less the hard iron points there.
         """
@@ -286,35 +288,37 @@ class MagnetometerAiding:
 
     def _refuse(self) -> bool:
         self.refused += 1
-        self._row += 1
-        if self._row >= PATIENCE:
-            self._row = 0
+        self._refused_in_a_row += 1
+        if self._refused_in_a_row >= PATIENCE:
+            self._refused_in_a_row = 0
             self.renewed += 1
             self.reference.forget()
             self.bias.forget(np.array([UNKNOWN_RAD**2, 0.0, 0.0]))
-            if self.off:
+            if self.disabled:
                 self._samples.clear()
         return False
 
     def notes(self) -> list[str]:
-        """What was made of the fields, in sentences."""
+        """How many headings were used and rejected, and why, in sentences."""
         if not self.used and not self.refused:
             return []
-        found = [f"magnetometer: {self.used} headings, one a second, were used, {self.refused} refused"]
+        notes = [f"magnetometer: {self.used} headings, one a second, were used, {self.refused} refused"]
         if self.refused > ODD_SHARE * (self.used + self.refused):
-            why = "a wrong declination, " if self.given_rad is not None else ""
+            why = "a wrong declination, " if self.declination_rad is not None else ""
             why += "iron of the robot or of the ground"
-            found.append(f"magnetometer: many headings disagree with the drive: {why}")
+            notes.append(f"magnetometer: many headings disagree with the drive: {why}")
         sigma = math.sqrt(float(self.bias.covariance[0, 0]))
-        astray = wrapped(float(self.bias.mean[0]) - (self.given_rad or 0.0))
-        if self.given_rad is not None and abs(astray) > ASTRAY_SIGMA * max(sigma, GIVEN_SIGMA_RAD):
-            found.append(
-                f"magnetometer: the declination given is off by {math.degrees(astray):.0f} deg "
+        astray = wrapped(float(self.bias.mean[0]) - (self.declination_rad or 0.0))
+        if self.declination_rad is not None and abs(astray) > ASTRAY_SIGMA * max(
+            sigma, DECLINATION_SIGMA_RAD
+        ):
+            notes.append(
+                f"magnetometer: the declination given is disabled by {math.degrees(astray):.0f} deg "
                 f"(1 sigma {math.degrees(sigma):.0f}), or the robot's iron turns its heading"
             )
         iron = self.bias.mean[1:]
         if np.hypot(*iron) > ASTRAY_SIGMA * self.spec.hard_iron_sigma_t:
-            found.append(f"magnetometer: hard iron of {np.hypot(*iron) * 1e6:.0f} uT was found; calibrate it")
-        if self.off:
-            found.append("magnetometer: left out, its headings do not turn as the robot does")
-        return found
+            notes.append(f"magnetometer: hard iron of {np.hypot(*iron) * 1e6:.0f} uT was found; calibrate it")
+        if self.disabled:
+            notes.append("magnetometer: left out, its headings do not turn as the robot does")
+        return notes

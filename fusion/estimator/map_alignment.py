@@ -1,8 +1,8 @@
-"""A path that was begun without GNSS, laid onto the map by the fixes that come later.
+"""Alignment of a path that was begun without GNSS with the map.
 
-Until then the path is local: its start and heading are arbitrary. Wheels and gyro trace its shape (see
-`DeadReckoning`), and once the fixes of the last half minute tell how that shape lies on the map, the window
-is turned and shifted there as a whole. What was told before stays as it was told.
+Until fixes come the path is local: its start and heading are arbitrary. Wheels and gyro trace its shape
+(`DeadReckoning`); once the fixes of the last half minute show how that shape lies on the map, the window
+is turned and shifted as a whole. States already reported stay as they are.
 """
 
 from __future__ import annotations
@@ -26,18 +26,17 @@ Array = NDArray[np.float64]
 PLACE = (2, 3, 4, 5)
 """Tangent of heading and position: what a local frame leaves open."""
 YAW_SIGMA_RAD = 0.25
-"""What the window's linearisation bears; further fixes make the heading surer (assumed)."""
+"""What the window's linearisation bears; further fixes reduce it (assumed)."""
 UPRIGHT = 0.99
-"""Vertical part of a direction that is the same in every frame: a level robot's up."""
+"""Least vertical part of a direction that is the same in every frame: a level robot's up."""
 OPEN_YAW_RAD, OPEN_M = np.pi, 1e4
-"""Prior sigmas of heading and place of the first keyframe in a batch, once fixes tell them."""
+"""Prior sigmas of heading and position of the first keyframe in a batch, once aligned."""
 
 
 @dataclass(frozen=True, eq=False)
 class MapAlignment:
-    """The turn `yaw_rad` about the vertical and the shift that brings `from_m` (3,) to `to_m` (3,), ENU.
-
-    `t_ns` is when it became known.
+    """The turn `yaw_rad` about the vertical and the shift that brings `from_m` (3,) to `to_m` (3,), ENU,
+    since `t_ns`.
     """
 
     t_ns: int
@@ -46,7 +45,7 @@ class MapAlignment:
     to_m: Array
 
     def moved(self, state: State) -> State:
-        """A local state as it lies on the map."""
+        """A local state on the map."""
         turn = gtsam.Rot3.Rz(self.yaw_rad)
         R = turn.matrix()
         both = np.kron(np.eye(2), R)
@@ -68,7 +67,7 @@ def align_to_map(
     antenna_m: Array,
     drift_sigma_m: float,
 ) -> MapAlignment | None:
-    """Lay the window onto the map, once the heading on it is known to `YAW_SIGMA_RAD`; else None."""
+    """Align the window with the map once the heading on it is known to `YAW_SIGMA_RAD`; else None."""
     fit = track.fit(1.0, YAW_SIGMA_RAD)
     if fit is None:
         return None
@@ -79,35 +78,36 @@ def align_to_map(
     known = bool(np.isfinite(fix.enu_m[2] + fix.sigma_m[2]))
     to_m = np.array([there.real, there.imag, fix.enu_m[2] if known else antenna[2]])
     away_m = abs(track.antenna() - fit.middle)
-    claimed_m = float(np.max(fix.sigma_m[:2]))
+    reported_m = float(np.max(fix.sigma_m[:2]))
     doubt = np.zeros(chain.dim)
     doubt[2] = fit.sigma_rad**2
-    doubt[3:5] = claimed_m**2 + fit.rest_m**2 + (fit.sigma_rad * away_m) ** 2
+    doubt[3:5] = reported_m**2 + fit.residual_m**2 + (fit.sigma_rad * away_m) ** 2
     doubt[5] = float(fix.sigma_m[2]) ** 2 if known else OPEN_M**2
     doubt[DRIFT] = drift_sigma_m**2
-    told = MapAlignment(fix.t_ns, track.error_of(fit), antenna, to_m)
+    alignment = MapAlignment(fix.t_ns, track.error_of(fit), antenna, to_m)
     drop_local_factors(chain.nodes)
     chain.restart(doubt, chain.first, PLACE)
-    chain.turn(told.yaw_rad, told.from_m, told.to_m)
+    chain.turn(alignment.yaw_rad, alignment.from_m, alignment.to_m)
     chain.smooth(len(chain.nodes))
     if chain.archive is not None:
         drop_local_factors(chain.archive.nodes)
-        chain.archive.turn(told.yaw_rad, told.from_m, told.to_m)
+        chain.archive.turn(alignment.yaw_rad, alignment.from_m, alignment.to_m)
         prior = chain.archive.nodes[0].prior
         prior[PLACE, :] = 0.0
         prior[PLACE, PLACE] = 1.0 / np.array([OPEN_YAW_RAD, *[OPEN_M] * 3])
     track.restart()
-    return told
+    return alignment
 
 
 def drop_local_factors(nodes: list[Node]) -> None:
-    """Drop the headings and heights that barometer and magnetometer have told in a frame that is no more.
+    """Drop headings and heights of aiding sensors in a local frame.
 
-    They are as sure as the start was, which was arbitrary: turned along they would make the map's as sure.
+    Their sigmas are relative to an arbitrary start: turned along they would make the map's heading as
+    certain.
     """
     for node in nodes:
         factors = [node.unary.at(i) for i in range(node.unary.size())]
-        stays = [factor for factor in factors if not _of_a_frame(factor)]
+        stays = [factor for factor in factors if not _is_local(factor)]
         if len(stays) < len(factors):
             node.unary = gtsam.NonlinearFactorGraph()
             for factor in stays:
@@ -116,8 +116,8 @@ def drop_local_factors(nodes: list[Node]) -> None:
             node.unary_keys = {chr(symbol.chr()).upper() for symbol in symbols}
 
 
-def _of_a_frame(factor: gtsam.NonlinearFactor) -> bool:
-    """Whether a factor of one pose tells a height, or a direction other than the vertical."""
+def _is_local(factor: gtsam.NonlinearFactor) -> bool:
+    """Whether a factor of one pose is a height, or a direction other than the vertical."""
     if isinstance(factor, gtsam.AttitudeFactorPose3):
         return abs(float(factor.nRef().point3()[2])) < UPRIGHT
     return isinstance(factor, gtsam.GPSFactorArm)

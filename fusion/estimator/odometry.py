@@ -1,18 +1,16 @@
-"""Odometry between keyframes: the newest state carried to the newest IMU sample.
+"""Odometry between keyframes: the newest state propagated to the newest IMU sample.
 
-A keyframe is made every 0.1 s and waits for the wheels; a controller wants the
-pose at the rate of the IMU. From the newest keyframe on, samples are
-integrated as between keyframes (`Preintegrator`), bias removed. The error of
-that state, (rotation, position: body axes; velocity: world axes; biases), is
-carried to first order in the time since the keyframe (Forster, Carlone,
-Dellaert, Scaramuzza 2017, IEEE T-RO 33(1), eq. 37 and appendix A.2)::
+A keyframe is made every 0.1 s and waits for the wheels; a controller needs the pose at the rate of the IMU.
+From the newest keyframe on, samples are integrated as between keyframes (`Preintegrator`), bias removed.
+The error of that state, (rotation, position: body axes; velocity: world axes; biases), is propagated to
+first order (Forster, Carlone, Dellaert, Scaramuzza 2017, IEEE T-RO 33(1), eq. 37 and appendix A.2)::
 
     d theta_j = dR' d theta_i - dt d b_g
     d p_j     = R_j' (R_i d p_i + dt d v_i - R_i [dp]x d theta_i - dt^2/2 R_i d b_a)
     d v_j     = d v_i - R_i [dv]x d theta_i - dt R_i d b_a
 
-with the preintegrated dR, dp, dv, whose own covariance is added. Wheels take no
-part: a keyframe is at most `wheel_wait_s` and one step behind the IMU.
+with the preintegrated dR, dp, dv, whose own covariance is added. Wheels take no part: a keyframe is at
+most `wheel_wait_s` and one step behind the IMU.
 """
 
 from __future__ import annotations
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.key_states import covariance_fields, key_state_of
-from terrafusion.fusion.graph.key_state import DIM, NAV, quaternion_of
+from terrafusion.fusion.graph.key_state import DIM, NAV, quaternion_of, skew
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -36,7 +34,7 @@ Array = NDArray[np.float64]
 
 
 class Propagator:
-    """Carries one keyframe's state on; each sample is integrated once."""
+    """Propagates one keyframe's state; each sample is integrated once."""
 
     def __init__(self, preintegrator: Preintegrator) -> None:
         self._preintegrator = preintegrator
@@ -46,20 +44,19 @@ class Propagator:
         self._measured: gtsam.PreintegratedCombinedMeasurements
 
     def carry(self, state: State, covariance: Array, imu: ImuStream, noise: SensorNoise) -> State:
-        """The state at the newest IMU sample, with `covariance` (dim, dim) of the keyframe carried along.
+        """The state at the newest IMU sample, with `covariance` (dim, dim) of the keyframe propagated.
 
-        Slip, terrain, status and biases stay those of the keyframe, the
-        angular velocity is that of the newest sample. With no sample after the
-        keyframe this is `state` itself.
+        Slip, terrain, status and biases stay those of the keyframe, the angular velocity is that of the
+        newest sample. With no sample after the keyframe this is `state` itself.
         """
         newest_ns = imu.t_ns[-1]
         if newest_ns <= state.t_ns:
             return state
         if self._state is not state or self._taken(imu) != self._count:
             self._begin(state, covariance, noise)
-        for piece in imu.segments(self._until_ns, newest_ns):
-            self._measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
-            self._readings += piece.dt_s * np.array([piece.gyro_radps, piece.accel_mps2])
+        for segment in imu.segments(self._until_ns, newest_ns):
+            self._measured.integrateMeasurement(segment.accel_mps2, segment.gyro_radps, segment.dt_s)
+            self._readings += segment.dt_s * np.array([segment.gyro_radps, segment.accel_mps2])
         self._until_ns = newest_ns
         self._count = self._taken(imu)
         density = np.array(noise.gyro_axes()) * self._preintegrator.spec.gyro_noise_radps_sqrthz
@@ -68,7 +65,7 @@ class Propagator:
         return self._carried(state, gyro, density / math.sqrt(interval_s))
 
     def _taken(self, imu: ImuStream) -> int:
-        """How many samples lie between keyframe and `_until_ns`: it changes when a late one comes."""
+        """Number of samples between keyframe and `_until_ns`: it changes when a late one comes."""
         assert self._state is not None
         return bisect.bisect_right(imu.t_ns, self._until_ns) - bisect.bisect_right(imu.t_ns, self._state.t_ns)
 
@@ -112,19 +109,11 @@ def transition(
     F, G = np.eye(dim), np.eye(15)
     back = R_j.T @ R_i
     F[0:3, 0:3] = F[3:6, 3:6] = G[3:6, 3:6] = back
-    F[0:3, 12:15] = -dt_s * _EYE
-    F[3:6, 0:3] = -back @ _cross(dp_m)
+    F[0:3, 12:15] = -dt_s * np.eye(3)
+    F[3:6, 0:3] = -back @ skew(dp_m)
     F[3:6, 6:9] = dt_s * R_j.T
     F[3:6, 9:12] = -0.5 * dt_s**2 * back
-    F[6:9, 0:3] = -R_i @ _cross(dv_mps)
+    F[6:9, 0:3] = -R_i @ skew(dv_mps)
     F[6:9, 9:12] = -dt_s * R_i
     G[6:9, 6:9] = R_i
     return F, G
-
-
-_EYE = np.eye(3)
-
-
-def _cross(v: Array) -> Array:
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

@@ -1,14 +1,11 @@
-"""Slip and immobilisation told from the wheels' travel against the estimate's.
+"""Slip and immobilisation from the travel of the wheels against that of the estimate.
 
-Both travels are compared over windows of one, two and four seconds: long
-enough for an encoder's quantum to be small in them, where a comparison of
-single samples mistakes each quantum for slip. Slip is told where the travels
-differ by more than `SIGMAS` of what is uncertain about them and by more than
+Both travels are compared over windows of one, two and four seconds, in which an encoder's quantum is
+small. Slip is reported where they differ by more than `SIGMAS` of their uncertainty and by more than
 `SLIP` of the wheels' travel.
 
-A robot is immobilised where its wheels turn and it stays ("traction lost"), or
-where driving is commanded and neither wheels nor robot move ("motors stalled";
-it takes `command`, because at the wheels a stall looks like a stop).
+A robot is immobilised where its wheels turn and it stays ("traction lost"), or where driving is commanded
+and neither wheels nor robot move ("motors stalled"; at the wheels alone a stall looks like a stop).
 """
 
 from __future__ import annotations
@@ -29,7 +26,7 @@ Array = NDArray[np.float64]
 WINDOWS_S = (1.0, 2.0, 4.0)
 SIGMAS = 4.0
 SLIP = 0.08
-"""Slip worth telling: above that of firm ground and of an unknown tyre radius (assumed 3 %) together."""
+"""Least slip reported: above that of firm ground and of an unknown tyre radius (assumed 3 %) together."""
 RELEASE = 0.5
 """Slip is over once the travels agree to this share of `SLIP` over `HOLD_S`."""
 HOLD_S = 2.0
@@ -38,17 +35,17 @@ STUCK_S = 0.7
 STUCK_MPS = 0.05
 """A robot slower than this stands (as in the twin's summary)."""
 SPIN_MPS, SPIN_SHARE = 0.1, 0.25
-"""Wheels turn at more than SPIN_MPS and the robot makes less than SPIN_SHARE of it."""
+"""Wheels spin above SPIN_MPS while the robot makes less than SPIN_SHARE of it."""
 COMMAND_MPS = 0.1
-"""A command of at least this speed asks for motion."""
+"""Least command that asks for motion."""
 COMMAND_HOLD_NS = 500_000_000
-"""A command holds so long when no other comes."""
+"""A command holds for so long when no other comes."""
 SPINNING, STALLED = "traction lost", "motors stalled"
 
 
 @dataclass(frozen=True)
 class Step:
-    """From keyframe to keyframe: time, wheel travel (None: unknown), mean speed, its sigma, command."""
+    """Between keyframes: time, wheel travel (None: unknown), mean speed, its sigma, command."""
 
     dt_s: float
     rolled_m: float | None
@@ -69,7 +66,7 @@ class Travel:
 
 
 class MotionMonitor:
-    """Watches wheels against estimate at every keyframe.
+    """Compares wheels and estimate at every keyframe.
 
     Attributes:
         slipping: the wheels travel another distance than the robot.
@@ -123,9 +120,9 @@ class MotionMonitor:
         self.cause = None if stuck is None else self._cause(stuck)
 
     def travel(self, seconds: float) -> Travel | None:
-        """The last `seconds`; None before so much is known, or where wheels are missing.
+        """Travel over the last `seconds`; None before so much is known, or where wheels are missing.
 
-        Errors of the estimated speed last longer than a window: their sigmas add up.
+        Errors of the estimated speed outlast a window: their sigmas add up.
         """
         total = rolled = moved = sigma = 0.0
         least = math.inf

@@ -1,15 +1,13 @@
-"""Rest: does the robot stand? Wheels and IMU are asked together, over a window.
+"""Stationarity from wheels and IMU over a window, and zero-velocity updates (ZUPT).
 
-The IMU is tested by the generalised likelihood ratio of Skog, Handel, Nilsson
-and Rantakokko (2010, IEEE T-BME 57(11), the SHOE detector): at rest the gyro
-reads its bias and the specific force is gravity in one unknown direction. The
-wheels must not turn by more than their encoders' quantum over a window so long
-that a creeping robot would turn them by two.
+The IMU is tested by the generalised likelihood ratio of Skog, Handel, Nilsson and Rantakokko (2010, IEEE
+T-BME 57(11), the SHOE detector): at rest the gyro reads its bias and the specific force is gravity in an
+unknown direction. The wheels must turn by less than their encoders' quantum over a window in which a
+creeping robot would turn them by two.
 
-The noise in the test is that of the data sheet, or the shaking seen where that
-is more: from differences of successive samples (von Neumann 1941, Ann. Math.
-Stat. 12(4)), which an engine that idles raises and a body that is carried does
-not. It is believed up to a ceiling only, so that no ride on a lorry passes.
+The noise in the test is that of the data sheet, or the vibration from differences of successive samples
+(von Neumann 1941, Ann. Math. Stat. 12(4)) where that is more, as of an idling engine; it has a ceiling, so
+that no ride on a lorry passes.
 """
 
 from __future__ import annotations
@@ -32,21 +30,21 @@ Array = NDArray[np.float64]
 CREEP_MPS = 0.02
 """The slowest motion that the wheels must show within a window."""
 PARKED_MPS = 1e-3
-"""A parked robot may creep by this (assumed; the twin's creeps 0.06 mm/s down 5 deg)."""
+"""Creep of a parked robot (assumed; the twin's creeps 0.06 mm/s down 5 deg)."""
 SHORTEST_S, LONGEST_S = 0.3, 1.5
 LIMIT = 3.0
-"""Statistic for each degree of freedom, 1 expected at rest: white noise of 30 degrees passes 3 with
-p = 2e-7; the rest of the room is for noise that is not white."""
+"""Statistic per degree of freedom, 1 expected at rest: white noise of 30 degrees passes 3 with p = 2e-7; the
+margin is for noise that is not white."""
 GRAVITY_SIGMA_MPS2 = 0.03
-"""Standard gravity differs so much from the local one, equator to pole."""
+"""Difference of local and standard gravity, equator to pole."""
 CEILING_RADPS, CEILING_MPS2 = 0.01, 0.2
-"""Largest noise a resting IMU is granted (assumed)."""
+"""Largest noise of a resting IMU (assumed)."""
 MOVING_MPS = 0.05
-"""A speed so far above four sigma is motion, whatever wheels and IMU show."""
-KEPT_AT_REST_S, AT_REST_M = 10.0, 0.02
+"""A speed this far above four sigma is motion, whatever wheels and IMU show."""
+WINDOW_AT_REST_S, AT_REST_M = 10.0, 0.02
 """What is kept of a rest before the start, and how far its wheels may turn meanwhile."""
 LONGEST_WAIT_S = 300.0
-"""A start that takes longer looks at the newer half only."""
+"""A start that takes longer uses the newer half of the samples only."""
 
 _STOPPED = gtsam.noiseModel.Isotropic.Sigma(3, 0.005)
 
@@ -62,7 +60,7 @@ def shaking(samples: Array) -> float:
 def likelihood_ratio(
     gyro_radps: Array, accel_mps2: Array, sigma_gyro_radps: float, sigma_accel_mps2: float
 ) -> float:
-    """The statistic of Skog et al. (2010) for each degree of freedom; about 1 at rest, large in motion.
+    """The statistic of Skog et al. (2010) per degree of freedom; about 1 at rest, large in motion.
 
     Args:
         gyro_radps: (n, 3), bias removed; an axis that is not measured is NaN.
@@ -84,7 +82,7 @@ class StationarityDetector:
     """Tells rest from motion at each keyframe.
 
     Attributes:
-        window_s: length of the window, so long that `CREEP_MPS` turns the wheels by more than two quanta.
+        window_s: length of the window, in which `CREEP_MPS` turns the wheels by more than two quanta.
         still_m: how far the wheels may turn within it.
     """
 
@@ -108,7 +106,7 @@ class StationarityDetector:
     ) -> bool:
         """Whether the robot has stood during the window that ends at `t_ns`.
 
-        `speed_mps` with its sigma is the estimate's, where something other than wheels and IMU holds it.
+        `speed_mps` with its sigma is the estimate's, where it does not rest on wheels and IMU alone.
         """
         if speed_mps > MOVING_MPS + 4.0 * speed_sigma_mps:
             return False
@@ -126,17 +124,17 @@ class StationarityDetector:
 
 
 def drop_before_start(imu: ImuStream, wheels: WheelStream, fixes: list[GnssFix]) -> bool:
-    """Before the start: drop samples and fixes that no start can use; True when some were dropped.
+    """Drop samples and fixes that no start can use; True when some were dropped.
 
-    A robot that stands learns no heading from it, and needs only the last seconds to level itself. One
-    that moves for minutes and finds none is helped by the newest of them alone.
+    A robot at rest needs only the last seconds to level itself; one that moves for minutes without finding
+    its heading uses the newest samples alone.
     """
     newest = imu.t_ns[-1]
     waited_s = (newest - imu.t_ns[0]) * 1e-9
     if waited_s > LONGEST_WAIT_S:
         cut = newest - round(0.5e9 * LONGEST_WAIT_S)
-    elif waited_s > 2.0 * KEPT_AT_REST_S:
-        cut = newest - round(1e9 * KEPT_AT_REST_S)
+    elif waited_s > 2.0 * WINDOW_AT_REST_S:
+        cut = newest - round(1e9 * WINDOW_AT_REST_S)
         turned = wheel_motion(wheels, imu.t_ns[0], newest)
         if turned is None or turned > AT_REST_M:
             return False
@@ -155,7 +153,7 @@ def add_zero_velocity(chain: Chain, k: int, link: gtsam.NonlinearFactorGraph) ->
 
 
 def noise_at_rest(spec: ImuSpec, rate_hz: float, gyro: Array, accel: Array) -> tuple[float, float]:
-    """1 sigma of a sample, rad/s and m/s2: the data sheet's, or the shaking seen where that is more."""
+    """1 sigma of a sample, rad/s and m/s2: the data sheet's, or the vibration where that is more."""
     gyro_white = max(spec.gyro_noise_radps_sqrthz * math.sqrt(rate_hz), shaking(gyro))
     sigma_gyro = min(math.hypot(gyro_white, spec.gyro_bias_sigma_radps), CEILING_RADPS)
     accel_white = max(spec.accel_noise_mps2_sqrthz * math.sqrt(rate_hz), shaking(accel))

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.sensors import ImuSpec
-from terrafusion.fusion.graph.key_state import DIM, VELOCITY
+from terrafusion.fusion.graph.key_state import DIM, VELOCITY, skew
 from terrafusion.fusion.noise.policy import SensorNoise
 
 Array = NDArray[np.float64]
@@ -27,9 +27,8 @@ def twist_jacobian(R: Array, velocity_mps: Array, dim: int = DIM) -> Array:
         R: (3, 3) body to world.
         velocity_mps: (3,) of the body origin, world axes.
     """
-    x, y, z = R.T @ velocity_mps
     J = np.zeros((6, dim))
-    J[:3, _ROTATION] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]
+    J[:3, _ROTATION] = skew(R.T @ velocity_mps)
     J[:3, VELOCITY] = R.T
     J[3:, _GYRO_BIAS] = -np.eye(3)
     return J

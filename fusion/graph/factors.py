@@ -23,14 +23,13 @@ NO_MOTION_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
 UP_SIDE_RATIO = 0.05
 """Vertical over forward displacement in the body frame (1 sigma): wheels follow the ground."""
 YAW_SIGMA_RADPS, YAW_SIGMA_SHARE = 1.0, 0.3
-"""Yaw rate of skid-steered wheels: 1 sigma a keyframe of 0.1 s, and share of the rate. Unequal wheels turn a
-robot by 0.03 rad/s for a minute (assumed), which weighs like white noise of 0.03 sqrt(2 60 / 0.1). The rows
-tell the yaw scale; with 0.05 they also bent the gyro's bias, and a drive without GNSS by 0.45 rad."""
+"""Yaw rate of skid-steered wheels: 1 sigma per keyframe of 0.1 s, and share of the rate. Unequal wheels turn
+a robot by 0.03 rad/s for a minute (assumed), like white noise of 0.03 sqrt(2 60 / 0.1)."""
 FLOOR_M = 2e-3
-"""Least sigma of a wheel displacement across the rolling direction, m a keyframe."""
+"""Least sigma of a wheel displacement across the rolling direction, m per keyframe."""
 SURGE_SPEED_MPS = 0.3
 """Wheels that accelerate slip as if they were so much faster (assumed; in the twin straight on 0.07 m/s on
-asphalt, 0.44 on loose sand: `scores.calibration_trials`)."""
+asphalt, 0.44 on loose sand)."""
 
 
 def wheel_increment(
@@ -43,19 +42,19 @@ def wheel_increment(
     speed_change_mps: float = 0.0,
     surging: bool = False,
 ) -> WheelIncrement:
-    """Displacement of the body origin and turn as the wheels and the gyro tell them.
+    """Displacement of the body origin and turn by wheels and gyro.
 
-    The travelled distance is spread evenly over the interval and turned by the
-    yaw integrated from the gyro (bias removed), exactly for constant rates. What the acceleration asks for
-    is in the increment only with `surging`.
+    The travelled distance is spread evenly over the interval and turned by the yaw integrated from the
+    gyro (bias removed), exactly for constant rates. `surging`: with the part that the acceleration asks
+    for.
     """
     left, right = travelled_m
     distance = 0.5 * (left + right)
-    total = sum(piece.dt_s for piece in segments)
+    total = sum(segment.dt_s for segment in segments)
     x = y = yaw = 0.0
-    for piece in segments:
-        turn = (float(piece.gyro_radps[2]) - gyro_bias_z) * piece.dt_s
-        step = distance * piece.dt_s / total
+    for segment in segments:
+        turn = (float(segment.gyro_radps[2]) - gyro_bias_z) * segment.dt_s
+        step = distance * segment.dt_s / total
         chord = step * (1.0 - turn * turn / 24.0)
         x += chord * math.cos(yaw + 0.5 * turn)
         y += chord * math.sin(yaw + 0.5 * turn)
@@ -72,14 +71,14 @@ def wheel_increment(
 
 
 def no_motion_factor(k: int) -> gtsam.NonlinearFactor:
-    """Zero velocity and zero rotation between two keyframes."""
+    """Zero translation and rotation between two keyframes."""
     return gtsam.BetweenFactorPose3(
         X(k - 1), X(k), gtsam.Pose3(), gtsam.noiseModel.Diagonal.Sigmas(NO_MOTION_SIGMAS)
     )
 
 
 def bridge(k: int, before: KeyState, carried: KeyState, dt_s: float) -> gtsam.NonlinearFactorGraph:
-    """Loose links across a hole in the IMU, to the state that wheels or a held velocity `carried` there."""
+    """Loose links across a gap in the IMU, to the state that wheels or a constant velocity `carried` there."""
     graph = gtsam.NonlinearFactorGraph()
     sigmas = np.array([0.05, 0.05, 0.3, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
     step = before.pose.between(carried.pose)
@@ -97,8 +96,8 @@ def antenna_lever(
 ) -> Array:
     """Antenna position (3,) at `dt_s` from the keyframe, in the body frame of the keyframe, m.
 
-    A fix rarely falls on a keyframe. Within half a keyframe the body is carried
-    by its velocity, acceleration and rate, so that the fix keeps its own time.
+    Within half a keyframe the body is propagated by its velocity, acceleration and rate, so that the fix
+    keeps its own time.
     """
     R_body_world = state.pose.rotation().matrix().T
     moved = R_body_world @ (state.velocity * dt_s + 0.5 * accel_world_mps2 * dt_s**2)
@@ -107,8 +106,31 @@ def antenna_lever(
 
 
 def gnss_velocity(k: int, velocity_mps: Array, sigma_mps: float) -> gtsam.NonlinearFactor:
-    """Velocity of the body origin, the lever arm's part already removed."""
+    """Velocity of the body origin, that of the lever arm removed."""
     return gtsam.PriorFactorVector(V(k), velocity_mps, _isotropic(3, sigma_mps))
+
+
+def mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
+    """Mean angular rate (3,) and specific force (3,) over the segments."""
+    total = sum(s.dt_s for s in segments)
+    gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
+    accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
+    return gyro, accel
+
+
+def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:
+    """The preintegrated IMU between keyframes k - 1 and k."""
+    return gtsam.CombinedImuFactor(X(k - 1), V(k - 1), X(k), V(k), B(k - 1), B(k), measured)
+
+
+def carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
+    """The state after `dt` seconds by the wheels, or by its velocity where they are silent."""
+    if wheels is None:
+        step = gtsam.Pose3(gtsam.Rot3(), before.pose.rotation().matrix().T @ before.velocity * dt)
+    else:
+        turn = gtsam.Rot3.Rz(before.turning * wheels.turn_rad)
+        step = gtsam.Pose3(turn, before.rolling * wheels.displacement_m)
+    return KeyState(before.pose.compose(step), before.velocity, before.bias, before.linear)
 
 
 @functools.lru_cache(maxsize=4096)

@@ -20,8 +20,8 @@ from terrafusion.fusion.estimator.barometer import BarometerAiding, height_facto
 from terrafusion.fusion.estimator.magnetometer import (
     CHANCES,
     PATIENCE,
+    FieldReference,
     MagnetometerAiding,
-    Reference,
     levelled,
     wrapped,
     yaw_factor,
@@ -55,7 +55,7 @@ def test_the_bias_beside_the_graph_is_the_joint_filter() -> None:
             )
             s, before = s + variance / (variance + 1.0) * (z - s), variance
             variance = before / (before + 1.0)
-            bias.told(before, variance)
+            bias.state_updated(before, variance)
         P[1, 1] += 0.01
         bias.drift(np.array([0.01]))
         z, H, noise = 5.0 + rng.normal(), np.ones(2), 0.5
@@ -92,7 +92,7 @@ def test_a_variance_that_shrinks_unseen_leaves_a_possible_covariance() -> None:
     bias.measure(3.0, np.ones(1), state, 0.07)
     for _ in range(10):
         state *= 0.9
-        bias.told(state, 0.95 * state)
+        bias.state_updated(state, 0.95 * state)
         state *= 0.95
         assert bias.cross[0] ** 2 <= state * bias.covariance[0, 0] * (1.0 + 1e-9)
         assert bias.variance(np.ones(1), state, 0.07) > 0.07
@@ -213,14 +213,14 @@ def test_a_start_at_rest_and_its_sigma() -> None:
 
 
 def test_a_disturbed_field_is_not_like_the_drives() -> None:
-    reference = Reference()
+    reference = FieldReference()
     plain = np.array([0.0, 19e-6, -45e-6])
-    assert reference.fits(0, plain)
-    assert reference.fits(10**9, plain + 1e-6)
-    assert not reference.fits(2 * 10**9, plain + np.array([0.0, 15e-6, 0.0]))
-    assert not reference.fits(3 * 10**9, 3.0 * plain)
-    assert not Reference().fits(0, 1e-3 * plain)
-    slow = [reference.fits(i * 10**9, plain * (1.0 + 0.002 * (i - 4))) for i in range(4, 100)]
+    assert reference.accepts(0, plain)
+    assert reference.accepts(10**9, plain + 1e-6)
+    assert not reference.accepts(2 * 10**9, plain + np.array([0.0, 15e-6, 0.0]))
+    assert not reference.accepts(3 * 10**9, 3.0 * plain)
+    assert not FieldReference().accepts(0, 1e-3 * plain)
+    slow = [reference.accepts(i * 10**9, plain * (1.0 + 0.002 * (i - 4))) for i in range(4, 100)]
     assert all(slow), "a field that changes slowly, from place to place, is followed"
 
 
@@ -280,7 +280,7 @@ def test_a_magnetometer_that_does_not_turn_with_the_robot_is_left_out() -> None:
     aid = MagnetometerAiding(None, None, lambda _: None)
     for _ in range((CHANCES + 1) * PATIENCE):
         aid._refuse()
-    assert aid.off
+    assert aid.disabled
     aid.add(0, np.array([0.0, 19e-6, -45e-6]))
     assert not aid.active
     assert "left out" in aid.notes()[-1]

@@ -1,4 +1,4 @@
-"""FrictionEstimator of the ground, heard from fixes, on a twin whose laws are not those of `graph.friction`."""
+"""The friction estimator on a twin whose laws are not those of `graph.coulomb`."""
 
 from __future__ import annotations
 

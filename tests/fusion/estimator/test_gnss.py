@@ -370,7 +370,7 @@ def test_fixes_of_a_robot_that_stood_show_no_heading_whatever_else_was_seen() ->
     wild = [(1 + 0j, -2 + 31j), (2 + 0j, -18 - 22j), (3 + 0j, -24 - 38j)]
     track = DeadReckoning(np.zeros(3))
     track.pairs = [FixPair(i, z, fix, 1.0) for i, (z, fix) in enumerate([*rest, *wild])]
-    assert track.wrong_by(0.1, 1.0) is None
+    assert track.heading_correction(0.1, 1.0) is None
 
 
 @pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
