@@ -10,7 +10,6 @@ are downloaded (`fetch`).
 from __future__ import annotations
 
 import csv
-import dataclasses
 import fnmatch
 import functools
 import hashlib
@@ -147,44 +146,36 @@ def _load(own: str) -> Catalog:
     return Catalog(sets, tuple(files))
 
 
+@dataclass(frozen=True)
+class VariantFile:
+    """Keys of a variant (`cases`) in `catalog.yaml`."""
+
+    conventions: Conventions = field(default_factory=Conventions)
+    note: str = ""
+
+
+@dataclass(frozen=True)
+class SetFile:
+    """Keys of a set in `catalog.yaml`."""
+
+    title: str
+    holds: str
+    licence: str
+    citation: str
+    homepage: str
+    format: str
+    conventions: Conventions = field(default_factory=Conventions)
+    cases: dict[str, VariantFile] = field(default_factory=dict)
+
+
 def _read_sets(path: Path) -> dict[str, DataSet]:
+    content = read_yaml(path)
+    structure(dict[str, SetFile], content, file=path)
     sets = {}
-    for name, raw in read_yaml(path).items():
-        if not isinstance(raw, dict):
-            raise ConfigError(f"'{name}' is not a set", file=path, remedy="give title, licence, format ...")
-        texts: dict[str, Any] = {
-            f.name: raw.get(f.name)
-            for f in dataclasses.fields(DataSet)
-            if f.type == "str" and f.name != "name"
-        }
-        strange = sorted(set(raw) - set(texts) - {"conventions", "cases"})
-        lacking = [key for key, text in texts.items() if not isinstance(text, str)]
-        if strange or lacking:
-            what = f"unknown key '{strange[0]}'" if strange else f"'{lacking[0]}' is missing"
-            raise ConfigError(
-                what, file=path, channel=name, remedy=f"a set has {', '.join(texts)}, conventions, cases"
-            )
-        held, raw_cases = raw.get("conventions") or {}, raw.get("cases") or {}
-        good = isinstance(held, dict) and isinstance(raw_cases, dict)
-        if not good or not all(_is_case(case) for case in raw_cases.values()):
-            raise ConfigError(
-                "conventions or cases are no mapping, or have an unknown key",
-                file=path,
-                channel=name,
-                remedy="a case has conventions and note",
-            )
-        cases = {
-            str(p): SetVariant(c.get("conventions") or {}, c.get("note", ""))
-            for p, c in (raw.get("cases") or {}).items()
-        }
-        sets[name] = DataSet(name=name, **texts, conventions=raw.get("conventions") or {}, cases=cases)
+    for name, raw in content.items():
+        cases = {p: SetVariant(**case) for p, case in raw.get("cases", {}).items()}
+        sets[name] = DataSet(**{"conventions": {}} | raw | {"name": name, "cases": cases})
     return sets
-
-
-def _is_case(case: Any) -> bool:
-    if not isinstance(case, dict) or not set(case) <= {"conventions", "note"}:
-        return False
-    return isinstance(case.get("note", ""), str) and isinstance(case.get("conventions") or {}, dict)
 
 
 def _read_files(path: Path, sets: set[str]) -> list[CatalogFile]:

@@ -263,7 +263,7 @@ def structure(kind: type[T], raw: Any, *, file: Path | str, key: str = "", compl
     """
     from pydantic import ValidationError
 
-    errors = list(_gaps(kind, raw, complete))
+    errors: list[Any] = list(_gaps(kind, raw, complete))
     try:
         found = _adapter(cast(Any, kind)).validate_python(raw)
     except ValidationError as error:
@@ -320,8 +320,8 @@ def schema(kind: Any, title: str = "") -> dict[str, Any]:
 def _adapter(kind: Any) -> Any:
     from pydantic import TypeAdapter, with_config
 
-    if dataclasses.is_dataclass(kind):
-        with_config({"extra": "forbid"})(kind)  # holds for the dataclasses inside, too
+    section = get_args(kind)[1] if get_origin(kind) is dict else kind
+    with_config({"extra": "forbid"})(section)  # holds for the dataclasses inside, too
     return TypeAdapter(kind)
 
 

@@ -135,5 +135,5 @@ def test_a_misspelt_key_of_a_set_is_told(tmp_path: Path, monkeypatch: pytest.Mon
     (tmp_path / "catalog.yaml").write_text("mine: {titel: x}\n")
     (tmp_path / "catalog_files.csv").write_text(",".join(catalog.FILE_COLUMNS) + "\n")
     monkeypatch.setenv(catalog.CATALOG_VARIABLE, str(tmp_path))
-    with pytest.raises(ConfigError, match="unknown key 'titel'"):
+    with pytest.raises(ConfigError, match=r"unknown key 'mine\.titel'; did you mean 'title'"):
         catalog.load_catalog()
