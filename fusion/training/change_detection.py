@@ -1,4 +1,4 @@
-"""Routes over several grounds, cut together from the signals of held-out runs: how soon a change is seen."""
+"""Delay of detecting changes of ground, on routes spliced from the signals of held-out runs."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ Array = NDArray[np.float64]
 PATCHES = 30
 PATCH_S = (10.0, 30.0)
 """Shortest and longest time on one ground."""
-LEAST_RUN_S = PATCH_S[0] + 1.0
+MIN_RUN_S = PATCH_S[0] + 1.0
 """Shorter runs give no patch."""
 SEEN_WITHIN_S = 2.0
 
 
 @dataclass(frozen=True)
 class ChangeDetection:
-    """Delays of the changes of ground: quantiles of those seen, s, and shares of all changes.
+    """Detection of changes of ground: quantiles of the delays, s, and shares of all changes.
 
-    A change counts as seen when its new ground first has the largest
-    probability; never, if that does not happen before the next.
+    A change is detected when the new ground first has the largest probability, and missed (`never`) if that does
+    not happen before the next change; `right` is the share of correctly classified windows.
     """
 
     median_s: float
@@ -38,10 +38,10 @@ class ChangeDetection:
 
 
 def spliced(runs: Sequence[tuple[Signals, str]], seed: int) -> tuple[Signals, list[tuple[float, str]]]:
-    """One route cut from runs of two grounds or more, and when each ground begins.
+    """One route cut from runs of at least two grounds, and the start and name of each patch.
 
-    The cut is in the raw samples, so windows across a change see both grounds. No run may be shorter than
-    `LEAST_RUN_S`.
+    The raw samples are spliced, so windows across a change contain both grounds. No run may be shorter than
+    `MIN_RUN_S`.
     """
     rng = np.random.default_rng([seed, 23])
     grounds = sorted({label for _, label in runs})
@@ -76,7 +76,7 @@ def _joined(parts: Sequence[tuple[float, Signals]]) -> Signals:
 def delays(
     model: SoftmaxModel, route: Signals, begins: Sequence[tuple[float, str]]
 ) -> tuple[list[float], float]:
-    """Time from each change to its detection, s (inf: never), and the share of windows named right."""
+    """Delay of each change, s (inf: missed), and the share of correctly classified windows."""
     windows = surface_windows(route)
     ends = windows.end_s
     winner = np.array(model.classes)[model.filtered(windows).argmax(axis=1)]
@@ -95,14 +95,14 @@ def delays(
 def changes_seen(
     models: Sequence[SoftmaxModel], held_out: Sequence[Sequence[tuple[Signals, str]]]
 ) -> ChangeDetection | None:
-    """Each model on two routes over the runs (signals, label) it has not seen.
+    """Each model on two routes over its held-out runs (signals, label).
 
-    None where no model has runs of two grounds that are long enough.
+    None if no model has long enough runs of two grounds.
     """
     found: list[float] = []
     right: list[float] = []
     for fold, (model, given) in enumerate(zip(models, held_out, strict=True)):
-        runs = [(signals, label) for signals, label in given if signals.end_s() > LEAST_RUN_S]
+        runs = [(signals, label) for signals, label in given if signals.end_s() > MIN_RUN_S]
         if len({label for _, label in runs}) < 2:
             continue
         for seed in (2 * fold, 2 * fold + 1):

@@ -1,4 +1,4 @@
-"""Labelled drives: folds by run, training with calibration, and scores no run of which was trained on."""
+"""Cross-validation by run over labelled logs: folds, training with calibration, scores on held-out runs."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.catalog.catalog import sha256_of
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of
-from terrafusion.fusion.training.detector_scores import calibration_error
+from terrafusion.fusion.metrics.classification import ClassificationScores, classification_scores
 from terrafusion.fusion.training.softmax import (
     UNKNOWN_SHARE,
     SoftmaxModel,
@@ -32,16 +32,16 @@ Array = NDArray[np.float64]
 
 FOLDS = 5
 INNER_FOLDS = 4
-LEAST_RUNS = 2
-"""Of a ground: one to learn from, another to answer for."""
+MIN_RUNS = 2
+"""Of a ground: one to train on, one to test."""
 TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
-"""Windows of 2 s every 0.5 s see each moment four times, and those of one run err alike. The calibration has
-only runs on one ground, so it would go further, at the cost of every change of ground (docs/detector.md)."""
+"""Windows of 2 s every 0.5 s overlap fourfold, and errors within a run are correlated. Calibrated on runs of one
+ground, the temperature would be higher and changes of ground be detected later (docs/detector.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class LabelledRun:
-    """One drive on one ground: its signals, and what its n windows show."""
+    """One run on one ground: its signals and its n windows."""
 
     name: str
     label: str
@@ -54,21 +54,9 @@ class LabelledRun:
         return self.windows.x
 
 
-@dataclass(frozen=True)
-class LearnerScores:
-    """Scores over windows: rows of `confusion` are true grounds, as shares; `ece` of the winner."""
-
-    classes: tuple[str, ...]
-    macro_f1: float
-    accuracy: float
-    ece: float
-    confusion: tuple[tuple[float, ...], ...]
-    windows: int
-
-
 @dataclass(frozen=True, eq=False)
 class CrossValidation:
-    """Answers (n, k) of the windows of all runs, each by the model that has not seen its fold."""
+    """Probabilities (n, k) of the windows of all runs, each by the model trained without its fold."""
 
     classes: tuple[str, ...]
     runs: tuple[LabelledRun, ...]
@@ -77,16 +65,16 @@ class CrossValidation:
     single: tuple[Array, ...]
     filtered: tuple[Array, ...]
 
-    def figures(self, filtered: bool = True) -> LearnerScores:
-        """Scores of the filtered answers, or of each window by itself."""
-        return learner_scores(self.classes, self.runs, self.filtered if filtered else self.single)
+    def scores(self, filtered: bool = True) -> ClassificationScores:
+        """Scores of the filtered probabilities, or of single windows."""
+        return scores_of(self.classes, self.runs, self.filtered if filtered else self.single)
 
 
 def open_runs(logs: Sequence[str]) -> list[LabelledRun]:
     """The labelled runs of logs: files, folders of them, or names of the catalogue.
 
     Raises:
-        DataError: a run has no one ground label, or no windows at all were found.
+        DataError: a run has no ground label, or there are no windows.
         TerrafusionError: a log cannot be read.
     """
     from terrafusion.datasets.readers import open_recordings
@@ -106,9 +94,7 @@ def open_runs(logs: Sequence[str]) -> list[LabelledRun]:
 
 
 def hashes_of(logs: Sequence[str]) -> dict[str, str]:
-    """SHA-256 of every file that is read of the logs: what was learnt from.
-
-    Files are named by folder and name, by more folders where two would be called the same.
+    """SHA-256 of every file of the logs, by folder and name, with more folders where names coincide.
 
     Raises:
         DataError: there is no such log.
@@ -124,22 +110,22 @@ def hashes_of(logs: Sequence[str]) -> dict[str, str]:
 
 
 def check_runs(runs: Sequence[LabelledRun]) -> None:
-    """Refuse what no run can be left out of.
+    """Check that every ground has enough runs to leave one out.
 
     Raises:
-        DataError: a ground has fewer than `LEAST_RUNS` runs.
+        DataError: a ground has fewer than `MIN_RUNS` runs.
     """
     for label, count in sorted(Counter(r.label for r in runs).items()):
-        if count < LEAST_RUNS:
+        if count < MIN_RUNS:
             raise DataError(
-                f"ground '{label}' has {count} run, {LEAST_RUNS} are needed to leave one out",
+                f"ground '{label}' has {count} run, {MIN_RUNS} are needed to leave one out",
                 channel="terrain",
                 remedy="give more runs of it, or none",
             )
 
 
 def assign_folds(runs: Sequence[LabelledRun], folds: int = FOLDS) -> NDArray[np.intp]:
-    """The fold (n,) of each run: by ground, the longest first, each to the fold with least of that ground."""
+    """The fold (n,) of each run: by ground, longest first, each to the fold with the least of that ground."""
     fold_of = np.zeros(len(runs), dtype=np.intp)
     total = np.zeros(folds)
     for label in sorted({r.label for r in runs}):
@@ -157,26 +143,26 @@ def train_on(
     features: Sequence[str] = SURFACE_FEATURES,
     temperature: float | None = None,
 ) -> SoftmaxModel:
-    """Fit, and calibrate on inner folds by run: the temperature by the filtered log-score, and what is odd.
+    """Fit, and calibrate temperature (by the filtered log score) and novelty threshold on inner folds by run.
 
     A given `temperature` skips the calibration.
 
     Raises:
-        ConfigError: fewer than two grounds, or no scikit-learn.
-        DataError: no ground has a run to leave out.
+        ConfigError: fewer than two grounds.
+        DataError: no ground has a second run.
     """
     model = fit_softmax(np.vstack([r.x for r in runs]), labels_of(runs), features)
     if temperature is not None:
         return dataclasses.replace(model, temperature=temperature)
     fold_of = assign_folds(runs, INNER_FOLDS)
-    held: list[tuple[SoftmaxModel, LabelledRun]] = []
+    held_out: list[tuple[SoftmaxModel, LabelledRun]] = []
     for fold in range(INNER_FOLDS):
         inner = [r for r, f in zip(runs, fold_of, strict=True) if f != fold]
         if {r.label for r in inner} != set(model.classes):
             continue
         part = fit_softmax(np.vstack([r.x for r in inner]), labels_of(inner), features)
-        held += [(part, r) for r, f in zip(runs, fold_of, strict=True) if f == fold]
-    if not held:
+        held_out += [(part, r) for r, f in zip(runs, fold_of, strict=True) if f == fold]
+    if not held_out:
         raise DataError(
             "no ground has a second run: nothing to calibrate on", channel="terrain", remedy="give more runs"
         )
@@ -184,11 +170,11 @@ def train_on(
     def loss(t: float) -> float:
         scores = [
             -np.log(dataclasses.replace(m, temperature=t).filtered(r.windows)[:, m.classes.index(r.label)])
-            for m, r in held
+            for m, r in held_out
         ]
         return float(np.concatenate(scores).mean())
 
-    odd = np.quantile(np.concatenate([m.oddness(r.x) for m, r in held]), 1.0 - UNKNOWN_SHARE)
+    odd = np.quantile(np.concatenate([m.oddness(r.x) for m, r in held_out]), 1.0 - UNKNOWN_SHARE)
     return dataclasses.replace(model, temperature=min(TEMPERATURES, key=loss), odd_distance=float(odd))
 
 
@@ -200,7 +186,7 @@ def labels_of(runs: Sequence[LabelledRun]) -> list[str]:
 def cross_validate(
     runs: Sequence[LabelledRun], features: Sequence[str] = SURFACE_FEATURES, temperature: float | None = None
 ) -> CrossValidation:
-    """Train on four fifths of the runs and answer for the others, for each fifth."""
+    """Train on all folds but one and predict that one, for each fold."""
     fold_of = assign_folds(runs)
     models = tuple(
         train_on([r for r, f in zip(runs, fold_of, strict=True) if f != fold], features, temperature)
@@ -217,30 +203,17 @@ def cross_validate(
     )
 
 
-def learner_scores(
-    classes: tuple[str, ...], runs: Sequence[LabelledRun], answers: Sequence[Array]
-) -> LearnerScores:
+def scores_of(
+    classes: tuple[str, ...], runs: Sequence[LabelledRun], probabilities: Sequence[Array]
+) -> ClassificationScores:
     """Scores of probabilities (n, k) for the windows of each run."""
-    k = len(classes)
-    p = np.vstack(list(answers))
+    p = np.vstack(list(probabilities))
     true = np.array([classes.index(label) for label in labels_of(runs)])
-    winner = p.argmax(axis=1)
-    counts = np.bincount(true * k + winner, minlength=k * k).reshape(k, k).astype(float)
-    present = counts.sum(axis=1) > 0
-    f1 = 2.0 * np.diag(counts) / np.maximum(counts.sum(axis=0) + counts.sum(axis=1), 1.0)
-    shares = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1.0)
-    return LearnerScores(
-        classes=classes,
-        macro_f1=float(f1[present].mean()),
-        accuracy=float((winner == true).mean()),
-        ece=calibration_error(p.max(axis=1), winner == true),
-        confusion=tuple(tuple(row) for row in shares.tolist()),
-        windows=len(true),
-    )
+    return classification_scores(classes, true, p.argmax(axis=1), p.max(axis=1))
 
 
 def window_ms(model: SoftmaxModel, run: LabelledRun, windows: int = 200) -> float:
-    """Mean computing time of one window, features and answers, ms."""
+    """Mean processor time of one window, features and probabilities, ms."""
     from terrafusion.fusion.training.surface_features import HOP_S, RECENT_S, WINDOW_S, window_features
 
     first, times = float(run.signals.imu_s[0]) + WINDOW_S, []

@@ -1,10 +1,8 @@
-"""A learner of labelled drives: softmax regression over `surface` features, calibrated, in a small file.
+"""Ground classifier of one robot: calibrated softmax regression over its surface features, in a YAML file.
 
-Softmax regression (multinomial logistic regression) and not a forest: grouped
-by run it is the better one on BorealTC (docs/detector.md), it is 300 numbers
-in a YAML file, and it answers in microseconds. Features not observed count as
-the mean of the training drives; so that this does not make it too sure of
-itself, it is trained on copies of the windows with whole inputs taken out.
+Multinomial logistic regression, fitted by scikit-learn, evaluated here without it. Cross-validated by run it is
+better than a forest on BorealTC (docs/detector.md). Missing features count as the training mean; training on
+copies of the windows without whole feature groups keeps it calibrated then.
 """
 
 from __future__ import annotations
@@ -36,33 +34,33 @@ UNKNOWN = "unknown"
 PATCH_LENGTH_M = 10.0
 BREAK_MEMORY = 6
 BREAK_FROM = 0.75
-"""A last second that answers otherwise than the six before (total variation above this) ends the patch:
-windows of one patch err alike, so the filter is slow to give up a ground for evidence of the usual kind."""
+"""A last second whose class probabilities differ from the mean of the six before (total variation above this) ends
+the patch: errors within a patch are correlated, so the filter alone is slow to leave a ground."""
 STRADDLES = round(WINDOW_S / HOP_S)
-"""Windows from a change on that still show some of the ground before: there the last second is believed."""
+"""Windows after a change that contain some of the ground before: for them only the last second is used."""
 STRENGTH = 0.1
 """Inverse of the L2 penalty on the weights of standardised features."""
 ERROR_SHARE = 1e-3
-"""Share of windows that look like nothing they are: no window rules a ground out."""
+"""Probability floor, so that no single window excludes a class."""
 UNKNOWN_SHARE = 0.05
-"""Share of windows of known ground that may be called unknown (split conformal, Vovk et al. 2005)."""
+"""Share of windows of known ground that may be classified as unknown (split conformal, Vovk et al. 2005)."""
 _NUMBERS = ("mean", "scale", "weights", "offsets", "centres", "precision")
 _PLAIN = ("schema", "made_by", "inputs", "features", "classes", "temperature", "odd_distance")
 
 
 @dataclass(frozen=True, eq=False)
 class SoftmaxModel:
-    """Weights of standardised features, and what makes probabilities of them.
+    """Weights of standardised features, calibration and novelty threshold.
 
     Attributes:
         classes: k names.
         mean, scale: (d,) of the features in training.
         weights, offsets: (k, d), (k,).
         centres, precision: (k, d) class means and (d, d) inverse scatter within classes, standardised.
-        odd_distance: squared Mahalanobis distance per observed feature from the nearest class beyond
-            which a window is called unknown.
-        temperature: what log-probabilities are divided by before the patch filter, as windows overlap.
-        inputs: file name -> SHA-256 of what it was trained on.
+        odd_distance: novelty threshold: squared Mahalanobis distance per observed feature from the nearest
+            class beyond which a window is unknown.
+        temperature: divisor of the log-probabilities before the patch filter, as windows overlap.
+        inputs: file name -> SHA-256 of the training logs.
     """
 
     classes: tuple[str, ...]
@@ -78,7 +76,7 @@ class SoftmaxModel:
     made_by: str = ""
 
     def standardised(self, x: Array) -> Array:
-        """Features (n, d) in units of the training's scatter, 0 where not observed."""
+        """Standardised features (n, d), 0 where not observed."""
         return np.nan_to_num((np.atleast_2d(x) - self.mean) / self.scale)
 
     def log_probabilities(self, x: Array) -> Array:
@@ -95,8 +93,8 @@ class SoftmaxModel:
         away = z[:, None, :] - self.centres
         away[np.broadcast_to(~np.isfinite(np.atleast_2d(x))[:, None, :], away.shape)] = 0.0
         distance = np.einsum("nki,ij,nkj->nk", away, self.precision, away)
-        seen = np.maximum(np.isfinite(np.atleast_2d(x)).sum(axis=1), 1)
-        return np.asarray(distance.min(axis=1) / seen)
+        observed = np.maximum(np.isfinite(np.atleast_2d(x)).sum(axis=1), 1)
+        return np.asarray(distance.min(axis=1) / observed)
 
     def filtered(self, windows: SurfaceWindows) -> Array:
         """Class probabilities (n, k) along the n windows of a drive."""
@@ -106,9 +104,9 @@ class SoftmaxModel:
         age = STRADDLES
         for i, rolled in enumerate(windows.rolled_m):
             patches.predict(float(rolled))
-            broken = _broken(np.exp(recent[max(i - BREAK_MEMORY, 0) : i + 1]))
-            patches.forget(broken)
-            age = 0 if broken > 0.5 else age + 1
+            share = _change_evidence(np.exp(recent[max(i - BREAK_MEMORY, 0) : i + 1]))
+            patches.forget(share)
+            age = 0 if share > 0.5 else age + 1
             p[i] = patches.update((recent if age < STRADDLES else log_p)[i] / self.temperature)
         return p
 
@@ -129,11 +127,11 @@ class SoftmaxModel:
             yaml.dump(content, out)
 
 
-def _broken(answers: Array) -> float:
-    """How surely the last of the answers (m, k) ends what the others were about, 0 to 1."""
-    if len(answers) < 4:
+def _change_evidence(p: Array) -> float:
+    """Evidence, 0 to 1, that the ground of the last of the class probabilities (m, k) is a new one."""
+    if len(p) < 4:
         return 0.0
-    away = 0.5 * float(np.abs(answers[-1] - answers[:-1].mean(axis=0)).sum())
+    away = 0.5 * float(np.abs(p[-1] - p[:-1].mean(axis=0)).sum())
     return min(max(0.0, (away - BREAK_FROM) / (1.0 - BREAK_FROM)), 1.0)
 
 
@@ -141,10 +139,10 @@ def read_softmax(path: Path) -> SoftmaxModel:
     """A model file.
 
     Raises:
-        ConfigError: not such a file, or its numbers do not fit together.
+        ConfigError: another schema, or inconsistent numbers.
     """
     content = read_yaml(path)
-    again = "make it again with 'terrafusion terrain train'"
+    again = "create it again with 'terrafusion terrain train'"
     if content.get("schema") != SCHEMA or set(content) != {*_PLAIN, *_NUMBERS}:
         raise ConfigError(f"no model of schema {SCHEMA}", file=path, remedy=again)
     if content["features"] != list(SURFACE_FEATURES):
@@ -179,33 +177,29 @@ def read_softmax(path: Path) -> SoftmaxModel:
 def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFACE_FEATURES) -> SoftmaxModel:
     """Fit to windows (n, d) with a label each, by `features` alone; not yet calibrated.
 
-    Every class counts the same, however many windows it has.
+    Classes have equal weight.
 
     Raises:
-        ConfigError: scikit-learn is not installed, or there are fewer than two classes.
+        ConfigError: fewer than two classes.
     """
-    try:
-        from sklearn.linear_model import LogisticRegression
-    except ImportError:
-        raise ConfigError(
-            "training on logs needs scikit-learn", remedy='pip install "terrafusion[learn]"'
-        ) from None
+    from sklearn.linear_model import LogisticRegression
+
     used = np.isin(SURFACE_FEATURES, list(features))
     x = np.where(used & np.isfinite(x), x, np.nan)
     classes, y = np.unique(np.asarray(labels, dtype=str), return_inverse=True)
     if len(classes) < 2:
-        raise ConfigError("a learner needs at least two grounds", remedy="give logs of more grounds")
-    seen = np.isfinite(x).any(axis=0)
+        raise ConfigError("training needs at least two grounds", remedy="give logs of more grounds")
+    observed = np.isfinite(x).any(axis=0)
     mean, scale = np.zeros(x.shape[1]), np.ones(x.shape[1])
-    mean[seen] = np.nanmean(x[:, seen], axis=0)
-    scale[seen] = np.maximum(np.nanstd(x[:, seen], axis=0), 1e-6)
+    mean[observed] = np.nanmean(x[:, observed], axis=0)
+    scale[observed] = np.maximum(np.nanstd(x[:, observed], axis=0), 1e-6)
     z = np.nan_to_num((x - mean) / scale)
-    machine = LogisticRegression(C=STRENGTH, max_iter=2000, class_weight="balanced")
-    machine.fit(*_with_gaps(z, y))
+    regression = LogisticRegression(C=STRENGTH, max_iter=2000, class_weight="balanced")
+    regression.fit(*_with_gaps(z, y))
     two = len(classes) == 2  # scikit-learn then keeps one row, of the second class
-    weights = np.vstack([-machine.coef_, machine.coef_]) / 2.0 if two else machine.coef_
-    offsets = np.append(-machine.intercept_, machine.intercept_) / 2.0 if two else machine.intercept_
-    weights = np.where(seen, weights, 0.0)
+    weights = np.vstack([-regression.coef_, regression.coef_]) / 2.0 if two else regression.coef_
+    offsets = np.append(-regression.intercept_, regression.intercept_) / 2.0 if two else regression.intercept_
+    weights = np.where(observed, weights, 0.0)
     centres = np.stack([z[y == c].mean(axis=0) for c in range(len(classes))])
     scatter = np.cov((z - centres[y]).T) + 0.1 * np.eye(z.shape[1])
     precision: Array = np.asarray(np.linalg.inv(scatter), dtype=np.float64)
@@ -213,14 +207,14 @@ def fit_softmax(x: Array, labels: Sequence[str], features: Sequence[str] = SURFA
 
 
 def _with_gaps(z: Array, y: NDArray[np.intp]) -> tuple[Array, NDArray[np.intp]]:
-    """The windows (n, d), and every fourth of them again for each input without that input."""
-    copies, answers = [z], [y]
+    """The windows (n, d), and for each of some feature groups every fourth of them again without it."""
+    copies, labels = [z], [y]
     for i, group in enumerate(("motor current", "spectrum above 10 Hz", "gyro spectrum")):
         part = z[i::4].copy()
         part[:, np.isin(SURFACE_FEATURES, GROUPS[group])] = 0.0
         copies.append(part)
-        answers.append(y[i::4])
-    return np.vstack(copies), np.concatenate(answers)
+        labels.append(y[i::4])
+    return np.vstack(copies), np.concatenate(labels)
 
 
 def _digits(x: Any) -> Any:

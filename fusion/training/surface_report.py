@@ -1,4 +1,4 @@
-"""The evaluation of labelled logs: everything `terrafusion terrain eval LOGS` measures, as one mapping."""
+"""Evaluation of labelled logs, as `terrafusion terrain eval LOGS` prints it."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.fusion.training.change_detection import LEAST_RUN_S, changes_seen
+from terrafusion.fusion.training.change_detection import MIN_RUN_S, changes_seen
 from terrafusion.fusion.training.cross_validation import (
     FOLDS,
-    LEAST_RUNS,
+    MIN_RUNS,
     CrossValidation,
     LabelledRun,
     assign_folds,
     check_runs,
     cross_validate,
     labels_of,
-    learner_scores,
+    scores_of,
     train_on,
     window_ms,
 )
@@ -31,19 +31,19 @@ from terrafusion.fusion.training.surface_features import GROUPS, SURFACE_FEATURE
 Array = NDArray[np.float64]
 
 STEPS = 5 + len(GROUPS)
-"""How often `report_on` ticks."""
+"""Number of calls of `tick` in `report_on`."""
 ABLATION_TEMPERATURE = 8.0
-"""Calibrated once on all inputs; not again for each input taken away."""
+"""Calibrated once with all features, not again without a group of them."""
 
 
 def report_on(
     runs: Sequence[LabelledRun], others: Sequence[LabelledRun] = (), tick: Callable[[], None] = lambda: None
 ) -> dict[str, Any]:
-    """All figures of one set of labelled runs, and of a model of it on `others`; JSON-able.
+    """All scores of one set of labelled runs, and of a model of it on `others`, as a JSON object.
 
     Raises:
-        ConfigError: fewer than two grounds, or no scikit-learn.
-        DataError: a ground of a single run.
+        ConfigError: fewer than two grounds.
+        DataError: a ground with a single run.
     """
     check_runs(runs)
     folded = cross_validate(runs)
@@ -59,8 +59,8 @@ def report_on(
             for k in range(FOLDS)
         },
         "temperatures": [m.temperature for m in folded.models],
-        "window by window": dataclasses.asdict(folded.figures(filtered=False)),
-        "filtered": dataclasses.asdict(folded.figures()),
+        "window by window": dataclasses.asdict(folded.scores(filtered=False)),
+        "filtered": dataclasses.asdict(folded.scores()),
         "changes of ground": None if changes is None else dataclasses.asdict(changes),
         "window_ms": window_ms(folded.models[0], max(runs, key=lambda r: len(r.x))),
     }
@@ -79,7 +79,7 @@ def report_on(
 
 
 def ablation(runs: Sequence[LabelledRun], tick: Callable[[], None]) -> dict[str, dict[str, float]]:
-    """Macro-F1 by run without each input, and with it alone."""
+    """Macro-F1 by run without each feature group, and with it alone."""
     table: dict[str, dict[str, float]] = {}
     for name, features in {"nothing": (), **GROUPS}.items():
         rest = [f for f in SURFACE_FEATURES if f not in features]
@@ -91,13 +91,13 @@ def ablation(runs: Sequence[LabelledRun], tick: Callable[[], None]) -> dict[str,
 
 
 def trees(runs: Sequence[LabelledRun], fold_of: NDArray[np.intp]) -> float:
-    """Macro-F1, window by window, of extremely randomised trees (Geurts et al. 2006) on the same folds."""
+    """Macro-F1 of single windows, of extremely randomised trees (Geurts et al. 2006) on the same folds."""
     x, y, fold = _stacked(runs, fold_of)
     return _tree_f1(x, y, fold)
 
 
 def leaking(runs: Sequence[LabelledRun]) -> dict[str, float]:
-    """Macro-F1 where windows, not runs, are dealt to the folds: overlapping windows in training and test."""
+    """Macro-F1 with folds of windows instead of runs: overlapping windows leak from training into test."""
     x, y, _ = _stacked(runs, assign_folds(runs))
     fold = np.random.default_rng(0).permutation(len(x)) % FOLDS
     p = np.zeros((len(x), len(set(y.tolist()))))
@@ -105,20 +105,20 @@ def leaking(runs: Sequence[LabelledRun]) -> dict[str, float]:
         model = fit_softmax(x[fold != k], y[fold != k].tolist())
         p[fold == k] = np.exp(model.log_probabilities(x[fold == k]))
     return {
-        "softmax": learner_scores(model.classes, runs, [p]).macro_f1,
+        "softmax": scores_of(model.classes, runs, [p]).macro_f1,
         "extra trees": _tree_f1(x, y, fold),
     }
 
 
 def never_seen(runs: Sequence[LabelledRun]) -> dict[str, dict[str, float]]:
-    """Shares of windows called odd: of a ground left out of the training, and of runs of known ground."""
+    """Share of windows beyond the novelty threshold: of a ground left out of the training, and of known ground."""
     shares: dict[str, dict[str, float]] = {}
     fold_of = assign_folds(runs)
     for ground in sorted({r.label for r in runs}):
         known = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f != 0]
         test = [r for r, f in zip(runs, fold_of, strict=True) if r.label != ground and f == 0]
         counts = Counter(r.label for r in known)
-        if len(counts) < 2 or max(counts.values()) < LEAST_RUNS or not test:
+        if len(counts) < 2 or max(counts.values()) < MIN_RUNS or not test:
             continue
         model = train_on(known)
         odd = {
@@ -130,7 +130,7 @@ def never_seen(runs: Sequence[LabelledRun]) -> dict[str, dict[str, float]]:
 
 
 def transfer(runs: Sequence[LabelledRun], others: Sequence[LabelledRun]) -> dict[str, Any]:
-    """A model of `runs` on another set, by the inputs that set has, on the grounds both have."""
+    """A model of `runs` on another set, with the features of that set, on the grounds of both."""
     common = sorted({r.label for r in runs} & {r.label for r in others})
     test = [r for r in others if r.label in common]
     if len(common) < 2:
@@ -143,34 +143,34 @@ def transfer(runs: Sequence[LabelledRun], others: Sequence[LabelledRun]) -> dict
         back = [r for r in on if r.label in common]
         model = train_on(here, features, ABLATION_TEMPERATURE)
         x = np.vstack([r.x for r in back])
-        single = learner_scores(model.classes, back, [np.exp(model.log_probabilities(x))])
+        single = scores_of(model.classes, back, [np.exp(model.log_probabilities(x))])
         result[name] = dataclasses.asdict(single)
     result["odd"] = float(np.mean(_odd(runs, test, features)))
     return result
 
 
 def score(model: SoftmaxModel, runs: Sequence[LabelledRun]) -> dict[str, Any]:
-    """Figures of a finished model on runs that it was not trained on; JSON-able.
+    """Scores of a model on runs that it was not trained on, as a JSON object.
 
     Raises:
-        DataError: a ground that the model does not know.
+        DataError: a ground without a class in the model.
     """
-    strange = sorted({r.label for r in runs} - set(model.classes))
-    if strange:
+    unknown = sorted({r.label for r in runs} - set(model.classes))
+    if unknown:
         raise DataError(
-            f"the model does not know {', '.join(strange)}",
+            f"the model does not know {', '.join(unknown)}",
             channel="terrain",
             remedy=f"give runs on {', '.join(model.classes)}",
         )
-    answers = {
+    probabilities = {
         "window by window": [np.exp(model.log_probabilities(r.x)) for r in runs],
         "filtered": [model.filtered(r.windows) for r in runs],
     }
-    return {name: dataclasses.asdict(learner_scores(model.classes, runs, p)) for name, p in answers.items()}
+    return {name: dataclasses.asdict(scores_of(model.classes, runs, p)) for name, p in probabilities.items()}
 
 
 def figures_lines(report: dict[str, Any]) -> list[str]:
-    """The figures of single and of filtered answers in words and tables, line by line."""
+    """Scores of single windows and of the filter, as lines of text."""
     lines: list[str] = []
     for name in ("window by window", "filtered"):
         figures = report[name]
@@ -184,7 +184,7 @@ def figures_lines(report: dict[str, Any]) -> list[str]:
 
 
 def lines_of(report: dict[str, Any]) -> list[str]:
-    """The report in words and tables, line by line."""
+    """The report as lines of text."""
     lines = [f"{fold}: {', '.join(names)}" for fold, names in report["runs"].items()]
     lines += figures_lines(report)
     lines += [
@@ -192,7 +192,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         _change(report["changes of ground"]),
         f"one window {report['window_ms']:.2f} ms",
         "",
-        "macro-F1 without an input, and with it alone:",
+        "macro-F1 without a feature group, and with it alone:",
     ]
     for name, row in report["ablation"].items():
         alone = f"{row['alone']:.3f}" if "alone" in row else ""
@@ -205,7 +205,7 @@ def lines_of(report: dict[str, Any]) -> list[str]:
         "windows of one run in training and test: "
         f"softmax {leak['softmax']:.3f}, extra trees {leak['extra trees']:.3f}",
         "",
-        "called odd, of a ground left out of the training and of known ground:",
+        "classified as unknown, of a ground left out of the training and of known ground:",
         *(
             f"{ground:14s} {s['left out']:.3f} {s['known']:.3f}"
             for ground, s in report["ground never seen"].items()
@@ -217,16 +217,16 @@ def lines_of(report: dict[str, Any]) -> list[str]:
             "",
             f"trained here, tested on the other set ({', '.join(other['common grounds'])}): "
             f"macro-F1 {other['there']['macro_f1']:.3f}; the other way {other['back']['macro_f1']:.3f}; "
-            f"called odd there {other['odd']:.3f}",
+            f"classified as unknown there {other['odd']:.3f}",
         ]
     return lines
 
 
 def _change(change: dict[str, Any] | None) -> str:
     if change is None:
-        return f"change of ground: not measured, no fold has two grounds with runs above {LEAST_RUN_S:g} s"
+        return f"change of ground: not measured, no fold has two grounds with runs above {MIN_RUN_S:g} s"
     return (
-        f"change of ground seen after {change['median_s']:.1f} s (median), {change['p95_s']:.1f} s (95 %); "
+        f"change of ground detected after {change['median_s']:.1f} s (median), {change['p95_s']:.1f} s (95 %); "
         f"within 2 s {change['within_2_s']:.0%}, never {change['never']:.0%} of {change['changes']}"
     )
 
@@ -245,7 +245,7 @@ def _odd(
 
 
 def _f1(folded: CrossValidation) -> float:
-    return folded.figures().macro_f1
+    return folded.scores().macro_f1
 
 
 def _stacked(
@@ -262,6 +262,6 @@ def _tree_f1(x: Array, y: NDArray[Any], fold: NDArray[np.intp]) -> float:
     filled = np.where(np.isfinite(x), x, 0.0)
     named = np.empty(len(y), dtype=object)
     for k in np.unique(fold):
-        machine = ExtraTreesClassifier(200, min_samples_leaf=2, class_weight="balanced", random_state=0)
-        named[fold == k] = machine.fit(filled[fold != k], y[fold != k]).predict(filled[fold == k])
+        forest = ExtraTreesClassifier(200, min_samples_leaf=2, class_weight="balanced", random_state=0)
+        named[fold == k] = forest.fit(filled[fold != k], y[fold != k]).predict(filled[fold == k])
     return float(f1_score(y, named.astype(str), average="macro"))

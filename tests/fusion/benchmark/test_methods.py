@@ -57,7 +57,7 @@ def test_the_data_sheet_knows_no_slip_and_no_tuning() -> None:
     assert options is not None
     row = options["policy"].fixed
     assert {name: getattr(row, name) for name in DATA_SHEET_NOISE} == DATA_SHEET_NOISE
-    assert options["settings"]["tuning"].fixed.of(row) == row
+    assert options["settings"]["tuning"].fixed.applied(row) == row
 
 
 def test_true_labels_follow_the_simulation(two_grounds) -> None:

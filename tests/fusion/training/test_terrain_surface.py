@@ -150,7 +150,7 @@ def test_no_run_is_in_two_folds_and_every_ground_is_in_each(runs: Sequence[Label
 
 def test_grounds_are_learnt_by_run(runs: Sequence[LabelledRun]) -> None:
     folded = cross_validate(runs)
-    single, filtered = folded.figures(filtered=False), folded.figures()
+    single, filtered = folded.scores(filtered=False), folded.scores()
     assert single.macro_f1 > 0.9
     assert filtered.macro_f1 > 0.9
     assert filtered.ece < 0.1
@@ -167,7 +167,7 @@ def test_grounds_are_learnt_by_run(runs: Sequence[LabelledRun]) -> None:
 def test_labels_at_random_are_not_learnt(runs: Sequence[LabelledRun]) -> None:
     names = list(SHAKES)
     mixed = [dataclasses.replace(r, label=names[i % 3]) for i, r in enumerate(runs)]
-    assert cross_validate(mixed, temperature=4.0).figures().macro_f1 < 0.6
+    assert cross_validate(mixed, temperature=4.0).scores().macro_f1 < 0.6
 
 
 def test_every_window_gets_probabilities_whatever_is_missing(
@@ -369,7 +369,7 @@ def test_a_real_husky_is_told_ice_from_loam_by_run(tmp_path: Path) -> None:
     if not logs:
         pytest.skip("no BorealTC among the field logs")
     runs = open_runs(logs)
-    assert cross_validate(runs, temperature=8.0).figures().macro_f1 > 0.95
+    assert cross_validate(runs, temperature=8.0).scores().macro_f1 > 0.95
     assert window_ms(train_on(runs, temperature=8.0), runs[0], 50) < 20.0
     out, figures = tmp_path / "grounds.yaml", tmp_path / "figures.json"
     held = logs[::4]

@@ -1,0 +1,60 @@
+"""Scores of a classifier's probabilities, by scikit-learn; only the calibration error is computed here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+ECE_BINS = 10
+
+
+@dataclass(frozen=True)
+class ClassificationScores:
+    """Scores over windows.
+
+    Attributes:
+        classes: k names.
+        macro_f1: mean F1 of the classes that occurred.
+        accuracy: share of windows with the right class.
+        ece: expected calibration error of the most probable class.
+        confusion: (k, k) shares; a row is a true class and sums to one, or to zero if it did not occur.
+        windows: their number.
+    """
+
+    classes: tuple[str, ...]
+    macro_f1: float
+    accuracy: float
+    ece: float
+    confusion: tuple[tuple[float, ...], ...]
+    windows: int
+
+
+def classification_scores(
+    classes: Sequence[str], true: NDArray[np.intp], winner: NDArray[np.intp], confidence: Array
+) -> ClassificationScores:
+    """Scores of n windows: true and most probable class (n,), as indices, and the probability of the latter."""
+    from sklearn.metrics import accuracy_score, confusion_matrix, f1_score
+
+    every: list[int] = list(range(len(classes)))
+    shares: NDArray[Any] = confusion_matrix(true, winner, labels=every, normalize="true")
+    return ClassificationScores(
+        classes=tuple(classes),
+        macro_f1=float(f1_score(true, winner, labels=np.unique(true), average="macro", zero_division=0.0)),
+        accuracy=float(accuracy_score(true, winner)),
+        ece=calibration_error(confidence, winner == true),
+        confusion=tuple(tuple(row) for row in shares.tolist()),
+        windows=len(true),
+    )
+
+
+def calibration_error(confidence: Array, correct: NDArray[np.bool_]) -> float:
+    """Expected calibration error (Naeini et al. 2015), ten bins, of probabilities (n,); scikit-learn has none."""
+    bins = np.minimum((confidence * ECE_BINS).astype(int), ECE_BINS - 1)
+    gap = np.bincount(bins, weights=confidence - correct, minlength=ECE_BINS)
+    return float(np.abs(gap).sum() / len(confidence))
