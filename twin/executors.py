@@ -1,8 +1,7 @@
-"""Where chunks of runs are computed: in this process, in processes of this machine, or on a Dask cluster.
+"""Executors for chunks of runs: this process, processes of this machine, or a Dask cluster.
 
-joblib's loky and a Dask client both offer the executor of `concurrent.futures`,
-so that all backends run the same code, and that a cluster that lost its workers is
-noticed while waiting (inside joblib's own Dask backend it could not be).
+joblib's loky and a Dask client both offer the executor of `concurrent.futures`, so that all backends run the
+same code, and that the loss of all workers is noticed while waiting (joblib's own Dask backend would wait).
 """
 
 from __future__ import annotations
@@ -28,11 +27,11 @@ T = TypeVar("T")
 
 BACKENDS = ("loky", "dask")
 REPLACED = "A worker stopped while some jobs"
-"""What loky warns of when it replaces a worker whose memory has grown: no job is lost by it."""
+"""Warning of loky when it replaces a worker whose memory has grown; no job is lost."""
 CONNECT_S = 8.0
-"""A scheduler or its first worker that has not answered by then is told as missing."""
+"""Timeout of the scheduler and of its first worker."""
 WORKERLESS_S = 10.0
-"""A cluster without any worker for so long is given up."""
+"""Timeout of a cluster without any worker."""
 _POLL_S = 1.0
 _MAX_GREETING = 1 << 20
 _CONTINUE = "finished runs are kept, and the same command continues"
@@ -40,10 +39,10 @@ _CONTINUE = "finished runs are kept, and the same command continues"
 
 @dataclass(frozen=True)
 class Workers:
-    """An executor (None: this process) and how to use it.
+    """An executor (None: this process), and how many jobs to submit ahead.
 
     Attributes:
-        at_once: jobs handed over ahead of their results; None for all.
+        at_once: jobs submitted ahead of their results; None for all.
         check: raises when the workers are gone for good.
     """
 
@@ -74,7 +73,7 @@ class Workers:
 
 @contextlib.contextmanager
 def open_workers(backend: str, jobs: int, address: str | None = None) -> Iterator[Workers]:
-    """A pool of `jobs` processes on this machine, or of the workers of the Dask scheduler at `address`.
+    """`jobs` processes on this machine, or the workers of the Dask scheduler at `address`.
 
     Raises:
         ConfigError: unknown backend, no jobs, or an address missing or out of place.
@@ -91,14 +90,14 @@ def open_workers(backend: str, jobs: int, address: str | None = None) -> Iterato
             remedy="give the scheduler's address, such as tcp://10.0.0.5:8786",
         )
     if address is not None:
-        with _dask(address) as pool:
-            yield pool
+        with _dask(address) as workers:
+            yield workers
     elif jobs == 1:
         yield Workers(None)
     else:
         with warnings.catch_warnings(), _loky(jobs) as executor:
             warnings.filterwarnings("ignore", message=REPLACED, category=UserWarning)
-            # Less than loky hands on at once (2 jobs + 1): it stops cleanly only when none waits inside it.
+            # Less than loky queues at once (2 jobs + 1): it stops cleanly only when none waits inside it.
             yield Workers(executor, at_once=2 * jobs)
 
 
@@ -129,14 +128,14 @@ def _first_line(error: BaseException) -> str:
 def _loky(jobs: int) -> Iterator[Executor]:
     from joblib.externals.loky import get_reusable_executor
 
-    # The arrays are small: threads of the linear algebra would only fight over the processors.
+    # One thread of linear algebra a process: the arrays are small.
     threads = dict.fromkeys(("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     executor = get_reusable_executor(max_workers=jobs, reuse=False, env=threads)
     try:
         yield executor
     finally:
-        # loky's thread fails on jobs that it has not yet handed on when the workers are killed. It takes them
-        # in order: once it has seen one more, it has handed on all.
+        # loky's thread fails on jobs still in its queue when the workers are killed. It takes them in order:
+        # once it has seen one more, the queue is empty.
         with contextlib.suppress(BrokenExecutor):
             last = executor.submit(int)
             last.cancel()
@@ -163,7 +162,7 @@ def _dask(address: str) -> Iterator[Workers]:
 
 
 def _knock(address: str) -> None:
-    """Refuse an address where no scheduler speaks, at once: a client that fails takes long to say so."""
+    """Refuse an address where no scheduler answers, faster than the timeout of a client."""
     scheme, _, place = address.rpartition("://")
     host, _, port = place.rpartition(":")
     if scheme not in ("tcp", "tls") or not host or not port.isdecimal():
@@ -190,7 +189,7 @@ def _no_scheduler(address: str, why: str) -> TerrafusionError:
 
 @contextlib.contextmanager
 def _quiet(name: str) -> Iterator[None]:
-    """Keep the log of a package off the terminal: what matters in it is raised as an error."""
+    """Mute the log of a package: what matters in it is raised as an error."""
     logger = logging.getLogger(name)
     before = logger.level
     logger.setLevel(logging.CRITICAL + 1)
@@ -201,7 +200,7 @@ def _quiet(name: str) -> Iterator[None]:
 
 
 def installed() -> dict[str, str]:
-    """What must be the same on all machines of a sweep."""
+    """Versions that must be the same on all machines of a sweep."""
     found = {"Python": ".".join(platform.python_version_tuple()[:2])}
     for name in ("numpy", "scipy", "casadi"):
         found[name] = metadata.version(name)

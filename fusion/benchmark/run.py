@@ -55,8 +55,8 @@ def run_benchmark(
     check_folder(out / FOLDER)
     results = {job: stored for job in planned if (stored := _stored(out, job)) is not None}
     missing = [job for job in planned if job not in results]
-    with open_workers("loky", min(jobs, max(len(missing), 1))) as pool:
-        for job, new in pool.results(run_job, [(job,) for job in missing]):
+    with open_workers("loky", min(jobs, max(len(missing), 1))) as workers:
+        for job, new in workers.results(run_job, [(job,) for job in missing]):
             part = write_part(out, job.key, dataclasses.asdict(new), _state(job))
             results[job] = BenchmarkResult.read(part)
             if progress is not None:

@@ -1,4 +1,4 @@
-"""`terrafusion calibrate`: soil and vehicle numbers fitted to logs, with sigma and what is not told."""
+"""`terrafusion calibrate`: soil and vehicle parameters fitted to logs, with sigma and identifiability."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LogsArgument = Annotated[
     typer.Argument(
         metavar="LOG...",
         help="Log folders, bags or catalogue names of one vehicle; "
-        "LOG@60-105 is a piece of one, LOG@/45 all of its pieces of 45 s.",
+        "LOG@60-105 is a segment of one, LOG@/45 all of its segments of 45 s.",
     ),
 ]
 OutOption = Annotated[
@@ -43,7 +43,7 @@ TerrainOption = Annotated[
 ]  # fmt: skip
 PriorOption = Annotated[
     list[str] | None,
-    typer.Option("--prior", metavar="NAME=VALUE+-SIGMA", help="What is known of a number; repeat for more."),
+    typer.Option("--prior", metavar="NAME=VALUE+-SIGMA", help="Prior of a parameter; repeat for more."),
 ]
 
 
@@ -60,21 +60,22 @@ def calibrate(
         str, typer.Option("--input", help="What drives the twin: auto, command, wheels.")
     ] = "auto",
     truth: Annotated[bool, typer.Option("--truth", help="Use the reference pose, too.")] = False,
-    robust: Annotated[bool, typer.Option("--robust", help="Weigh outliers down (Huber).")] = False,
+    robust: Annotated[bool, typer.Option("--robust", help="Down-weight outliers (Huber).")] = False,
     channels: Annotated[str | None, typer.Option(help="Use these channels only, with commas.")] = None,
     window_s: Annotated[float, typer.Option(help="The pose starts anew after so long.")] = 10.0,
     slope_deg: Annotated[float, typer.Option(help="Slope of the ground, 0 to 25 deg.")] = 0.0,
-    aspect_deg: Annotated[float, typer.Option(help="The way uphill, deg from east to the left.")] = 0.0,
+    aspect_deg: Annotated[float, typer.Option(help="Direction uphill, deg from east to the left.")] = 0.0,
     payload_kg: Annotated[float, typer.Option(help="Payload at the centre of gravity, kg.")] = 0.0,
     suggest: Annotated[
-        bool, typer.Option("--suggest", help="Try drives in the twin that would tell what is left open.")
+        bool,
+        typer.Option("--suggest", help="Suggest manoeuvres that would identify the unresolved parameters."),
     ] = False,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
 ) -> None:
-    """Fit soil and vehicle numbers to logs, tell how sure they are and what the logs cannot tell.
+    """Fit soil and vehicle parameters to logs, with their sigma and what the logs cannot identify.
 
     Writes calibration.json, vehicle.yaml and soil.yaml with the new numbers, and report.html.
 
@@ -102,9 +103,9 @@ def calibrate(
     for line in summary(found):
         print(line)
     if suggest:
-        from terrafusion.twin.calibrate.suggest import suggest as tried
+        from terrafusion.twin.calibrate.suggest import suggest as suggestions
 
-        for suggestion in tried(found):
+        for suggestion in suggestions(found):
             print(suggestion.sentence())
     print(f"written to {out}")
 

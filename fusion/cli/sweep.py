@@ -12,7 +12,7 @@ import typer
 from terrafusion.fusion.cli.common import progress_bar
 
 if TYPE_CHECKING:
-    from terrafusion.twin.sweep.run import Sweep
+    from terrafusion.twin.sweep.plan import Sweep
 
 RecordingsOption = Annotated[
     list[str] | None,
@@ -45,7 +45,9 @@ def sweep(
 
     Example: terrafusion sweep friction_slope --out results --jobs 2
     """
-    from terrafusion.twin.sweep.run import check_runs, load_sweep, run_sweep, write_recordings
+    from terrafusion.twin.sweep.load import load_sweep
+    from terrafusion.twin.sweep.recordings import check_runs, write_recordings
+    from terrafusion.twin.sweep.run import run_sweep
 
     if backend not in ("loky", "dask"):
         raise typer.BadParameter(f"'{backend}' is neither 'loky' nor 'dask'", param_hint="--backend")
@@ -86,8 +88,8 @@ def summary_lines(statuses: Sequence[str], errors: Sequence[str | None]) -> list
     """How the runs ended, in a line; where some failed, why the first did."""
     from terrafusion.twin.sweep.rows import STATUSES
 
-    told = [f"{statuses.count(word)} {word}" for word in STATUSES if word in statuses]
-    lines = [f"{len(statuses)} run{'s' if len(statuses) != 1 else ''}: {', '.join(told)}"]
+    counts = [f"{statuses.count(word)} {word}" for word in STATUSES if word in statuses]
+    lines = [f"{len(statuses)} run{'s' if len(statuses) != 1 else ''}: {', '.join(counts)}"]
     if "failed" in statuses:
         first = statuses.index("failed")
         lines.append(f"run {first} failed: {errors[first]} (column 'error' has the others)")

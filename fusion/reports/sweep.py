@@ -18,7 +18,7 @@ from terrafusion.fusion.reports.plots.sweep_cells import Columns, columns_of
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from terrafusion.twin.sweep.run import Sweep
+    from terrafusion.twin.sweep.plan import Sweep
 
 MOST_FAILURES = 20
 MEANINGS = {

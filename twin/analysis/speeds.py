@@ -50,7 +50,7 @@ class Profiles:
 
     Attributes:
         t_s: seconds from the recording's start.
-        command: commanded speed, m/s, as told to the robot, before its limits of acceleration.
+        command: commanded speed, m/s, before the limits of acceleration.
         truth, odometry, imu, gnss: forward speeds, m/s, low-passed.
         yaw_rate: of the IMU, rad/s, low-passed; `gyro` is the same as measured.
         true_yaw_rate: of the body, rad/s.

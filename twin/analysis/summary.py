@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import INDEX, VEHICLE_PARAMETERS, state_slice
+from terrafusion.twin.physics.layout import INDEX, SIDES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import gear_loss, motor_current, motor_voltage, winding_loss
 from terrafusion.twin.scenario.commands import DrivenStates
 
@@ -97,7 +97,7 @@ class Energy:
 def slip_ratios(states: Array, motion: BodyMotion, vehicle: VehicleParams) -> Array:
     """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest."""
     rim = states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
-    half = 0.5 * vehicle.body.track_m * np.array([1.0, -1.0, 1.0, -1.0])
+    half = 0.5 * vehicle.body.track_m * np.array(SIDES)
     hub = motion.velocity_body_mps[:, :1] - motion.yaw_rate_radps[:, None] * half
     larger = np.maximum(np.abs(rim), np.abs(hub))
     return np.where(larger > 1e-3, (rim - hub) / np.maximum(larger, 1e-3), 0.0)

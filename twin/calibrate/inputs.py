@@ -1,4 +1,4 @@
-"""What the twin is told in a log's place: the commands within the robot's limits, or the measured wheels."""
+"""Input of the twin for a log: its commands within the robot's limits, or its measured wheel speeds."""
 
 from __future__ import annotations
 
@@ -26,15 +26,11 @@ MOVING_RADPS = 0.3
 STEP = 4.0
 """Commands that change this many times faster than the robot may accelerate are steps."""
 LONGEST_GAP_S = 0.5
-"""A longer gap in measured wheel speeds voids what falls into it."""
+"""Measurements within a longer gap of the input are not used."""
 
 
 def check_source(source: str) -> None:
-    """Refuse what is none of `SOURCES`.
-
-    Raises:
-        ConfigError: it is none.
-    """
+    """Raise a ConfigError for what is none of `SOURCES`."""
     if source not in SOURCES:
         raise ConfigError(f"unknown input '{source}'", remedy=f"give one of {', '.join(SOURCES)}")
 
@@ -45,7 +41,7 @@ class TwinInput:
 
     Attributes:
         start_ns: time of the first sample.
-        sides: (N + 1, 2) wheel speeds told to left and right, rad/s, every `DT_S`, before any dead time.
+        sides: (N + 1, 2) wheel speeds of left and right, rad/s, every `DT_S`, before any dead time.
         follows: whether they are measured speeds that the wheels follow, not commands.
         gaps: (G, 2) stretches without input, s.
         notes: what was assumed.
@@ -77,7 +73,7 @@ def twin_input(recording: Recording, vehicle: VehicleParams, source: str) -> Twi
         )
     if wheels is None or len(wheels) < 3:
         raise DataError(
-            "the log has neither commands nor wheel speeds: nothing tells the twin what to do",
+            "the log has neither commands nor wheel speeds: the twin has no input",
             file=recording.name,
             remedy="give a log with a command or a wheels channel",
         )
@@ -89,7 +85,7 @@ def _measured(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     assert wheels is not None
     notes = [
         "driven by the measured wheel speeds, which the twin's wheels follow through a stiff speed loop: "
-        "motors, speed loop and delays cannot be told from this log"
+        "motors, speed loop and delays cannot be identified from this log"
     ]
     if not wheels.has_sides():
         notes.append("the log has one wheel speed for both sides: the twin drives straight ahead")
@@ -108,7 +104,7 @@ def _measured(recording: Recording, vehicle: VehicleParams) -> TwinInput:
 def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     """Commanded twists within the vehicle's own limits.
 
-    Between two commands the twist runs smoothly; a sudden change is a step.
+    Between two commands the twist is a cubic; a sudden change is a step.
     """
     command = recording.command
     assert command is not None
@@ -155,7 +151,7 @@ def _in_one_time(recording: Recording, after_ns: int) -> None:
 
 
 def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:
-    """Commands (n,) at times (n,) on the grid (N,): a smooth course with steps."""
+    """Commands (n,) at times (n,) interpolated on the grid (N,): cubic, except at steps."""
     before = np.clip(np.searchsorted(t_s, grid + 1e-6, side="right") - 1, 0, len(t_s) - 1)
     out = wanted[before]
     apart = np.append(np.diff(t_s), np.inf)
@@ -177,7 +173,7 @@ def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:
 
 
 def _rests(recording: Recording, vehicle: VehicleParams) -> bool:
-    """Whether the robot stands at the start, as far as its wheels say."""
+    """Whether the robot stands at the start, by its wheel speeds."""
     wheels = recording.wheels
     if wheels is None or len(wheels) < 2:
         return True

@@ -1,4 +1,4 @@
-"""A recording made ready: what the twin is told, the ground over time, windows and where each starts."""
+"""A recording prepared for the fit: input of the twin, ground over time, windows and their start poses."""
 
 from __future__ import annotations
 
@@ -25,17 +25,17 @@ LEAST_ROWS = 4
 
 @dataclass(frozen=True, eq=False)
 class PreparedLog:
-    """One drive as the fit sees it; times in seconds from the first input, on a grid of `inputs.DT_S`.
+    """One run as the fit uses it; times in seconds from the first input, on a grid of `inputs.DT_S`.
 
     Attributes:
         name: of the recording.
-        sides: (N + 1, 2) wheel speeds told to left and right, rad/s, before any dead time.
+        sides: (N + 1, 2) wheel speeds of left and right, rad/s, before any dead time.
         follows: whether the twin's wheels follow measured ones.
         labels, borders: grounds in the order driven, and the times (K - 1,) between them.
         windows: (W, 2) first and last grid sample of each window; each starts where the one before ends.
         start: (W, 3) x, y, yaw in the plane at each window's start, a guess from the data.
         observed: the channels.
-        posed: whether anything in the log says where the robot heads.
+        posed: whether the log determines the heading.
         notes: what was assumed, in sentences.
     """
 
@@ -65,7 +65,7 @@ def prepare(
     ground: str | None = None,
     channels: tuple[str, ...] | None = None,
 ) -> PreparedLog:
-    """The log as the fit needs it.
+    """The log, prepared.
 
     Args:
         source: one of `inputs.SOURCES`.
@@ -77,16 +77,16 @@ def prepare(
     Raises:
         DataError: no input, or nothing to compare the twin with.
     """
-    told = twin_input(recording, model.vehicle, source)
-    notes = list(told.notes)
-    observed = observe(recording, model.vehicle, told.start_ns, wheels=not told.follows, truth=truth)
+    given = twin_input(recording, model.vehicle, source)
+    notes = list(given.notes)
+    observed = observe(recording, model.vehicle, given.start_ns, wheels=not given.follows, truth=truth)
     if channels is not None:
         observed = tuple(o for o in observed if o.channel.startswith(channels))
     ends = [float(o.end_s[-1]) for o in observed]
-    end_s = min(told.end_s(), max(ends, default=0.0))
-    windows = _windows(_begin_s(told.sides, model.slope_rad), end_s, window_s)
+    end_s = min(given.end_s(), max(ends, default=0.0))
+    windows = _windows(_begin_s(given.sides, model.slope_rad), end_s, window_s)
     named = [o.channel for o in observed]
-    observed = tuple(filter(_enough, (_within(o, windows, told.gaps) for o in observed)))
+    observed = tuple(filter(_enough, (_within(o, windows, given.gaps) for o in observed)))
     if lost := [name for name in named if name not in {o.channel for o in observed}]:
         notes.append(f"left out, with less than {LEAST_ROWS} rows while the twin drives: {', '.join(lost)}")
     if not observed:
@@ -95,19 +95,19 @@ def prepare(
             file=recording.name,
             remedy="it needs wheels, an IMU, GNSS or motor currents beside what drives the twin",
         )
-    labels, borders = grounds(recording, told.start_ns) if ground is None else ((ground,), np.zeros(0))
+    labels, borders = grounds(recording, given.start_ns) if ground is None else ((ground,), np.zeros(0))
     at_s: Array = windows[:, 0].astype(float) * DT_S
-    start, posed = window_starts(recording, model, told.start_ns, at_s, window_s, truth=truth)
+    start, posed = window_starts(recording, model, given.start_ns, at_s, window_s, truth=truth)
     if model.slope_rad > 0.0 and not posed:
-        notes.append("on a slope, and nothing in the log says its heading: taken as 0 at the start")
+        notes.append("on a slope, and nothing in the log determines the heading: taken as 0 at the start")
     return PreparedLog(
-        recording.name, told.sides, told.follows, labels, borders, windows, start, observed, posed,
+        recording.name, given.sides, given.follows, labels, borders, windows, start, observed, posed,
         tuple(notes),
     )  # fmt: skip
 
 
 def _begin_s(sides: Array, slope_rad: float) -> float:
-    """Time from which the log is compared; a robot at rest on the flat is loaded by nothing."""
+    """Time from which the log is compared."""
     moving = np.abs(sides).max(axis=1) > MOVING_RADPS
     if moving[0]:
         return START_S
@@ -128,7 +128,7 @@ def grounds(recording: Recording, start_ns: int) -> tuple[tuple[str, ...], Array
 
 
 def _windows(begin_s: float, end_s: float, window_s: float) -> NDArray[np.int64]:
-    """First and last grid sample (W, 2) of the windows; what is left over, if half as long, is one too."""
+    """First and last grid sample (W, 2) of the windows; a remainder of half the length is one, too."""
     first, last, size = round(begin_s / DT_S), int(end_s / DT_S + 1e-6), max(2, round(window_s / DT_S))
     edges = np.arange(first, max(last, first) + 1, size)
     if len(edges) == 1 or last - edges[-1] >= size // 2:

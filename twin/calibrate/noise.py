@@ -1,10 +1,9 @@
-"""How the residuals of a channel scatter and how they hang together in time; whitening by it.
+"""Scale and autocorrelation of the residuals of a channel, and whitening by them.
 
-Neighbouring residuals are correlated: a chassis shakes in a band, GNSS errors drift, a twin that misses
-some physics is off for seconds. Counted as independent they would make sigma too small by the square root
-of their number. So each channel has a covariance, that of an autoregressive process fitted to its own
+Neighbouring residuals are correlated: a chassis vibrates in a band, GNSS errors drift, unmodelled physics
+lasts for seconds. Taken as independent they would make sigma too small. So each channel has a covariance, that of an autoregressive process fitted to its own
 residuals (Yule-Walker; order by the corrected Akaike criterion, Hurvich and Tsai 1989) or, where a data
-sheet tells the time constant, of white plus first-order Gauss-Markov noise; rows are whitened by its Cholesky
+sheet gives the time constant, of white plus first-order Gauss-Markov noise; rows are whitened by its Cholesky
 factor before they are squared.
 """
 
@@ -26,7 +25,7 @@ MAX_ORDER = 12
 LEAST_ROWS = 40
 """A channel with fewer rows is taken as white."""
 NUGGET = 0.01
-"""White share that is added to every correlation: no frequency is taken as free of noise."""
+"""White share added to every correlation, so that no frequency is free of noise."""
 OUTLIER_SIGMAS = 4.0
 """Residuals are clipped at this many robust sigmas before their correlation is estimated."""
 
@@ -56,8 +55,8 @@ class ResidualNoise:
             return np.asarray(scaled)
         g, n, k = columns.shape
         lower = _factor(self.rho, tuple((slots[1:] - slots[:-1]).tolist()))
-        side_by_side = scaled.transpose(1, 0, 2).reshape(n, g * k)
-        solved = dtrsm(1.0, lower, side_by_side.T, side=1, lower=1, trans_a=1).T
+        flat = scaled.transpose(1, 0, 2).reshape(n, g * k)
+        solved = dtrsm(1.0, lower, flat.T, side=1, lower=1, trans_a=1).T
         return np.asarray(solved.reshape(n, g, k).transpose(1, 0, 2))
 
 
@@ -83,11 +82,11 @@ def gauss_markov(share: float, time_s: float, slot_s: float, lags: int) -> tuple
 
 
 def autoregressive(series: Sequence[tuple[Rows, Array]], lags: int) -> tuple[float, ...]:
-    """Autocorrelation of the residuals: that of the autoregressive process that fits them best.
+    """Autocorrelation of the autoregressive process that fits the residuals best.
 
     Args:
         series: slots (n,) and residuals (n,) in units of their sigma, one pair a window.
-        lags: how many lags are wanted.
+        lags: number of lags.
     """
     total = sum(len(values) for _, values in series)
     order = min(MAX_ORDER, total // 10)
@@ -110,7 +109,7 @@ def autoregressive(series: Sequence[tuple[Rows, Array]], lags: int) -> tuple[flo
 
 
 def _autocovariance(series: Sequence[tuple[Rows, Array]], order: int) -> Array:
-    """Autocovariance (order + 1,), divided by the number of rows at all lags, which keeps it positive."""
+    """Autocovariance (order + 1,), divided by the number of rows at all lags: positive definite."""
     sums, total = np.zeros(order + 1), 0
     for slots, values in series:
         dense = np.zeros(int(slots[-1] - slots[0]) + 1) if len(slots) else np.zeros(0)
@@ -129,12 +128,12 @@ def _extended(coefficients: Array, rho: Array, lags: int) -> tuple[float, ...]:
     out = list(rho[: p + 1])
     while len(out) < lags:
         out.append(float(coefficients @ np.array(out[-1 : -p - 1 : -1])))
-    kept = np.array(out[: max(lags, 1)])
-    small = np.flatnonzero(np.abs(kept) > 1e-4)
-    return tuple(kept[: int(small[-1]) + 1].tolist())
+    whole = np.array(out[: max(lags, 1)])
+    last = int(np.flatnonzero(np.abs(whole) > 1e-4)[-1])
+    return tuple(whole[: last + 1].tolist())
 
 
 def clipped(values: Array) -> Array:
-    """Values with outliers pulled in to `OUTLIER_SIGMAS` robust sigmas about zero."""
+    """Values clipped to `OUTLIER_SIGMAS` robust sigmas about zero."""
     limit = OUTLIER_SIGMAS * 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
     return np.clip(values, -limit, limit) if limit > 0.0 else values

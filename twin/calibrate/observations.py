@@ -1,4 +1,4 @@
-"""What a log says, as rows that a twin run can be compared with: means over short intervals, and positions.
+"""Measurements of a log as rows that a twin run can be compared with: means over intervals, and positions.
 
 Rates and accelerations are averaged over bins of `BIN_S`: a row holds the measured mean and the interval
 it is the mean of, so that the twin's mean over the same interval is its exact counterpart. Positions and
@@ -24,9 +24,9 @@ Rows = NDArray[np.int64]
 BIN_S = 0.1
 """Rates and accelerations are compared as means over this long."""
 TRUTH_SIGMA = (0.01, 0.005)
-"""First guess of a reference's sigma (assumed): m, rad; the residuals correct it."""
+"""First guess of a reference's sigma (assumed): m, rad."""
 LEAST_SHARE = 1e-4
-"""Noise that is learnt is never less than this share of the first guess: exact data would divide by zero."""
+"""Learnt noise is at least this share of the first guess (exact data would give zero)."""
 CURRENT_SIGMA_A = 0.05
 """Least first guess of a current sensor's sigma (assumed)."""
 
@@ -41,9 +41,9 @@ class Observed:
         value: (n,) measured.
         sigma: (n,) first guess of the noise's 1 sigma.
         slot: (n,) number of the row on a regular clock of `slot_s` seconds.
-        least: the noise is never taken as less than this share of `sigma`.
+        least: lower bound of the learnt noise, as a share of `sigma`.
         correlation: share of the variance that is correlated in time, and its time constant in s,
-            where a data sheet says it; None: it is estimated.
+            where a data sheet gives it; None: it is estimated.
     """
 
     channel: str
@@ -138,7 +138,7 @@ def _wheels(recording: Recording, vehicle: VehicleParams, start_ns: int) -> list
     radius = vehicle.odometry.wheel_radius_m
     t_s = _seconds(wheels.t_ns, start_ns)
     sides = wheels.side_speeds_mps(radius) / radius
-    # Counts are finer than wheels are round: no log makes them better than the vehicle's file says.
+    # Wheels are less round than counts are fine: sigma is never below that of the vehicle's file.
     per_bin = max(1.0, BIN_S / sample_interval_s(t_s))
     sheet = max(vehicle.sensors.wheels.speed_sigma_mps / radius / math.sqrt(per_bin), 1e-6)
     if not wheels.has_sides():

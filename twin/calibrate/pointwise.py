@@ -1,4 +1,4 @@
-"""A CasADi function at many samples at once, compiled: no copies in, none out."""
+"""A CasADi function evaluated at many samples by compiled code."""
 
 from __future__ import annotations
 

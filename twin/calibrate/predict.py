@@ -1,9 +1,8 @@
-"""What the twin says the log's channels should read, and how that changes with every parameter.
+"""Predicts the channels of a log with the twin, and their derivatives by every parameter.
 
-The twin runs from window to window: its inner states (wheels, motors, soil under the wheels) and their
-derivatives are carried on from one window into the next, while the pose starts anew in each, from a guess
-that the fit corrects. So no error of the pose builds up, and no unknown inner state is needed
-(multiple shooting, Bock 1983, with the pose as the only state that is set free).
+Multiple shooting (Bock 1983) with the pose as the only free state: inner states (wheels, motors, soil under
+the wheels) and their derivatives continue from one window into the next, while the pose of each window
+starts from a guess that the fit corrects. So no error of the pose accumulates.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from terrafusion.twin.scenario.commands import delayed_inputs
 Array = NDArray[np.float64]
 
 LEAD_S = 5.0
-"""Before a log the twin stands, or drives on, for this long as it is first told: so it starts loaded."""
+"""Run-up under the first input of a log, so that the twin starts in steady state."""
 TRANSITION_S = 0.3
 """Two grounds join within this time."""
 POSE = ("x", "y", "yaw")
@@ -40,7 +39,7 @@ _FOLLOWING_LAG_S, _FOLLOWING_RATE = 0.001, 80.0
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """One channel as the twin has it.
+    """One channel as the twin predicts it.
 
     Attributes:
         value: (n,) at the rows of the channel.
@@ -130,14 +129,14 @@ def _knot_labels(log: PreparedLog) -> list[str]:
 def _run(log: PreparedLog, plant: Plant, d: Directions, inputs: Array, start: Array) -> tuple[Array, Array]:
     """States (N, X) at all samples of all windows, one after the other, and derivatives (N, X, M).
 
-    The last window's pose enters the next one's inner states on a slope only, by its heading; that is left
-    out. A shift of the start shifts the run; where no slope and no effect looks at the heading, a turn of
-    the start turns it: these directions need not be integrated.
+    A shift of the start shifts the run; without slope and effects a turn of the start turns it: these
+    directions are not integrated. On a slope the heading of a window also enters the inner states of the
+    next; that is neglected.
     """
     turns = not plant.effect_names(d.effects) and not plant.vehicle[_GRAVITY].any()
-    kept = np.arange(d.count - (len(POSE) if turns else len(POSE) - 1))
-    kept = kept if turns else np.append(kept, d.count - 1)
-    run = part_of(d, kept)
+    chosen = np.arange(d.count - (len(POSE) if turns else len(POSE) - 1))
+    chosen = chosen if turns else np.append(chosen, d.count - 1)
+    run = part_of(d, chosen)
     x, S = led_in(log, plant, run, inputs)
     pose = [INDEX[name] for name in POSE]
     states, changes = [], []
@@ -152,23 +151,23 @@ def _run(log: PreparedLog, plant: Plant, d: Directions, inputs: Array, start: Ar
         )  # fmt: skip
         x, S = xs[-1].copy(), Ss[-1].copy()
         states.append(xs)
-        changes.append(_with_pose(xs, Ss, d.count, kept, turns))
+        changes.append(_with_pose(xs, Ss, d.count, chosen, turns))
     return np.concatenate(states), np.concatenate(changes)
 
 
 _GRAVITY = [VEHICLE_PARAMETERS.index(name) for name in ("gravity_x_mps2", "gravity_y_mps2")]
 
 
-def part_of(d: Directions, kept: NDArray[np.int64]) -> Directions:
+def part_of(d: Directions, chosen: NDArray[np.int64]) -> Directions:
     """Some of the directions."""
-    effects = {name: values[kept] for name, values in d.effects.items()}
-    return Directions(d.start[:, kept], d.vehicle[:, kept], d.soil[:, :, kept], effects)
+    effects = {name: values[chosen] for name, values in d.effects.items()}
+    return Directions(d.start[:, chosen], d.vehicle[:, chosen], d.soil[:, :, chosen], effects)
 
 
-def _with_pose(xs: Array, Ss: Array, count: int, kept: NDArray[np.int64], turns: bool) -> Array:
-    """Derivatives (n, X, M) with those by the pose at the start put in, which were not integrated."""
+def _with_pose(xs: Array, Ss: Array, count: int, chosen: NDArray[np.int64], turns: bool) -> Array:
+    """Derivatives (n, X, M), with those by the start pose that were not integrated in closed form."""
     out = np.zeros((len(xs), xs.shape[1], count))
-    out[:, :, kept] = Ss
+    out[:, :, chosen] = Ss
     x, y, yaw = (INDEX[name] for name in POSE)
     out[:, x, count - 3] = out[:, y, count - 2] = 1.0
     if turns:
@@ -176,19 +175,12 @@ def _with_pose(xs: Array, Ss: Array, count: int, kept: NDArray[np.int64], turns:
     return out
 
 
-def _carried(
-    plant: Plant, d: Directions, inputs: Array, x: Array, S: Array, t0_s: float
-) -> tuple[Array, Array]:
-    xs, Ss = integrate_with_sensitivity(
-        x, inputs, DT_S, plant, Directions(S, d.vehicle, d.soil, d.effects), t0_s=t0_s
-    )
-    return xs[-1].copy(), Ss[-1].copy()
-
-
 def led_in(log: PreparedLog, plant: Plant, d: Directions, inputs: Array) -> tuple[Array, Array]:
-    """State (X,) and derivatives (X, M) at the first window, after driving as first told for `LEAD_S`."""
+    """State (X,) and derivatives (X, M) at the first window, after the run-up."""
     x, before = run_up(log, plant, inputs)
-    return _carried(plant, d, before, x, np.zeros((len(STATES), d.count)), -LEAD_S)
+    d = Directions(np.zeros((len(STATES), d.count)), d.vehicle, d.soil, d.effects)
+    xs, Ss = integrate_with_sensitivity(x, before, DT_S, plant, d, t0_s=-LEAD_S)
+    return xs[-1].copy(), Ss[-1].copy()
 
 
 def run_up(log: PreparedLog, plant: Plant, inputs: Array) -> tuple[Array, Array]:
@@ -209,8 +201,8 @@ def averaging(
 ) -> tuple[NDArray[np.int64], Array]:
     """Stacked samples (n, k) that a row depends on, and their weights (n, k): its mean over its interval.
 
-    Between samples the twin's channel is a cubic (Keys 1981, a = -1/2), at a window's ends it goes on
-    straight: the mean is right to the fourth order of `DT_S`.
+    Between samples the channel is a cubic (Keys 1981, a = -1/2), beyond the ends of a window a line: the
+    mean is of fourth order in `DT_S`.
     `window` (n,) is that of each row; None: the one it lies in.
     """
     window = window_of(observed, log.windows) if window is None else window

@@ -25,9 +25,9 @@ from terrafusion.twin.calibrate.sensor_offsets import sensor_errors
 Array = NDArray[np.float64]
 
 POSE_SIGMA = np.array([10.0, 10.0, 1.0])
-"""1 sigma of a window's start about its guess (assumed, m and rad): wide, as the log says where it is."""
+"""1 sigma of a window's start about its guess (assumed, m and rad): wide, as the log determines it."""
 UNPOSED_YAW_SIGMA = 0.2
-"""1 sigma of the heading (assumed, rad) where nothing in the log says it."""
+"""1 sigma of the heading (assumed, rad) where the log does not determine it."""
 HUBER = 2.5
 """Whitened residuals beyond this weigh linearly, not as squares, where robust (Huber 1964)."""
 

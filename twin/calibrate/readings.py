@@ -1,4 +1,4 @@
-"""The twin's channels at many samples at once, and their derivatives: the measurement graph, contracted."""
+"""The twin's channels at many samples at once, with their derivatives along directions."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Constant errors of the sensors, a log: offsets and gains that are estimated along with the parameters.
+"""Constant errors of the sensors of a log: offsets and gains, estimated as nuisance parameters.
 
-They are nuisances: nobody asks for them, but a current sensor that is 2 % off would otherwise pass for a
-heavier robot. Each has a Gaussian prior, its width from the vehicle's file where that says it.
+Otherwise a current sensor that is 2 % off would pass for a heavier robot. Each has a Gaussian prior, its
+width from the vehicle's file where that gives it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LEAST_GAIN, LEAST_CURRENT_OFFSET_A = 1e-3, 0.02
 
 @dataclass(frozen=True)
 class SensorError:
-    """Reading = (1 + gain) true + offset: one of the two for one channel, with its 1 sigma beforehand."""
+    """Gain or offset of one channel, reading = (1 + gain) true + offset, with its prior 1 sigma."""
 
     channel: str
     kind: str

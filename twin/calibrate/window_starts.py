@@ -1,4 +1,4 @@
-"""Where each window starts: a guess from dead reckoning laid onto the positions the log has."""
+"""Start pose of each window: a guess from dead reckoning aligned to the positions of the log."""
 
 from __future__ import annotations
 
@@ -25,10 +25,11 @@ LEAST_SPREAD = 5.0
 def window_starts(
     recording: Recording, model: Model, start_ns: int, at_s: Array, window_s: float, *, truth: bool
 ) -> tuple[Array, bool]:
-    """x, y, yaw (W, 3) in the plane at the times `at_s` (W,), and whether the log says the heading.
+    """x, y, yaw (W, 3) in the plane at the times `at_s` (W,), and whether the log determines the heading.
 
-    Wheels and gyro give a path up to a turn and a shift; positions around each window (or those of the
-    whole log, where the robot moves too little there) give these two. A reference yaw is taken as it is.
+    Wheels and gyro give a path up to a rotation and a translation; positions around each window (or those of
+    the whole log, where the robot moves too little there) give these two. Without positions a reference yaw
+    is used.
     """
     rows = {o.channel: o for o in observe(recording, model.vehicle, start_ns, wheels=True, truth=truth)}
     end_s = max([float(at_s[-1]), *(float(o.end_s[-1]) for o in rows.values())]) + window_s
@@ -84,7 +85,7 @@ def _dead_reckoned(rows: Mapping[str, Observed], model: Model, grid: Array) -> t
 
 
 def _turn(reckoned: Array, fixes: Array, sigma: float) -> float | None:
-    """Angle that lays the first path (n, 2) onto the second, least squares; None where they are too short."""
+    """Angle that rotates the first path (n, 2) onto the second, least squares; None where they are too short."""
     if len(fixes) < 4:
         return None
     a, b = reckoned - reckoned.mean(axis=0), fixes - fixes.mean(axis=0)

@@ -51,8 +51,8 @@ def hyperbolic_share(ratio: Any) -> Any:
 
 
 def _ground(q: Quantities, share: Any) -> dict[str, Any]:
-    slid = saturate(smooth_abs(q["slip"], 0.01) - 0.01, 1.0)
-    exponent = q["exponent"] + share * EXPONENT_GAIN * slid
+    slip = saturate(smooth_abs(q["slip"], 0.01) - 0.01, 1.0)
+    exponent = q["exponent"] + share * EXPONENT_GAIN * slip
     modulus = reece_modulus(q["k_c"], q["k_phi"], q["exponent"], q["width_m"], exponent)
     return {
         "k_c": (1.0 - share) * q["k_c"],

@@ -8,20 +8,20 @@ import casadi as ca
 
 from terrafusion.twin.effects.form import Form, Quantities, one
 
-# Constants of the laws, assumed unless a source is given; the equations below tell them.
+# Constants of the laws, assumed unless a source is given; see the equations below.
 AIR_KG_PER_M3 = 1.2
 WIND_MPS = 5.0
 CALM_MPS = 1e-3
 
 
-def _tilted(q: Quantities, way: tuple[Any, Any], angle: Any) -> dict[str, Any]:
-    """Gravity where the ground rises by `angle` (rad) along the unit vector `way` in the plane."""
-    along = way[0] * q["gravity_x_mps2"] + way[1] * q["gravity_y_mps2"]
+def _tilted(q: Quantities, uphill: tuple[Any, Any], angle: Any) -> dict[str, Any]:
+    """Gravity where the ground rises by `angle` (rad) along the unit vector `uphill` in the plane."""
+    along = uphill[0] * q["gravity_x_mps2"] + uphill[1] * q["gravity_y_mps2"]
     normal = q["gravity_normal_mps2"]
     change = along * (ca.cos(angle) - 1.0) - normal * ca.sin(angle)
     return {
-        "gravity_x_mps2": q["gravity_x_mps2"] + way[0] * change,
-        "gravity_y_mps2": q["gravity_y_mps2"] + way[1] * change,
+        "gravity_x_mps2": q["gravity_x_mps2"] + uphill[0] * change,
+        "gravity_y_mps2": q["gravity_y_mps2"] + uphill[1] * change,
         "gravity_normal_mps2": normal * ca.cos(angle) + along * ca.sin(angle),
     }
 

@@ -1,9 +1,8 @@
-"""What an optional effect is: a functional form, its parameters, and the stages of the model where it acts.
+"""An optional effect: a functional form, its parameters, and the stages of the model where it acts.
 
-The model is built in stages (see `STAGES`). At a stage a form's term reads any quantity known
-there by its name and gives new values of quantities of that stage. With a parameter of zero a
-term must give back what was there before; a graph made without the parameter does not hold the
-term at all.
+The model is built in stages (see `STAGES`). At a stage a form's term reads any quantity known there by its
+name and gives new values of quantities of that stage. With a parameter of zero a term must return the values
+it was given; a graph made without the parameter does not contain the term.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ derivative of an output is known as `d_<output>`.
 PLANE = frozenset(
     {"x", "y", "wheel_x_m", "wheel_y_m", "yaw", "cos_yaw", "sin_yaw", "gravity_x_mps2", "gravity_y_mps2"}
 )
-"""By these a law tells places and directions of the plane apart."""
+"""Quantities by which a law depends on place or direction in the plane."""
 
 SENSOR_STAGES = ("mounting", "measurement", "stamp")
 """Stages that change what is measured and not how the robot moves."""
@@ -64,7 +63,7 @@ class Parameter:
 
     Attributes:
         unit: "" for a pure number.
-        scale: what counts as one unit of "typical" (a prior's standard deviation).
+        scale: typical size (standard deviation of a prior).
         low, high: closed range of values a run may be made with.
         name: within the form; "" where it is the only one.
     """
@@ -87,7 +86,7 @@ class Form:
         terms: what it does at each stage where it acts.
         equation: the law, in words of the docs.
         source: author and year, or "ours" for a phenomenological law.
-        candidate: whether a gap may be explained by it without having been asked for by name.
+        candidate: whether a diagnosis tries it without being asked for it by name.
     """
 
     effect: str
@@ -128,7 +127,7 @@ class Form:
         or sets one of `PLANE`."""
         moving = [term for stage, term in self.terms.items() if stage not in SENSOR_STAGES]
         for side, end in itertools.product((1, -1), repeat=2):  # a term may branch on which wheel it is
-            noted = _Noted(side=side, end=end)
+            noted = _Recorder(side=side, end=end)
             values = [noted[f"e{i}"] for i in range(len(self.parameters))]
             changed = [name for term in moving for name in term(noted, *values)]
             if not PLANE.isdisjoint([*noted, *changed]):
@@ -136,8 +135,8 @@ class Form:
         return False
 
 
-class _Noted(dict[str, Any]):
-    """Some number by any name, held from when it is first read."""
+class _Recorder(dict[str, Any]):
+    """Quantities that record which of them are read."""
 
     def __missing__(self, name: str) -> Any:
         import casadi as ca

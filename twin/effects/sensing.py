@@ -16,7 +16,7 @@ ACCELS = ("accel_x_mps2", "accel_y_mps2")
 IMU = ("yaw_rate_radps", *ACCELS)
 POSITION, VELOCITY = ("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps")
 
-# Constants of the laws, assumed unless a source is given; the equations below tell them.
+# Constants of the laws, assumed unless a source is given; see the equations below.
 DROPPING_RADPS = 5.0
 WARM_UP_S, CLOCK_S = 60.0, 60.0
 TURN_WIDTH_RADPS = 0.01

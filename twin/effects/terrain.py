@@ -11,7 +11,7 @@ from terrafusion.twin.effects.form import Form, Quantities, one
 from terrafusion.twin.physics.smooth import grown, saturate, smooth_abs
 from terrafusion.twin.physics.wheel import RESISTANCE_SPEED_MPS
 
-# Constants of the laws, assumed unless a source is given; the equations below tell them.
+# Constants of the laws, assumed unless a source is given; see the equations below.
 RATE_SPEED_MPS = 0.01
 """Slip speed at which a logarithmic rate law departs from its value at rest."""
 DRIFT_M, DRIFT_PLACE_M, DRIFT_S = 50.0, 20.0, 60.0
@@ -38,8 +38,8 @@ def _compacted(q: Quantities, gain: Any) -> dict[str, Any]:
     return scaled_bearing(q, ca.exp(gain)) | {"shear_modulus_m": q["shear_modulus_m"] * ca.exp(-0.5 * gain)}
 
 
-def _slid(q: Quantities) -> Any:
-    """|s|, not beyond 1: a wheel that turns against its way has 2, where Bekker's law ends (n below 3)."""
+def _saturated_slip(q: Quantities) -> Any:
+    """|s|, not beyond 1: a wheel that turns backwards has 2, where Bekker's law ends (n below 3)."""
     return saturate(smooth_abs(q["slip"], 0.01) - 0.01, 1.0)
 
 
@@ -79,19 +79,19 @@ def _passive_grousers(q: Quantities, height: Any) -> dict[str, Any]:
     }
 
 
-def _way(q: Quantities) -> Any:
+def _rotation_sign(q: Quantities) -> Any:
     """Sign of the wheel's rotation, smooth through rest."""
     return q["rim_mps"] / smooth_abs(q["rim_mps"], CLINGING_SPEED_MPS)
 
 
 def _clinging(q: Quantities, share: Any) -> dict[str, Any]:
-    torque = share * q["load_n"] * q["radius_m"] * grown(q["travel"], BUILD_UP_M) * _way(q)
+    torque = share * q["load_n"] * q["radius_m"] * grown(q["travel"], BUILD_UP_M) * _rotation_sign(q)
     return {"drag_torque_nm": q["drag_torque_nm"] + torque}
 
 
 def _in_motion(q: Quantities, share: Any) -> dict[str, Any]:
     """A rolling resistance that does not hold at rest."""
-    return {"drag_torque_nm": q["drag_torque_nm"] + share * q["load_n"] * q["radius_m"] * _way(q)}
+    return {"drag_torque_nm": q["drag_torque_nm"] + share * q["load_n"] * q["radius_m"] * _rotation_sign(q)}
 
 
 def _with_speed(q: Quantities, share: Any) -> dict[str, Any]:
@@ -103,7 +103,7 @@ def _sucking(q: Quantities, pressure: Any) -> dict[str, Any]:
     """Suction under the rear contact that does not hold at rest."""
     z = q["sinkage_m"]
     chord_square = 2.0 * q["radius_m"] * z - z * z + q["contact_floor_m"] * q["contact_floor_m"]
-    torque = 0.5 * pressure * q["width_m"] * chord_square * _way(q)
+    torque = 0.5 * pressure * q["width_m"] * chord_square * _rotation_sign(q)
     return {"drag_torque_nm": q["drag_torque_nm"] + torque}
 
 
@@ -130,7 +130,7 @@ FORMS = (
     ),
     Form(
         "slip_sinkage", "exponent", one("", 0.1, 0.0, 0.8),
-        {"ground": lambda q, e: {"exponent": q["exponent"] + e * _slid(q)}},
+        {"ground": lambda q, e: {"exponent": q["exponent"] + e * _saturated_slip(q)}},
         "n = n0 + e abs(s), abs(s) saturating at 1", "Ding et al. 2010",
     ),
     Form(

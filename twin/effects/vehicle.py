@@ -11,7 +11,7 @@ from terrafusion.twin.effects.form import Form, Parameter, Quantities, one
 from terrafusion.twin.physics.layout import WHEELS
 from terrafusion.twin.physics.smooth import grown
 
-# Constants of the laws, assumed unless a source is given; the equations below tell them.
+# Constants of the laws, assumed unless a source is given; see the equations below.
 SHORTEST_LAG_S = 0.002
 """A filter of the command path is this fast where its parameter is zero: no stiffer than the motor lag."""
 FRICTION_SPEED_RADPS = 0.1
@@ -21,7 +21,7 @@ WARMING_J, DISCHARGE_J = 1e3, 1e4
 CROSSING_S = 0.03
 """Time in which a gear crosses its backlash."""
 CROSSING_NM = 0.3
-"""Torque at the wheel that tells which flank of the gear carries."""
+"""Torque at the wheel at which the loaded flank of the gear changes."""
 BUILD_UP_M = 10.0
 
 
@@ -37,7 +37,7 @@ def _on_rear_axle(q: Quantities, share: Any) -> dict[str, Any]:
 
 
 def _command_g(q: Quantities) -> Any:
-    """Commanded acceleration over that of gravity, held within what a robot gives (a step commands any)."""
+    """Commanded acceleration over that of gravity, saturated (a step commands any)."""
     wanted = 0.5 * q["radius_m"] * (q["left_rate_radps2"] + q["right_rate_radps2"]) / PULL_MPS2
     return PULL_MPS2 / GRAVITY_MPS2 * wanted / ca.sqrt(1.0 + wanted * wanted)
 
@@ -210,7 +210,7 @@ FORMS = (
     Form(
         "dead_time", "transport", one("s", 0.05, 0.0, 1.0),
         {"vehicle": lambda q, e: {"dead_time_s": q["dead_time_s"] + e}},
-        "command told e later", "pure delay",
+        "command e later", "pure delay",
     ),
     Form(
         "dead_time", "all_pass", one("s", 0.05, 0.0, 1.0),

@@ -33,7 +33,7 @@ NATIVE = "-march=native"
 
 
 def cache_folder() -> Path:
-    """Where compiled libraries are kept (not created here)."""
+    """Where compiled libraries are kept (not created by this call)."""
     own = os.environ.get("TERRAFUSION_CACHE")
     if own:
         return Path(own)
@@ -56,7 +56,7 @@ def find_compiler() -> tuple[str, ...] | None:
 
 
 def remembered(what: str | None, source: Callable[[], str], compiler: tuple[str, ...]) -> Path:
-    """Path of the shared library of a source that follows from `what` (None: from more than can be told).
+    """Path of the shared library of a source that follows from `what` (None: it does not).
 
     Where the library is cached, the source is not even written, which saves building its graph.
 
@@ -122,12 +122,12 @@ def _compile_into(target: Path, source: str, compiler: tuple[str, ...]) -> Path:
     with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
         code, library = Path(scratch) / "twin.c", Path(scratch) / "twin.so"
         code.write_text(source, encoding="utf-8")
-        said = ""
+        message = ""
         for native in ((NATIVE,), ()):  # a compiler that does not know the processor takes its baseline
             command = [*compiler, *FLAGS, *native, "-o", str(library), str(code), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
             if done.returncode == 0:
                 os.replace(library, target)
                 return target
-            said = said or (done.stderr.strip().splitlines() or ["no message"])[-1]
-        raise subprocess.SubprocessError(f"{' '.join(compiler)}: {said}")
+            message = message or (done.stderr.strip().splitlines() or ["no message"])[-1]
+        raise subprocess.SubprocessError(f"{' '.join(compiler)}: {message}")

@@ -2,7 +2,7 @@
 
 Every node belongs to a stage, by what it depends on: "late" arguments change at every evaluation, "wide" ones
 hold several directions of differentiation in a vector. Each stage becomes one C function; what a later stage
-needs of an earlier one is kept in that stage's array.
+needs of an earlier one is stored in that stage's array.
 
 Types in the C code: `tf_real` a number (or a vector of runs), `tf_four` one number for each wheel, `tf_wide`
 a vector of directions.
@@ -33,10 +33,10 @@ LEAST_32, MOST_32 = 1.2e-38, 3.4e38
 
 @dataclass(frozen=True)
 class Stage:
-    """One C function: its name, the array it keeps, and which nodes belong to it."""
+    """One C function: its name, the array it stores for later stages, and which nodes belong to it."""
 
     name: str
-    kept: str
+    store: str
     late: bool
     wide: bool
 
@@ -72,7 +72,7 @@ class Emitter:
     _roots: int = 0
 
     def source(self) -> str:
-        """The C functions of the stages that hold anything, and the sizes of what they keep."""
+        """The C functions of the stages that hold anything, and the sizes of what they store."""
         self._assign_stages()
         atoms = packs(self.graph, self._needed, self._pack_key, self.lane_of)
         self._packed = set(atoms)
@@ -95,7 +95,7 @@ class Emitter:
         """Only what is of one stage meets in a pack; vectors of directions do not."""
         return n if self._stage[n].wide else self._stage[n].name
 
-    # Placing: what each stage computes, in which order, and what it keeps for later ones
+    # Placing: what each stage computes, in which order, and what it stores for later ones
 
     def _atom(self, n: int) -> Atom:
         return self._home[n][0] if n in self._home else (n,)
@@ -105,7 +105,7 @@ class Emitter:
 
     def _place(self) -> None:
         self._slot: dict[Atom, int] = {}
-        self.sizes = {s.kept: 0 for s in STAGES if s.kept}
+        self.sizes = {s.store: 0 for s in STAGES if s.store}
         wanted: dict[Stage, list[Atom]] = {s: [] for s in STAGES}
         for name, nodes in self.outputs.items():
             wanted[_writer(name)] += [self._atom(n) for n in nodes if not self._is_leaf(n)]
@@ -114,9 +114,9 @@ class Emitter:
             self._order[stage], borrowed = self._ordered(stage, wanted[stage])
             for atom in borrowed:
                 if atom not in self._slot:
-                    kept = self._stage[atom[0]].kept
-                    self._slot[atom] = self.sizes[kept]
-                    self.sizes[kept] += len(atom)
+                    store = self._stage[atom[0]].store
+                    self._slot[atom] = self.sizes[store]
+                    self.sizes[store] += len(atom)
                     wanted[self._stage[atom[0]]].append(atom)
 
     def _take_apart(self) -> None:
@@ -146,7 +146,7 @@ class Emitter:
         return self._longest_first(list(order)), list(borrowed)
 
     def _longest_first(self, order: list[Atom]) -> list[Atom]:
-        """The atoms reordered: of those whose operands are there, the one with the longest way to a result.
+        """The atoms reordered: of those whose operands are there, the one with the longest path to a result.
 
         A processor looks only some hundred instructions ahead for work that does not wait for a result.
         """
@@ -158,12 +158,12 @@ class Emitter:
         for atom in order:
             for a in operands[atom]:
                 users[a].append(atom)
-        way: dict[Atom, int] = {}
+        path_cycles: dict[Atom, int] = {}
         for atom in reversed(order):
             cycles = _LATENCY.get(self.graph.ops[atom[0]], _LATENCY_ELSE)
-            way[atom] = cycles + max((way[user] for user in users[atom]), default=0)
+            path_cycles[atom] = cycles + max((path_cycles[user] for user in users[atom]), default=0)
         waiting = {atom: len(operands[atom]) for atom in order}
-        ready = [(-way[atom], place[atom], atom) for atom in order if not waiting[atom]]
+        ready = [(-path_cycles[atom], place[atom], atom) for atom in order if not waiting[atom]]
         heapq.heapify(ready)
         out = []
         while ready:
@@ -172,7 +172,7 @@ class Emitter:
             for user in users[atom]:
                 waiting[user] -= 1
                 if not waiting[user]:
-                    heapq.heappush(ready, (-way[user], place[user], user))
+                    heapq.heappush(ready, (-path_cycles[user], place[user], user))
         return out
 
     # Writing
@@ -181,7 +181,7 @@ class Emitter:
         lines = [self._statement(stage, atom) for atom in self._order[stage]]
         for atom in self._order[stage]:
             if atom in self._slot:
-                place = f"{stage.kept} + {self._slot[atom]}"
+                place = f"{stage.store} + {self._slot[atom]}"
                 lines.append(
                     f"tf_put({place}, {_name(atom)});" if len(atom) > 1 else f"*({place}) = {_name(atom)};"
                 )
@@ -224,7 +224,7 @@ class Emitter:
             return (
                 _name(t)
                 if self._stage[t[0]] == stage
-                else f"tf_get({self._stage[t[0]].kept} + {self._slot[t]})"
+                else f"tf_get({self._stage[t[0]].store} + {self._slot[t]})"
             )
         values = [self.graph.values[n] for n in t]
         if all(self.graph.ops[n] == INPUT for n in t) and values == [
@@ -234,7 +234,7 @@ class Emitter:
         return f"(tf_four){{{', '.join(self._scalar(stage, n) for n in t)}}}"
 
     def _scalar(self, stage: Stage, n: int) -> str:
-        """One node's value: the name of what was computed, a literal, an argument, or what was kept."""
+        """One node's value: the name of what was computed, a literal, an argument, or what was stored."""
         if self.graph.ops[n] == CONST:
             value = self._literal(self.graph.values[n])
             return f"({value})" if value.startswith("-") else value
@@ -243,7 +243,7 @@ class Emitter:
             return f"{name}[{i}]"
         atom, k = self._home.get(n, ((n,), 0))
         if self._stage[n] != stage:
-            return f"{self._stage[n].kept}[{self._slot[atom] + k}]"
+            return f"{self._stage[n].store}[{self._slot[atom] + k}]"
         return f"{_name(atom)}[{k}]" if len(atom) > 1 else _name(atom)
 
     def _literal(self, value: float) -> str:

@@ -41,7 +41,7 @@ def integrate(
 
     Args:
         x0: initial state, in the order of `STATES`.
-        inputs: `INPUTS` at the samples, linear in between (see `drive.told`).
+        inputs: `INPUTS` at the samples, linear in between (see `commands.delayed_inputs`).
         dt_s: sample interval, s.
         plant: vehicle, ground and optional effects.
         t0_s: time of the first sample (matters for routes over time).

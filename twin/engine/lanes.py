@@ -1,8 +1,8 @@
-"""Many runs at once: vehicles, grounds and commands of their own, side by side in the lanes of vectors.
+"""Many runs at once, each with its own vehicle, ground and commands, in the lanes of vectors.
 
 Every lane does what `integrate.integrate` does, in the same order and with the same functions: a run has the
-same bits alone and among others. Where numbers of 32 bits will do, twice as many go together; their bits are
-then their own, but again the same alone and among others.
+same bits alone and among others. With numbers of 32 bits twice as many go together; these have other bits,
+again the same alone and among others.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def integrate_many(
         every: only every so many-th sample is returned, from the first on.
         jobs: threads (compiled code runs outside Python's global lock).
         order: of the Runge-Kutta steps, 4 or 3 (a quarter less work).
-        short: whether numbers of 32 bits will do, twice as many side by side (compiled code only).
+        short: numbers of 32 bits, twice as many runs at once (compiled code only).
 
     Raises:
         ValueError: an array is misshapen, or there is no such order.
@@ -85,7 +85,7 @@ class _Task(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
-    """Plants made ready to be driven side by side, as often as is wanted."""
+    """Plants prepared to be driven together, as often as needed."""
 
     plants: Sequence[Plant]
     dt_s: float
@@ -102,7 +102,7 @@ class Fleet:
         order: int = 4,
         short: bool = False,
     ) -> Fleet:
-        """Plants that share a graph and a step, as many together as a driver has lanes; arguments as those of
+        """Groups plants that share graph and step, as many as a driver has lanes; arguments as those of
         `integrate_many`.
 
         Raises:

@@ -143,7 +143,7 @@ def pointer(array: Array) -> Any:
 
 
 def driver(variant: Variant) -> Driver | None:
-    """The driver, None where it cannot be compiled (said once)."""
+    """The driver, None where it cannot be compiled (logged once)."""
     with BUILDING:
         return _driver(variant)
 

@@ -10,13 +10,19 @@ from numpy.typing import NDArray
 
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.model.plant import Plant, SoilField
-from terrafusion.twin.physics.layout import INDEX, INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS
+from terrafusion.twin.physics.layout import (
+    ENDS,
+    INDEX,
+    INPUTS,
+    SIDES,
+    SOIL_PARAMETERS,
+    STATES,
+    VEHICLE_PARAMETERS,
+)
 
 Array = NDArray[np.float64]
 
 _CHUNK = 50
-_AHEAD, _LEFT = (0.5, 0.5, -0.5, -0.5), (0.5, -0.5, 0.5, -0.5)
-"""Hubs in the order of `WHEELS`, in wheelbases ahead and tracks to the left of the body origin."""
 _ARGUMENTS = ("x", "t", "ua", "ub", "constants", "effects", "at", "table")
 
 
@@ -108,7 +114,7 @@ def _sample(knots: int, steps: int, effects: tuple[str, ...], held: _Held, order
     constants, pe = ca.MX.sym("constants", f.size1_in(2) + 3), ca.MX.sym("effects", len(effects))
     at, flat = ca.MX.sym("at", knots), ca.MX.sym("table", knots * np_)
     h, vehicle, soil_at = constants[0] / steps, constants[3:], _soil(knots)
-    ahead = [sign * vehicle[VEHICLE_PARAMETERS.index("wheelbase_m")] for sign in _AHEAD]
+    ahead = [0.5 * end * vehicle[VEHICLE_PARAMETERS.index("wheelbase_m")] for end in ENDS]
 
     def slope(t: Any, x: Any, u: Any, vary: Any) -> Any:
         travel = [x[INDEX["travel"]] + a for a in ahead]
@@ -179,11 +185,11 @@ def _field(field: SoilField | None, x: Any, vehicle: Any) -> Any:
         for grid in (field.log_gain, field.patch_share)
     )
     cosine, sine = ca.cos(x[INDEX["yaw"]]), ca.sin(x[INDEX["yaw"]])
-    half_base = vehicle[VEHICLE_PARAMETERS.index("wheelbase_m")]
-    half_track = vehicle[VEHICLE_PARAMETERS.index("track_m")]
+    base = vehicle[VEHICLE_PARAMETERS.index("wheelbase_m")]
+    track = vehicle[VEHICLE_PARAMETERS.index("track_m")]
 
     def vary(wheel: int, soil: Any) -> Any:
-        ahead, left = _AHEAD[wheel] * half_base, _LEFT[wheel] * half_track
+        ahead, left = 0.5 * ENDS[wheel] * base, 0.5 * SIDES[wheel] * track
         cell = ca.vertcat(
             x[INDEX["x"]] + cosine * ahead - sine * left, x[INDEX["y"]] + sine * ahead + cosine * left
         ) / field.cell_m  # fmt: skip

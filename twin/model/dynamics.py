@@ -15,13 +15,16 @@ import functools
 from dataclasses import dataclass
 from typing import Any
 
-from terrafusion.twin.physics.layout import INPUTS, SOIL_PARAMETERS, STATES, VEHICLE_PARAMETERS, WHEELS
+from terrafusion.twin.physics.layout import (
+    ENDS,
+    INPUTS,
+    SIDES,
+    SOIL_PARAMETERS,
+    STATES,
+    VEHICLE_PARAMETERS,
+    WHEELS,
+)
 from terrafusion.twin.physics.motors import battery, drawn_power, motor_current, motor_torque
-
-ENDS = (1, 1, -1, -1)
-"""Front or rear, in the order of `WHEELS`."""
-SIDES = (1, -1, 1, -1)
-"""Left or right, in the order of `WHEELS`."""
 
 ARGUMENTS = ("x", "u", "vehicle", "soil", "effects")
 
@@ -89,7 +92,7 @@ def graph(effects: tuple[str, ...] = ()) -> ModelGraph:
     forces = _forces(wheels)
     q = terms.apply("body", q | forces)
     d = _derivatives(q, wheels)
-    if terms.at("body"):  # what reaches the body from elsewhere than the wheels is spent, or given, there
+    if terms.at("body"):  # forces on the body from elsewhere than the wheels
         d["resistance_work"] = d["resistance_work"] + _power(forces, q) - _power(q, q)
     derivative = ca.vertcat(*(d[name] for name in STATES))
     return ModelGraph((x, u, pv, ca.vec(ps), pe), terms, q, wheels, derivative)
@@ -108,7 +111,7 @@ def wheel_loads(p: dict[str, Any], gravity_x: Any, gravity_y: Any) -> list[Any]:
     """Quasi-static wheel loads, N: weight shared by the position of the centre of gravity and by the slope.
 
     `gravity_x`, `gravity_y` are gravity along body x and y, m/s2. A load is
-    kept above zero smoothly: the model does not tip over.
+    bounded above zero smoothly: the model does not tip over.
     """
     from terrafusion.twin.physics.wheel import smooth_max
 
@@ -132,7 +135,7 @@ def _gravity_along_body(q: dict[str, Any]) -> dict[str, Any]:
 
 
 def _commands(q: dict[str, Any]) -> dict[str, Any]:
-    """What the sides are told, rad/s, its rate, and the states of a command on its way, at rest."""
+    """Commanded wheel speed of the sides, rad/s, its rate, and zero rates of the filter states."""
     late = q["dead_time_s"] - q["dead_time_applied_s"]
     out = {f"d_command_{kind}_{side}": 0.0 for kind in ("lag", "delay") for side in ("left", "right")}
     for side in ("left", "right"):
@@ -154,7 +157,7 @@ def _supply(q: dict[str, Any]) -> dict[str, Any]:
 
 
 def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, Any]:
-    """Everything known of one wheel: its corner of the body, its ground, its motor, its forces."""
+    """All quantities of one wheel: its corner of the body, its ground, its motor, its forces."""
     from terrafusion.twin.physics.terramechanics import following
     from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, contact, slipping
 
@@ -183,7 +186,7 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
         WheelShape(w["radius_m"], w["width_m"], w["grouser_height_m"], w["grouser_count"]), w["following"],
     )  # fmt: skip
     w |= c._asdict() | {"ground_slip": c.slip}
-    for axis in ("x", "y"):  # a term may have changed what the displacement counts, not how it is renewed
+    for axis in ("x", "y"):  # a term may change the effective displacement, not its renewal
         w[f"shear_rate_{axis}"] = w[f"slip_{axis}_mps"] - w[f"shear_{axis}"] * c.renewal_per_s
 
     w["command_radps"] = q["command_left_radps"] if side > 0 else q["command_right_radps"]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.plant import RouteTable, SoilField
-from terrafusion.twin.physics.layout import INDEX, SOIL_PARAMETERS, VEHICLE_PARAMETERS
+from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
 
@@ -92,11 +92,12 @@ def soil_field(
     cells, cell_m = _grid(lengths)
     log_gain, share = np.zeros((cells, cells)), np.zeros((cells, cells))
     if variation is not None:
-        unit = gaussian_field(cells, cell_m, variation.length_m, _stream(seed, "ground strength"))
+        unit = gaussian_field(cells, cell_m, variation.length_m, random_stream(seed, "ground strength"))
         log_gain = variation.strength_sigma * unit - 0.5 * variation.strength_sigma**2
     if patches is not None:
         share = _patch_share(
-            gaussian_field(cells, cell_m, patches.length_m, _stream(seed, "ground patches")), patches.share
+            gaussian_field(cells, cell_m, patches.length_m, random_stream(seed, "ground patches")),
+            patches.share,
         )
     response = np.array([STRENGTH_RESPONSE.get(name, 0.0) for name in SOIL_PARAMETERS])
     soil = np.zeros(len(SOIL_PARAMETERS)) if patch_soil is None else patch_soil
@@ -144,7 +145,8 @@ def _patch_share(unit: Array, share: float) -> Array:
     return np.asarray(ndtr((unit - np.quantile(unit, 1.0 - share)) / BORDER))
 
 
-def _stream(seed: int, name: str) -> np.random.Generator:
+def random_stream(seed: int, name: str) -> np.random.Generator:
+    """Generator of the stream `name`: the same seed and name give the same numbers."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, zlib.crc32(name.encode())])))
 
 
@@ -157,7 +159,7 @@ def under_wheels(route: RouteTable, vehicle: Array, t_s: Array, states: Array) -
     half = {name: 0.5 * vehicle[VEHICLE_PARAMETERS.index(f"{name}_m")] for name in ("wheelbase", "track")}
     x, y, yaw, travel = (states[:, INDEX[name]] for name in ("x", "y", "yaw", "travel"))
     wheels = []
-    for end, side in ((1, 1), (1, -1), (-1, 1), (-1, -1)):
+    for end, side in zip(ENDS, SIDES, strict=True):
         ahead, left = end * half["wheelbase"], side * half["track"]
         soil = _on_route(route, time_weight * t_s + travel_weight * (travel + ahead))
         if route.field is not None:

@@ -1,4 +1,4 @@
-"""What the sensors would read, as expressions in the same graph as the motion.
+"""Measurement model of all sensors, as expressions in the same graph as the motion.
 
 y = h(x, u, vehicle, soil, effects, mounting): the instant values of `OUTPUTS`, without noise. The
 accelerations come from the right-hand side itself, so h and its derivatives by states, parameters and
@@ -170,7 +170,7 @@ def _known(g: ModelGraph) -> dict[str, Any]:
 def _readings(
     g: ModelGraph, q: Mapping[str, Any], wheels: list[dict[str, Any]], mounting: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Outputs by name of sensors that err in nothing."""
+    """Outputs by name of ideal sensors."""
     from terrafusion.twin.physics.motors import motor_current
 
     origin = origin_velocity(dict(q))
@@ -247,7 +247,7 @@ def _rates(g: ModelGraph, q: Mapping[str, Any]) -> dict[str, Any]:
     import casadi as ca
 
     x, u = g.arguments[:2]
-    told = len(INPUTS) // 2  # the inputs are speeds, then their rates, which are taken as constant
-    way = ca.vertcat(g.derivative, u[told:], ca.SX.zeros(told))
-    rates = ca.jtimes(ca.vertcat(*(q[name] for name in OUTPUTS)), ca.vertcat(x, u), way)
+    speeds = len(INPUTS) // 2  # the inputs are speeds, then their rates, which are taken as constant
+    direction = ca.vertcat(g.derivative, u[speeds:], ca.SX.zeros(speeds))
+    rates = ca.jtimes(ca.vertcat(*(q[name] for name in OUTPUTS)), ca.vertcat(x, u), direction)
     return {f"d_{name}": rates[i] for i, name in enumerate(OUTPUTS)}

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import INDEX
+from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES
 
 Array = NDArray[np.float64]
 
@@ -44,8 +44,8 @@ class BodyMotion:
     def point_velocity_mps(self, lever_m: ArrayLike) -> Array:
         """World velocities (N, 3) of the body-fixed point `lever_m`: R (v + omega x lever)."""
         lx, ly, _ = np.asarray(lever_m, dtype=float)
-        swing = np.stack([-self.yaw_rate_radps * ly, self.yaw_rate_radps * lx, 0.0 * self.t_s], axis=1)
-        return np.einsum("nij,nj->ni", self.rotation, self.velocity_body_mps + swing)
+        lever_mps = np.stack([-self.yaw_rate_radps * ly, self.yaw_rate_radps * lx, 0.0 * self.t_s], axis=1)
+        return np.einsum("nij,nj->ni", self.rotation, self.velocity_body_mps + lever_mps)
 
 
 def plane_rotation(slope_rad: float, aspect_rad: float) -> Array:
@@ -86,5 +86,5 @@ def wheel_shares(yaw_rad: ArrayLike, vehicle: VehicleParams, slope_rad: float, a
     along, across = -np.tan(slope_rad) * np.array([np.cos(aspect_rad - yaw), np.sin(aspect_rad - yaw)])
     lean_x = (body.cg_forward_m + body.cg_height_m * along) / body.wheelbase_m
     lean_y = (body.cg_left_m + body.cg_height_m * across) / body.track_m
-    sides = ((1, 1), (1, -1), (-1, 1), (-1, -1))
-    return np.stack([(0.5 + sx * lean_x) * (0.5 + sy * lean_y) for sx, sy in sides], axis=1)
+    corners = zip(ENDS, SIDES, strict=True)
+    return np.stack([(0.5 + end * lean_x) * (0.5 + side * lean_y) for end, side in corners], axis=1)

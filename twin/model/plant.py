@@ -1,4 +1,4 @@
-"""What an integrator drives: the vehicle's numbers, the ground under its wheels, the optional effects."""
+"""What is integrated: vehicle parameters, the ground under the wheels, the optional effects."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class RouteTable:
         return (1.0, 0.0) if self.coordinate == "time" else (0.0, 1.0)
 
     def is_fixed(self) -> bool:
-        """Whether every wheel stays on the same ground all the way."""
+        """Whether every wheel stays on the same ground throughout."""
         return len(self.at) == 1 and self.field is None
 
 
@@ -65,7 +65,7 @@ class Plant:
 
     Attributes:
         vehicle: (V,) `VEHICLE_PARAMETERS`.
-        route: ground along the way.
+        route: ground along the path.
         effects: values of the optional parameters; one that is not named is absent.
     """
 

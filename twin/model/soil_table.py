@@ -1,7 +1,7 @@
 """Published soils: our own table of measured Bekker and Janosi numbers, one a row with its source.
 
 A soil is called `collection:name`, e.g. `wong:lete_sand`; where one soil was measured at several
-moistures, its name ends in the percentage. What no table tells (vibration, rolling resistance, passive
+moistures, its name ends in the percentage. What no table gives (vibration, rolling resistance, passive
 pressure) stands in `params/published_soil.yaml`.
 """
 

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 def vehicle_vector(
     vehicle: VehicleParams, *, slope_rad: float = 0.0, aspect_rad: float = 0.0, payload_kg: float = 0.0
 ) -> Array:
-    """Values of `VEHICLE_PARAMETERS`; `aspect_rad` is the way uphill (0 east, left positive).
+    """Values of `VEHICLE_PARAMETERS`; `aspect_rad` is the direction uphill (0 east, left positive).
 
     The payload rides at the centre of gravity; see `vehicle.with_payload` for other places.
     """

@@ -23,7 +23,7 @@ from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.sensor_realism import SensorRealism
 
 GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
-"""What a log tells of its odometry, and the number of the body that it stands for, too, unless `measured`."""
+"""Odometry geometry a log may report, and the number of the body that it replaces, unless `measured`."""
 
 
 @dataclass(frozen=True)
@@ -207,13 +207,13 @@ def with_payload(
     body = vehicle.body
     own = (body.cg_forward_m, body.cg_left_m, body.cg_height_m)
     share = payload_kg / (body.mass_kg + payload_kg)
-    way = tuple(a - b for a, b in zip(at_m or own, own, strict=True))
-    forward, left, height = (b + share * w for b, w in zip(own, way, strict=True))
+    arm = tuple(a - b for a, b in zip(at_m or own, own, strict=True))
+    forward, left, height = (b + share * w for b, w in zip(own, arm, strict=True))
     spread = body.yaw_inertia_kgm2 * (1.0 + payload_kg / body.mass_kg)
     loaded = dataclasses.replace(
         body,
         mass_kg=body.mass_kg + payload_kg,
-        yaw_inertia_kgm2=spread + body.mass_kg * share * (way[0] ** 2 + way[1] ** 2),
+        yaw_inertia_kgm2=spread + body.mass_kg * share * (arm[0] ** 2 + arm[1] ** 2),
         cg_forward_m=forward,
         cg_left_m=left,
         cg_height_m=height,
@@ -222,7 +222,7 @@ def with_payload(
 
 
 def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParams:
-    """The vehicle with what a log says of it: wheel radius, track, antenna and IMU position.
+    """The vehicle with the geometry a log reports: wheel radius, track, antenna and IMU position.
 
     Radius and track replace the odometry's numbers and, unless `measured`, the body's: the log
     knows one geometry only.
@@ -246,16 +246,16 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
 
 
 def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
-    """What logs of one vehicle tell of its geometry.
+    """The geometry that logs of one vehicle report.
 
     Raises:
-        DataError: two of them tell another.
+        DataError: two of them differ.
     """
     first = recordings[0]
     for recording in recordings[1:]:
         if recording.overrides != first.overrides:
             raise DataError(
-                f"it tells another geometry of the vehicle ({_listed(recording.overrides)}) than "
+                f"it reports another geometry of the vehicle ({_listed(recording.overrides)}) than "
                 f"{first.name} ({_listed(first.overrides)})",
                 file=recording.name,
                 remedy="give logs of one vehicle, or the same wheel_radius_m, track_m, antenna_m and imu_m",
@@ -264,18 +264,17 @@ def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
 
 
 def _listed(overrides: Overrides) -> str:
-    """What a log tells of the geometry, in words."""
-    told = dataclasses.asdict(overrides).items()
-    return ", ".join(f"{name} = {value}" for name, value in told if value is not None) or "none"
+    values = dataclasses.asdict(overrides).items()
+    return ", ".join(f"{name} = {value}" for name, value in values if value is not None) or "none"
 
 
 def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, ...]:
-    """What `with_overrides` takes from a log, and what it leaves, in a sentence; none if it tells nothing."""
+    """What `with_overrides` takes from a log, and what it leaves, in a sentence."""
     if overrides == Overrides():
         return ()
     note = f"the log's own geometry is used: {_listed(overrides)}"
-    told = [number for name, number in GEOMETRY.items() if getattr(overrides, name) is not None]
-    kept = [number for number in told if number in vehicle.measured]
-    if kept:
-        note += f"; measured on this robot before, and kept for its body: {', '.join(kept)}"
+    reported = [number for name, number in GEOMETRY.items() if getattr(overrides, name) is not None]
+    retained = [number for number in reported if number in vehicle.measured]
+    if retained:
+        note += f"; measured on this robot before, and retained for its body: {', '.join(retained)}"
     return (note,)

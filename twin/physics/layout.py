@@ -7,9 +7,11 @@ from __future__ import annotations
 
 WHEELS = ("front_left", "front_right", "rear_left", "rear_right")
 """Order of the wheels in every array."""
+ENDS, SIDES = (1, 1, -1, -1), (1, -1, 1, -1)
+"""Front (1) or rear, left (1) or right, in the order of `WHEELS`."""
 
 ENERGIES = ("motor_work", "electric_energy", "slip_work", "resistance_work")
-"""States that sum up energies, J, and drive nothing but the battery's charge."""
+"""States that sum up energies, J; only the battery's charge depends on them."""
 
 STATES = (
     "x", "y", "yaw", "u", "v", "r",
@@ -40,7 +42,7 @@ backlash (-1 to 1).
 """
 
 INPUTS = ("left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2")
-"""Wheel speeds the two sides are told, rad/s, and their time derivatives (see `drive.delayed`)."""
+"""Commanded wheel speeds of the sides, rad/s, and their derivatives (see `commands.delayed_inputs`)."""
 
 VEHICLE_PARAMETERS = (
     "mass_kg", "yaw_inertia_kgm2", "wheelbase_m", "track_m", "cg_forward_m", "cg_left_m", "cg_height_m",
@@ -54,8 +56,8 @@ VEHICLE_PARAMETERS = (
 )  # fmt: skip
 """Parameters that hold for a whole run; gravity is given along the plane's x and y and into it.
 
-The command arrives `dead_time_applied_s` late already; the graph adds the first-order term of
-`dead_time_s - dead_time_applied_s`, which is zero, but whose derivative by `dead_time_s` is right.
+The inputs are delayed by `dead_time_applied_s` already; the graph adds the first-order term of
+`dead_time_s - dead_time_applied_s`, which is zero, with the right derivative by `dead_time_s`.
 """
 
 SOIL_PARAMETERS = (

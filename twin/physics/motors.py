@@ -43,15 +43,14 @@ def motor_torque(
 def motor_current(p: Any, torque_nm: Any, speed_radps: Any) -> Any:
     """Motor current, A, from the torque (N m) and speed (rad/s) at the wheel.
 
-    The gearbox takes its share of the power that flows through it, whichever
-    way it flows: 1/efficiency when driving, efficiency when braking, joined
-    such that its loss is never negative. The no-load current turns motor and
-    gears against their own friction, whatever the torque.
+    The gearbox takes its share of the power in both directions: 1/efficiency when driving, efficiency when
+    braking, joined such that its loss is never negative. The no-load current overcomes the friction of motor
+    and gears at any torque.
     """
     power = torque_nm * speed_radps
-    way = power / (power * power + 1e-2) ** 0.5
+    sign = power / (power * power + 1e-2) ** 0.5
     driving, braking = 1.0 / p["gear_efficiency"] - 1.0, 1.0 - p["gear_efficiency"]
-    loss = 1.0 + way * (0.5 * (driving + braking) + 0.5 * way * (driving - braking))
+    loss = 1.0 + sign * (0.5 * (driving + braking) + 0.5 * sign * (driving - braking))
     turning = speed_radps / (speed_radps * speed_radps + TURNING_RADPS**2) ** 0.5
     return torque_nm / p["gear_ratio"] * loss * p["no_load_radps"] / p["supply_v"] + p["no_load_a"] * turning
 

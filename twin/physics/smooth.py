@@ -25,9 +25,9 @@ def smooth_min(a: Scalar, b: Scalar, width: float) -> Scalar:
     return 0.5 * (a + b - smooth_abs(a - b, width))
 
 
-def grown(way: Scalar, length: float) -> Scalar:
-    """From 0 at `way` 0 towards 1, half at `length`, whichever way it goes."""
-    return way * way / (way * way + length * length)
+def grown(value: Scalar, length: float) -> Scalar:
+    """From 0 at 0 towards 1 for either sign of `value`, 1/2 at `length`."""
+    return value * value / (value * value + length * length)
 
 
 def saturate(value: Scalar, limit: Scalar) -> Scalar:

@@ -22,7 +22,7 @@ SINKAGE_LIMIT_RADII = 1.5
 SLIP_SPEED_MPS = 0.02
 """Speed below which slip and skid fade to zero: a standing wheel digs no deeper."""
 SKID_LIMIT = 2.0
-"""Skid of a wheel that turns against its way saturates here."""
+"""Skid of a wheel that turns backwards saturates here."""
 FOLLOWING_SPEED_MPS = 0.05
 """Speed over which an axle becomes the one that follows."""
 
@@ -46,21 +46,21 @@ def static_sinkage(k_c: Scalar, k_phi: Scalar, exponent: Scalar, load_n: Scalar,
 
 
 def driven_slip(rim_mps: Scalar, along_mps: Scalar, transport_mps: Scalar) -> Scalar:
-    """How far the rim runs ahead of the hub, 0 to 1 (2 against it); 0 for a braked wheel."""
+    """Slip ratio of a driven wheel, 0 to 1 (2 against the motion); 0 for a braked wheel."""
     rim = smooth_abs(rim_mps, SLIP_SPEED_MPS)
     ahead = (rim_mps - along_mps) * rim_mps / (rim * smooth_abs(transport_mps, SLIP_SPEED_MPS))
     return smooth_max(ahead, 0.0, 0.01)
 
 
 def skid(rim_mps: Scalar, hub_mps: tuple[Scalar, Scalar]) -> Scalar:
-    """How much of its way the wheel slides: 1 - w R u / |V|^2, 0 where it rolls or spins.
+    """Skid 1 - w R u / |V|^2: share of the path that the wheel slides, 0 where it rolls or spins.
 
-    A braked wheel has its skid ratio, one that is pushed sideways 1, whatever its rim does.
+    The skid ratio of a braked wheel; 1 for one that is pushed sideways.
     """
     u, v = hub_mps
     square = u * u + v * v
-    slid = smooth_max((square - rim_mps * u) / (square + SLIP_SPEED_MPS**2), 0.0, 0.01)
-    return saturate(slid, SKID_LIMIT)
+    skid = smooth_max((square - rim_mps * u) / (square + SLIP_SPEED_MPS**2), 0.0, 0.01)
+    return saturate(skid, SKID_LIMIT)
 
 
 def compaction_resistance(exponent: Scalar, load_n: Scalar, sinkage_m: Scalar, radius_m: Scalar) -> Scalar:

@@ -1,7 +1,7 @@
 """One wheel on soft ground, as CasADi expressions: the laws of `terramechanics` put together.
 
 Every function takes and returns CasADi scalars (or floats) in SI units, is
-smooth everywhere, and is zero where the physics says zero: no force without
+smooth everywhere, and is zero where the physics is: no force without
 shear displacement, no resistance without motion.
 """
 
@@ -70,7 +70,7 @@ class WheelSoil(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """What the ground does to one wheel.
+    """Forces of the ground on one wheel, and rates of its contact states.
 
     `force_x_n`, `force_y_n` act on the body at the hub (traction less motion
     resistance and drag, body axes), `traction_x_n` turns the wheel back (`traction_y_n` is its side part),
@@ -93,9 +93,9 @@ class Contact(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """Sinkage and length of the contact, m, and how much the wheel skids over it, 0 to 2.
+    """Sinkage and length of the contact, m, and skid, 0 to 2.
 
-    `wall_m` is how deep its side stands in the ground, the rut it rolls in included.
+    `wall_m` is the depth of its side in the ground, the rut it rolls in included.
     """
 
     sinkage_m: Scalar
@@ -189,7 +189,7 @@ def contact(
     traction_y = stiffness * jy + side * tm.mobilised(jy, ground.shear_modulus_m)
 
     pushed = tm.compaction_resistance(ground.exponent, load_n, z, shape.radius_m)
-    # The soil is pushed along the hub's way: the resistance opposes its velocity.
+    # The soil is pushed along the path of the hub: the resistance opposes its velocity.
     speed = ca.sqrt(u * u + v * v + RESISTANCE_SPEED_MPS**2)
     drag = pushed / speed + ground.viscous_ns_per_m
     clog_square = clog * clog

@@ -1,4 +1,4 @@
-"""Scenarios: what the robot is told to do, on which ground, and how its GNSS fares.
+"""Scenarios: commands, ground, and reception of GNSS.
 
 A scenario is a YAML file in `twin/params/scenarios` or the user's own, with
 strict keys. Its numbers are choices, so they stand plain, unit in the key::
@@ -63,7 +63,7 @@ class DriveSegment:
 class RouteLeg:
     """Ground `terrain` for `length` metres (or seconds, see `Scenario.route_over`); the last has none.
 
-    `moisture_percent`, where known, is held against the range in which the soil was measured.
+    `moisture_percent`, where known, is checked against the range in which the soil was measured.
     """
 
     terrain: str
@@ -118,7 +118,7 @@ class Scenario:
 
     `route_over` is "travel" (legs in metres driven) or "time" (in seconds);
     grounds join smoothly over `transition` metres or seconds. `variation` and `patches`
-    make the whole plane uneven, another way for each seed (see `ground`). With `waypoints`
+    make the whole plane uneven, differently for each seed (see `ground`). With `waypoints`
     ((x, y) m in the plane from the start, x east on flat ground) the robot steers by
     its true pose at `waypoint_speed_mps` instead of following `drive`.
 
@@ -165,7 +165,7 @@ class Scenario:
         return twist
 
     def plane(self) -> tuple[float, float]:
-        """Slope and aspect (the way uphill), rad, of the plane that `slope_deg` and `cross_slope_deg` make.
+        """Slope and aspect (direction uphill), rad, of the plane that `slope_deg` and `cross_slope_deg` make.
 
         Their tangents add as vectors: heading uphill, gravity along and across the robot, over
         gravity into the ground, is tan(slope) and tan(cross slope).
@@ -210,7 +210,7 @@ class Scenario:
             changed = dataclasses.replace(changed, payload_kg=payload_kg)
         if payload_at_m is not None:
             checked_number(payload_at_m, PLACE, file="the run", key="payload_at_m")
-            # A mass of 0 that is told is a level of a batch; one that is not was forgotten.
+            # A mass of 0 that is given is a level of a batch; one that is not was forgotten.
             if payload_kg is None and self.payload_kg == 0.0:
                 raise ConfigError(
                     "the payload has a place but no mass", file=self.name, remedy="give its mass in kg, too"

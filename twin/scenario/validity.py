@@ -1,7 +1,6 @@
-"""Where a soil's numbers hold: what lies outside is refused, not extrapolated.
+"""Validity ranges of soils: what lies outside is refused, not extrapolated.
 
-Each number of a soil file has its own range `valid`, held against it when the file is loaded
-(`datasets.config`). What depends on the run is checked here: ground pressure, wheel diameter and
+Each number of a soil file has its own range `valid`, checked when the file is loaded (`datasets.core.config`). What depends on the run is checked here: ground pressure, wheel diameter and
 moisture before the drive, slip after it.
 """
 
@@ -74,7 +73,7 @@ def check_ground(route: Route, scenario: Scenario, vehicle: VehicleParams) -> No
             continue
         if soil.validity.moisture_percent is None:
             raise ConfigError(
-                f"'{soil.name}' tells no range of moisture", remedy="leave out 'moisture_percent' there"
+                f"'{soil.name}' has no range of moisture", remedy="leave out 'moisture_percent' there"
             )
         _check(soil, "moisture_percent", moisture, "moisture", "%")
 

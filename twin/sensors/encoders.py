@@ -41,8 +41,8 @@ def counted(angle_rad: Array, vehicle: VehicleParams, noise: NoiseStreams) -> Ar
     real, quantum = vehicle.realism.encoder, vehicle.sensors.wheels.quantum_rad
     if real.position_error_rad > 0.0:
         phase = noise.stream("encoder eccentricity").uniform(0.0, 2.0 * np.pi, 4)
-        swing = np.sin(real.shaft_turns * angle_rad + phase) - np.sin(phase)
-        angle_rad = angle_rad + real.position_error_rad / real.shaft_turns * swing
+        error_rad = np.sin(real.shaft_turns * angle_rad + phase) - np.sin(phase)
+        angle_rad = angle_rad + real.position_error_rad / real.shaft_turns * error_rad
     if quantum > 0.0:
         offset = noise.stream("encoder phase").uniform(0.0, quantum, 4)
         angle_rad = np.floor((angle_rad + offset) / quantum) * quantum

@@ -1,7 +1,7 @@
-"""Barometer and magnetometer; a vehicle whose file says nothing of them has none.
+"""Barometer and magnetometer, of vehicles whose file has them.
 
-Pressure: the standard atmosphere at the sensor's height, plus what the weather makes of it (an offset and
-a trend that are drawn once a run, and a random walk), plus white noise.
+Pressure: the standard atmosphere at the sensor's height, plus the weather (an offset and a trend that are
+drawn once a run, and a random walk), plus white noise.
 
 Field: M (R^T b + disturbance of the place) + hard iron + white noise, in body axes. b is Earth's field at
 the datum of simulated drives. M = I + E (soft iron), E symmetric, and the hard iron are drawn once a run.
@@ -18,7 +18,13 @@ from terrafusion.datasets.core.atmosphere import pressure_at
 from terrafusion.datasets.core.channels import Barometer, Magnetometer
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate, sample_rate_hz
+from terrafusion.twin.sensors.noise import (
+    PLANE_WAVES,
+    NoiseStreams,
+    place_field,
+    rows_at_rate,
+    sample_rate_hz,
+)
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
@@ -26,7 +32,6 @@ TimesNs = NDArray[np.int64]
 FIELD_SIZE_T, INCLINATION_RAD, DECLINATION_RAD = 49.54e-6, math.radians(67.35), math.radians(3.35)
 """World Magnetic Model 2020 at 52 deg N, 8 deg E, 100 m, for 2024-01-01. The declination is positive to the
 east, the inclination downwards."""
-DISTURBANCE_WAVES = 24
 
 
 def earth_field_t() -> Array:
@@ -66,9 +71,9 @@ def magnetometer_channel(
     rows = rows_at_rate(len(t_ns), sample_rate_hz(motion.t_s), spec.rate_hz)
     world = np.tile(earth_field_t(), (len(rows), 1))
     if not noise.noiseless:
-        world = world + real.disturbance_t * _of_the_place(
-            motion.position_m[rows], real.disturbance_length_m, noise.stream("magnetic place")
-        )
+        rng = noise.stream("magnetic place")
+        place = place_field(motion.position_m[rows], real.disturbance_length_m, rng)
+        world = world + real.disturbance_t * (math.sqrt(2.0 / PLANE_WAVES) * place)
     field = np.einsum("nji,nj->ni", motion.rotation[rows], world)
     if not noise.noiseless:
         rng = noise.stream("iron")
@@ -77,12 +82,3 @@ def magnetometer_channel(
         field = field @ mixing.T + spec.hard_iron_sigma_t * hard
         field = field + spec.noise_t * noise.stream("magnetometer").normal(size=field.shape)
     return Magnetometer(t_ns[rows], field)
-
-
-def _of_the_place(position_m: Array, length_m: float, rng: np.random.Generator) -> Array:
-    """A fixed random vector field (N, 3) of unit variance an axis over the ground, squared-exponential over
-    `length_m`: a sum of plane waves with Gaussian wave vectors (Rahimi and Recht 2007)."""
-    waves = rng.normal(0.0, 1.0 / length_m, (3, 2, DISTURBANCE_WAVES))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (3, DISTURBANCE_WAVES))
-    parts = [np.cos(position_m[:, :2] @ w + p).sum(axis=1) for w, p in zip(waves, phase, strict=True)]
-    return np.asarray(math.sqrt(2.0 / DISTURBANCE_WAVES) * np.stack(parts, axis=1))

@@ -14,27 +14,32 @@ from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.sensor_realism import GnssRealism
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.scenario.scenario import Canopy, Scenario, Zone, inside
-from terrafusion.twin.sensors.noise import NoiseStreams, gauss_markov, rows_at_rate, sample_rate_hz
+from terrafusion.twin.sensors.noise import (
+    PLANE_WAVES,
+    NoiseStreams,
+    gauss_markov,
+    place_field,
+    rows_at_rate,
+    sample_rate_hz,
+)
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
 RTK_SIGMA_M, DGPS_SIGMA_M = 0.05, 0.5
 """A receiver whose best sigma is at most this reports fixed, or differential, fixes."""
-LADDERS = {
+FIX_LEVELS = {
     Fix.SINGLE: (Fix.NONE, Fix.SINGLE),
     Fix.DGPS: (Fix.NONE, Fix.SINGLE, Fix.DGPS),
     Fix.FLOAT: (Fix.NONE, Fix.SINGLE, Fix.FLOAT),
     Fix.FIXED: (Fix.NONE, Fix.SINGLE, Fix.FLOAT, Fix.FIXED),
 }
-"""Classes a receiver passes on its way to its best one."""
-MULTIPATH_WAVES = 24
-"""Plane waves whose sum is the multipath of a place."""
+"""Classes a receiver passes until it reaches its best one."""
 
 
 @dataclass(frozen=True, eq=False)
 class Sky:
-    """What a receiver sees at its epochs (N,): canopy density from 0 to 1, and whether it sees anything."""
+    """Sky view at the epochs (N,): canopy density from 0 to 1, and whether there is any signal."""
 
     density: Array
     visible: NDArray[np.bool_]
@@ -97,7 +102,7 @@ def gnss_channel(
 def fix_classes(
     sky: Sky, best: Fix, interval_s: float, real: GnssRealism, rng: np.random.Generator
 ) -> NDArray[np.uint8]:
-    """Fix class (N,) at epochs `interval_s` apart: a Markov chain up and down the receiver's ladder.
+    """Fix class (N,) at epochs `interval_s` apart: a Markov chain over the levels of the receiver.
 
     A step down comes at the rate `canopy_loss_per_s` times the density; a step up at
     (1 - density) / `reacquire_s` from no fix, and from there at (1 - density) steps / `refix_s`.
@@ -106,11 +111,11 @@ def fix_classes(
     fixes = np.full(len(sky.density), int(best), dtype=np.uint8)
     if not sky.density.any() and sky.visible.all():
         return fixes
-    ladder = LADDERS[best]
-    steps = len(ladder) - 2
+    levels = FIX_LEVELS[best]
+    steps = len(levels) - 2
     rise_s = [real.reacquire_s, *[real.refix_s / steps] * steps] if steps else [real.reacquire_s]
     drawn = rng.uniform(size=len(fixes)).tolist()
-    step = len(ladder) - 1
+    step = len(levels) - 1
     for i, (density, visible, u) in enumerate(
         zip(sky.density.tolist(), sky.visible.tolist(), drawn, strict=True)
     ):
@@ -121,12 +126,12 @@ def fix_classes(
             step = max(step - 1, 0)
         else:
             step = _risen(step, rise_s, 1.0 - density, interval_s, 1.0 - u)
-        fixes[i] = ladder[step]
+        fixes[i] = levels[step]
     return fixes
 
 
 def _risen(step: int, rise_s: list[float], openness: float, interval_s: float, u: float) -> int:
-    """The step of the ladder after an interval in which it may rise; steps that take no time come at once."""
+    """The level after an interval in which it may rise; levels that take no time come at once."""
     if openness <= 0.0:
         return step
     while step < len(rise_s) and rise_s[step] == 0.0:
@@ -171,20 +176,13 @@ def _position_error(
 def _multipath(
     position_m: Array, fix: NDArray[np.uint8], sky: Sky, vehicle: VehicleParams, noise: NoiseStreams
 ) -> Array:
-    """Displacement (N, 3) by reflections under canopy: a fixed field of the place, unknown to the receiver.
+    """Displacement (N, 3) by reflections under canopy: a fixed field of the place, not in the reported sigma.
 
-    A sum of plane waves with Gaussian wave vectors has a squared-exponential correlation of length
-    `multipath_length_m` (random Fourier features, Rahimi and Recht 2007). It shrinks with the sigma
-    of the fix class: carrier phase is displaced by centimetres where the code is by metres.
+    It shrinks with the sigma of the fix class: carrier phase is displaced by centimetres, code by metres.
     """
     real = vehicle.realism
     if real.gnss.canopy_multipath_m == 0.0 or not sky.density.any():
         return np.zeros_like(position_m)
-    rng = noise.stream("gnss multipath")
-    waves = rng.normal(0.0, 1.0 / real.gnss.multipath_length_m, (3, 2, MULTIPATH_WAVES))
-    phase = rng.uniform(0.0, 2.0 * np.pi, (3, MULTIPATH_WAVES))
-    field = np.stack(
-        [np.cos(position_m[:, :2] @ w + p).sum(axis=1) for w, p in zip(waves, phase, strict=True)], axis=1
-    )
+    field = place_field(position_m, real.gnss.multipath_length_m, noise.stream("gnss multipath"))
     size = real.gnss.canopy_multipath_m * _class_sigma(fix, vehicle) / real.gnss_single_sigma_m
-    return np.asarray(math.sqrt(2.0 / MULTIPATH_WAVES) * sky.density[:, None] * size * field)
+    return np.asarray(math.sqrt(2.0 / PLANE_WAVES) * sky.density[:, None] * size * field)

@@ -63,7 +63,7 @@ def _truth(motion: BodyMotion, position_m: tuple[float, ...]) -> tuple[Array, Ar
 def _measured(
     gyro: Array, accel: Array, rate_hz: float, vehicle: VehicleParams, noise: NoiseStreams
 ) -> tuple[Array, Array]:
-    """What the triads make of the angular rate and specific force (N, 3) they feel."""
+    """Readings of the triads for the angular rate and specific force (N, 3)."""
     spec, real = vehicle.sensors.imu, vehicle.realism.imu
     gyro = gyro @ triad(noise.stream("gyro triad"), real.gyro_scale_sigma, real.misalignment_sigma_rad).T
     accel = accel @ triad(noise.stream("accel triad"), real.accel_scale_sigma, real.misalignment_sigma_rad).T

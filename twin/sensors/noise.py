@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-import zlib
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
+from terrafusion.twin.model.ground import random_stream
 
 Array = NDArray[np.float64]
 
+PLANE_WAVES = 24
+"""Waves in the sum of `place_field`."""
 FLICKER_RATIO = math.sqrt(10.0)
 """Ratio of neighbouring correlation times of `flicker`."""
 FLICKER_TIMES_S = tuple(FLICKER_RATIO**k for k in range(8))
@@ -32,8 +34,7 @@ class NoiseStreams:
 
     def stream(self, name: str) -> np.random.Generator:
         """The generator of the stream `name`; the same seed and name give the same numbers."""
-        entropy = np.random.SeedSequence([self.seed, zlib.crc32(name.encode())])
-        return np.random.Generator(np.random.PCG64(entropy))
+        return random_stream(self.seed, name)
 
 
 def rows_at_rate(count: int, sample_hz: float, rate_hz: float) -> NDArray[np.int64]:
@@ -98,3 +99,15 @@ def band_noise(rng: np.random.Generator, count: int, rate_hz: float, low_hz: flo
 def stepped(values: Array, quantum: float) -> Array:
     """The values rounded to multiples of `quantum`; unchanged where it is 0."""
     return np.round(values / quantum) * quantum if quantum > 0.0 else values
+
+
+def place_field(position_m: Array, length_m: float, rng: np.random.Generator) -> Array:
+    """A fixed random field (N, 3) over the ground, of variance `PLANE_WAVES` / 2 an axis.
+
+    A sum of plane waves with Gaussian wave vectors: its correlation is squared-exponential over `length_m`
+    (random Fourier features, Rahimi and Recht 2007).
+    """
+    waves = rng.normal(0.0, 1.0 / length_m, (3, 2, PLANE_WAVES))
+    phase = rng.uniform(0.0, 2.0 * np.pi, (3, PLANE_WAVES))
+    parts = [np.cos(position_m[:, :2] @ w + p).sum(axis=1) for w, p in zip(waves, phase, strict=True)]
+    return np.stack(parts, axis=1)

@@ -143,8 +143,8 @@ def _run_all(
     """The results of all calls, in the order of `work` whatever the number of processes."""
     results: list[Any] = [None] * len(work)
     numbered = ((number, function, arguments) for number, (function, arguments) in enumerate(work))
-    with open_workers("loky", jobs) as pool:
-        for done, (number, result) in enumerate(pool.results(_numbered, numbered), 1):
+    with open_workers("loky", jobs) as workers:
+        for done, (number, result) in enumerate(workers.results(_numbered, numbered), 1):
             results[number] = result
             if progress is not None:
                 progress(done / len(work))

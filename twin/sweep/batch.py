@@ -1,4 +1,4 @@
-"""Driving many runs without sensors, several side by side where the engine can."""
+"""Drives many runs without sensors, several at once in the lanes of the engine."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ TOGETHER = 8
 
 
 def attempt(work: Callable[..., T], *inputs: Any) -> T | Exception:
-    """`work(*inputs)`, or the exception it raises or finds among its inputs: a run takes no other along."""
+    """`work(*inputs)`, or the exception it raises or finds among its inputs: other runs go on."""
     failed = next((value for value in inputs if isinstance(value, Exception)), None)
     if failed is not None:
         return failed

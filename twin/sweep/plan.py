@@ -1,4 +1,4 @@
-"""What a sweep is: a scenario, a vehicle and axes, and the runs they make.
+"""A sweep: a scenario, a vehicle and axes, and the runs they make.
 
 The runs are the cross product of the axes, the last axis of `AXES` running
 fastest; a random sweep is a Latin hypercube of so many runs instead.
@@ -30,9 +30,9 @@ MAX_RUNS = 100_000
 CHUNK_S = 4000.0
 """Driving in a chunk, s: some seconds of work, lost when a process is killed."""
 MIN_CHUNKS = 32
-"""A sweep is cut into so many chunks at least, so that many workers have something to do."""
+"""Least number of chunks of a sweep, for many workers."""
 CHUNK_STEP = 8
-"""Chunks hold a multiple of so many runs, which a vector unit may drive side by side."""
+"""Chunks hold a multiple of so many runs, which the engine may drive together."""
 
 Level = str | float | int
 
@@ -60,7 +60,7 @@ class Axis:
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """One run of a sweep; None stands for what the scenario and its soils say themselves."""
+    """One run of a sweep; None stands for the value of the scenario and its soils."""
 
     run: int
     terrain: str | None = None
@@ -119,7 +119,7 @@ class Sweep:
         return 1.0 if case.speed_scale is None else case.speed_scale
 
     def chunks(self) -> list[range]:
-        """Runs that are computed together, whatever the number of workers: the rows hang on nothing else."""
+        """Runs that are computed together, the same for any number of workers."""
         most = int(CHUNK_S / self.scenario.duration_s)
         size = max(1, min(most, self.runs // MIN_CHUNKS) // CHUNK_STEP) * CHUNK_STEP
         return [range(i, min(i + size, self.runs)) for i in range(0, self.runs, size)]

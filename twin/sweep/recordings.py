@@ -54,8 +54,8 @@ def write_recordings(
     chosen = set(runs)
     work = [(sweep, case, Path(folder), form) for case in sweep.cases() if case.run in chosen]
     failures = []
-    with open_workers("loky", min(jobs, len(work)) or 1) as pool:
-        for number, failure in enumerate(pool.results(_write, work), 1):
+    with open_workers("loky", min(jobs, len(work)) or 1) as workers:
+        for number, failure in enumerate(workers.results(_write, work), 1):
             failures += [failure] if failure else []
             if progress is not None:
                 progress(number / len(work))

@@ -28,12 +28,12 @@ Row = dict[str, str | float | int | None]
 
 DONE, SPINNING, IMMOBILISED, SLID, FAILED = ("done", "spinning", "immobilised", "slid", "failed")
 STATUSES = (DONE, SPINNING, IMMOBILISED, SLID, FAILED)
-"""How a run ended: it drove on; its wheels turned, but it made less than a tenth of its way; it came
-to rest for good; it ended behind its start, as on too steep a slope; it could not be computed."""
+"""How a run ended: it drove on; its wheels turned, but it covered less than a tenth of the commanded
+distance; it came to rest for good; it ended behind its start, as on too steep a slope; it failed."""
 MOBILE_RATIO = 0.1
-"""A robot that makes less than this share of its commanded way spins (assumed)."""
+"""A robot that covers less than this share of the commanded distance spins (assumed)."""
 MIN_COMMANDED_M = 0.5
-"""A drive that is told to cover less has no travel ratio."""
+"""With a shorter commanded distance there is no travel ratio."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ def columns(sensors: bool) -> tuple[Column, ...]:
 
 
 def run_chunk(sweep: Sweep, cases: Sequence[SweepPoint]) -> list[Row]:
-    """The rows of some runs, in their order. A run that fails is a row that says why."""
+    """The rows of some runs, in their order. A failed run has its reason in `error`."""
     rows: list[Row] = []
     for first in range(0, len(cases), TOGETHER):
         some = cases[first : first + TOGETHER]

@@ -1,6 +1,7 @@
 """`run_sweep`: many runs of the twin, as one table; resumed where it was stopped.
 
-    from terrafusion.twin.sweep.run import load_sweep, run_sweep
+    from terrafusion.twin.sweep.load import load_sweep
+    from terrafusion.twin.sweep.run import run_sweep
     table = run_sweep(load_sweep("friction_slope"), "out", jobs=2)     # a pyarrow Table
 
 The rows and their order depend on the sweep alone, not on the number of
@@ -15,22 +16,9 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.executors import open_workers
-from terrafusion.twin.sweep.load import load_sweep, sweep_names
 from terrafusion.twin.sweep.plan import MAX_RUNS, Sweep, SweepPoint
-from terrafusion.twin.sweep.recordings import check_runs, write_recordings
 from terrafusion.twin.sweep.rows import Row, run_chunk
 from terrafusion.twin.sweep.store import RUNS_FILE, Store
-
-__all__ = [
-    "Sweep",
-    "SweepPoint",
-    "check_runs",
-    "load_sweep",
-    "read_table",
-    "run_sweep",
-    "sweep_names",
-    "write_recordings",
-]
 
 
 def run_sweep(
@@ -47,15 +35,15 @@ def run_sweep(
 
     Args:
         sweep: what to run.
-        out: folder of the results, see `sweeping.store`.
+        out: folder of the results, see `sweep.store`.
         jobs: processes on this machine; a Dask cluster has its own number.
         backend: "loky" (this machine) or "dask".
         address: of the Dask scheduler, such as "tcp://10.0.0.5:8786".
         max_runs: a sweep of more runs is refused.
-        progress: told the share of the runs that is done, from 0 to 1.
+        progress: called with the share of the runs done, 0 to 1.
 
     Returns:
-        pyarrow `Table`, one row a run in the order of `sweep.cases()`; see `sweeping.rows.columns`.
+        pyarrow `Table`, one row a run in the order of `sweep.cases()`; see `sweep.rows.columns`.
 
     Raises:
         ConfigError: too many runs, another sweep in `out`, or an option that makes no sense.
@@ -75,8 +63,8 @@ def run_sweep(
     if missing:
         cases = list(sweep.cases())
         work = [(sweep, number, [cases[run] for run in chunks[number]]) for number in missing]
-        with open_workers(backend, min(jobs, len(missing)), address) as pool:
-            for number, rows in pool.results(_numbered, work):
+        with open_workers(backend, min(jobs, len(missing)), address) as workers:
+            for number, rows in workers.results(_numbered, work):
                 store.write_part(number, rows)
                 done += len(rows)
                 if progress is not None:

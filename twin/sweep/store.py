@@ -1,10 +1,10 @@
-"""What a sweep leaves on the disk while it runs and when it is done.
+"""Files of a sweep while it runs and when it is done.
 
     sweep.json        the sweep, its hash, whether it is complete; the same on every machine
     parts/            one Parquet file a chunk, written beside its place and moved there when whole
     runs.parquet      all rows, when all chunks are there; the parts are then removed
 
-A process that is killed loses the chunks it was computing, nothing else.
+A killed process loses only the chunks it was computing.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Store:
         return [i for i, chunk in enumerate(self.chunks) if not self._holds(self._part(i), len(chunk))]
 
     def write_part(self, number: int, rows: Sequence[Row]) -> None:
-        """Keep the rows of one chunk."""
+        """Write the rows of one chunk."""
         self._write_table(self._part(number), self._table(rows))
 
     def assemble(self) -> None:

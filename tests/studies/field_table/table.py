@@ -138,8 +138,8 @@ def run_tasks(
     """
     check_folder(out / FOLDER)
     missing = [task for task in tasks if read_part(out, task.key, log_state(task.log)) is None]
-    with open_workers("loky", min(jobs, max(len(missing), 1))) as pool:
-        for task, found in pool.results(run_task, [(task,) for task in missing]):
+    with open_workers("loky", min(jobs, max(len(missing), 1))) as workers:
+        for task, found in workers.results(run_task, [(task,) for task in missing]):
             runs = [dataclasses.asdict(r) for r in found if isinstance(r, Run)]
             refused = [dataclasses.asdict(r) for r in found if isinstance(r, Refusal)]
             write_part(out, task.key, {"runs": runs, "refused": refused}, log_state(task.log))

@@ -140,7 +140,7 @@ def test_what_was_calibrated_holds_against_the_geometry_that_a_log_assumes(tmp_p
     assert with_overrides(known, log.overrides).wheel.radius_m == found["vehicle.wheel.radius_m"].value
     assert with_overrides(known, Overrides(track_m=0.7)).body.track_m == 0.7
     again = calibrate(log, known, SOIL, NAMES[:1])
-    assert any("kept for its body: wheel.radius_m" in note for note in again.notes)
+    assert any("retained for its body: wheel.radius_m" in note for note in again.notes)
     assert again.before.vehicle.wheel.radius_m == pytest.approx(TRUTH["vehicle.wheel.radius_m"], rel=0.01)
 
 

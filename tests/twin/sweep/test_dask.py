@@ -18,8 +18,10 @@ from pathlib import Path
 import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
-from terrafusion.twin import executors as pools
-from terrafusion.twin.sweep.run import Sweep, load_sweep, run_sweep
+from terrafusion.twin import executors
+from terrafusion.twin.sweep.load import load_sweep
+from terrafusion.twin.sweep.plan import Sweep
+from terrafusion.twin.sweep.run import run_sweep
 
 pytest.importorskip("distributed", reason="distributed is not installed: pip install 'terrafusion[cluster]'")
 
@@ -147,13 +149,13 @@ def test_what_is_no_address_is_refused(tmp_path: Path, address: str) -> None:
 
 
 def test_a_scheduler_without_workers_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pools, "CONNECT_S", 2.0)
+    monkeypatch.setattr(executors, "CONNECT_S", 2.0)
     with scheduler(tmp_path) as address:
         _fails_fast(tmp_path, address, "the Dask scheduler has no worker; start some: `dask worker tcp://")
 
 
 def test_other_versions_are_told(cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(pools, "version", lambda: "9.9")
+    monkeypatch.setattr(executors, "version", lambda: "9.9")
     _fails_fast(
         tmp_path, cluster, r"the worker tcp://\S+ has terrafusion \S+, here it is 9.9; install the same"
     )
@@ -162,7 +164,7 @@ def test_other_versions_are_told(cluster: str, tmp_path: Path, monkeypatch: pyte
 def test_dead_workers_are_told_and_nothing_finished_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(pools, "WORKERLESS_S", 2.0)
+    monkeypatch.setattr(executors, "WORKERLESS_S", 2.0)
     sweep = sweep_of(tmp_path, duration_s=20)
     whole = run_sweep(sweep, tmp_path / "whole")
     with scheduler(tmp_path) as address:

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.scenario.file import load_scenario
-from terrafusion.twin.sweep.plan import Axis, at_speed, top_speed_mps
-from terrafusion.twin.sweep.run import Sweep, load_sweep, sweep_names
+from terrafusion.twin.sweep.load import load_sweep, sweep_names
+from terrafusion.twin.sweep.plan import Axis, Sweep, at_speed, top_speed_mps
 
 
 def written(folder: Path, text: str) -> Sweep:

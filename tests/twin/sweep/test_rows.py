@@ -14,8 +14,9 @@ from terrafusion.twin.scenario.commands import DrivenStates
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.sweep import batch
 from terrafusion.twin.sweep import rows as rows_module
+from terrafusion.twin.sweep.load import load_sweep
+from terrafusion.twin.sweep.plan import Sweep
 from terrafusion.twin.sweep.rows import DONE, FAILED, IMMOBILISED, Row, arguments, columns, run_chunk
-from terrafusion.twin.sweep.run import Sweep, load_sweep
 
 DRIVE = """\
 drive:

@@ -21,8 +21,11 @@ import pytest
 from terrafusion.datasets.core.errors import ConfigError, TerrafusionError
 from terrafusion.twin.executors import open_workers
 from terrafusion.twin.sweep import run as module
+from terrafusion.twin.sweep.load import load_sweep
+from terrafusion.twin.sweep.plan import Sweep, SweepPoint
+from terrafusion.twin.sweep.recordings import write_recordings
 from terrafusion.twin.sweep.rows import columns
-from terrafusion.twin.sweep.run import Sweep, SweepPoint, load_sweep, read_table, run_sweep, write_recordings
+from terrafusion.twin.sweep.run import read_table, run_sweep
 
 SWEEP = """\
 scenario: drive.yaml
@@ -32,7 +35,8 @@ axes:
   slope_deg: [0, 3, 6, 9]
 """
 PROGRAM = (
-    "import sys; from terrafusion.twin.sweep.run import *; run_sweep(load_sweep(sys.argv[1]), sys.argv[2])"
+    "import sys; from terrafusion.twin.sweep.load import load_sweep; "
+    "from terrafusion.twin.sweep.run import run_sweep; run_sweep(load_sweep(sys.argv[1]), sys.argv[2])"
 )
 
 
@@ -118,8 +122,8 @@ def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Pat
 
 def test_a_worker_that_dies_is_told() -> None:
     words = "a worker process died .* fewer --jobs; finished runs are kept"
-    with pytest.raises(TerrafusionError, match=words), open_workers("loky", 2) as pool:
-        list(pool.results(os._exit, [(1,)]))
+    with pytest.raises(TerrafusionError, match=words), open_workers("loky", 2) as workers:
+        list(workers.results(os._exit, [(1,)]))
 
 
 def test_a_worker_that_is_replaced_is_no_news_and_other_warnings_are() -> None:
