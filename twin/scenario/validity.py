@@ -1,6 +1,6 @@
 """Validity ranges of soils: what lies outside is refused, not extrapolated.
 
-Each number of a soil file has its own range `valid`, checked when the file is loaded (`datasets.core.config`). What depends on the run is checked here: ground pressure, wheel diameter and
+Each number of a soil file has its own range `valid`, checked on loading (`datasets.core.config`). What depends on the run is checked here: ground pressure, wheel diameter and
 moisture before the drive, slip after it.
 """
 
