@@ -1,10 +1,4 @@
-"""The formats that can be read: who claims a file, and who reads it.
-
-A reader module has two functions: `claims(path, head)` tells from the name and the first bytes
-whether a file is of its format, `read(request)` reads it. Modules import their parsers inside
-`read`, so that asking all of them costs nothing. Where a recording has several files, `kin(path)`
-tells those that are read with one of them.
-"""
+"""The formats that can be read: which module recognises a file and reads it (how to add one: `readers`)."""
 
 from __future__ import annotations
 
@@ -20,24 +14,23 @@ from terrafusion.datasets.core.sensors import Rig
 
 HEAD_BYTES = 4096
 MAP_SUFFIX = ".columns.yaml"
-"""Behind the name of a table, the name of its column map."""
+"""Appended to the name of a table, the name of its column map."""
 PARQUET_MAGIC = b"PAR1"
 
 
 @dataclass(frozen=True)
 class Request:
-    """What is asked of a reader.
+    """What a reader gets.
 
     Attributes:
         path: the file or folder.
         rig: geometry of the robot, where known.
         topics: topic by channel, for bags.
         stamps: "header" or "receipt", for bags.
-        repair_clock: take steps of a clock out (and list them in `clock_jumps`) instead of refusing them.
+        repair_clock: remove steps of a clock (and list them in `clock_jumps`) instead of refusing them.
         columns: YAML that says what the columns of a plain table are.
         trusted: the file's bytes are those of a catalogue entry.
-        conventions: what the catalogue says of it; applied after reading, here for readers that
-            must know some of them to read at all.
+        conventions: of the catalogue; applied after reading, here for readers that need some of them.
     """
 
     path: Path
@@ -52,10 +45,10 @@ class Request:
 
 @dataclass(frozen=True)
 class Format:
-    """A kind of file: its name in the catalogue, what it is called, and the module that reads it."""
+    """A kind of file: its name in the catalogue, its description, and the module that reads it."""
 
     name: str
-    words: str
+    description: str
     module: str
 
     def claims(self, path: Path, head: bytes) -> bool:
@@ -68,13 +61,13 @@ class Format:
         return recordings
 
     def files(self, path: Path) -> list[Path]:
-        """What `read` opens: all files of a folder; else the file, and those beside it that belong to it."""
+        """What `read` opens: all files of a folder; else the file and its companions."""
         if path.is_dir():
             return sorted(file for file in path.rglob("*") if file.is_file())
         module = import_module(self.module)
-        kin: Sequence[Path] = module.kin(path) if hasattr(module, "kin") else ()
+        others: Sequence[Path] = module.companions(path) if hasattr(module, "companions") else ()
         columns = path.with_name(path.name + MAP_SUFFIX)
-        return sorted({path, *kin, *([columns] if columns.is_file() else [])})
+        return sorted({path, *others, *([columns] if columns.is_file() else [])})
 
 
 _READERS = "terrafusion.datasets.readers"
@@ -93,7 +86,7 @@ FORMATS: tuple[Format, ...] = (
     Format("tum", "a TUM trajectory", f"{_READERS}.text.tum"),
     Format("table", "a table (.csv, .tsv, .txt, .parquet) with a column map", f"{_READERS}.text.table"),
 )
-"""In the order in which they are asked; the first that claims a file reads it. Tables come last."""
+"""In the order of priority: the first that claims a file reads it. Tables come last."""
 
 
 def format_of(path: Path, *, mapped: bool = False) -> Format:
@@ -101,7 +94,7 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
 
     Args:
         path: the file or folder.
-        mapped: a column map was given: text is a table then, as it is where a map lies beside it.
+        mapped: a column map was given: text is a table then, as it is where `NAME.columns.yaml` exists.
 
     Raises:
         DataError: it cannot be read, is empty, or no format claims it.
@@ -109,21 +102,22 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
     try:
         if not path.exists():
             raise DataError("no such file or folder", file=path, remedy="check the path")
+        if not (path.is_dir() or path.is_file()):
+            raise DataError("is neither a file nor a folder", file=path, remedy="give a log")
         head = b""
         if path.is_file():
             with path.open("rb") as file:
                 head = file.read(HEAD_BYTES)
             if not head:
                 raise DataError("the file is empty", file=path, remedy="record or copy it again")
-        elif not path.is_dir():
-            raise DataError("is neither a file nor a folder", file=path, remedy="give a log")
         mapped = mapped or bool(head and path.with_name(path.name + MAP_SUFFIX).is_file())
-        table = FORMATS[-1] if mapped and _may_be_table(head) else None
+        may_be_table = head.startswith(PARQUET_MAGIC) or (bool(head) and b"\0" not in head)
+        table = FORMATS[-1] if mapped and may_be_table else None
         found = table or next((form for form in FORMATS if form.claims(path, head)), None)
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
     if found is None:
-        kinds = ", ".join(form.words for form in FORMATS)
+        kinds = ", ".join(form.description for form in FORMATS)
         raise DataError(
             f"unknown kind of {'folder' if path.is_dir() else 'file'} '{path.suffix or path.name}'",
             file=path,
@@ -133,7 +127,7 @@ def format_of(path: Path, *, mapped: bool = False) -> Format:
 
 
 def logs_in(folder: Path, most: int = 50) -> list[str]:
-    """Names of the files of a folder that some format claims, and of log folders in it, sorted.
+    """Names of the readable files and log folders in a folder, sorted.
 
     Only the first `most` entries are looked at.
     """
@@ -146,7 +140,3 @@ def logs_in(folder: Path, most: int = 50) -> list[str]:
         if form.name != "log_folder" or (path / "meta.yaml").is_file():
             found.append(path.name)
     return found
-
-
-def _may_be_table(head: bytes) -> bool:
-    return head.startswith(PARQUET_MAGIC) or (bool(head) and b"\0" not in head)

@@ -1,10 +1,9 @@
-"""`open_recording` and `open_recordings`: one door to every format."""
+"""`open_recording` and `open_recordings`: every format by one function."""
 
 from __future__ import annotations
 
 import dataclasses
 import difflib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,23 +26,23 @@ def open_recordings(
     repair_clock: bool = False,
     columns: Path | str | None = None,
 ) -> list[Recording]:
-    """Read the recorded drives of a log, whatever its format.
+    """Read the recordings of a log, whatever its format.
 
     Args:
         path: a log folder, a ROS bag, a file of a public set, a table, ..., or the name of a
             recording in the catalogue (`set/recording`). `path#3` is the fourth of several.
-        rig: geometry of the robot: how its IMU is mounted, the track its odometry uses, its usual
+        rig: geometry of the robot: mounting of its IMU, the track its odometry uses, its usual
             topics. Without it the IMU is taken as mounted along the body axes, unless the
-            catalogue knows better.
+            catalogue says otherwise.
         topics: topic of a channel where the choice by type is not the one wanted, such as
             {"imu": "/imu/data", "wheels": "/odom", "gnss": "/fix"}; ROS bags only.
         stamps: times of a ROS bag: "header" (when measured) or "receipt" (when recorded).
-        repair_clock: take out steps of a clock, which are refused otherwise; each is listed in
+        repair_clock: remove steps of a clock, which are refused otherwise; each is listed in
             the recording's `clock_jumps`.
         columns: YAML file that says what the columns of a plain table are.
 
     Returns:
-        The recordings, mostly one; their notes tell what was chosen, assumed and left out.
+        The recordings, mostly one; their notes say what was chosen, assumed and left out.
 
     Raises:
         TerrafusionError: in one line the file, the channel, the time where known, and the remedy.
@@ -55,25 +54,20 @@ def open_recordings(
     entry, conventions, notes = _known(place, form)
     if rig is not None and form.name in ("ros1", "ros2"):
         conventions = dataclasses.replace(conventions, imu_axes=BODY_AXES)  # the reader turns it by the rig
-    request = Request(
-        place,
-        rig,
-        topics,
-        stamps,
-        repair_clock,
-        Path(columns) if columns is not None else None,
-        entry is not None,
-        conventions,
-    )
+    map_file = Path(columns) if columns is not None else None
+    request = Request(place, rig, topics, stamps, repair_clock, map_file, entry is not None, conventions)
     recordings = form.read(request)
-    chosen = recordings if number is None else [_chosen(place, recordings, number)]
+    if number is not None and number >= len(recordings):
+        what = f"holds {len(recordings)} recordings, numbered from 0"
+        raise DataError(what, file=place, remedy="give a smaller number")
+    chosen = recordings if number is None else [recordings[number]]
     return [
         apply(_credited(r, entry).with_notes(*notes, *_unused(form, request)), conventions) for r in chosen
     ]
 
 
 def open_recording(path: Path | str, **options: Any) -> Recording:
-    """Read the one recorded drive of a log; arguments and errors as in `open_recordings`.
+    """Read the one recording of a log; arguments and errors as in `open_recordings`.
 
     Raises:
         DataError: also where the log holds several: choose one with `path#number`.
@@ -89,7 +83,7 @@ def open_recording(path: Path | str, **options: Any) -> Recording:
 
 
 def find_log(path: Path | str) -> tuple[Path, int | None]:
-    """The file or folder that a LOG means, and the number behind `#` where there is one.
+    """The file or folder that LOG stands for, and the number after `#` where there is one.
 
     Raises:
         DataError: it cannot be read; or it is in the catalogue, but not on this machine, or a document.
@@ -131,11 +125,7 @@ def _find_log(path: Path | str) -> tuple[Path, int | None]:
 
 
 def _misspelt(name: str, place: Path) -> Path:
-    """`place`, unless the name is nearly one of the catalogue's.
-
-    Raises:
-        DataError: it is; names the near ones.
-    """
+    """`place`; DataError where the name is nearly one of the catalogue's."""
     close = difflib.get_close_matches(name, load_catalog().recordings(), n=3, cutoff=0.8)
     if close:
         remedy = f"did you mean {', '.join(close)} of the catalogue?"
@@ -150,11 +140,11 @@ def _known(path: Path, form: Format) -> tuple[CatalogFile | None, Conventions, t
     if entry is not None:
         known = catalog.sets[entry.set_name]
         return entry, known.conventions_of(entry.recording), known.notes_of(entry.recording)
-    kin = catalog.of_format(form.name)
-    if kin is None:
+    same = catalog.of_format(form.name)
+    if same is None:
         return None, Conventions(), ()
-    note = f"this file is not in the catalogue; read with the conventions of {kin.name}: check the findings"
-    return None, kin.conventions_of(), (note,)
+    note = f"this file is not in the catalogue; read with the conventions of {same.name}: check the findings"
+    return None, same.conventions_of(), (note,)
 
 
 def _credited(recording: Recording, entry: CatalogFile | None) -> Recording:
@@ -166,21 +156,12 @@ def _credited(recording: Recording, entry: CatalogFile | None) -> Recording:
     )
 
 
-def _chosen(path: Path, recordings: Sequence[Recording], number: int) -> Recording:
-    if number >= len(recordings):
-        raise DataError(
-            f"holds {len(recordings)} recordings, numbered from 0", file=path, remedy="give a smaller number"
-        )
-    return recordings[number]
-
-
 def _unused(form: Format, request: Request) -> list[str]:
-    """Options that were given and mean nothing for this format."""
+    """Notes on options that mean nothing for this format."""
     bag = form.name in ("ros1", "ros2")
-    given = [
-        word for word, said in (("topics", request.topics), ("stamps", request.stamps != "header")) if said
-    ]
-    notes = [] if bag or not given else [f"{' and '.join(given)} only matter for ROS bags; not used here"]
+    used = {"topics": request.topics, "stamps": request.stamps != "header"}
+    given = [] if bag else [word for word, value in used.items() if value]
+    notes = [f"{' and '.join(given)} only matter for ROS bags; not used here"] if given else []
     if request.columns is not None and form.name != "table":
         notes.append("columns only matter for plain tables; not used here")
     return notes

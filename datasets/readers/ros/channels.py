@@ -21,22 +21,22 @@ from terrafusion.datasets.core.channels import (
 )
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.joints import holding, joint_names, joint_values, wheel_joints
 from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE, Stream, poses, twists
+from terrafusion.datasets.readers.text.fixes import Fixes, located
 
 Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 Datum = tuple[float, float, float]
 
 NOMINAL_TRACK_M = 1.0
-DEFAULT_SIGMA_M = (3.0, 3.0, 6.0)
-"""Sigma (east, north, up) of a stand-alone fix whose receiver and log say nothing."""
-
-FIX_OF_STATUS = {0: Fix.SINGLE, 1: Fix.DGPS, 2: Fix.FIXED}
+DEFAULT_SIGMA_M = (3.0, 6.0)
+"""Horizontal and vertical sigma of a stand-alone fix without a covariance."""
+NAVSATFIX = ("latitude", "longitude", "altitude")
+FIX_OF_STATUS = {1: Fix.DGPS, 2: Fix.FIXED}
 MOVING_MPS = 0.05
 
 
@@ -200,62 +200,32 @@ class ChannelBuilder:
 
     def gnss(self, stream: Stream, t_ns: TimesNs, datum: Datum | None) -> tuple[Gnss | None, Datum | None]:
         """Fixes as ENU about `datum`, or about the first valid fix."""
-        llh = self._llh(stream)
         status = stream.column("status.status")
-        valid = np.isfinite(llh[:, :2]).all(axis=1) & (status >= 0)
-        null = (llh[:, 0] == 0.0) & (llh[:, 1] == 0.0)
-        if valid.any() and np.abs(np.median(llh[valid, :2], axis=0)).max() > 0.1:
-            valid &= ~null
-        self._check_range(llh, valid, t_ns, stream.topic)
-        dropped = int((~valid).sum())
-        if dropped:
-            self.notes.append(
-                f"gnss: {dropped} of {len(valid)} messages of {stream.topic} hold no fix; left out"
-            )
-        if not valid.any():
+        fix = np.where(status >= 0, Fix.SINGLE, Fix.NONE).astype(np.uint8)
+        for number, fix_class in FIX_OF_STATUS.items():
+            fix[status == number] = fix_class
+        fixes = Fixes(t_ns, self._llh(stream), fix, np.full((len(stream), 3), np.nan))
+        rows = f"messages of {stream.topic}"
+        held, enu, datum, notes = located(self.file, fixes, datum, channel=stream.topic, rows=rows)
+        self.notes += notes
+        if not held.any():
             return None, datum
-        llh, t_ns, status = llh[valid], t_ns[valid], status[valid]
-        if datum is None:
-            heights = llh[np.isfinite(llh[:, 2]), 2]
-            datum = (float(llh[0, 0]), float(llh[0, 1]), float(heights[0]) if heights.size else 0.0)
-            self.notes.append(
-                f"gnss: datum is the first fix, {datum[0]:.7f} deg, {datum[1]:.7f} deg, {datum[2]:.2f} m"
-            )
-        flat = np.isnan(llh[:, 2])
-        enu = geodetic_to_enu(np.where(flat[:, None] & [False, False, True], datum[2], llh), datum)
-        enu[flat, 2] = np.nan
-        codes = np.full(len(status), Fix.SINGLE, dtype=np.uint8)
-        for number, fix in FIX_OF_STATUS.items():
-            codes[status == number] = fix
-        return Gnss(t_ns, enu, self._sigma(stream.select(valid)), codes), datum
+        return Gnss(t_ns[held], enu, self._sigma(stream.select(held)), fix[held]), datum
 
     def _llh(self, stream: Stream) -> Array:
         """Latitude, longitude (deg) and height (m), (N, 3)."""
-        names = ("latitude", "longitude", "altitude")
-        return np.stack([stream.column(name).astype(float) for name in names], axis=1)
-
-    def _check_range(self, llh: Array, valid: NDArray[np.bool_], t_ns: TimesNs, topic: str) -> None:
-        bad = valid & ((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
-        if bad.any():
-            i = int(np.flatnonzero(bad)[0])
-            raise DataError(
-                f"latitude {llh[i, 0]:g}, longitude {llh[i, 1]:g} is not on Earth",
-                file=self.file,
-                channel=topic,
-                time_s=self._since(t_ns[i]),
-                remedy="NavSatFix wants degrees",
-            )
+        return np.stack([stream.column(name).astype(float) for name in NAVSATFIX], axis=1)
 
     def _sigma(self, stream: Stream) -> Array:
-        diagonal = [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)]
-        variance = np.stack(diagonal, axis=1)
+        variance = np.stack(
+            [stream.column(f"position_covariance.{i}").astype(float) for i in (0, 4, 8)], axis=1
+        )
         unknown = stream.column("position_covariance_type") == 0
         with np.errstate(invalid="ignore"):
             sigma = np.sqrt(variance)
         if unknown.any():
             spec = self.rig.sensors.gnss if self.rig else None
-            flat = spec.sigma_horizontal_m if spec else DEFAULT_SIGMA_M[0]
-            up = spec.sigma_vertical_m if spec else DEFAULT_SIGMA_M[2]
+            flat, up = (spec.sigma_horizontal_m, spec.sigma_vertical_m) if spec else DEFAULT_SIGMA_M
             sigma[unknown] = (flat, flat, up)
             origin = "the vehicle's receiver" if spec else "a stand-alone receiver, assumed"
             self.notes.append(

@@ -51,7 +51,7 @@ def claims(path: Path, head: bytes) -> bool:
     return sorted(split(header, ",")) == sorted(COLUMNS[named["kind"]])
 
 
-def kin(path: Path) -> list[Path]:
+def companions(path: Path) -> list[Path]:
     """The files of the run."""
     return [file for file in _pair(path).values() if file.is_file()]
 

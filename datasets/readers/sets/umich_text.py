@@ -63,7 +63,7 @@ def claims(path: Path, head: bytes) -> bool:
     return path.is_file() and _part(path) is not None and are_numbers(head)
 
 
-def kin(path: Path) -> list[Path]:
+def companions(path: Path) -> list[Path]:
     """The files that are read with it, also those that are then found to be of another time."""
     given = _part(path)
     assert given is not None, "claimed by its name"

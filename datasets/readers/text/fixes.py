@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ UP_FACTOR = 2.0
 
 @dataclass(frozen=True, eq=False)
 class Fixes:
-    """Fixes as a receiver tells them.
+    """Fixes as a receiver reports them.
 
     Attributes:
         t_ns: (N,) int64, never decreasing.
@@ -51,7 +52,7 @@ class Fixes:
 def gnss_channel(
     request: Request, fixes: Fixes, datum: Datum | None = None
 ) -> tuple[Gnss | None, Datum | None, list[str]]:
-    """The fixes about `datum`, or about the first of them.
+    """The fixes about `datum`, or about the first of them; unknown sigmas are assumed.
 
     Returns:
         The channel without the rows that hold no fix (None where none does), the datum, and notes.
@@ -59,40 +60,56 @@ def gnss_channel(
     Raises:
         DataError: a latitude or longitude that is not on Earth.
     """
-    held = np.isfinite(fixes.llh[:, :2]).all(axis=1) & (fixes.fix > Fix.NONE)
-    null = (fixes.llh[:, 0] == 0.0) & (fixes.llh[:, 1] == 0.0)
-    if held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
-        held &= ~null
-    notes = []
-    if not held.all():
-        notes.append(f"gnss: {int((~held).sum())} of {len(held)} rows hold no fix; left out")
+    held, enu, datum, notes = located(request.path, fixes, datum)
     if not held.any():
         return None, datum, [*notes, "gnss: no row holds a fix; the channel is absent"]
     fixes = fixes.select(held)
-    _check_on_earth(request, fixes)
+    sigma, note = with_assumed_sigma(request, fixes.sigma_enu_m, fixes.fix)
+    velocity, sigma_v = fixes.velocity_enu_mps, fixes.sigma_v_mps
+    if velocity is None or not np.isfinite(velocity[:, :2]).any():
+        velocity = sigma_v = None
+    return Gnss(fixes.t_ns, enu, sigma, fixes.fix, velocity, sigma_v), datum, [*notes, *note]
+
+
+def located(
+    file: Path, fixes: Fixes, datum: Datum | None, *, channel: str = "gnss", rows: str = "rows"
+) -> tuple[NDArray[np.bool_], Array, Datum | None, list[str]]:
+    """Which of the fixes (N,) hold a position, their ENU positions (M, 3), the datum, and notes.
+
+    Latitude and longitude 0, 0 is no position in a log that is elsewhere.
+
+    Raises:
+        DataError: a latitude or longitude that is not on Earth.
+    """
+    held = np.asarray(np.isfinite(fixes.llh[:, :2]).all(axis=1) & (fixes.fix > Fix.NONE))
+    if held.any() and np.abs(np.median(fixes.llh[held, :2], axis=0)).max() > 0.1:
+        held &= (fixes.llh[:, :2] != 0.0).any(axis=1)
+    notes = []
+    if not held.all():
+        notes.append(f"gnss: {int((~held).sum())} of {len(held)} {rows} hold no fix; left out")
+    llh = fixes.llh[held]
+    if not held.any():
+        return held, llh, datum, notes
+    bad = np.flatnonzero((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
+    if bad.size:
+        i = int(bad[0])
+        raise DataError(
+            f"latitude {llh[i, 0]:g} deg, longitude {llh[i, 1]:g} deg is not on Earth",
+            file=file,
+            channel=channel,
+            time_s=float(fixes.t_ns[held][i] - fixes.t_ns[0]) * 1e-9,
+            remedy="give degrees up to 90 and 180; are they swapped, or in another unit?",
+        )
+    flat = np.isnan(llh[:, 2])
     if datum is None:
-        datum = first_fix(fixes.llh)
+        datum = float(llh[0, 0]), float(llh[0, 1]), 0.0 if flat.all() else float(llh[~flat, 2][0])
         notes.append(
             f"gnss: datum is the first fix, {datum[0]:.7f} deg, {datum[1]:.7f} deg, {datum[2]:.2f} m"
         )
-    flat = np.isnan(fixes.llh[:, 2])
-    llh = fixes.llh.copy()
     llh[flat, 2] = datum[2]
     enu = geodetic_to_enu(llh, datum)
     enu[flat, 2] = np.nan
-    sigma, note = with_assumed_sigma(request, fixes.sigma_enu_m, fixes.fix)
-    velocity = fixes.velocity_enu_mps
-    known = velocity is not None and np.isfinite(velocity[:, :2]).any()
-    channel = Gnss(
-        fixes.t_ns, enu, sigma, fixes.fix, velocity if known else None, fixes.sigma_v_mps if known else None
-    )
-    return channel, datum, [*notes, *note]
-
-
-def first_fix(llh: Array) -> Datum:
-    """Latitude, longitude and the first known height, 0 where there is none."""
-    heights = llh[np.isfinite(llh[:, 2]), 2]
-    return float(llh[0, 0]), float(llh[0, 1]), float(heights[0]) if heights.size else 0.0
+    return held, enu, datum, notes
 
 
 def with_assumed_sigma(request: Request, sigma: Array, fix: NDArray[np.uint8]) -> tuple[Array, list[str]]:
@@ -111,18 +128,4 @@ def with_assumed_sigma(request: Request, sigma: Array, fix: NDArray[np.uint8]) -
         assumed = np.stack([flat, flat, UP_FACTOR * flat], axis=1)
         used = ", ".join(f"{Fix(k).name.lower()} {ASSUMED_SIGMA_M[Fix(k)]:g} m" for k in np.unique(fix))
         origin = f"assumed by class, flat: {used}"
-    return np.where(unknown, assumed, sigma), [f"gnss: {filled} fixes tell no sigma; taken from {origin}"]
-
-
-def _check_on_earth(request: Request, fixes: Fixes) -> None:
-    llh = fixes.llh
-    bad = np.flatnonzero((np.abs(llh[:, 0]) > 90.0) | (np.abs(llh[:, 1]) > 180.0))
-    if bad.size:
-        i = int(bad[0])
-        raise DataError(
-            f"latitude {llh[i, 0]:g} deg, longitude {llh[i, 1]:g} deg is not on Earth",
-            file=request.path,
-            channel="gnss",
-            time_s=float(fixes.t_ns[i] - fixes.t_ns[0]) * 1e-9,
-            remedy="latitudes end at 90 deg, longitudes at 180 deg; are they swapped, or in another unit?",
-        )
+    return np.where(unknown, assumed, sigma), [f"gnss: {filled} fixes have no sigma; taken from {origin}"]
