@@ -63,7 +63,7 @@ class DataSet:
     Attributes:
         name, title, holds, licence, citation, homepage: texts for people.
         format: the reader's name; files of this format that are not in the catalogue are read
-            with the conventions of the set, and that is said.
+            with the conventions of the set, with a note.
         conventions: hold for all its recordings.
         cases: by pattern of the recording's name (as in a shell), what differs there.
     """
@@ -87,7 +87,7 @@ class DataSet:
         return structure(Conventions, merged, file="catalog.yaml", key=f"{self.name}.conventions")
 
     def notes_of(self, recording: str) -> tuple[str, ...]:
-        """What the catalogue has to say of one recording."""
+        """Remarks of the catalogue on one recording."""
         return tuple(c.note for p, c in self.cases.items() if c.note and fnmatch.fnmatchcase(recording, p))
 
 
@@ -108,7 +108,7 @@ class Catalog:
         return next((entry for entry in same_size if entry.sha256 == digest), None)
 
     def of_format(self, name: str) -> DataSet | None:
-        """The set whose files have the format `name`, where one set has a format of its own."""
+        """The set whose files have the format `name`, where one set has its own format."""
         return next((s for s in self.sets.values() if s.format == name), None)
 
     def recordings(self) -> dict[str, list[CatalogFile]]:
@@ -210,9 +210,9 @@ def _entry(path: Path, number: int, row: list[str], sets: set[str]) -> CatalogFi
         }
         wrong = next((name for name, fits in good.items() if not fits), "")
     if wrong:
-        said = f"'{shown(fields[wrong])}'" if wrong in fields else "missing"
+        value = f"'{shown(fields[wrong])}'" if wrong in fields else "missing"
         raise ConfigError(
-            f"column '{wrong}' is {said} at line {number}",
+            f"column '{wrong}' is {value} at line {number}",
             file=path,
             remedy="give a known set, a relative file, owner/name or a URL, and the file's SHA-256 and size",
         )

@@ -34,7 +34,7 @@ ATTEMPTS = 3
 BLOCK = 1 << 16
 
 Progress = Callable[[CatalogFile, int], None]
-"""Told the file and how many of its bytes have come."""
+"""Called with the file and the number of its bytes received."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def fetch(
         folder: where the files are wanted; the cache folder when None. A file that is in
             `TERRAFUSION_DATA` or in the cache with the right hash is not downloaded.
         offline: take what is here; download nothing.
-        progress: told how far each download is.
+        progress: called as each download proceeds.
 
     Yields:
         Fetched, a file at a time, as soon as it is here and its SHA-256 is the catalogue's.
@@ -152,7 +152,7 @@ def _download(entry: CatalogFile, folder: Path, progress: Progress | None) -> Pa
 
 @contextmanager
 def _quiet_pooch() -> Iterator[None]:
-    """pooch tells of each download on standard error; here the caller does."""
+    """Silences pooch, which reports each download on standard error."""
     logger = pooch.get_logger()
     level = logger.level
     logger.setLevel(logging.ERROR)
@@ -163,7 +163,7 @@ def _quiet_pooch() -> Iterator[None]:
 
 
 class _BrokenOffError(requests.ConnectionError):
-    """The server closed the connection before the file was whole; its text says how far it came."""
+    """The server closed the connection before the file was whole; the text has the bytes received."""
 
 
 def _reason(error: requests.RequestException) -> str:
@@ -217,8 +217,8 @@ class _Resuming:
                 out.write(block[: len(block) - max(have - self.entry.bytes, 0)])
                 self.progress(self.entry, min(have, self.entry.bytes))
                 if have > self.entry.bytes:
-                    break  # more than the catalogue says: the hash will tell
+                    break  # more than in the catalogue: the hash will not match
         except (requests.ConnectionError, requests.exceptions.ChunkedEncodingError):
-            pass  # told below, with how far it came
+            pass  # reported below
         if have < self.entry.bytes:
             raise _BrokenOffError(f"the connection broke after {have} of {self.entry.bytes} bytes")

@@ -1,7 +1,4 @@
-"""Tables of the log folder's columns -> channels of a recording.
-
-The tables come from the CSVs of a log folder, or from a bag that this library wrote.
-"""
+"""Tables with the columns of the log folder -> channels of a recording."""
 
 from __future__ import annotations
 
@@ -66,7 +63,7 @@ class TableSource(Protocol):
 
 
 class ChannelReader:
-    """Makes channels of tables; `notes` gathers what is to be noted."""
+    """Makes channels of tables; `notes` collects what was assumed or left out."""
 
     def __init__(self, source: TableSource, meta: Meta, layouts: Layouts = WHEEL_LAYOUTS) -> None:
         self.source = source
@@ -91,9 +88,9 @@ class ChannelReader:
         names, unit = self._wheel_layout(table)
         columns = [f"{n}_rad" for n in names]
         present = [c for c in columns if c in table.numbers]
-        if present and len(present) < len(columns):
-            lacking = next(c for c in columns if c not in present)
-            raise self._error("wheels", f"column '{lacking}' is missing beside '{present[0]}'", "add it")
+        missing = [c for c in columns if c not in table.numbers]
+        if present and missing:
+            raise self._error("wheels", f"column '{missing[0]}' is missing beside '{present[0]}'", "add it")
         speed = table.stack([f"{n}_{unit}" for n in names])
         return Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
 
@@ -101,19 +98,14 @@ class ChannelReader:
         speeds = [c for c in table.numbers if not c.endswith("_rad")]
         for names, unit in self.layouts:
             if sorted(speeds) == sorted(f"{n}_{unit}" for n in names):
-                angles = {c for c in table.numbers if c.endswith("_rad")}
-                stray = angles - {f"{n}_rad" for n in names}
+                stray = set(table.numbers) - set(speeds) - {f"{n}_rad" for n in names}
                 if stray:
-                    raise self._error(
-                        "wheels",
-                        f"column '{min(stray)}' has no speed beside it",
-                        "remove it or add the speed",
-                    )
+                    what = f"column '{min(stray)}' has no speed beside it"
+                    raise self._error("wheels", what, "remove it or add the speed")
                 return names, unit
         layouts = " | ".join(", ".join(f"{n}_{unit}" for n in names) for names, unit in self.layouts)
-        raise self._error(
-            "wheels", f"columns {', '.join(speeds) or '(none)'} are not a layout", f"give one of: {layouts}"
-        )
+        what = f"columns {', '.join(speeds) or '(none)'} are not a layout"
+        raise self._error("wheels", what, f"give one of: {layouts}")
 
     def imu(self) -> Imu | None:
         table = self._table("imu", [*GYRO, *ACCEL])
@@ -132,9 +124,8 @@ class ChannelReader:
         if has("up_m") != has("sigma_u_m"):
             raise self._error("gnss", "up_m and sigma_u_m must come together", "add the missing one")
         if has("v_e_mps") != has("v_n_mps") or (has("v_u_mps") and not has("v_e_mps")):
-            raise self._error(
-                "gnss", "the velocity is incomplete", "give v_e_mps and v_n_mps, or no velocity column"
-            )
+            remedy = "give v_e_mps and v_n_mps, or no velocity column"
+            raise self._error("gnss", "the velocity is incomplete", remedy)
         return Gnss(
             self._t(table),
             table.stack(("east_m", "north_m", "up_m")),
@@ -152,16 +143,12 @@ class ChannelReader:
         words, inverse = np.unique(table.texts["fix"].astype(str), return_inverse=True)
         for k, word in enumerate(words):
             if word not in codes:
-                i = int(np.flatnonzero(inverse == k)[0])
-                raise self._error(
-                    "gnss",
-                    f"column 'fix' is '{word}' at data row {i + 1}",
-                    f"give one of {', '.join(fix.name.lower() for fix in Fix)}",
-                    time_s=float(table.t_ns[i]) * 1e-9,
-                )
-        unsaid = int((table.texts["fix"] == "").sum())
-        if unsaid:
-            self.notes.append(f"gnss: {unsaid} rows have no fix class; taken as 'single'")
+                row = int(np.flatnonzero(inverse == k)[0])
+                remedy = f"give one of {', '.join(fix.name.lower() for fix in Fix)}"
+                raise self._row_error("gnss", table, row, f"column 'fix' is '{word}'", remedy)
+        unknown = int((table.texts["fix"] == "").sum())
+        if unknown:
+            self.notes.append(f"gnss: {unknown} rows have no fix class; taken as 'single'")
         return np.array([codes[word] for word in words], dtype=np.uint8)[inverse]
 
     def motor(self) -> Motor | None:
@@ -216,19 +203,14 @@ class ChannelReader:
         if not present:
             return None
         if len(present) < 4:
-            raise self._error(
-                "truth", f"only {', '.join(present)} of the quaternion", "give qx, qy, qz and qw, or none"
-            )
+            what = f"only {', '.join(present)} of the quaternion"
+            raise self._error("truth", what, "give qx, qy, qz and qw, or none")
         q = table.stack(QUATERNION)
-        off = np.flatnonzero(np.abs(np.linalg.norm(q, axis=1) - 1.0) > 0.01)
+        norm = np.linalg.norm(q, axis=1)
+        off = np.flatnonzero(np.abs(norm - 1.0) > 0.01)
         if off.size:
-            i = int(off[0])
-            raise self._error(
-                "truth",
-                f"the quaternion has norm {np.linalg.norm(q[i]):.3g} at data row {i + 1}",
-                "give unit quaternions x, y, z, w",
-                time_s=float(table.t_ns[i]) * 1e-9,
-            )
+            what = f"the quaternion has norm {norm[off[0]]:.3g}"
+            raise self._row_error("truth", table, int(off[0]), what, "give unit quaternions x, y, z, w")
         return q
 
     def _covariance(self, table: ChannelTable) -> NDArray[np.float64] | None:
@@ -261,11 +243,10 @@ class ChannelReader:
         if table is None:
             return None
         self.notes.extend(table.notes)
-        for name in required:
-            if name not in table.numbers and name not in table.texts:
-                raise self._error(
-                    channel, f"column '{name}' is missing", f"needed: t_s, {', '.join(required)}"
-                )
+        missing = [name for name in required if name not in table.numbers and name not in table.texts]
+        if missing:
+            what = f"column '{missing[0]}' is missing"
+            raise self._error(channel, what, f"needed: t_s, {', '.join(required)}")
         return table if self.meta.keep_empty else self._with_values(channel, table)
 
     def _with_values(self, channel: str, table: ChannelTable) -> ChannelTable | None:
@@ -283,6 +264,10 @@ class ChannelReader:
 
     def _error(self, channel: str, what: str, remedy: str, *, time_s: float | None = None) -> DataError:
         return DataError(what, file=self.source.place(channel), time_s=time_s, remedy=remedy)
+
+    def _row_error(self, channel: str, table: ChannelTable, row: int, what: str, remedy: str) -> DataError:
+        time_s = float(table.t_ns[row]) * 1e-9
+        return self._error(channel, f"{what} at data row {row + 1}", remedy, time_s=time_s)
 
 
 def rows_with_values(numbers: Mapping[str, NDArray[np.float64]], n: int) -> NDArray[np.bool_]:

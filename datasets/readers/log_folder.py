@@ -63,7 +63,7 @@ def read_log_folder(folder: Path, clocks: Mapping[str, TimesNs] | None = None) -
         clocks: times in ns from the start, by channel, in place of those of the files; one for each row.
 
     Returns:
-        Recording named after the folder, times in ns from `start_ns`; its notes tell what was
+        Recording named after the folder, times in ns from `start_ns`; its notes say what was
         left out or assumed.
 
     Raises:
@@ -118,7 +118,7 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
 
 
 class _Folder:
-    """The tables of one folder, each read from its CSV; `notes` tell which rows were sorted."""
+    """The tables of one folder, each read from its CSV; `notes` say which rows were sorted."""
 
     def __init__(self, folder: Path, clocks: Mapping[str, TimesNs] | None = None) -> None:
         self.folder = folder

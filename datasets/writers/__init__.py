@@ -1,4 +1,4 @@
-"""Writers of recorded drives, one format a file."""
+"""Writers of recordings, one format a file."""
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
 from terrafusion.datasets.writers.mcap import write_mcap

@@ -48,11 +48,11 @@ def write_mcap(
     `/datum` NavSatFix (the ENU origin, once), `/cmd_vel` TwistStamped, `/terrain` String,
     `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link,
     `/tf` (the estimate) and `/tf_static` (positions of IMU and antenna where known) TFMessage,
-    `/diagnostics` (what the estimate tells of itself) DiagnosticArray. Log times are the stamps. What these
+    `/diagnostics` (status of the estimate) DiagnosticArray. Log times are the stamps. What these
     cannot hold to the bit stands on topics of their own, see `readers/ros/exact.py`.
 
     Args:
-        recording: the drive.
+        recording: what is written.
         path: the file to write; it appears when it is whole.
         estimate: what to write beside it, or its poses alone; it is not part of the recording and
             not read back.
@@ -127,7 +127,7 @@ def _definitions(topics: list[TopicMessages]) -> dict[str, Definition]:
 
 
 class _Parts:
-    """The topics of one recording; `unseen` gathers what only this library reads."""
+    """The topics of one recording; `unseen` lists what only this library reads."""
 
     def __init__(self, recording: Recording, rig: Rig | None) -> None:
         self.recording = recording

@@ -18,7 +18,7 @@ from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
-from terrafusion.datasets.readers.ros.topics import JOINTS, BagTopic, choose_topics, said_joints
+from terrafusion.datasets.readers.ros.topics import JOINTS, BagTopic, choose_topics, joints_given
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
@@ -53,7 +53,7 @@ def _assemble(container: BagContainer, request: Request) -> Recording:
     there = {(source.topic, source.msgtype) for source in container.sources if source.count}
     if META in there and not request.topics and request.stamps == "header":
         return restore(functools.partial(read_streams, container), there, path)
-    joints = said_joints(request.topics)
+    joints = joints_given(request.topics)
     topics = _topics_of(container)
     chosen, notes = choose_topics(
         topics,

@@ -42,7 +42,7 @@ MOVING_MPS = 0.05
 
 @dataclass
 class ChannelBuilder:
-    """Turns streams into channels; `notes` gathers what a user should know.
+    """Turns streams into channels; `notes` collects what was assumed or left out.
 
     `known` are the conventions of a catalogued bag: its track makes the side speeds where there is
     no rig, and its IMU's axes are left to whoever applies the conventions.
@@ -95,11 +95,11 @@ class ChannelBuilder:
 
     def _to_body(self, name: str, stream: Stream, *vectors: Array) -> tuple[Array, ...]:
         frames = sorted(set(stream.frame_ids.tolist()))
-        said = ", ".join(f"'{name}'" for name in frames)
+        names = ", ".join(f"'{frame}'" for frame in frames)
         if self.rig is None:
             if self.known.imu_axes == BODY_AXES:
                 self.notes.append(
-                    f"{name}: no vehicle given: {stream.topic} (frame {said}) taken as x forward, y left, "
+                    f"{name}: no vehicle given: {stream.topic} (frame {names}) taken as x forward, y left, "
                     "z up"
                 )
             return vectors
@@ -108,7 +108,7 @@ class ChannelBuilder:
         turn = np.asarray(stream.frame_ids == wanted, dtype=bool)
         if not turn.any():
             self.notes.append(
-                f"{name}: {stream.topic} is in frame {said}, not '{wanted}' of the vehicle: not rotated"
+                f"{name}: {stream.topic} is in frame {names}, not '{wanted}' of the vehicle: not rotated"
             )
             return vectors
         R = spec.base_from_sensor()
@@ -182,8 +182,8 @@ class ChannelBuilder:
         stream, t_ns = stream.select(held), t_ns[held]
         speed = joint_values(stream, [*joints.values()], "velocity")
         angle = joint_values(stream, [*joints.values()], "position")
-        said = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
-        self.notes.append(f"wheels: joints of {stream.topic}: {said}")
+        names = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
+        self.notes.append(f"wheels: joints of {stream.topic}: {names}")
         if speed is None and angle is not None and len(t_ns) > 1:
             dt = np.diff(t_ns) * 1e-9
             keep = np.concatenate([[False], dt > 0])
@@ -291,8 +291,8 @@ class ChannelBuilder:
         if not fresh.all():
             self.notes.append(f"truth: {int((~fresh).sum())} poses with a repeated time left out")
         columns = (position, orientation, twist, covariance)
-        kept = [None if column is None else column[fresh] for column in columns]
-        return Trajectory(t_ns[fresh], position[fresh], *kept[1:]), frame
+        fresh_columns = [None if column is None else column[fresh] for column in columns]
+        return Trajectory(t_ns[fresh], position[fresh], *fresh_columns[1:]), frame
 
     def _truth_twist(self, stream: Stream) -> Array | None:
         if stream.msgtype != topics.ODOMETRY:
@@ -313,7 +313,7 @@ class ChannelBuilder:
                 file=self.file,
                 channel=topic,
                 time_s=self._since(t_ns[i]),
-                remedy="mend the driver, or filter these messages out of the bag",
+                remedy="correct the driver, or filter these messages out of the bag",
             )
 
 

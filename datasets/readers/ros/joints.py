@@ -27,7 +27,7 @@ _NOT_WHEELS = re.compile(r"steer|arm|flipper|gripper|pan|tilt|caster|suspension|
 
 
 def wheel_of_joint(joint: str) -> str | None:
-    """Name of the wheel (left, front_right, ...) that a joint's name tells, or None."""
+    """Name of the wheel (left, front_right, ...) by the name of its joint, or None."""
     if _NOT_WHEELS.search(joint):
         return None
     spaced = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint)
@@ -44,9 +44,9 @@ def wheel_of_joint(joint: str) -> str | None:
     return f"{end}_{side}" if end else side
 
 
-def wheel_joints(names: Sequence[str], said: dict[str, str]) -> dict[str, str]:
+def wheel_joints(names: Sequence[str], named: dict[str, str]) -> dict[str, str]:
     """Wheel -> joint name for the best layout the joints fill; empty when none is filled."""
-    found = dict(said)
+    found = dict(named)
     candidates = [n for n in names if "wheel" in n.lower()] or list(names)
     for joint in candidates:
         wheel = wheel_of_joint(joint)

@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
 UNKNOWN_VARIANCE = 1e6
-"""A variance from here on says, by ROS custom, that the quantity is not known."""
+"""By ROS custom, a variance this large marks an unknown quantity."""
 
 TWIST_AT = {
     topics.TWIST: ("", ""),

@@ -137,12 +137,12 @@ class Ros1File:
         return self._file.read(size)
 
     def _source(self, number: int) -> BagSource:
-        fields, said = self._connections[number]
+        fields, details = self._connections[number]
         return BagSource(
             number,
             _topic(fields.get("topic", b"").decode()),
-            normal_type(said.get("type", b"").decode()),
-            said.get("message_definition", b"").decode(errors="replace"),
+            normal_type(details.get("type", b"").decode()),
+            details.get("message_definition", b"").decode(errors="replace"),
             "msg",
             "ros1",
             sum(chunk.counts.get(number, 0) for chunk in self._chunks),

@@ -67,16 +67,16 @@ class Ros2Folder:
         self._ids: list[dict[int, int]] = []
         self._scratch: tempfile.TemporaryDirectory[str] | None = None
         self.sources: list[BagSource] = []
-        said = _metadata(folder / "metadata.yaml")
-        storage = STORAGES.get(str(said.get("storage_identifier")))
-        names = said.get("relative_file_paths")
+        metadata = _metadata(folder / "metadata.yaml")
+        storage = STORAGES.get(str(metadata.get("storage_identifier")))
+        names = metadata.get("relative_file_paths")
         if storage is None or not isinstance(names, list) or not names:
             raise BagError("metadata.yaml names no storage and files that could be read")
-        mode = str(said.get("compression_mode") or "none").lower()
+        mode = str(metadata.get("compression_mode") or "none").lower()
         if mode not in ("none", "file", "message") or (
-            mode != "none" and said.get("compression_format") != "zstd"
+            mode != "none" and metadata.get("compression_format") != "zstd"
         ):
-            raise BagError(f"compression '{mode}' by '{said.get('compression_format')}' is not supported")
+            raise BagError(f"compression '{mode}' by '{metadata.get('compression_format')}' is not supported")
         self._packed = mode == "message"
         try:
             for name in names:
@@ -85,7 +85,7 @@ class Ros2Folder:
                     raise BagError(f"the file {path.name} is missing")
                 path = self._unpacked(path) if mode == "file" else path
                 alone = storage is Db3File and len(names) == 1
-                self._add(Db3File(path, _counts(said)) if alone else storage(path))
+                self._add(Db3File(path, _counts(metadata)) if alone else storage(path))
         except BaseException:
             self.close()
             raise
@@ -150,10 +150,10 @@ def _unpacked_messages(batch: MessageBatch) -> MessageBatch:
     return batch._replace(data=np.frombuffer(b"".join(messages), dtype=np.uint8), starts=starts, sizes=sizes)
 
 
-def _counts(said: dict[str, Any]) -> dict[str, int] | None:
-    """Numbers of messages by topic, as the metadata tell them; None where they tell of none on a topic."""
+def _counts(metadata: dict[str, Any]) -> dict[str, int] | None:
+    """Numbers of messages by topic, by metadata.yaml; None where a topic has none."""
     try:
-        topics = said["topics_with_message_count"]
+        topics = metadata["topics_with_message_count"]
         found = {str(t["topic_metadata"]["name"]): int(t["message_count"]) for t in topics}
         return found if found and all(count > 0 for count in found.values()) else None
     except (KeyError, TypeError, ValueError):
@@ -167,10 +167,10 @@ def _metadata(path: Path) -> dict[str, Any]:
     if path.stat().st_size > MAX_METADATA_BYTES:
         raise BagError(f"metadata.yaml has {path.stat().st_size} bytes")
     try:
-        told = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
+        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
     except YAMLError as error:
         raise BagError(f"metadata.yaml is not valid YAML: {str(error).splitlines()[0]}") from None
-    said = told.get("rosbag2_bagfile_information") if isinstance(told, dict) else None
-    if not isinstance(said, dict):
+    metadata = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+    if not isinstance(metadata, dict):
         raise BagError("metadata.yaml holds no rosbag2_bagfile_information")
-    return said
+    return metadata

@@ -1,4 +1,4 @@
-"""Which clock of a bag is taken: header stamps or receipt stamps, and what is done where one steps."""
+"""Times of a bag's messages: header stamps or receipt stamps, and the repair of clock steps."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def timing_of(streams: Mapping[str, Stream], *, stamps: str, repair_clock: bool,
     receipt = {kind: stream.receipt_ns for kind, stream in timing.streams.items()}
     received_jumps: tuple[ClockJump, ...] = ()
     if repair_clock:
-        with _told_of(file):
+        with _errors_in(file):
             receipt, received_jumps = repair_together(receipt)
     headed = _headed(timing, stamps)
     headed, header_jumps = _on_one_clock(timing, headed, receipt, repair_clock, file)
@@ -119,7 +119,7 @@ def _on_one_clock(
     jumps: tuple[ClockJump, ...] = ()
     beside = {kind: receipt[kind] for kind, t in headed.items() if _same_rate(t, receipt[kind])}
     if repair_clock:
-        with _told_of(file):
+        with _errors_in(file):
             headed, jumps = repair_together(headed, beside=beside)
     else:
         timing.notes += _leaps(headed, beside)
@@ -135,7 +135,7 @@ def _on_one_clock(
 
 
 @contextmanager
-def _told_of(file: Path) -> Iterator[None]:
+def _errors_in(file: Path) -> Iterator[None]:
     """Errors that name the file too."""
     try:
         yield
@@ -229,20 +229,20 @@ def _onto(headed: Times, receipt: Times, others: Times) -> Times:
 
 def _latencies(timing: StreamTimes, headed: Times, receipt: Times) -> str:
     """What was measured of receipt against header stamps, in words."""
-    told = []
+    parts = []
     for kind, t_ns in headed.items():
         late_s = (receipt[kind] - t_ns) * 1e-9
         median, most = np.percentile(late_s, [50, 95])
         topic = timing.streams[kind].topic
         if abs(median) > CLOCK_TOLERANCE_S:
-            told.append(f"{topic} on another clock, {median:.6g} s away")
+            parts.append(f"{topic} on another clock, {median:.6g} s away")
         else:
-            told.append(f"{topic} {median * 1e3:.3g} and {most * 1e3:.3g} ms")
-    return f"received later by (median, 95 %): {', '.join(told)}" if told else ""
+            parts.append(f"{topic} {median * 1e3:.3g} and {most * 1e3:.3g} ms")
+    return f"received later by (median, 95 %): {', '.join(parts)}" if parts else ""
 
 
 def _sort(timing: StreamTimes) -> None:
-    """Bring messages into the order of their times; a note tells which were not."""
+    """Sort messages by time, with a note where they were not."""
     for kind, order in _disorders(timing.times):
         moved = int((order != np.arange(len(order))).sum())
         timing.notes.append(f"{kind}: {moved} messages out of order were sorted")

@@ -1,4 +1,4 @@
-"""Which topic of a bag becomes which channel: by type, by name, or as the user says."""
+"""Which topic of a bag becomes which channel: by type, by name, or on request."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TYPES: dict[str, tuple[str, ...]] = {
     "magnetometer": (FIELD,),
     "datum": (FIX,),
 }
-"""Message types of each channel, the more telling ones first."""
+"""Message types of each channel, preferred ones first."""
 
 ALIASES = {
     "odom": "wheels",
@@ -85,10 +85,10 @@ def choose_topics(
     usual: Mapping[str, str] | None = None,
     is_wheel_joints: Callable[[str], bool] = lambda topic: True,
 ) -> tuple[dict[str, BagTopic], list[str]]:
-    """The topic of each channel, and notes telling what was taken and what was left.
+    """The topic of each channel, and notes on what was taken and left.
 
-    The user's word goes first and must hold; then the vehicle's usual topics where the bag has
-    them; then by type. Among several of a type: the more telling type, then the name (wheel
+    The user's choice goes first and must be there; then the vehicle's usual topics where the bag has
+    them; then by type. Among several of a type: the preferred type, then the name (wheel
     controllers before others, raw data last), then the most messages, then the alphabet. A
     topic that looks like a fused estimate is never taken for a sensor by itself.
 
@@ -132,7 +132,7 @@ def choose_topics(
     return chosen, notes
 
 
-def said_joints(user: Mapping[str, str] | None) -> dict[str, str]:
+def joints_given(user: Mapping[str, str] | None) -> dict[str, str]:
     """Wheel -> joint name from the entries `joint.<wheel>`."""
     entries = (user or {}).items()
     return {key.removeprefix(JOINT_PREFIX): name for key, name in entries if key.startswith(JOINT_PREFIX)}

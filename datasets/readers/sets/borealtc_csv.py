@@ -7,7 +7,6 @@ of one number are one run, the folder names its ground, and both begin at 0: no 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,14 +31,6 @@ LATEST_START_NS = 60 * 10**9
 """Times count from the start of the run; what begins later is of another clock."""
 EVEN_NS = 1000
 """Stamps of a clock scatter by more than this."""
-
-
-@dataclass(frozen=True)
-class Ground:
-    """What the folder says of the ground: its label ("" for nothing), and a note."""
-
-    label: str
-    note: str
 
 
 def claims(path: Path, head: bytes) -> bool:
@@ -76,17 +67,18 @@ def read(request: Request) -> list[Recording]:
                 file=r.path,
                 remedy="subtract the start of the run from both files",
             )
-    ground = _ground(folder.resolve().name)
-    notes = [*_pairing(rows), *clock, *(note for r in rows.values() for note in r.notes), ground.note]
-    label = np.array([ground.label], dtype=object)
+    terrain, terrain_note = _terrain(folder.resolve().name)
+    notes = [*_pairing(rows), *clock, *(note for r in rows.values() for note in r.notes), terrain_note]
+    label = np.array([terrain], dtype=object)
+    imu, pro = rows.get("imu"), rows.get("pro")
     recording = Recording(
         name=f"{folder.resolve().name}/{run}",
         start_ns=0,
-        wheels=_wheels(rows["pro"]) if "pro" in rows else None,
-        imu=_imu(rows["imu"]) if "imu" in rows else None,
-        motor=_motor(rows["pro"]) if "pro" in rows else None,
-        terrain=Terrain(np.zeros(1, dtype=np.int64), label) if ground.label else None,
-        terrain_name=ground.label,
+        wheels=Wheels(pro.t_ns, pro.values[:, 2:], ("left", "right"), "mps") if pro else None,
+        imu=Imu(imu.t_ns, imu.values[:, :3], imu.values[:, 3:]) if imu else None,
+        motor=Motor(pro.t_ns, pro.values[:, :2]) if pro else None,
+        terrain=Terrain(np.zeros(1, dtype=np.int64), label) if terrain else None,
+        terrain_name=terrain,
         clock_jumps=jumps,
         notes=tuple(notes),
     )
@@ -104,12 +96,13 @@ def _pair(path: Path) -> dict[str, Path]:
     return {kind: path.parent / f"{kind}_{_run(path)}.csv" for kind in COLUMNS}
 
 
-def _ground(folder: str) -> Ground:
+def _terrain(folder: str) -> tuple[str, str]:
+    """Terrain label by the folder's name, "" for none, and a note."""
     if not FOLDER.fullmatch(folder):
-        return Ground("", f"the folder '{folder}' names no ground (such as SNOW): no terrain label")
+        return "", f"the folder '{folder}' names no ground (such as SNOW): no terrain label"
     label = CLASS_OF_FOLDER.get(folder, folder.lower())
     known = "" if label in TERRAINS else "; the library has no class for it"
-    return Ground(label, f"terrain: '{label}' from the folder {folder}{known}")
+    return label, f"terrain: '{label}' from the folder {folder}{known}"
 
 
 def _pairing(rows: dict[str, Rows]) -> list[str]:
@@ -134,15 +127,3 @@ def _pairing(rows: dict[str, Rows]) -> list[str]:
 
 def _is_even(t_ns: NDArray[np.int64]) -> bool:
     return len(t_ns) > 2 and int(np.ptp(np.diff(t_ns))) <= EVEN_NS
-
-
-def _imu(rows: Rows) -> Imu:
-    return Imu(rows.t_ns, rows.values[:, :3], rows.values[:, 3:])
-
-
-def _wheels(rows: Rows) -> Wheels:
-    return Wheels(rows.t_ns, rows.values[:, 2:], ("left", "right"), "mps")
-
-
-def _motor(rows: Rows) -> Motor:
-    return Motor(rows.t_ns, rows.values[:, :2])

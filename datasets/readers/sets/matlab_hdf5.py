@@ -94,7 +94,7 @@ class MatlabFile:
         return values.ravel()
 
     def rows(self, name: str, width: int) -> Array:
-        """A variable (N, width), whichever way it is stored."""
+        """A variable (N, width), stored in either orientation."""
         values = self._numbers(name)
         if values.ndim != 2 or width not in values.shape:
             raise self._wrong(name, f"has the shape {values.shape}, not N x {width}")

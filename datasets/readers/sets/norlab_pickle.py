@@ -158,7 +158,9 @@ def _command_of_drive(t_ns: NDArray[np.int64], table: Table, notes: list[str]) -
     if not driving.any():
         notes.append("command: none, a person drove all the time")
         return None
-    when = "at all times, for all the file tells" if state is None else f"in {driving.mean():.0%} of the rows"
+    when = (
+        "at all times, as far as the file shows" if state is None else f"in {driving.mean():.0%} of the rows"
+    )
     notes.append(f"command: the calibration driver's, {when}; what a person commanded is not in the log")
     twist = _stack(table, "cmd_vel_x", "cmd_vel_omega")[driving]
     return Command(t_ns[driving], twist[:, 0], twist[:, 1])
@@ -253,7 +255,7 @@ def _against_the_wheels(signals: dict[str, Array], conventions: Conventions) -> 
 
 
 def _of_folder(name: str, conventions: Conventions) -> tuple[str, list[str]]:
-    """Terrain by the folder's name, "" where the catalogue or nobody says; what to say about the name."""
+    """Terrain by the folder's name, "" where the catalogue has it or the name has none; and notes."""
     words, notes = name.split("_"), []
     if words[0] != ROBOT and len(words) > 3:
         notes.append(f"the folder's name does not begin with {ROBOT}: the geometry may be another robot's")

@@ -1,4 +1,4 @@
-"""When and how good the fixes of a Pathfinder workspace are: it says so in three ways, or not at all."""
+"""Times, fix class and sigmas of the fixes in a Pathfinder workspace, which come in several ways."""
 
 from __future__ import annotations
 

@@ -138,8 +138,8 @@ def _positions(file: MatlabFile) -> tuple[Array, tuple[float, float, float] | No
     enu_m = geodetic_to_enu(geodetic, (lat, lon, height))
     notes = ["gnss: the datum is the first fix"]
     if file.has("ENUGPS"):
-        said = file.rows("ENUGPS", 3)
-        off = np.abs(said - enu_m).max() if said.shape == enu_m.shape else np.inf
+        published = file.rows("ENUGPS", 3)
+        off = np.abs(published - enu_m).max() if published.shape == enu_m.shape else np.inf
         if not off <= LARGEST_DISAGREEMENT_M:
             notes.append(f"gnss: ENUGPS is up to {off:.2f} m off llhGPS about the first fix; llhGPS is taken")
     return enu_m, (lat, lon, height), notes

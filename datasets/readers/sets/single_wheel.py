@@ -46,7 +46,7 @@ class WheelTrials:
         rim_speed_mps: rate times radius.
         commanded_rim_speed_mps, commanded_side_slip_rad: what was asked for.
         trial: number of the repetition on its day.
-        notes: what the file told otherwise than expected, in sentences.
+        notes: what was unexpected in the file, in sentences.
     """
 
     slip: Array

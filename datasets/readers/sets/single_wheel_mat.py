@@ -1,4 +1,4 @@
-"""Trials of the CMU single-wheel test bed (MATLAB v5): recognised, but no drive."""
+"""Trials of the CMU single-wheel test bed (MATLAB v5): recognised, but not a recording."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def claims(path: Path, head: bytes) -> bool:
 
 
 def read(request: Request) -> NoReturn:
-    """Tell what the file is and which function reads it.
+    """Refuse, with the function that reads it.
 
     Raises:
         DataError: always.

@@ -84,8 +84,8 @@ def read(request: Request) -> list[Recording]:
     rows, jumps, clock = put_in_time(rows, repair_clock=request.repair_clock)
     rows, apart = _contemporaries(rows, given.kind)
     notes = [_joined(given, rows), *apart, *clock, *(note for r in rows.values() for note in r.notes)]
-    truth, said = _truth(rows)
-    wheels, spoken = _wheels(rows.get("wheels"), given.kind == "wheels")
+    truth, truth_notes = _truth(rows)
+    wheels, wheel_notes = _wheels(rows.get("wheels"), given.kind == "wheels")
     recording = Recording(
         name=name or request.path.resolve().parent.name,
         start_ns=max(min(int(r.t_ns[0]) for r in rows.values()), 0),  # no recording starts before 1970
@@ -96,7 +96,7 @@ def read(request: Request) -> list[Recording]:
         clock_jumps=tuple(
             replace(jump, channel="truth") if jump.channel == _truth_of(rows) else jump for jump in jumps
         ),
-        notes=(*notes, *said, *spoken),
+        notes=(*notes, *truth_notes, *wheel_notes),
     )
     return [recording]
 
@@ -117,7 +117,7 @@ def _robot_name(stem: str) -> str:
 def _family(given: Part) -> tuple[str, list[Part]]:
     """Name of the recording and its files, one of a kind.
 
-    Motion capture carries the shape of the drive behind the name it shares with IMU and wheels.
+    Motion capture files have the shape of the path behind the name it shares with IMU and wheels.
     """
     found = [part for path in sorted(given.path.parent.glob("*.txt")) if (part := _part(path)) is not None]
     robots = {_robot_name(p.stem) for p in found if p.kind in ("imu", "wheels")}
@@ -221,7 +221,7 @@ def _trajectory(rows: Rows) -> tuple[Trajectory, list[str]]:
     notes = []
     fresh = np.concatenate([[True], np.diff(rows.t_ns) > 0])
     if not fresh.all():
-        notes.append(f"{int((~fresh).sum())} rows repeat a time; the first of each is kept")
+        notes.append(f"{int((~fresh).sum())} rows repeat a time; only the first of each is used")
         rows = rows.select(fresh)
     if len(rows) > 1:
         notes += _gaps(rows.t_ns)
@@ -250,6 +250,6 @@ def _front_note(center: Trajectory, front: Trajectory) -> str:
     apart = np.degrees(np.abs(wrap_angle(yaw[np.isfinite(yaw)])))
     if not apart.size:
         return "front: no time in common with the centre"
-    told = f"yaw within {np.percentile(apart, 95):.1f} deg of the centre's in 95 % of the frames"
+    agreement = f"yaw within {np.percentile(apart, 95):.1f} deg of the centre's in 95 % of the frames"
     verdict = "" if np.median(apart) < FRONT_DEG else ": one of the two is wrong"
-    return f"front: second rigid body, used to check the centre only; {told}{verdict}"
+    return f"front: second rigid body, used to check the centre only; {agreement}{verdict}"

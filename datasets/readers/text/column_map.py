@@ -164,7 +164,7 @@ def contract_map(names: list[str]) -> ColumnMap | None:
 
 
 def starter_map(names: list[str]) -> str:
-    """A first column map for these columns, on one line, to be mended by hand."""
+    """A first column map for these columns, on one line, for the user to correct."""
     time = next((n for n in names if re.search(r"time|stamp|^t(_|$)|sec", n, re.I)), names[0])
     channels: dict[str, dict[str, str]] = {}
     for name in names:
@@ -172,11 +172,11 @@ def starter_map(names: list[str]) -> str:
         if name != time and field_of and field_of[1] not in channels.get(field_of[0], {}):
             channels.setdefault(field_of[0], {})[field_of[1]] = name
     channels = channels or {"imu": {"gyro_z_radps": names[-1]}}
-    told = ", ".join(
+    sections = ", ".join(
         f"{channel}: {{{', '.join(f'{f}: {json.dumps(n)}' for f, n in fields.items())}}}"
         for channel, fields in channels.items()
     )
-    return f"time: {{column: {json.dumps(time)}, unit: s, epoch: unix}}, channels: {{{told}}}"
+    return f"time: {{column: {json.dumps(time)}, unit: s, epoch: unix}}, channels: {{{sections}}}"
 
 
 _UNIT = r"(?:_\w+| ?[\[(].*)?"

@@ -38,7 +38,7 @@ def read(request: Request) -> list[Recording]:
     if path.stat().st_size > MAX_BYTES:
         raise DataError(f"has more than {MAX_BYTES // 2**20} MB", file=path, remedy="split it")
     epochs, notes = collect(path, path.read_bytes().decode("latin-1"))
-    t_ns, told = _dated(path, epochs)
+    t_ns, date_notes = _dated(path, epochs)
     times = row_times(request, "gnss", t_ns)
     fixes, more = _fixes(request, epochs, t_ns)
     fixes = dataclasses.replace(fixes.select(times.order), t_ns=times.t_ns)
@@ -51,41 +51,41 @@ def read(request: Request) -> list[Recording]:
         gnss=gnss,
         datum=datum,
         source="NMEA 0183 log",
-        notes=(*notes, *told, *times.notes, *more, *rest),
+        notes=(*notes, *date_notes, *times.notes, *more, *rest),
         clock_jumps=times.jumps,
     )
     return [recording]
 
 
 def _dated(path: Path, epochs: Epochs) -> tuple[NDArray[np.int64], list[str]]:
-    """Unix nanoseconds of the epochs: their day counts from the log's first, and who tells its date."""
+    """Unix nanoseconds of the epochs: and notes on the source of their date."""
     day = epochs.day
     if np.isfinite(epochs.date).any():
-        said = epochs.date - day  # the date of the log's first day, as each dated epoch has it
-        known = np.flatnonzero(np.isfinite(said))
+        first_days = epochs.date - day  # the date of the log's first day, as each dated epoch has it
+        known = np.flatnonzero(np.isfinite(first_days))
         nearest = known[np.clip(np.searchsorted(known, np.arange(len(day)), side="right") - 1, 0, None)]
-        first, notes = said[nearest], _date_notes(said[known])
+        first, notes = first_days[nearest], _date_notes(first_days[known])
         off = first[0] - _receipt_days(epochs)
         weeks = round(off / WEEKS_1024_DAYS) if np.isfinite(off) else 0
         if weeks and abs(off - weeks * WEEKS_1024_DAYS) <= 1.0:
             first = first - weeks * WEEKS_1024_DAYS
             notes.append(
                 f"gnss: dates are {weeks * 1024} GPS weeks off the log's own time stamps "
-                "(the receiver's week counter rolled over); mended"
+                "(the receiver's week counter rolled over); corrected"
             )
         elif abs(off) > 1.0:
-            notes.append(f"gnss: dates are {off:.0f} days off the log's own time stamps; kept")
+            notes.append(f"gnss: dates are {off:.0f} days off the log's own time stamps; not corrected")
     elif np.isfinite(epochs.receipt_s).any():
         first = np.full(len(day), _receipt_days(epochs))
-        notes = ["gnss: no sentence tells a date; that of the log's own time stamps is taken"]
+        notes = ["gnss: no sentence has a date; that of the log's own time stamps is taken"]
     else:
         first = np.zeros(len(day))
-        notes = ["gnss: no sentence tells a date: times are those of day 0, 1970-01-01"]
+        notes = ["gnss: no sentence has a date: times are those of day 0, 1970-01-01"]
     return (day + first).astype(np.int64) * DAY_NS + epochs.of_day_ns, notes
 
 
-def _date_notes(said: Array) -> list[str]:
-    changes = int((np.diff(said) != 0).sum())
+def _date_notes(first_days: Array) -> list[str]:
+    changes = int((np.diff(first_days) != 0).sum())
     return [f"gnss: the date jumps {changes} times beyond midnights"] if changes else []
 
 
@@ -99,7 +99,7 @@ def _receipt_days(epochs: Epochs) -> float:
 
 
 def _fixes(request: Request, epochs: Epochs, t_ns: NDArray[np.int64]) -> tuple[Fixes, list[str]]:
-    """The fixes, with HDOP for the sigmas that no GST tells."""
+    """The fixes, with HDOP for the sigmas that no GST gives."""
     notes = []
     fix, sigma = epochs.fix, epochs.sigma_enu_m.copy()
     spec = request.rig.sensors.gnss if request.rig else None

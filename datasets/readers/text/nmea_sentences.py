@@ -1,4 +1,4 @@
-"""Sentences of an NMEA log, checked and gathered by epoch: what one receiver says of one moment."""
+"""Sentences of an NMEA log, checked and grouped by epoch."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ CENTURIES_END = 2200
 
 
 class _NoTimeError(Exception):
-    """A sound sentence of a receiver that does not know the time yet."""
+    """A valid sentence of a receiver that does not know the time yet."""
 
 
 @dataclass
 class _Epoch:
-    """One moment: nanoseconds of the day, days since the log's first, and what was said of it."""
+    """One epoch: nanoseconds of the day, days since the log's first, and its data."""
 
     of_day_ns: int
     day: int
@@ -71,10 +71,10 @@ class _Epoch:
 
 @dataclass(frozen=True, eq=False)
 class Epochs:
-    """The epochs that tell of a position, as arrays (N,) or (N, 3); NaN where unknown.
+    """The epochs with a position, as arrays (N,) or (N, 3); NaN where unknown.
 
     `day` counts midnights since the log's first epoch, `date` is days since 1970 where a sentence
-    said so, `receipt_s` the Unix time in front of the sentence.
+    gives it, `receipt_s` the Unix time in front of the sentence.
     """
 
     of_day_ns: NDArray[np.int64]
@@ -114,7 +114,7 @@ def collect(path: Path, text: str) -> tuple[Epochs, list[str]]:
     """All epochs of a log with a position, and what was wrong with its sentences.
 
     Raises:
-        DataError: no sentence, more than half of them damaged, or none that tells a position.
+        DataError: no sentence, more than half of them damaged, or none with a position.
     """
     log, damaged, unchecked, timeless, total = _Log(), 0, 0, 0, 0
     summed = re.search(r"\*[0-9A-Fa-f]{2}\r?(\n|$)", text) is not None
@@ -154,8 +154,8 @@ def collect(path: Path, text: str) -> tuple[Epochs, list[str]]:
 def _arrays(path: Path, log: _Log) -> Epochs:
     epochs = [epoch for epoch in log.epochs if epoch.position is not None]
     if not epochs:
-        raise DataError("no GGA or RMC sentence tells a position", file=path, remedy="record GGA or RMC")
-    if any(epoch.from_gga for epoch in epochs):  # RMC tells a poorer position of the same fixes
+        raise DataError("no GGA or RMC sentence has a position", file=path, remedy="record GGA or RMC")
+    if any(epoch.from_gga for epoch in epochs):  # RMC repeats the position with fewer digits
         epochs = [epoch for epoch in epochs if epoch.from_gga]
     velocity = np.array([(*epoch.velocity, np.nan) for epoch in epochs])
     return Epochs(
@@ -183,7 +183,7 @@ def _gga(log: _Log, f: list[str]) -> _Epoch:
     hdop = _float(f[7])
     epoch = log.at(f[0])
     if epoch.from_gga:
-        return epoch  # a second talker tells the same moment again
+        return epoch  # a second talker repeats the epoch
     log.left_out += quality in NO_FIX
     epoch.position, epoch.hdop, epoch.from_gga = position, hdop, True
     epoch.fix = FIX_OF_QUALITY.get(quality, Fix.NONE)
@@ -224,7 +224,7 @@ def _zda(log: _Log, f: list[str]) -> _Epoch:
 
 
 def _vtg(log: _Log, f: list[str]) -> None:
-    """Course and speed of the epoch before it, where no RMC tells them."""
+    """Course and speed of the epoch before it, where no RMC has them."""
     velocity = _velocity(f[4], f[0])
     if log.epochs and np.isnan(log.epochs[-1].velocity[0]):
         log.epochs[-1].velocity = velocity
@@ -275,7 +275,7 @@ def _angle(text: str, side: str, sides: str) -> float:
 
 
 def _velocity(knots: str, course: str) -> tuple[float, float]:
-    """East and north, m/s; a receiver that stands tells no course."""
+    """East and north, m/s; a receiver at rest gives no course."""
     speed = _float(knots) * KNOT_MPS
     if speed == 0.0:
         return 0.0, 0.0

@@ -1,4 +1,4 @@
-"""Times of the rows of a file: in order, or repaired where that was asked for, else refused."""
+"""Times of the rows of a file: in order, or repaired on request, else refused."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def row_times(request: Request, channel: str, t_ns: TimesNs) -> RowTimes:
     """The times of a file's rows as a recording needs them.
 
     Args:
-        request: tells the file, and whether clocks are to be repaired.
+        request: the file, and whether clocks are repaired.
         channel: name of the channel or clock, for errors and jumps.
         t_ns: (N,) int64 in the order of the rows.
 

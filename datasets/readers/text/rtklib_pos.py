@@ -49,7 +49,7 @@ FIX_OF_Q = {0: Fix.NONE, 1: Fix.FIXED, 2: Fix.FLOAT, 3: Fix.DGPS, 4: Fix.DGPS, 5
 
 @dataclass(frozen=True)
 class Header:
-    """What the `%` lines say: names of the columns, where they stand, and the base station."""
+    """The `%` lines: names of the columns, their line, and the base station."""
 
     line: int
     names: tuple[str, ...]
@@ -153,7 +153,7 @@ def _columns(path: Path, data: bytes, header: Header) -> TextTable:
 
 
 def _times(path: Path, columns: TextTable, header: Header) -> tuple[TimesNs, list[str]]:
-    """Unix nanoseconds of the rows as the file has them, and how UTC was got."""
+    """Unix nanoseconds of the rows in the order of the file, and notes on UTC."""
     gps_epoch_ns = np.datetime64("1980-01-06", "ns").astype(np.int64)
     if "week" in columns.texts:
         weeks = columns.times_ns("week", "ns")
@@ -205,7 +205,7 @@ class _Solution:
         if base is not None and len(base) == 3 and abs(base[0]) <= 90 and abs(base[1]) <= 180:
             datum = (base[0], base[1], base[2])
         else:
-            self.notes.append("gnss: baselines of a base station whose position the file does not tell")
+            self.notes.append("gnss: baselines of a base station whose position is not in the file")
         enu = self.stack(*POSITIONS[BASELINE])
         held = np.isfinite(enu[:, :2]).all(axis=1) & (self.fix > Fix.NONE)
         if not held.all():

@@ -1,4 +1,4 @@
-"""Plain tables, text or Parquet, by a column map that says what their columns are."""
+"""Plain tables, text or Parquet, with a column map."""
 
 from __future__ import annotations
 
@@ -86,23 +86,23 @@ def read(request: Request) -> list[Recording]:
     """The one recording of a table."""
     path = request.path
     given = request.columns or path.with_name(path.name + MAP_SUFFIX)
-    found = read_column_map(given) if request.columns or given.is_file() else None
+    column_map = read_column_map(given) if request.columns or given.is_file() else None
     columns: AnyColumns
     with path.open("rb") as file:
         parquet = file.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
-    columns = ParquetColumns(path) if parquet else TextColumns(path, found)
-    notes = [] if found is None else [f"columns as {given.name} says"]
-    if found is None:
-        found = contract_map(columns.names)
+    columns = ParquetColumns(path) if parquet else TextColumns(path, column_map)
+    notes = [] if column_map is None else [f"columns as {given.name} says"]
+    if column_map is None:
+        column_map = contract_map(columns.names)
         notes = ["columns are known by the log folder's names for them"]
-    if found is None:
+    if column_map is None:
         raise _mapless(path, columns.names)
-    for name in found.columns():
+    for name in column_map.columns():
         if name not in columns.names:
             few = ", ".join(columns.names[:SHOWN_COLUMNS])
             raise DataError(f"there is no column '{name}'", file=path, remedy=f"the file has {few}")
-    columns.read(found.columns())
-    return [_recording(request, columns, found, notes)]
+    columns.read(column_map.columns())
+    return [_recording(request, columns, column_map, notes)]
 
 
 def _mapless(path: Path, names: list[str]) -> DataError:
@@ -111,32 +111,32 @@ def _mapless(path: Path, names: list[str]) -> DataError:
     return DataError(
         f"nothing says what the columns {', '.join(names)} are",
         file=path,
-        remedy=f"mend this and save it as {path.name}{MAP_SUFFIX}: {{{starter_map(names)}}}",
+        remedy=f"correct this and save it as {path.name}{MAP_SUFFIX}: {{{starter_map(names)}}}",
     )
 
 
-def _recording(request: Request, columns: AnyColumns, found: ColumnMap, notes: list[str]) -> Recording:
-    t_ns, told = _times(columns, found)
+def _recording(request: Request, columns: AnyColumns, column_map: ColumnMap, notes: list[str]) -> Recording:
+    t_ns, time_notes = _times(columns, column_map)
     times = row_times(request, "table", t_ns)
     if not len(t_ns):
         raise DataError("holds no rows", file=request.path, remedy="record or copy it again")
     start_ns = max(int(times.t_ns[0]), 0)  # no recording starts before 1970
-    meta = dataclasses.replace(found.meta, start_ns=start_ns)
-    reader = _Reader(_Source(request.path, columns, found, times, start_ns), meta, request)
+    meta = dataclasses.replace(column_map.meta, start_ns=start_ns)
+    reader = _Reader(_Source(request.path, columns, column_map, times, start_ns), meta, request)
     channels = {name: getattr(reader, name)() for name in CHANNELS}
     if not any(channel is not None and len(channel) for channel in channels.values()):
         raise DataError("no channel holds a sample", file=request.path, remedy="check the column map")
     of_text = columns.notes if isinstance(columns, TextColumns) else ()
-    notes = [*notes, *told, *of_text, *times.notes, *reader.notes]
+    notes = [*notes, *time_notes, *of_text, *times.notes, *reader.notes]
     recording = recording_of(channels, meta, request.path.stem, notes)
     held = [name for name, channel in channels.items() if channel is not None]
     recording = dataclasses.replace(recording, datum=reader.datum, clock_jumps=times.jumps_of(held))
-    return apply(recording, found.conventions())
+    return apply(recording, column_map.conventions())
 
 
-def _times(columns: AnyColumns, found: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
-    """Nanoseconds of the rows, since 1970 where the map tells the epoch."""
-    time = found.time
+def _times(columns: AnyColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
+    """Nanoseconds of the rows, since 1970 where the map gives the epoch."""
+    time = column_map.time
     t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
     if t_ns is None:
         return _iso_ns(columns, time.column)
@@ -175,9 +175,9 @@ class _Source:
     """The mapped columns of a file as tables of channels, in SI units."""
 
     def __init__(
-        self, path: Path, columns: AnyColumns, found: ColumnMap, times: RowTimes, start_ns: int
+        self, path: Path, columns: AnyColumns, column_map: ColumnMap, times: RowTimes, start_ns: int
     ) -> None:
-        self.path, self.columns, self.found, self.times = path, columns, found, times
+        self.path, self.columns, self.found, self.times = path, columns, column_map, times
         self.t_ns = times.t_ns - start_ns
 
     def place(self, channel: str) -> Path:
@@ -210,15 +210,15 @@ class _Source:
             return texts
         words, inverse = np.unique(texts.astype(str), return_inverse=True)
         codes = FIX_WORDS[of.unit]
-        told = [codes.get(_whole(word), "") for word in words]
-        for word, meant in zip(words, told, strict=True):
+        meanings = [codes.get(_whole(word), "") for word in words]
+        for word, meant in zip(words, meanings, strict=True):
             if word.strip() and not meant:
                 raise DataError(
                     f"column '{of.column}' is '{word[:40]}'",
                     file=self.path,
                     remedy=f"{of.unit} has the codes {', '.join(map(str, codes))}",
                 )
-        return np.array(told, dtype=object)[inverse]
+        return np.array(meanings, dtype=object)[inverse]
 
 
 def _whole(word: str) -> int:

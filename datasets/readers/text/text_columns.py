@@ -1,4 +1,4 @@
-"""Columns of a plain text table: where its header stands, and the columns that are asked for."""
+"""Columns of a plain text table, and where its header is."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.delimited import (
     TextLayout,
-    TextTable,
     head_lines,
     read_columns,
     read_text,
@@ -30,46 +29,39 @@ class TextColumns:
         DataError: no header, or one that is no line of a table.
     """
 
-    def __init__(self, path: Path, found: ColumnMap | None) -> None:
+    def __init__(self, path: Path, column_map: ColumnMap | None) -> None:
         self.path = path
-        self._found = found
+        self._map = column_map
         self._data = read_text(path)
-        self._layout = _layout(path, self._data, found)
+        self._layout = _layout(path, self._data, column_map)
         self.names = list(self._layout.names)
-        self._columns: TextTable | None = None
         self.notes: tuple[str, ...] = ()
 
     def read(self, names: list[str]) -> None:
-        """Parse these columns: as text the times and words, as numbers all others."""
-        texts = {self._found.time.column} if self._found else {"t_s"}
-        channels = self._found.channels.values() if self._found else ()
+        """Parse these columns: times and words as text, all others as numbers."""
+        texts = {self._map.time.column} if self._map else {"t_s", *(set(TEXT_FIELDS) & set(names))}
+        channels = self._map.channels.values() if self._map else ()
         texts |= {of.column for fields in channels for name, of in fields.items() if name in TEXT_FIELDS}
-        if self._found is None:
-            texts |= set(TEXT_FIELDS) & set(names)
-        self._columns = read_columns(
-            self.path, self._data, self._layout, [n for n in names if n not in texts], sorted(texts)
-        )
-        self.notes = self._columns.notes
+        numbers = [name for name in names if name not in texts]
+        self._table = read_columns(self.path, self._data, self._layout, numbers, sorted(texts))
+        self.notes = self._table.notes
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where the cell is empty."""
-        assert self._columns is not None
-        if name in self._columns.texts:
+        if name in self._table.texts:
             raise DataError(f"column '{name}' is mapped twice, as numbers and not", file=self.path)
-        return self._columns.numbers[name]
+        return self._table.numbers[name]
 
     def texts(self, name: str) -> NDArray[Any]:
         """A column of texts (N,)."""
-        assert self._columns is not None
-        return self._columns.texts[name]
+        return self._table.texts[name]
 
     def times_ns(self, name: str, unit: str) -> NDArray[np.int64]:
         """A column of decimal times as ns (N,)."""
-        assert self._columns is not None
-        return self._columns.times_ns(name, unit)
+        return self._table.times_ns(name, unit)
 
 
-def _layout(path: Path, data: bytes, found: ColumnMap | None) -> TextLayout:
+def _layout(path: Path, data: bytes, column_map: ColumnMap | None) -> TextLayout:
     """Names from the first line that is no comment, or from the comment before a first line of numbers."""
     comment, header, number = "", "", 0
     for at, line in head_lines(data):
@@ -80,10 +72,10 @@ def _layout(path: Path, data: bytes, found: ColumnMap | None) -> TextLayout:
             break
     if not header:
         raise DataError("the first line is no header of a table", file=path, remedy="write names of columns")
-    separator = (found.separator if found else "") or separator_of(header)
+    separator = (column_map.separator if column_map else "") or separator_of(header)
     cells = split(header, separator)
     first_line = number + 1
-    if found is not None and found.header == "none":
+    if column_map is not None and column_map.header == "none":
         cells, first_line = [str(i) for i in range(1, len(cells) + 1)], number
     elif comment and len(split(comment, separator)) == len(cells) and _is_row(cells):
         cells, first_line = split(comment, separator), number

@@ -58,17 +58,14 @@ def read(request: Request) -> list[Recording]:
         quaternion = None
         notes += ("truth: every orientation is the identity: taken as unknown",)
     truth = Trajectory(times.t_ns[fresh], table[fresh, :3], quaternion)
-    said = (
-        "truth: the file does not tell whose poses these are, nor their world: taken as those of the "
-        "body, z up"
-    )
+    frames = "truth: the file names neither body nor world frame: taken as poses of the body, z up"
     recording = Recording(
         name=request.path.stem,
         start_ns=max(int(truth.t_ns[0]), 0),  # no recording starts before 1970
         truth=truth,
         truth_channels=truth_contents(truth),
         source="TUM trajectory",
-        notes=(said, *notes, *times.notes),
+        notes=(frames, *notes, *times.notes),
         clock_jumps=times.jumps,
     )
     return [recording]

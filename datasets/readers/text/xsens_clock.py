@@ -29,7 +29,7 @@ SLOWEST_HZ = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Clock:
-    """Times (M,) of the rows (N,) bool that have one, and what is to be noted."""
+    """Times (M,) of the rows (N,) bool that have one, and notes."""
 
     t_ns: TimesNs
     rows: NDArray[np.bool_]
@@ -40,7 +40,7 @@ def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Clock:
     """The best clock the export has.
 
     UTC on every row is taken as it is. Else the ticks count from one to the next row, and the
-    median of their distance to the UTC rows tells the date, where there are any.
+    median of their distance to the UTC rows gives the date, where there are any.
 
     Raises:
         DataError: none of ticks, UTC, or a packet counter with the update rate; UTC that is no date.
@@ -66,8 +66,8 @@ def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Clock:
         raise DataError(
             "no row has a time", file=path, remedy="export SampleTimeFine, UTC time or PacketCounter"
         )
-    t_ns, told = _dated(t_ns, utc[rows], valid[rows])
-    return Clock(t_ns, rows, (*notes, told, *_left_out(rows)))
+    t_ns, date_note = _dated(t_ns, utc[rows], valid[rows])
+    return Clock(t_ns, rows, (*notes, date_note, *_left_out(rows)))
 
 
 def _known(values: Array | None) -> bool:
@@ -88,16 +88,16 @@ def _utc(path: Path, columns: TextTable) -> tuple[TimesNs, NDArray[np.bool_]]:
     t_ns = np.zeros(len(parts), dtype=np.int64)
     if not valid.any():
         return t_ns, valid
-    told = np.nan_to_num(parts[valid, :7])
-    in_range = np.asarray(((told >= UTC_LOWEST) & (told <= UTC_HIGHEST)).all(axis=1))
-    year, month, day, hour, minute, second, nano = np.where(in_range[:, None], told, 1.0).astype(np.int64).T
+    given = np.nan_to_num(parts[valid, :7])
+    in_range = np.asarray(((given >= UTC_LOWEST) & (given <= UTC_HIGHEST)).all(axis=1))
+    year, month, day, hour, minute, second, nano = np.where(in_range[:, None], given, 1.0).astype(np.int64).T
     months = (year - 1970) * 12 + month - 1
     days = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
     in_range &= days.astype("datetime64[D]").astype("datetime64[M]").astype(np.int64) == months
     if not in_range.all():
         i = int(np.flatnonzero(~in_range)[0])
         raise DataError(
-            f"UTC '{' '.join(f'{x:g}' for x in told[i])}' is no date, in data row "
+            f"UTC '{' '.join(f'{x:g}' for x in given[i])}' is no date, in data row "
             f"{int(np.flatnonzero(valid)[i]) + 1}",
             file=path,
             remedy="remove that row",
@@ -132,8 +132,8 @@ def _check_ticks(path: Path, t_ns: TimesNs) -> None:
 
 
 def _update_rate(path: Path, settings: dict[str, str]) -> float:
-    said = next((settings[k] for k in ("update rate", "sample rate", "output rate") if k in settings), "")
-    number = re.match(r"\s*(\d+(?:\.\d+)?)", said)
+    text = next((settings[k] for k in ("update rate", "sample rate", "output rate") if k in settings), "")
+    number = re.match(r"\s*(\d+(?:\.\d+)?)", text)
     rate_hz = float(number[1]) if number else 0.0
     if not 0.0 < rate_hz <= 1e5:
         raise DataError(
@@ -145,7 +145,7 @@ def _update_rate(path: Path, settings: dict[str, str]) -> float:
 
 
 def _dated(t_ns: TimesNs, utc: TimesNs, valid: NDArray[np.bool_]) -> tuple[TimesNs, str]:
-    """Device times brought to UTC where any row tells it."""
+    """Device times shifted to UTC where any row has it."""
     if not valid.any():
         return t_ns, "times are of the device's clock: the export holds no valid UTC"
     apart = utc[valid] - t_ns[valid]

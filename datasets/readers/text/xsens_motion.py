@@ -33,7 +33,7 @@ def inertial(
     """The IMU channel of the rows that hold a sample (None where none does), and notes.
 
     Raises:
-        DataError: rates beyond what an MTi measures, in a unit that nothing tells.
+        DataError: rates beyond what an MTi measures, in an unknown unit.
     """
     gyro, accel = columns.stack(GYR), columns.stack(ACC)
     notes: list[str] = []
@@ -42,8 +42,8 @@ def inertial(
         gyro = _rotation_vectors(columns.stack(INCREMENTS[1])) / period_s
         notes.append(f"imu: rates are orientation increments over {period_s:g} s")
     else:
-        gyro, told = _in_radps(path, gyro, columns, t_ns, settings)
-        notes += told
+        gyro, rate_notes = _in_radps(path, gyro, columns, t_ns, settings)
+        notes += rate_notes
     if np.isnan(accel).all() and INCREMENTS[0][0] in columns.numbers and period_s > 0.0:
         accel = columns.stack(INCREMENTS[0]) / period_s
         notes.append(f"imu: specific force is velocity increments over {period_s:g} s")
@@ -59,7 +59,7 @@ def inertial(
 def _in_radps(
     path: Path, gyro: Array, columns: TextTable, t_ns: NDArray[np.int64], settings: dict[str, str]
 ) -> tuple[Array, list[str]]:
-    """Rates in rad/s: as the column's name says, else as the attitude shows, else as documented."""
+    """Rates in rad/s: by the column's name, else by the attitude, else as documented."""
     units = {settings.get(f"unit of {name}", "") for name in GYR}
     if len(units) > 1 or not units <= {"", "deg/s", "rad/s"}:
         raise DataError(
@@ -68,9 +68,9 @@ def _in_radps(
             channel="imu",
             remedy="give all three in rad/s or in deg/s",
         )
-    said = units.pop()
-    if said:
-        return gyro * (DEG if said == "deg/s" else 1.0), [f"imu: rates are in {said}, as the header says"]
+    unit = units.pop()
+    if unit:
+        return gyro * (DEG if unit == "deg/s" else 1.0), [f"imu: rates are in {unit}, as the header says"]
     ratio = _rate_ratio(gyro, columns, t_ns)
     if ratio is not None and 20.0 < ratio < 170.0:
         return gyro * DEG, [f"imu: rates are {ratio:.3g} times those of the attitude: taken as deg/s"]
@@ -89,7 +89,7 @@ def _in_radps(
 
 
 def _rate_ratio(gyro: Array, columns: TextTable, t_ns: NDArray[np.int64]) -> float | None:
-    """How many times faster the gyro turns than the attitude does; None where that cannot be told."""
+    """Ratio of the gyro's rate to that of the attitude; None where too little turns."""
     if all(name in columns.numbers for name in ATTITUDES[0]):
         q = columns.stack(ATTITUDES[0])[:CHECKED_ROWS, [1, 2, 3, 0]]
     elif all(name in columns.numbers for name in ATTITUDES[1]):

@@ -2,7 +2,7 @@
 
 Column names and units are those of the MT Manager manual (Acc m/s2, Gyr rad/s, SampleTimeFine in
 ticks of 10 kHz that wrap at 32 bits). The position is the device's own, fused with its IMU; its
-attitude is left out altogether: the output of a filter is no truth.
+attitude is left out: the output of a filter is not ground truth.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def read(request: Request) -> list[Recording]:
 
 
 def _header(data: bytes) -> tuple[int, str, dict[str, str]] | None:
-    """Line number and text of the column names, and what the `//` lines before them say."""
+    """Line number and text of the column names, and what the `//` lines before them set."""
     settings: dict[str, str] = {}
     for number, line in head_lines(data, 100):
         if line.startswith("//"):
@@ -133,7 +133,7 @@ def _columns(path: Path) -> tuple[TextTable, dict[str, str], list[str]]:
     left = [name for name in names if name not in (*numbers, *texts, *attitude)]
     notes = []
     if attitude:
-        notes.append("the device's attitude is the output of its own filter, no truth: left out")
+        notes.append("the device's attitude is the output of its filter, not ground truth: left out")
     if left:
         notes.append(f"columns left out: {', '.join(left)}")
     return columns, settings, notes
@@ -155,8 +155,8 @@ def _select(columns: TextTable, rows: NDArray[np.bool_], order: Any) -> TextTabl
 
 def _device(settings: dict[str, str]) -> str:
     keys = ("deviceid", "device id", "productcode", "firmware version", "filter profile")
-    told = [f"{key} {settings[key]}" for key in keys if settings.get(key)]
-    return f"Xsens MT Manager export ({', '.join(told)})" if told else "Xsens MT Manager export"
+    given = [f"{key} {settings[key]}" for key in keys if settings.get(key)]
+    return f"Xsens MT Manager export ({', '.join(given)})" if given else "Xsens MT Manager export"
 
 
 def _gnss(
@@ -169,7 +169,7 @@ def _gnss(
     if not rows.any():
         return None, None, ["gnss: no row holds a position; the channel is absent"]
     notes = ["gnss: the position is the device's own, fused with its IMU: errors of near fixes go together"]
-    fix, told = _fix(request.path, columns, rows)
+    fix, fix_notes = _fix(request.path, columns, rows)
     velocity, more = _velocity(columns, settings)
     fixes = Fixes(
         t_ns[rows],
@@ -179,7 +179,7 @@ def _gnss(
         None if velocity is None else velocity[rows],
     )
     gnss, datum, rest = gnss_channel(request, fixes)
-    return gnss, datum, [*notes, *told, *more, *rest]
+    return gnss, datum, [*notes, *fix_notes, *more, *rest]
 
 
 def _fix(path: Path, columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArray[np.uint8], list[str]]:
@@ -200,26 +200,26 @@ def _fix(path: Path, columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArr
 def _status_words(path: Path, name: str, words: NDArray[np.str_]) -> list[int]:
     """Status words written as 32 binary digits, in hexadecimal, or in decimal."""
     cells = [word.strip() for word in words]
-    told = [cell for cell in cells if cell]
-    base = _base_of(told)
+    given = [cell for cell in cells if cell]
+    base = _base_of(given)
     try:
         return [int(cell, base) if cell else 0 for cell in cells]
     except ValueError:
         pattern = r"[+-]?[0-9]+" if base == 10 else r"(0[xX])?[0-9a-fA-F]+"
-        bad = next((cell for cell in told if not re.fullmatch(pattern, cell)), told[0])
+        bad = next((cell for cell in given if not re.fullmatch(pattern, cell)), given[0])
         raise DataError(
             f"column '{name}' holds '{bad[:40]}'", file=path, remedy="it must be a number or hexadecimal"
         ) from None
 
 
-def _base_of(told: list[str]) -> int:
-    if told and all(len(cell) == 32 and set(cell) <= {"0", "1"} for cell in told):
+def _base_of(given: list[str]) -> int:
+    if given and all(len(cell) == 32 and set(cell) <= {"0", "1"} for cell in given):
         return 2
-    if any(re.search("[xXa-fA-F]", cell) for cell in told):
+    if any(re.search("[xXa-fA-F]", cell) for cell in given):
         return 16
-    if told and all(len(cell) == 8 and cell.isdigit() for cell in told):  # either, but for unused bits
-        padded = any(cell[0] == "0" for cell in told)
-        decimal, other = (any(int(cell, base) & UNUSED_BITS for cell in told) for base in (10, 16))
+    if given and all(len(cell) == 8 and cell.isdigit() for cell in given):  # either, but for unused bits
+        padded = any(cell[0] == "0" for cell in given)
+        decimal, other = (any(int(cell, base) & UNUSED_BITS for cell in given) for base in (10, 16))
         return 16 if padded or (decimal and not other) else 10
     return 10
 
@@ -236,8 +236,8 @@ def _velocity(columns: TextTable, settings: dict[str, str]) -> tuple[Array | Non
         return columns.stack(VELOCITIES[1]), []
     if not all(name in columns.numbers for name in VELOCITIES[0]):
         return None, []
-    told = settings.get("coordinate system", "").upper()
-    frame = told if told in ENU_OF else "ENU"
+    setting = settings.get("coordinate system", "").upper()
+    frame = setting if setting in ENU_OF else "ENU"
     velocity = columns.stack(VELOCITIES[0])[:, ENU_OF[frame]] * ENU_SIGNS[frame]
-    said = "as the export says" if told in ENU_OF else "which the export does not say"
-    return velocity, [f"gnss: velocity columns are taken as {frame}, {said}"]
+    origin = "as in the header" if setting in ENU_OF else "which the header does not state"
+    return velocity, [f"gnss: velocity columns are taken as {frame}, {origin}"]

@@ -200,7 +200,7 @@ def test_no_date_at_all(tmp_path: Path) -> None:
     recording = open_recording(log(tmp_path, "".join(gga(k, p) for k, p in enumerate(llh_of()))))
     assert recording.start_ns == 86_398 * 10**9
     assert recording.duration_s() == pytest.approx(3.9)
-    assert any("no sentence tells a date" in note for note in recording.notes)
+    assert any("no sentence has a date" in note for note in recording.notes)
 
 
 def test_damaged_sentences_are_counted_and_left_out(tmp_path: Path) -> None:

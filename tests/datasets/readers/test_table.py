@@ -205,7 +205,7 @@ def test_latitude_and_longitude(tmp_path: Path, datum: tuple[float, float, float
     assert recording.datum is not None
     back = geodetic_to_enu(enu_to_geodetic(recording.gnss.enu_m, recording.datum), datum)
     np.testing.assert_allclose(back, enu, atol=1e-3)
-    assert any("tell no sigma" in note for note in recording.notes)
+    assert any("have no sigma" in note for note in recording.notes)
 
 
 def test_longitudes_beyond_180_are_refused(tmp_path: Path) -> None:
