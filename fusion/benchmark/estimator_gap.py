@@ -80,13 +80,13 @@ def judged(
         return out
 
     def twins(effects: Mapping[str, float]) -> list[Recording]:
-        drives = zip(runs, found.bench.runs, itertools.count(seed), strict=False)
-        return [twin_of(run, evidence.log, found.bench.model, effects, k) for run, evidence, k in drives]
+        drives = zip(runs, found.evidence.runs, itertools.count(seed), strict=False)
+        return [twin_of(run, evidence.log, found.evidence.model, effects, k) for run, evidence, k in drives]
 
     groups = [marks(references), marks(runs), marks(twins({})), []]
     fit = found.verdict.fit
     if fit is not None:
-        groups[-1] = marks(twins(effects_at(found.bench, fit.columns, fit.value)))
+        groups[-1] = marks(twins(effects_at(found.evidence, fit.columns, fit.value)))
     names = dict.fromkeys(name for group in groups for one in group for name in one)
     return [Compared(name, *(_mean(group, name) for group in groups)) for name in names], failed
 

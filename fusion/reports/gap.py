@@ -81,7 +81,7 @@ def _where(d: GapDiagnosis) -> str:
 
 def _causes(d: GapDiagnosis) -> str:
     fig, _ = plots.plot_causes(d)
-    c, rows = d.bench.candidates, []
+    c, rows = d.evidence.candidates, []
     for cause in d.verdict.causes[:MOST_CAUSES]:
         told = "; ".join(
             f"{c.keys[i]} = {v * c.scale[i]:.3g} {_within(s * c.scale[i])} {escape(c.units[i])}"
@@ -102,7 +102,7 @@ def _within(sigma: float) -> str:
 
 
 def _shrink(d: GapDiagnosis) -> str:
-    if d.shrinking is None:
+    if d.shrinkage is None:
         return ""
     fig, _ = plots.plot_shrink(d)
     parts = [

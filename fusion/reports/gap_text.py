@@ -71,7 +71,7 @@ def _class_of(cause: Cause) -> str:
 
 def numbers(d: GapDiagnosis, cause: Cause | None = None) -> str:
     """A cause's parameters with one sigma; None: the first one's."""
-    cause, c = cause or d.verdict.causes[0], d.bench.candidates
+    cause, c = cause or d.verdict.causes[0], d.evidence.candidates
     parts = []
     for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
         unit = f" {c.units[i]}" if c.units[i] else ""
@@ -93,7 +93,7 @@ def _place(d: GapDiagnosis) -> str:
 
 
 def _shrink(d: GapDiagnosis) -> str:
-    s = d.shrinking
+    s = d.shrinkage
     if s is None or not d.verdict.named:
         return ""
     if s.share is None:

@@ -23,7 +23,7 @@ from terrafusion.twin.effects.catalogue import lookup
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.diagnose import diagnose
-from terrafusion.twin.gap.rollout.sensitivities import Drive
+from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
@@ -65,11 +65,11 @@ class Bench:
     def diagnoses(self, changes: Sequence[Mapping[str, float]]) -> Iterator[GapDiagnosis]:
         """One for each change, against the same references."""
         normal = [self.recorded(i, {}) for i in range(self.references)]
-        kept = dict[str, Drive]()
+        cache = dict[str, Linearisation]()
         for i, change in enumerate(changes):
             first = self.references + i * self.runs
             judged = [self.recorded(first + k, change) for k in range(self.runs)]
-            yield diagnose(judged, normal, self.vehicle, kept=kept)
+            yield diagnose(judged, normal, self.vehicle, cache=cache)
 
 
 def first_forms(effects: Sequence[str] | None = None) -> dict[str, str]:

@@ -9,7 +9,7 @@ import numpy as np
 from terrafusion.fusion.reports.plots import style
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.where import BANDS, REGIMES
-from terrafusion.twin.gap.rollout.nuisance import NAMES
+from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -58,14 +58,14 @@ def plot_causes(d: GapDiagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
 
 def plot_shrink(d: GapDiagnosis, ax: Axes | None = None) -> tuple[Figure, Axes]:
     """Whitened error of every channel before and after, and in the references."""
-    assert d.shrinking is not None
-    names = list(d.shrinking.channels)
+    assert d.shrinkage is not None
+    names = list(d.shrinkage.channels)
     fig, ax = style.canvas(ax, (8.0, 1.2 + 0.42 * len(names)))
     at = np.arange(len(names))[::-1]
     for shift, colour, label, column in ((0.2, BEFORE, "before", 0), (-0.2, AFTER, "after", 1)):
-        values = [d.shrinking.channels[name][column] or 0.0 for name in names]
+        values = [d.shrinkage.channels[name][column] or 0.0 for name in names]
         ax.barh(at + shift, values, height=0.38, color=colour, label=label)
-    floors = [d.shrinking.channels[name][2] for name in names]
+    floors = [d.shrinkage.channels[name][2] for name in names]
     for y, floor in zip(at, floors, strict=True):
         if floor is not None:
             ax.plot([floor, floor], [y - 0.42, y + 0.42], color=SURE, linewidth=1.5)
@@ -81,8 +81,8 @@ def plot_errors(d: GapDiagnosis, run: int) -> Figure:
     """Whitened errors of one run over time, channel by channel, before and after."""
     from matplotlib.figure import Figure
 
-    assert d.shrinking is not None
-    evidence, channels = d.bench.runs[run], d.bench.channels
+    assert d.shrinkage is not None
+    evidence, channels = d.evidence.runs[run], d.evidence.channels
     rows = (len(channels) + 1) // 2
     fig = Figure(figsize=(10.0, 1.2 + 1.5 * rows), layout="constrained")
     axes = fig.subplots(rows, 2, sharex=True, squeeze=False)
@@ -90,9 +90,9 @@ def plot_errors(d: GapDiagnosis, run: int) -> Figure:
         mine = np.flatnonzero(evidence.channel == i)
         mine = mine[:: max(1, len(mine) // style.MAX_POINTS)]
         t_s = evidence.time_s[mine]
-        ax.plot(t_s, d.shrinking.was[run][mine], ".", color=BEFORE, markersize=2, label="before")
-        ax.plot(t_s, d.shrinking.left[run][mine], ".", color=AFTER, markersize=2, label="after")
-        style.dress(ax, title=f"{NAMES[channel]} ({channel})")
+        ax.plot(t_s, d.shrinkage.errors_before[run][mine], ".", color=BEFORE, markersize=2, label="before")
+        ax.plot(t_s, d.shrinkage.errors_after[run][mine], ".", color=AFTER, markersize=2, label="after")
+        style.dress(ax, title=f"{CHANNEL_NAMES[channel]} ({channel})")
     for ax in axes.flat[len(channels) :]:
         ax.set_axis_off()
     for ax in axes[-1]:

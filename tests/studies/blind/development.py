@@ -1,7 +1,7 @@
 """Trials on which the diagnosis is tuned, and the weights of its odds, trained on them.
 
     python -m tests.studies.blind.development make --site 1 --out development
-    python -m tests.studies.blind.development train development/*.json --out choice.yaml
+    python -m tests.studies.blind.development train development/*.json --out cause_posterior.yaml
     python -m tests.studies.blind.development cross development/*.json
     python -m tests.studies.blind.development score others/*.json
 
@@ -39,13 +39,18 @@ from terrafusion.twin.gap.blind.shapes import (
     Shape,
     shapes,
 )
-from terrafusion.twin.gap.infer.cause_posterior import OUTSIDE_SHARE, Told, Weights, probabilities
-from terrafusion.twin.gap.infer.goodness_of_fit import FITS, Goodness
+from terrafusion.twin.gap.infer.cause_posterior import (
+    OUTSIDE_SHARE,
+    CauseResidual,
+    PosteriorWeights,
+    probabilities,
+)
+from terrafusion.twin.gap.infer.goodness_of_fit import PERFECT_FIT, GoodnessOfFit
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 
 if TYPE_CHECKING:
-    from terrafusion.twin.gap.infer.evidence import Bench
+    from terrafusion.twin.gap.null.evidence import GapEvidence
 
 Array = NDArray[np.float64]
 
@@ -75,7 +80,7 @@ class Trial:
         told: what each effect's best law leaves (inside, outside, most), by effect; empty where no gap is
         seen.
         before: the gap as it is.
-        fits: of the likeliest effects: `left`, `above` and `quieter` of `Goodness`.
+        fits: of the likeliest effects: `left`, `above` and `quieter` of `GoodnessOfFit`.
         answer: the diagnosis, by the weights that the package had.
     """
 
@@ -130,34 +135,37 @@ def make(number: int, jobs: int) -> list[Trial]:
     """The trials of a site, diagnosed."""
     from terrafusion.twin.gap.blind.plant.run import record
     from terrafusion.twin.gap.data.candidates import Candidates
-    from terrafusion.twin.gap.infer.evidence import gather
+    from terrafusion.twin.gap.null.evidence import gather_evidence
     from terrafusion.twin.gap.threads import one_blas_thread
 
     _, _, trials = site(number)
     recordings, split = record(specs(number)), RUNS * len(trials)
     vehicle = load_vehicle(VEHICLE)
     with one_blas_thread():
-        bench = gather(recordings[:split], recordings[split:], vehicle, None, Candidates.of(), jobs=jobs)
-        return diagnosed_trials(number, bench)
+        evidence = gather_evidence(
+            recordings[:split], recordings[split:], vehicle, None, Candidates.of(), jobs=jobs
+        )
+        return diagnosed_trials(number, evidence)
 
 
-def diagnosed_trials(number: int, bench: Bench) -> list[Trial]:
+def diagnosed_trials(number: int, evidence: GapEvidence) -> list[Trial]:
     """The trials of a site, from the evidence of all its runs."""
-    from terrafusion.twin.gap.diagnose import diagnosed
+    from terrafusion.twin.gap.diagnose import diagnose_evidence
 
     kind, soil, trials = site(number)
     out = []
     for t, (shape, severity) in enumerate(trials):
         mine = slice(RUNS * t, RUNS * (t + 1))
-        found = diagnosed(dataclasses.replace(bench, runs=bench.runs[mine], raws=bench.raws[mine]), VEHICLE)
-        good = found.verdict.goodness or FITS
-        told = {k: _numbers(v) for k, v in found.choice.told.items()} if found.detected else {}
+        part = dataclasses.replace(evidence, runs=evidence.runs[mine], residuals=evidence.residuals[mine])
+        found = diagnose_evidence(part, VEHICLE)
+        good = found.verdict.goodness or PERFECT_FIT
+        told = {k: _numbers(v) for k, v in found.posterior.residuals.items()} if found.detected else {}
         key, effect = NULL, None
         if shape is not None:
             key, effect = shape.key, None if shape.kind == OUTSIDE else shape.effect
         out.append(
             Trial(
-                key, kind, soil, severity, effect, told, _numbers(found.choice.before),
+                key, kind, soil, severity, effect, told, _numbers(found.posterior.before),
                 (good.left, good.above, good.quieter), _brief(found.to_json()),
             )
         )  # fmt: skip
@@ -170,19 +178,21 @@ def _brief(answer: Mapping[str, Any]) -> dict[str, Any]:
     return {key: answer[key] for key in ("gap", "verdict", "named", "causes", "p_unknown", "shrink")}
 
 
-def _numbers(told: Told) -> tuple[float, float, float]:
+def _numbers(told: CauseResidual) -> tuple[float, float, float]:
     return told.inside, told.outside, told.most
 
 
-def utilities(trial: Trial, weights: Weights) -> dict[str | None, float]:
+def utilities(trial: Trial, weights: PosteriorWeights) -> dict[str | None, float]:
     """Log odds of all causes of a trial; None is the unknown one."""
-    before = Told(*trial.before)
-    odds: dict[str | None, float] = {k: weights.cause(Told(*v), before) for k, v in trial.told.items()}
-    odds[None] = weights.outsider(before, Goodness(*trial.fits))
+    before = CauseResidual(*trial.before)
+    odds: dict[str | None, float] = {
+        k: weights.log_odds(CauseResidual(*v), before) for k, v in trial.told.items()
+    }
+    odds[None] = weights.unknown_log_odds(before, GoodnessOfFit(*trial.fits))
     return odds
 
 
-def surprise(trials: Iterable[Trial], weights: Weights, outside: float = 1.0) -> float:
+def surprise(trials: Iterable[Trial], weights: PosteriorWeights, outside: float = 1.0) -> float:
     """Negative log likelihood of the true causes; each one outside the catalogue counts `outside` times."""
     total = 0.0
     for trial in trials:
@@ -193,7 +203,7 @@ def surprise(trials: Iterable[Trial], weights: Weights, outside: float = 1.0) ->
     return total
 
 
-def train(trials: Sequence[Trial]) -> Weights:
+def train(trials: Sequence[Trial]) -> PosteriorWeights:
     """Weights of least surprise on trials in which a gap was seen.
 
     A site has more causes outside the catalogue than `OUTSIDE_SHARE`: each counts less.
@@ -205,13 +215,15 @@ def train(trials: Sequence[Trial]) -> Weights:
     outside = OUTSIDE_SHARE / (1.0 - OUTSIDE_SHARE) * (len(some) - outsiders) / max(outsiders, 1)
 
     def cost(w: Array) -> float:
-        return surprise(some, Weights(*w.tolist()), outside) + SHRINK * float(w @ w)
+        return surprise(some, PosteriorWeights(*w.tolist()), outside) + SHRINK * float(w @ w)
 
     limits = [(0.0, 60.0), (0.0, 1.5), (-20.0, 20.0), (0.0, 10.0), (0.0, 10.0)]
-    return Weights(*minimize(cost, [6.0, 0.8, 0.0, 1.0, 1.0], method="L-BFGS-B", bounds=limits).x.tolist())
+    return PosteriorWeights(
+        *minimize(cost, [6.0, 0.8, 0.0, 1.0, 1.0], method="L-BFGS-B", bounds=limits).x.tolist()
+    )
 
 
-def unknown_chance(trial: Trial, weights: Weights) -> float:
+def unknown_chance(trial: Trial, weights: PosteriorWeights) -> float:
     """Probability of an unknown cause, given that there is a gap."""
     odds = utilities(trial, weights)
     outsider = odds.pop(None)
@@ -289,13 +301,13 @@ def read(paths: Iterable[Path]) -> list[Trial]:
     ]
 
 
-def write(path: Path, weights: Weights, trials: Sequence[Trial], sites: int) -> None:
+def write(path: Path, weights: PosteriorWeights, trials: Sequence[Trial], sites: int) -> None:
     """The weights, with what they come from: the digest is that of all but the answers, which depend on the
     weights of their time."""
     told = [dataclasses.asdict(dataclasses.replace(trial, answer={})) for trial in trials]
     digest = hashlib.sha256(json.dumps(told).encode()).hexdigest()[:16]
     lines = [
-        "# Weights of the odds of causes (see choice.py), made by",
+        "# Weights of the odds of causes (see cause_posterior.py), made by",
         "# python -m tests.studies.blind.development train",
         f"# from {sum(t.teaches() for t in trials)} trials with a gap of {sites} sites;",
         f"# sha256 {digest}",

@@ -31,15 +31,17 @@ def detections(
     """P-value of each group of runs against the references, as `diagnose` has it."""
     from terrafusion.twin.gap.data.candidates import Candidates
     from terrafusion.twin.gap.infer.detect import detect
-    from terrafusion.twin.gap.infer.evidence import gather
-    from terrafusion.twin.gap.null.score import learnt_sigma, score
-    from terrafusion.twin.gap.rollout.residuals import state_sigmas
+    from terrafusion.twin.gap.null.evidence import gather_evidence
+    from terrafusion.twin.gap.null.score import learn_state_sigma, score
+    from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 
     candidates = Candidates.of(None)
-    bench = gather([run for group in groups for run in group], references, vehicle, None, candidates, jobs=1)
-    sigma = learnt_sigma(bench.references, state_sigmas(candidates))
-    normal = [score(run, sigma) for run in bench.references]
-    scores = iter([score(run, sigma) for run in bench.runs])
+    evidence = gather_evidence(
+        [run for group in groups for run in group], references, vehicle, None, candidates, jobs=1
+    )
+    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
+    normal = [score(run, sigma) for run in evidence.references]
+    scores = iter([score(run, sigma) for run in evidence.runs])
     return [detect([next(scores) for _ in group], normal, candidates, 0).p_value for group in groups]
 
 

@@ -27,7 +27,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.segments import piece, spans
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.twin.gap.diagnose import diagnose
-from terrafusion.twin.gap.rollout.sensitivities import Drive
+from terrafusion.twin.gap.rollout.sensitivities import Linearisation
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.model.version import model_sha256
 from tests.studies.fault_injection.faults import INJECTIONS, Injection, pose_as_gnss
@@ -86,7 +86,7 @@ class Source:
     vehicle: VehicleParams
     recordings: list[Recording]
     spans: list[tuple[int, float, float]]
-    kept: dict[int, dict[str, Drive]] = field(default_factory=dict)
+    cache: dict[int, dict[str, Linearisation]] = field(default_factory=dict)
 
     @classmethod
     def of(cls, logs: LogSet) -> Source:
@@ -105,11 +105,11 @@ class Source:
         """Numbers of the pieces that are judged in a fold."""
         return list(range(fold % FOLDS, len(self.spans), FOLDS))
 
-    def kept_for(self, fold: int) -> dict[str, Drive]:
-        """Signatures of a fold; those of another are forgotten."""
-        if fold not in self.kept:
-            self.kept.clear()
-        return self.kept.setdefault(fold, {})
+    def cache_for(self, fold: int) -> dict[str, Linearisation]:
+        """Linearisations of a fold; those of another are dropped."""
+        if fold not in self.cache:
+            self.cache.clear()
+        return self.cache.setdefault(fold, {})
 
     def cut(
         self, numbers: Sequence[int], injection: Injection | None = None, severity: float = 0.0
@@ -192,9 +192,9 @@ def answered(
     except TerrafusionError as error:
         return {"skipped": str(error)}
     try:
-        normal, kept = source.cut(others), source.kept_for(fold)
+        normal, cache = source.cut(others), source.cache_for(fold)
         answer = diagnose(
-            runs, normal, source.vehicle, logs.soil, effects=effects, source="wheels", kept=kept
+            runs, normal, source.vehicle, logs.soil, effects=effects, source="wheels", cache=cache
         ).to_json()
     except Exception as error:  # a crash is a wrong answer, whatever it was
         return {"crash": f"{type(error).__name__}: {error}", "right": False}

@@ -1,4 +1,4 @@
-"""Parts of the diagnosis by themselves: signatures, choices of runs, probabilities, candidates."""
+"""Parts of the diagnosis alone: sensitivities, permutations of runs, probabilities, candidates."""
 
 from __future__ import annotations
 
@@ -13,23 +13,30 @@ from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.effects import catalogue
 from terrafusion.twin.effects.alternative_terramechanics import second_terramechanics
 from terrafusion.twin.effects.form import Form, one
-from terrafusion.twin.gap.answer.classes import done, likeness
-from terrafusion.twin.gap.answer.verdict import HeldOut, null_probability
+from terrafusion.twin.gap.answer.effect_search import explained_held_out
+from terrafusion.twin.gap.answer.look_alikes import effect_signal, similarity
+from terrafusion.twin.gap.answer.verdict import null_probability
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.samples import layout
-from terrafusion.twin.gap.infer.detect import choices
-from terrafusion.twin.gap.infer.discrepancy import FUNCTIONS, modulated
-from terrafusion.twin.gap.infer.evidence import prepared, starting_model
-from terrafusion.twin.gap.infer.posterior import Pool, beliefs
-from terrafusion.twin.gap.null.channel_noise import first_noise
-from terrafusion.twin.gap.null.null import learn
+from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.samples import sample_map
+from terrafusion.twin.gap.infer.detect import permutations
+from terrafusion.twin.gap.infer.discrepancy import FUNCTIONS, discrepancy_of
+from terrafusion.twin.gap.infer.posterior import PooledScores, bayes_factors
+from terrafusion.twin.gap.null.channel_noise import data_sheet_noise
+from terrafusion.twin.gap.null.null import learn_null
 from terrafusion.twin.gap.null.score import Score, score
-from terrafusion.twin.gap.rollout import batch as side_by_side
-from terrafusion.twin.gap.rollout.batch import graphs, groups, what_moves
-from terrafusion.twin.gap.rollout.residuals import raw_of, state_sigmas, whitened
-from terrafusion.twin.gap.rollout.sensitivities import Ask, drive, placed, predictions, signatures
+from terrafusion.twin.gap.rollout import batch
+from terrafusion.twin.gap.rollout.batch import assign_graphs, effect_groups, motion_effects
+from terrafusion.twin.gap.rollout.residuals import initial_state_sigma, residuals_from, whitened
+from terrafusion.twin.gap.rollout.sensitivities import (
+    Rollout,
+    channel_sensitivities,
+    linearise,
+    moved_to,
+    predictions,
+)
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.drives import run
+from tests.twin.gap.runs import run
 
 CANDIDATES = Candidates.of()
 
@@ -44,26 +51,28 @@ def log_and_model():
 @pytest.mark.parametrize(("short", "within"), [(False, 1e-8), (True, 2e-6)])
 def test_a_drive_from_other_poses_is_the_same_drive_moved(log_and_model, monkeypatch, short, within) -> None:
     """In 64 bits to the last digits; in the 32 that the diagnosis takes, as far as these go."""
-    monkeypatch.setattr(side_by_side, "SHORT", short)
+    monkeypatch.setattr(batch, "SINGLE_PRECISION", short)
     log, model = log_and_model
     moved = log.start + np.array([2.0, -1.0, 0.3])
     keys = ("gnss_lever_arm/offset/x", "wheel_radius/scale")
-    first, there = (signatures(log, drive(log, model, CANDIDATES, at, keys)) for at in (log.start, moved))
-    here = placed(log, first, log.start, moved)
+    first, there = (
+        channel_sensitivities(log, linearise(log, model, CANDIDATES, at, keys)) for at in (log.start, moved)
+    )
+    here = moved_to(log, first, log.start, moved)
     for mine, its in zip(here, there, strict=True):
-        for name in ("value", "change", "by_pose", "heading"):
+        for name in ("value", "by_effect", "by_pose", "heading"):
             np.testing.assert_allclose(getattr(mine, name), getattr(its, name), atol=within)
     east = [o.channel for o in log.observed].index("gnss_east_m")
-    assert np.abs(here[east].change - first[east].change).max() > 1e-3
+    assert np.abs(here[east].by_effect - first[east].by_effect).max() > 1e-3
 
 
 def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
     log, model = log_and_model
     keys = ("wheel_radius/scale", "gyro_scale/scale", "gnss_latency/both")
-    found = signatures(log, drive(log, model, CANDIDATES, log.start, keys))
+    found = channel_sensitivities(log, linearise(log, model, CANDIDATES, log.start, keys))
     columns = [CANDIDATES.keys.index(k) for k in keys]
     sets = [{k: 0.1 * float(CANDIDATES.scale[c])} for k, c in zip(keys, columns, strict=True)]
-    plain, *with_effect = predictions([Ask(log, some) for some in ({}, *sets)], model, CANDIDATES)
+    plain, *with_effect = predictions([Rollout(log, some) for some in ({}, *sets)], model, CANDIDATES)
     assert plain is not None
     for column, values in zip(columns, with_effect, strict=True):
         assert values is not None
@@ -71,30 +80,36 @@ def test_signatures_are_what_a_finite_effect_does(log_and_model) -> None:
             if observed.channel in ("accel_x_mps2", "wheel_left_radps", "wheel_right_radps"):
                 continue  # a wheel that is about to slide is not linear in anything
             true = (values[i] - plain[i]) / 0.1
-            error = np.linalg.norm(true - found[i].change[:, column])
+            error = np.linalg.norm(true - found[i].by_effect[:, column])
             assert error < 0.12 * np.linalg.norm(true) + 0.02 * np.median(observed.sigma) * len(true) ** 0.5
 
 
 def test_a_column_does_not_depend_on_what_else_is_asked_for(log_and_model) -> None:
     log, model = log_and_model
-    keys = ("mass/at_cg", "slope/uniform", "wheel_radius/scale", "gyro_scale/scale")  # of several graphs
-    all_, some = drive(log, model, CANDIDATES, log.start), drive(log, model, CANDIDATES, log.start, keys)
+    keys = (
+        "mass/at_cg",
+        "slope/uniform",
+        "wheel_radius/scale",
+        "gyro_scale/scale",
+    )  # of several assign_graphs
+    all_, some = (
+        linearise(log, model, CANDIDATES, log.start),
+        linearise(log, model, CANDIDATES, log.start, keys),
+    )
     assert np.array_equal(all_.fine, some.fine)
     for i, key in enumerate(CANDIDATES.keys):
         if key in keys:
-            np.testing.assert_allclose(some.change[:, :, i], all_.change[:, :, i], rtol=0.0, atol=1e-9)
-            assert np.abs(some.change[:, :, i]).max() > 1e-3
+            np.testing.assert_allclose(some.by_effect[:, :, i], all_.by_effect[:, :, i], rtol=0.0, atol=1e-9)
+            assert np.abs(some.by_effect[:, :, i]).max() > 1e-3
         else:
-            assert not some.change[:, :, i].any()
+            assert not some.by_effect[:, :, i].any()
 
 
 @pytest.mark.parametrize(("short", "within"), [(False, 1e-3), (True, 0.05)])
-def test_sets_of_effects_side_by_side_are_what_each_is_alone(
-    log_and_model, monkeypatch, short, within
-) -> None:
-    """Whatever graphs drive them, and though those of the sensors alone share a run. In units of the noise;
+def test_sets_of_effects_batch_are_what_each_is_alone(log_and_model, monkeypatch, short, within) -> None:
+    """Whatever graphs run them, although those of the sensors alone share a run. In units of the noise;
     32 bits may differ by more in a row where a wheel is about to slide, but not in all."""
-    monkeypatch.setattr(side_by_side, "SHORT", short)
+    monkeypatch.setattr(batch, "SINGLE_PRECISION", short)
     log, model = log_and_model
     alone = {
         "gyro_bias/constant": 0.01, "mass/at_cg": 0.1, "wheel_radius/scale": 0.02, "dead_time/transport": 0.1,
@@ -102,9 +117,9 @@ def test_sets_of_effects_side_by_side_are_what_each_is_alone(
     }  # fmt: skip
     sets = [{}, *({k: v} for k, v in alone.items()), {"mass/at_cg": 0.1, "gyro_bias/constant": 0.01}]
     sets += [{"wheel_radius/scale": 0.002 * k} for k in range(1, 9)]
-    together = predictions([Ask(log, some) for some in sets], model, CANDIDATES)
+    together = predictions([Rollout(log, some) for some in sets], model, CANDIDATES)
     for some, found in zip(sets, together, strict=True):
-        (by_itself,) = predictions([Ask(log, some)], model, CANDIDATES)
+        (by_itself,) = predictions([Rollout(log, some)], model, CANDIDATES)
         square = 0.0
         for observed, a, b in zip(log.observed, found, by_itself, strict=True):
             np.testing.assert_allclose(a, b, atol=within * np.median(observed.sigma), err_msg=f"{some}")
@@ -121,12 +136,12 @@ def test_numbers_of_32_bits_lose_less_than_steps_of_third_order(log_and_model, m
     log, model = log_and_model
     keys = ("mass/at_cg", "wheel_radius/scale", "slip_sinkage/linear", "backlash/lost_motion")
     keys += ("slope/uniform",)
-    asks = [Ask(log, {})]
-    asks += [Ask(log, {k: 0.3 * float(CANDIDATES.scale[CANDIDATES.keys.index(k)])}) for k in keys]
+    asks = [Rollout(log, {})]
+    asks += [Rollout(log, {k: 0.3 * float(CANDIDATES.scale[CANDIDATES.keys.index(k)])}) for k in keys]
     told = {}
     for short, order in ((True, 3), (False, 3), (False, 4)):
-        monkeypatch.setattr(side_by_side, "SHORT", short)
-        monkeypatch.setattr(side_by_side, "ORDER", order)
+        monkeypatch.setattr(batch, "SINGLE_PRECISION", short)
+        monkeypatch.setattr(batch, "INTEGRATOR_ORDER", order)
         found = predictions(asks, model, CANDIDATES)
         told[short, order] = np.array(
             [np.concatenate([y / o.sigma for o, y in zip(log.observed, ys, strict=True)]) for ys in found]
@@ -146,19 +161,23 @@ def test_runs_of_several_logs_are_what_each_is_alone(log_and_model) -> None:
     start = log.start + np.array([3.0, 1.0, 0.5])
     other = dataclasses.replace(log, windows=ends, start=start, observed=inside)
     sets = [{}, {"mass/at_cg": 0.1}, {"gyro_bias/constant": 0.01}]
-    asks = [Ask(of, some) for some in sets for of in (log, other, log)]
+    asks = [Rollout(of, some) for some in sets for of in (log, other, log)]
     together = predictions(asks, model, CANDIDATES, jobs=2)
     for ask, found in zip(asks, together, strict=True):
-        alone = predictions([Ask(ask.log, some) for some in sets], model, CANDIDATES)[sets.index(ask.effects)]
+        alone = predictions([Rollout(ask.log, some) for some in sets], model, CANDIDATES)[
+            sets.index(ask.effects)
+        ]
         for a, b in zip(found, alone, strict=True):
             np.testing.assert_array_equal(a, b)
 
 
 def test_stretches_that_are_alike_hold_every_row_once(log_and_model) -> None:
     log, _ = log_and_model
-    found, rows = layout(log), sum(len(o.value) for o in log.observed)
-    assert sorted(np.concatenate([places.ravel() for _, _, places in found.alike])) == list(range(rows))
-    for i, of, places in found.alike:
+    found, rows = sample_map(log), sum(len(o.value) for o in log.observed)
+    assert sorted(np.concatenate([places.ravel() for _, _, places in found.equally_spaced])) == list(
+        range(rows)
+    )
+    for i, of, places in found.equally_spaced:
         for mine, at in zip(of, places, strict=True):
             assert any(j == i and np.array_equal(some, mine) for j, _, some in found.blocks)
             assert np.ptp(at) == len(at) - 1
@@ -167,7 +186,7 @@ def test_stretches_that_are_alike_hold_every_row_once(log_and_model) -> None:
 def test_sets_may_start_from_poses_of_their_own(log_and_model) -> None:
     log, model = log_and_model
     moved, sets = log.start + np.array([0.0, 0.0, 0.3]), [{}, {}, {"gyro_bias/constant": 0.01}]
-    asks = [Ask(log, some, at) for some, at in zip(sets, (log.start, moved, moved), strict=True)]
+    asks = [Rollout(log, some, at) for some, at in zip(sets, (log.start, moved, moved), strict=True)]
     here, there, biased = predictions(asks, model, CANDIDATES)
     alone = predictions(asks[1:], model, CANDIDATES)
     for i, observed in enumerate(log.observed):
@@ -179,10 +198,10 @@ def test_sets_may_start_from_poses_of_their_own(log_and_model) -> None:
 
 def test_graphs_hold_what_their_runs_need_and_every_run_once() -> None:
     def of(*sets: dict[str, float]) -> dict[tuple[str, ...], list[int]]:
-        return graphs(CANDIDATES, [what_moves(CANDIDATES, some) for some in sets])
+        return assign_graphs(CANDIDATES, [motion_effects(CANDIDATES, some) for some in sets])
 
     few = of({}, {"gyro_bias/constant": 0.1}, *({"mass/at_cg": 0.01 * k} for k in range(1, 5)))
-    assert list(few) == [next(g for g in groups(CANDIDATES) if "mass/at_cg" in g)]
+    assert list(few) == [next(g for g in effect_groups(CANDIDATES) if "mass/at_cg" in g)]
     assert sorted(run for runs in few.values() for run in runs) == list(range(6))
     apart = [{k: 0.01} for k in ("mass/at_cg", "wheel_radius/scale", "slip_sinkage/linear", "slope/uniform")]
     assert list(of({}, *apart)) == [CANDIDATES.moving]  # one vector of the whole graph
@@ -191,11 +210,11 @@ def test_graphs_hold_what_their_runs_need_and_every_run_once() -> None:
 
 
 def test_choices_are_all_others_where_there_are_few() -> None:
-    assert len(choices(5, 2, 0)) == 9
-    assert (0, 1) not in choices(5, 2, 0)
-    some = choices(23, 3, 0)
+    assert len(permutations(5, 2, 0)) == 9
+    assert (0, 1) not in permutations(5, 2, 0)
+    some = permutations(23, 3, 0)
     assert len(set(some)) == len(some) == 99
-    assert some == choices(23, 3, 0)
+    assert some == permutations(23, 3, 0)
 
 
 def test_null_probability_rises_with_the_p_value() -> None:
@@ -219,7 +238,7 @@ def test_an_effect_of_one_side_is_not_believed_on_the_other(sign: float) -> None
     rng = np.random.default_rng(3)
     normal = _scores(rng, 20, shift)
     shift[column] = sign
-    found = beliefs(Pool.of(_scores(rng, 3, shift), learn(normal, 3)), CANDIDATES)
+    found = bayes_factors(PooledScores.of(_scores(rng, 3, shift), learn_null(normal, 3)), CANDIDATES)
     first = max(found.effects, key=lambda k: found.effects[k])
     assert (first == "encoder_dropout") == (sign > 0.0)
 
@@ -227,36 +246,38 @@ def test_an_effect_of_one_side_is_not_believed_on_the_other(sign: float) -> None
 def test_what_references_share_is_no_gap() -> None:
     rng = np.random.default_rng(5)
     wrong = 0.5 * rng.standard_normal(len(CANDIDATES.keys) + 6)
-    null = learn(_scores(rng, 20, wrong), 3)
-    alike = beliefs(Pool.of(_scores(rng, 3, wrong), null), CANDIDATES).statistic()
-    repaired = beliefs(Pool.of(_scores(rng, 3, 0.0 * wrong), null), CANDIDATES).statistic()
+    null = learn_null(_scores(rng, 20, wrong), 3)
+    alike = bayes_factors(PooledScores.of(_scores(rng, 3, wrong), null), CANDIDATES).statistic()
+    repaired = bayes_factors(PooledScores.of(_scores(rng, 3, 0.0 * wrong), null), CANDIDATES).statistic()
     assert alike < 0.01 * repaired
 
 
 def test_an_effect_is_wholly_like_itself() -> None:
-    null = learn(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
-    pool = Pool.of(_scores(np.random.default_rng(2), 3, np.zeros(len(CANDIDATES.keys) + 6)), null)
-    does, size = pool.information[:, 3], float(pool.information[3, 3])
-    assert likeness(pool, does, size, [3, 4]) == pytest.approx(1.0)
-    assert likeness(pool, does, size, [5]) < 0.5
+    null = learn_null(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
+    pooled = PooledScores.of(_scores(np.random.default_rng(2), 3, np.zeros(len(CANDIDATES.keys) + 6)), null)
+    does, size = pooled.information[:, 3], float(pooled.information[3, 3])
+    assert similarity(pooled, does, size, [3, 4]) == pytest.approx(1.0)
+    assert similarity(pooled, does, size, [5]) < 0.5
 
 
 def test_what_a_silent_law_does_is_what_its_fit_takes_away() -> None:
     """Its column says nothing; its fit takes away what another column does."""
     silent, other, third = 3, 4, 5
-    null = learn(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
+    null = learn_null(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
     truth = np.zeros(len(CANDIDATES.keys) + 6)
     truth[other] = 3.0
-    gap, after = (Pool.of(_scores(np.random.default_rng(2), 3, t), null) for t in (truth, 0.0 * truth))
+    gap, after = (
+        PooledScores.of(_scores(np.random.default_rng(2), 3, t), null) for t in (truth, 0.0 * truth)
+    )
     information = gap.information.copy()
     information[silent], information[:, silent] = 0.0, 0.0
-    pool = dataclasses.replace(gap, information=information)
-    does, size = done(pool, [silent], lambda: after)
+    pooled = dataclasses.replace(gap, information=information)
+    does, size = effect_signal(pooled, [silent], lambda: after)
     assert size == pytest.approx(gap.square - after.square)
-    assert likeness(pool, does, size, [other]) > 0.8 > 2.0 * likeness(pool, does, size, [third])
-    _, nothing = done(pool, [silent], lambda: pool)
+    assert similarity(pooled, does, size, [other]) > 0.8 > 2.0 * similarity(pooled, does, size, [third])
+    _, nothing = effect_signal(pooled, [silent], lambda: pooled)
     assert nothing == pytest.approx(0.0, abs=1e-9)
-    _, by_signature = done(gap, [other], lambda: pool)
+    _, by_signature = effect_signal(gap, [other], lambda: pooled)
     assert by_signature > 100.0
 
 
@@ -301,17 +322,17 @@ def test_factors_of_all_columns_are_those_of_each() -> None:
     rng = np.random.default_rng(8)
     shift = np.zeros(len(CANDIDATES.keys) + 6)
     shift[4] = 0.3
-    pool = Pool.of(_scores(rng, 3, shift), learn(_scores(rng, 20, 0.0 * shift), 3))
-    np.testing.assert_allclose(pool.log_factors(), [pool.log_factor([i]) for i in range(len(shift))])
+    pooled = PooledScores.of(_scores(rng, 3, shift), learn_null(_scores(rng, 20, 0.0 * shift), 3))
+    np.testing.assert_allclose(pooled.log_factors(), [pooled.log_factor([i]) for i in range(len(shift))])
 
 
 def test_scores_of_other_forms_are_those_of_the_whole_covariance(log_and_model) -> None:
     log, model = log_and_model
     keys = ("gyro_scale/scale", "wheel_radius/scale")
     channels = tuple(o.channel for o in log.observed)
-    seen = signatures(log, drive(log, model, CANDIDATES, log.start, keys))
-    raw = raw_of(log, seen, model, CANDIDATES, channels)
-    run, sigma = whitened(raw, first_noise([raw])), state_sigmas(CANDIDATES)
+    seen = channel_sensitivities(log, linearise(log, model, CANDIDATES, log.start, keys))
+    raw = residuals_from(log, seen, model, CANDIDATES, channels)
+    run, sigma = whitened(raw, data_sheet_noise([raw])), initial_state_sigma(CANDIDATES)
     T, K = run.states, len(CANDIDATES.keys)
     rows = run.rows.astype(float)
     covariance = np.eye(len(rows)) + (rows[:, :T] * sigma**2) @ rows[:, :T].T
@@ -322,7 +343,7 @@ def test_scores_of_other_forms_are_those_of_the_whole_covariance(log_and_model) 
     time = (run.time_s - run.time_s.mean()) / run.time_s.std()
     at = CANDIDATES.keys.index(keys[1])
     expected = P.T @ np.linalg.solve(covariance, P[:, at] * time)
-    found = modulated(run, model, sigma, K)[:, at, FUNCTIONS.index("time")]
+    found = discrepancy_of(run, model, sigma, K)[:, at, FUNCTIONS.index("time")]
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3 * np.abs(expected).max())
 
 
@@ -336,9 +357,9 @@ def test_a_law_of_another_form_is_believed_beside_its_effect() -> None:
     other = np.zeros((len(zero), len(CANDIDATES.keys), len(FUNCTIONS)))
     other[:, column, 0] = hidden
     gap = [dataclasses.replace(r, b=r.b + 0.2 * r.A[:, column] + 0.3 * hidden) for r in plain]
-    null = learn(normal, 3)
-    with_forms = [dataclasses.replace(r, other=other) for r in gap]
-    believed = [beliefs(Pool.of(runs, null), CANDIDATES) for runs in (gap, with_forms)]
+    null = learn_null(normal, 3)
+    with_forms = [dataclasses.replace(r, discrepancy=other) for r in gap]
+    believed = [bayes_factors(PooledScores.of(runs, null), CANDIDATES) for runs in (gap, with_forms)]
     assert believed[1].effects["encoder_scale"] > believed[0].effects["encoder_scale"] + 20.0
     assert max(believed[1].effects, key=lambda k: believed[1].effects[k]) == "encoder_scale"
 
@@ -347,11 +368,13 @@ def test_held_out_share_is_of_what_runs_have_in_common() -> None:
     """An effect in all runs explains the run left out; one in a single run does not."""
     rng = np.random.default_rng(21)
     shift = np.zeros(len(CANDIDATES.keys) + 6)
-    null = learn(_scores(rng, 20, shift), 3)
+    null = learn_null(_scores(rng, 20, shift), 3)
     still = _scores(rng, 2, shift)
     shift[3] = 0.5
     shared, single = _scores(rng, 3, shift), [*_scores(rng, 1, shift), *still]
-    pools = [[Pool.of([r], null) for r in runs] for runs in (shared, single)]
-    np.testing.assert_allclose(Pool.sum(pools[0]).information, Pool.of(shared, null).information)
-    assert HeldOut(tuple(pools[0])).explained([3]) > 0.8 * Pool.of(shared, null).fit([3])[2]
-    assert HeldOut(tuple(pools[1])).explained([3]) < 0.0
+    pools = [[PooledScores.of([r], null) for r in runs] for runs in (shared, single)]
+    np.testing.assert_allclose(
+        PooledScores.sum(pools[0]).information, PooledScores.of(shared, null).information
+    )
+    assert explained_held_out(pools[0], [3]) > 0.8 * PooledScores.of(shared, null).fit([3])[2]
+    assert explained_held_out(pools[1], [3]) < 0.0

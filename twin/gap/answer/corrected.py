@@ -1,19 +1,17 @@
-"""The vehicle's file with the effects found in it: as numbers that it has, or in its section `effects`."""
+"""Writes a vehicle file with the effects found: as numbers that it has, or in its section `effects`."""
 
 from __future__ import annotations
 
 import copy
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from terrafusion.twin.calibrate.files import mark_measured, write_yaml
 from terrafusion.twin.effects.catalogue import lookup
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams
-
-if TYPE_CHECKING:
-    from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
 FIELDS = {
     "mass/at_cg": (("body.mass_kg", "times"), ("body.yaw_inertia_kgm2", "times")),
@@ -26,7 +24,7 @@ FIELDS = {
     "dead_time/transport": (("drive.dead_time_s", "plus"),),
     "actuator_lag/torque": (("drive.lag_s", "plus"),),
 }
-"""Numbers of the vehicle's file that an effect changes: by a factor 1 + e, 1 - e, or by e."""
+"""Numbers of the vehicle file that an effect changes: by a factor 1 + e, 1 - e, or by e."""
 _CHANGES = {
     "times": lambda x, e: x * (1.0 + e),
     "less": lambda x, e: x * (1.0 - e),
@@ -35,41 +33,40 @@ _CHANGES = {
 
 
 def values_of(diagnosis: GapDiagnosis) -> dict[str, float]:
-    """Parameters of the effects named, by key."""
+    """Parameters of the named effects, by key."""
     answer = diagnosis.to_json()
-    named = set(answer["named"])
     return {
         key: number["value"]
         for cause in answer["causes"]
-        if cause["effect"] in named
+        if cause["effect"] in answer["named"]
         for key, number in cause["parameters"].items()
     }
 
 
 def write_corrected(diagnosis: GapDiagnosis, vehicle: str | Path, target: Path) -> list[str]:
-    """Write the vehicle's file with the effects named; what was done, in sentences.
+    """Write the vehicle file with the named effects; returns the changes, in sentences.
 
     The twin of that file has them: `terrafusion gap` and `simulate` with `--vehicle` as with `--effect`.
 
     Raises:
-        ConfigError: the vehicle's file cannot be read.
+        ConfigError: the vehicle file cannot be read.
         TerrafusionError: the file cannot be written.
     """
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
-    out, said = copy.deepcopy(raw), []
+    out, changes, params = copy.deepcopy(raw), list[str](), diagnosis.evidence.model.vehicle
     for key, value in values_of(diagnosis).items():
-        for path, how in FIELDS.get(key, ()):
-            said.append(_change(out, diagnosis.bench.model.vehicle, path, how, value))
-        if key not in FIELDS:
-            said.append(_added(out, diagnosis.bench.model.vehicle, key, value))
-    if not said:
+        if key in FIELDS:
+            changes += [_change_field(out, params, path, how, value) for path, how in FIELDS[key]]
+        else:
+            changes.append(_change_effect(out, params, key, value))
+    if not changes:
         return ["no effect was named: the vehicle's file stays as it is"]
     write_yaml(target, out)
-    return [*said, f"written to {target}"]
+    return [*changes, f"written to {target}"]
 
 
-def _added(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) -> str:
-    """An effect that is no number of the vehicle, on top of what it has of it."""
+def _change_effect(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) -> str:
+    """Adds to an effect that is no number of the vehicle."""
     before, number = vehicle.effects.get(key, 0.0), lookup(key)[1]
     after = min(max(before + value, number.low), number.high)
     source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
@@ -77,7 +74,7 @@ def _added(raw: dict[str, Any], vehicle: VehicleParams, key: str, value: float) 
     return f"effects.{key}: {before:.6g} -> {after:.6g}"
 
 
-def _change(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, value: float) -> str:
+def _change_field(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, value: float) -> str:
     before: Any = vehicle
     for part in path.split("."):
         before = getattr(before, part)
@@ -88,7 +85,7 @@ def _change(raw: dict[str, Any], vehicle: VehicleParams, path: str, how: str, va
         section = section.setdefault(part, {})
     old = section.get(last)
     source = f"gap diagnosis: {value:+.4g} on {before:.6g}"
-    kept: Mapping[str, Any] = {k: v for k, v in old.items() if k == "valid"} if isinstance(old, dict) else {}
-    section[last] = {"value": after, **kept, "source": source}
+    valid: Mapping[str, Any] = {k: v for k, v in old.items() if k == "valid"} if isinstance(old, dict) else {}
+    section[last] = {"value": after, **valid, "source": source}
     mark_measured(raw, path)
     return f"{path}: {before:.6g} -> {after:.6g}"

@@ -1,4 +1,4 @@
-"""`GapDiagnosis`: what a diagnosis found, and the same as `diagnosis.json` has it."""
+"""`GapDiagnosis`: the result of a diagnosis, and its form in `diagnosis.json`."""
 
 from __future__ import annotations
 
@@ -7,54 +7,65 @@ from dataclasses import dataclass
 from typing import Any
 
 from terrafusion.twin.gap.answer.next_run import NextRun
-from terrafusion.twin.gap.answer.shrink import METRIC, Shrink
-from terrafusion.twin.gap.answer.verdict import Cause, Verdict
-from terrafusion.twin.gap.answer.where import Cell
-from terrafusion.twin.gap.infer.cause_posterior import Choice
+from terrafusion.twin.gap.answer.shrinkage import METRIC, Shrinkage
+from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
+from terrafusion.twin.gap.answer.where import GapCell
+from terrafusion.twin.gap.infer.cause_posterior import CausePosterior
 from terrafusion.twin.gap.infer.detect import Detection
-from terrafusion.twin.gap.infer.evidence import Bench
 from terrafusion.twin.gap.infer.refit import Refit
+from terrafusion.twin.gap.null.evidence import GapEvidence
 
 SCHEMA = "terrafusion.gap/1"
 
 
 @dataclass(frozen=True, eq=False)
 class GapDiagnosis:
-    """What `diagnose` finds.
+    """Result of `diagnose`.
 
     Attributes:
-        runs, references, vehicle: names.
-        seconds: length of what was judged.
+        vehicle: its name.
         detection: the permutation test.
         significance: threshold of its p-value.
         uncalibrated: whether twin replicates stood in for references.
         where: cells of the gap map, most important first.
-        choice: what each cause leaves of the gap, and its odds.
+        posterior: what each cause leaves of the gap, and its odds.
         verdict: causes and the judgement.
-        shrinking: how far the gap shrinks on runs left out.
+        shrinkage: how far the gap shrinks on runs left out.
         next_run: drive that would separate look-alikes.
         refits: by effect, failures included.
-        bench: the evidence, for plots.
-        notes: what was assumed, in sentences.
-        elapsed_s: time the diagnosis took.
+        evidence: for plots.
+        notes: assumptions, in sentences.
+        elapsed_s: computing time.
     """
 
-    runs: tuple[str, ...]
-    references: tuple[str, ...]
     vehicle: str
-    seconds: float
     detection: Detection
     significance: float
     uncalibrated: bool
-    where: list[Cell]
-    choice: Choice
-    verdict: Verdict
-    shrinking: Shrink | None
+    where: list[GapCell]
+    posterior: CausePosterior
+    verdict: GapVerdict
+    shrinkage: Shrinkage
     next_run: NextRun | None
     refits: dict[str, Refit]
-    bench: Bench
+    evidence: GapEvidence
     notes: tuple[str, ...]
     elapsed_s: float
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """Names of the judged runs."""
+        return tuple(r.name for r in self.evidence.runs)
+
+    @property
+    def references(self) -> tuple[str, ...]:
+        """Names of the references."""
+        return tuple(r.name for r in self.evidence.references)
+
+    @property
+    def seconds(self) -> float:
+        """Length of the judged runs."""
+        return sum(r.seconds for r in self.evidence.runs)
 
     @property
     def detected(self) -> bool:
@@ -62,59 +73,51 @@ class GapDiagnosis:
         return self.detection.p_value <= self.significance
 
     def to_json(self) -> dict[str, Any]:
-        """The answer as `docs/schemas/diagnosis.schema.json` has it; what is not known is null."""
-        return as_dict(self)
-
-
-def as_dict(d: GapDiagnosis) -> dict[str, Any]:
-    """The diagnosis in plain types; what is not known is null."""
-    found, verdict = d.detection, d.verdict
-    return {
-        "schema": SCHEMA,
-        "runs": list(d.runs),
-        "reference_runs": list(d.references),
-        "vehicle": d.vehicle,
-        "seconds": round(d.seconds, 3),
-        "gap": {
-            "detected": d.detected,
-            "statistic": _number(found.statistic) or 0.0,
-            "p_value": float(found.p_value),
-            "significance": d.significance,
-            "uncalibrated": d.uncalibrated,
-        },
-        "where": [
-            {"channel": c.channel, "regime": c.regime, "band": c.band, "share": c.share, "p_value": c.p_value}
-            for c in d.where
-        ],
-        "verdict": verdict.kind,
-        "causes": [_cause(d, c) for c in verdict.causes],
-        "named": list(verdict.named),
-        "p_unknown": verdict.p_unknown,
-        "p_null": verdict.p_null,
-        "shrink": None if d.shrinking is None else _shrink(d.shrinking),
-        "next_run": None
-        if d.next_run is None
-        else {
-            "scenario": d.next_run.scenario,
-            "separates": list(d.next_run.separates),
-            "why": d.next_run.why,
-        },
-    }
+        """The answer as `docs/schemas/diagnosis.schema.json` has it; unknown values are null."""
+        verdict, following = self.verdict, self.next_run
+        return {
+            "schema": SCHEMA,
+            "runs": list(self.runs),
+            "reference_runs": list(self.references),
+            "vehicle": self.vehicle,
+            "seconds": round(self.seconds, 3),
+            "gap": {
+                "detected": self.detected,
+                "statistic": _number(self.detection.statistic) or 0.0,
+                "p_value": float(self.detection.p_value),
+                "significance": self.significance,
+                "uncalibrated": self.uncalibrated,
+            },
+            "where": [
+                {key: getattr(c, key) for key in ("channel", "regime", "band", "share", "p_value")}
+                for c in self.where
+            ],
+            "verdict": verdict.kind,
+            "causes": [_cause(self.evidence, c) for c in verdict.causes],
+            "named": list(verdict.named),
+            "p_unknown": verdict.p_unknown,
+            "p_null": verdict.p_null,
+            "shrink": _shrink(self.shrinkage),
+            "next_run": None
+            if following is None
+            else {
+                "scenario": following.scenario,
+                "separates": list(following.separates),
+                "why": following.why,
+            },
+        }
 
 
 def _number(value: float | None) -> float | None:
     return None if value is None or not math.isfinite(value) else float(value)
 
 
-def _cause(d: GapDiagnosis, cause: Cause) -> dict[str, Any]:
-    c, base = d.bench.candidates, d.bench.model.effects
-    parameters = {}
+def _cause(evidence: GapEvidence, cause: Cause) -> dict[str, Any]:
+    c, parameters = evidence.candidates, {}
     for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
-        shift = float(value * c.scale[i])
-        low, high = float(c.low[i]), float(c.high[i])
-        at = base.get(c.keys[i], 0.0)
+        base, shift = evidence.model.effects.get(c.keys[i], 0.0), float(value * c.scale[i])
         parameters[c.keys[i]] = {
-            "value": min(max(at + shift, low), high) - at,
+            "value": min(max(base + shift, float(c.low[i])), float(c.high[i])) - base,
             "sigma": _number(float(sigma * c.scale[i])),
             "unit": c.units[i],
         }
@@ -127,7 +130,7 @@ def _cause(d: GapDiagnosis, cause: Cause) -> dict[str, Any]:
     }
 
 
-def _shrink(s: Shrink) -> dict[str, Any]:
+def _shrink(s: Shrinkage) -> dict[str, Any]:
     return {
         "metric": METRIC,
         "before": s.before,

@@ -1,12 +1,11 @@
-"""Which drive would tell two look-alikes apart: the twin drives each of a small catalogue, and counts by how
-many standard deviations the two effects would differ there at the sizes they have been found with."""
+"""Suggests a drive that would distinguish two look-alikes: the twin simulates each of a small catalogue and
+counts by how many standard deviations the two effects, at the sizes found, would differ there."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,25 +14,24 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.observations import Observed
-from terrafusion.twin.gap.answer.classes import TELLING, likeness
-from terrafusion.twin.gap.infer.evidence import WINDOW_S, Bench
-from terrafusion.twin.gap.infer.posterior import Pool
+from terrafusion.twin.gap.answer.look_alikes import SEPARABLE_SIGMAS, unlike_square
+from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
+from terrafusion.twin.gap.data.logs import WINDOW_S
+from terrafusion.twin.gap.infer.posterior import PooledScores
+from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.null import JITTER, Null
 from terrafusion.twin.gap.null.score import score
-from terrafusion.twin.gap.rollout.residuals import SOIL_STATE, Evidence, raw_of, whitened
-from terrafusion.twin.gap.rollout.sensitivities import drive, signatures
+from terrafusion.twin.gap.rollout.residuals import SOIL_SIGMAS, WhitenedRun, residuals_from, whitened
+from terrafusion.twin.gap.rollout.sensitivities import channel_sensitivities, linearise
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.scenario.commands import open_loop
 from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
-
-if TYPE_CHECKING:
-    from terrafusion.twin.gap.answer.verdict import Cause
 
 Array = NDArray[np.float64]
 
 BY_HAND = "measurement by hand"
 MOST_REPEATS = 10
-"""Where so many repeats of the best drive do not tell two effects apart, none is proposed."""
+"""If the best drive would have to be repeated more often, none is suggested."""
 LIFTED = "wheels lifted"
 HALF_TURN_S, QUARTER_TURN_S = math.pi / 0.6, 0.5 * math.pi / 0.6
 
@@ -60,12 +58,12 @@ DRIVES: dict[str, tuple[DriveSegment, ...]] = {
     "speed staircase": _sequence(*((5.0, v, 0.0) for v in (0.3, 0.6, 0.9, 1.2, 1.5))),
     "figure of eight": _sequence((14.0, 0.8, 0.45), (14.0, 0.8, -0.45)),
 }
-"""What is tried, by name: about 30 s each, level ground of the kind that the runs were on."""
+"""Drives that are tried, by name: about 30 s each, level, on the soil of the runs."""
 
 
 @dataclass(frozen=True)
 class NextRun:
-    """A drive, the two effects that it separates, by how many sigmas one such drive does, and in words."""
+    """A drive, the two effects that it separates, by how many sigmas one such drive does, and a sentence."""
 
     scenario: str
     separates: tuple[str, str]
@@ -73,12 +71,21 @@ class NextRun:
     why: str
 
 
-def propose(bench: Bench, sigma: Array, one: Cause, other: Cause) -> NextRun:
-    """The drive on which two causes differ most; a measurement by hand where none tells them apart."""
-    found = {name: separation(bench, sigma, name, one, other) for name in DRIVES}
+def next_run(evidence: GapEvidence, sigma: Array, verdict: GapVerdict) -> NextRun | None:
+    """For the first named cause with look-alikes and the most probable of these; None without one."""
+    first = verdict.ambiguous() if verdict.kind == "ambiguous" else None
+    if first is None:
+        return None
+    other = next(c for c in verdict.causes if c.effect == first.members[1])
+    return propose(evidence, sigma, first, other)
+
+
+def propose(evidence: GapEvidence, sigma: Array, one: Cause, other: Cause) -> NextRun:
+    """The drive on which two causes differ most; a direct measurement where none separates them."""
+    found = {name: separation(evidence, sigma, name, one, other) for name in DRIVES}
     best = max(found, key=lambda name: found[name])
     sigmas, pair = found[best], (one.effect, other.effect)
-    repeats = math.inf if sigmas <= 0.0 else math.ceil((TELLING / sigmas) ** 2)
+    repeats = math.inf if sigmas <= 0.0 else math.ceil((SEPARABLE_SIGMAS / sigmas) ** 2)
     if repeats > MOST_REPEATS:
         why = (
             f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by {sigmas:.1f} "
@@ -93,32 +100,33 @@ def propose(bench: Bench, sigma: Array, one: Cause, other: Cause) -> NextRun:
     return NextRun(best, pair, sigmas, why)
 
 
-def separation(bench: Bench, sigma: Array, name: str, one: Cause, other: Cause) -> float:
-    """Sigmas by which a drive tells two causes apart, whichever is true; 0 where the twin diverges on it."""
+def separation(evidence: GapEvidence, sigma: Array, name: str, one: Cause, other: Cause) -> float:
+    """Sigmas by which a drive separates two causes, whichever is true; 0 where the twin diverges on it."""
     try:
-        run = _forecast(bench, name, {one.effect, other.effect})
+        run = _forecast(evidence, name, {one.effect, other.effect})
     except TerrafusionError:
         return 0.0
     own = score(run, sigma)
     zero = np.zeros(len(own.b))
     covariance = own.fisher + JITTER * np.eye(len(zero))
-    pool = Pool.of([dataclasses.replace(own, b=zero)], Null(zero, zero, covariance, 1))
-    return min(_told(pool, bench, one, other.effect), _told(pool, bench, other, one.effect))
+    pooled = PooledScores.of([dataclasses.replace(own, b=zero)], Null(zero, zero, covariance, 1))
+    return min(
+        _remaining_sigmas(pooled, evidence, one, other.effect),
+        _remaining_sigmas(pooled, evidence, other, one.effect),
+    )
 
 
-def _told(pool: Pool, bench: Bench, true: Cause, other: str) -> float:
-    """Sigmas that are left of the true cause once any form of the other is fitted to it."""
+def _remaining_sigmas(pooled: PooledScores, evidence: GapEvidence, true: Cause, other: str) -> float:
+    """Sigmas that remain of the true cause once any form of the other is fitted to it."""
     at = np.asarray(true.columns)
-    does = pool.information[:, at] @ true.value
-    signal = float(true.value @ does[at])
-    forms = [h.columns for h in bench.candidates.hypotheses if h.effect == other]
-    alike = max(likeness(pool, does, signal, columns) for columns in forms)
-    return math.sqrt(max(signal * (1.0 - alike**2), 0.0))
+    signal = pooled.information[:, at] @ true.value
+    square = float(true.value @ signal[at])
+    return math.sqrt(max(unlike_square(pooled, evidence.candidates, signal, square, other)[1], 0.0))
 
 
-def _forecast(bench: Bench, name: str, effects: set[str]) -> Evidence:
-    """Evidence of a drive that has not been driven: its errors are zero."""
-    template, model, segments = bench.runs[0].log, bench.model, DRIVES[name]
+def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRun:
+    """Sensitivities of a drive that has not been driven: its errors are zero."""
+    template, model, segments = evidence.runs[0].log, evidence.model, DRIVES[name]
     label = template.labels[0]
     if name == LIFTED:
         model = dataclasses.replace(model, soils={**model.soils, label: _no_ground()})
@@ -130,16 +138,16 @@ def _forecast(bench: Bench, name: str, effects: set[str]) -> Evidence:
     end = float(windows[-1, 1]) * DT_S
     log = PreparedLog(
         name, inputs[:, :2], template.follows, (label,), np.zeros(0), windows,
-        np.zeros((len(windows), 3)), tuple(_rows(o, end) for o in template.observed), True, (),
+        np.zeros((len(windows), 3)), tuple(_empty(o, end) for o in template.observed), True, (),
     )  # fmt: skip
-    keys = {k for k in bench.candidates.keys if k.split("/")[0] in effects or k in SOIL_STATE}
-    found = drive(log, model, bench.candidates, log.start, keys)
-    seen = signatures(log, found)
-    return whitened(raw_of(log, seen, model, bench.candidates, bench.channels), bench.noise)
+    candidates = evidence.candidates
+    keys = {k for k in candidates.keys if k.split("/")[0] in effects or k in SOIL_SIGMAS}
+    found = channel_sensitivities(log, linearise(log, model, candidates, log.start, keys))
+    return whitened(residuals_from(log, found, model, candidates, evidence.channels), evidence.noise)
 
 
 def _no_ground() -> SoilParams:
-    """What lifted wheels turn on: next to no friction."""
+    """Contact of lifted wheels: next to no friction."""
     firm = load_soil("asphalt")
     return dataclasses.replace(
         firm,
@@ -149,15 +157,15 @@ def _no_ground() -> SoilParams:
 
 
 def _windows(count: int) -> NDArray[np.int64]:
-    """Windows (W, 2) of so many grid samples; a last one of less than half the length is left out."""
+    """Windows (W, 2) of so many grid samples, without a last one of less than half the length."""
     size = round(WINDOW_S / DT_S)
     edges = np.append(np.arange(0, count - 1, size), count - 1)
     windows = np.stack([edges[:-1], edges[1:]], axis=1)
     return windows[windows[:, 1] - windows[:, 0] >= size // 2]
 
 
-def _rows(observed: Observed, end_s: float) -> Observed:
-    """Regular rows of a channel up to a time, as noisy as those of a log."""
+def _empty(observed: Observed, end_s: float) -> Observed:
+    """Regular samples of a channel up to a time, with the noise of those of a log."""
     slot = np.arange(1, max(2, int(end_s / observed.slot_s)))
     end: Array = slot.astype(float) * observed.slot_s
     length = float(np.median(observed.end_s - observed.begin_s))

@@ -1,21 +1,24 @@
-"""Where: cells of channel, regime and band in which the judged runs err more than the references.
+"""Where the gap shows: cells of channel, regime and band in which the judged runs err more than the
+references.
 
-A cell's share is what it adds to the excess of squared errors. Its p-value holds for all cells together:
-the greatest standardised excess over all cells, of other choices of runs (max-T, Westfall and Young 1993).
+A cell's share is its part of the excess of squared errors. Its p-value holds for all cells together: the
+greatest standardised excess over all cells, of other choices of runs (max-T, Westfall and Young 1993).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.calibrate.model import Model
-from terrafusion.twin.gap.infer.detect import choices
-from terrafusion.twin.gap.rollout.nuisance import NAMES, told_twist
-from terrafusion.twin.gap.rollout.residuals import Evidence
+from terrafusion.twin.gap.answer.shrinkage import own_error, without_states
+from terrafusion.twin.gap.infer.detect import permutations
+from terrafusion.twin.gap.null.evidence import GapEvidence
+from terrafusion.twin.gap.null.null import Null
+from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, commanded_twist
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 Array = NDArray[np.float64]
 
@@ -27,17 +30,20 @@ REGIMES = (
     ("straight, slow", lambda v, r, a: (np.abs(r) <= 0.1) & (np.abs(v) <= 0.7)),
     ("straight, fast", lambda v, r, a: (np.abs(r) <= 0.1) & (np.abs(v) > 0.7)),
 )
-"""Name and condition on told speed (m/s), turn rate (rad/s) and acceleration (m/s2); the first that holds."""
+"""Name and condition on commanded speed (m/s), turn rate (rad/s) and acceleration (m/s2); the first that
+holds."""
 BANDS = ("below 0.5 Hz", "above 0.5 Hz")
 SLOW_S = 2.0
-"""Means over this long are the slow band."""
-LEAST_ROWS = 5
+"""Means over this interval are the slow band."""
+ACCELERATION_SAMPLES = 51
+"""Grid samples over which the acceleration is averaged: half a second."""
+LEAST_SAMPLES = 5
 LEAST_REFERENCES = 2
 """Fewer have no scatter from run to run."""
 
 
 @dataclass(frozen=True)
-class Cell:
+class GapCell:
     """One cell of the gap map."""
 
     channel: str
@@ -48,12 +54,12 @@ class Cell:
     rms: float
 
 
-def regimes(run: Evidence, model: Model) -> NDArray[np.int64]:
-    """Number (n,) of the regime of each row."""
-    t_s, twist = told_twist(run.log, model)
-    rate = np.gradient(twist[:, 0], t_s)
-    width = 51  # half a second
-    rate = np.convolve(np.pad(rate, width // 2, mode="edge"), np.ones(width) / width, mode="valid")
+def regimes(run: WhitenedRun, model: Model) -> NDArray[np.int64]:
+    """Index (n,) of the regime of each sample."""
+    t_s, twist = commanded_twist(run.log, model)
+    width = ACCELERATION_SAMPLES
+    rate = np.pad(np.gradient(twist[:, 0], t_s), width // 2, mode="edge")
+    rate = np.convolve(rate, np.ones(width) / width, mode="valid")
     v, r, a = (np.interp(run.time_s, t_s, x) for x in (twist[:, 0], twist[:, 1], rate))
     out = np.full(len(run.time_s), len(REGIMES) - 1)
     for i in reversed(range(len(REGIMES))):
@@ -61,16 +67,16 @@ def regimes(run: Evidence, model: Model) -> NDArray[np.int64]:
     return out
 
 
-def cells(run: Evidence, model: Model, errors: Array) -> dict[tuple[str, int, int], tuple[float, float]]:
+def cells(run: WhitenedRun, model: Model, errors: Array) -> dict[tuple[str, int, int], tuple[float, float]]:
     """Sum of squares and effective count of each cell of a run (channel, regime, band)."""
     regime, out = regimes(run, model), dict[tuple[str, int, int], tuple[float, float]]()
     for i, observed in enumerate(run.log.observed):
-        name = NAMES[observed.channel]
+        name = CHANNEL_NAMES[observed.channel]
         rows = np.flatnonzero(run.channel == i)
         rows = rows[np.argsort(run.time_s[rows], kind="stable")]
         e = errors[rows]
-        block = np.floor(run.time_s[rows] / SLOW_S).astype(np.int64)
-        key = regime[rows] + len(REGIMES) * (block - block.min())
+        interval = np.floor(run.time_s[rows] / SLOW_S).astype(np.int64)
+        key = regime[rows] + len(REGIMES) * (interval - interval.min())
         _, group, count = np.unique(key, return_inverse=True, return_counts=True)
         mean = np.bincount(group, e) / count
         for band, values in enumerate((np.sqrt(count)[group] * mean[group], e - mean[group])):
@@ -83,38 +89,33 @@ def cells(run: Evidence, model: Model, errors: Array) -> dict[tuple[str, int, in
     return out
 
 
-def gap_map(
-    runs: Sequence[Evidence], references: Sequence[Evidence], model: Model, errors: Sequence[Array], seed: int
-) -> list[Cell]:
-    """All cells with enough rows, most important first; none without references to compare with.
-
-    Args:
-        errors: whitened errors of runs, then references, theta and the common offset taken out.
-    """
-    if len(references) < LEAST_REFERENCES:
+def gap_map(evidence: GapEvidence, sigma: Array, null: Null, seed: int) -> list[GapCell]:
+    """All cells with enough samples, most important first; none with fewer than `LEAST_REFERENCES`."""
+    runs, count_runs = [*evidence.runs, *evidence.references], len(evidence.runs)
+    if len(evidence.references) < LEAST_REFERENCES:
         return []
-    every = [*runs, *references]
-    table = [cells(run, model, e) for run, e in zip(every, errors, strict=True)]
+    errors = [without_states(run, sigma, own_error(run, null)) for run in runs]
+    table = [cells(run, evidence.model, e) for run, e in zip(runs, errors, strict=True)]
     keys = [
-        k for k in table[0] if all(k in t for t in table) and min(t[k][1] for t in table[: len(runs)]) >= 1.0
+        k for k in table[0] if all(k in t for t in table) and min(t[k][1] for t in table[:count_runs]) >= 1.0
     ]
-    keys = [k for k in keys if sum(t[k][1] for t in table) >= LEAST_ROWS]
+    keys = [k for k in keys if sum(t[k][1] for t in table) >= LEAST_SAMPLES]
     if not keys:
         return []
     square = np.array([[t[k][0] for k in keys] for t in table])
     count = np.array([[t[k][1] for k in keys] for t in table])
-    own = np.arange(len(runs))
+    own = np.arange(count_runs)
     excess = _excess(square, count, own)
     tops = [
         float(_excess(square, count, np.asarray(choice)).max())
-        for choice in choices(len(every), len(runs), seed)
+        for choice in permutations(len(runs), count_runs, seed)
     ]
-    floor = square[len(runs) :].sum(axis=0) / np.maximum(count[len(runs) :].sum(axis=0), 1e-9)
+    floor = square[count_runs:].sum(axis=0) / np.maximum(count[count_runs:].sum(axis=0), 1e-9)
     over = np.maximum(square[own].sum(axis=0) - floor * count[own].sum(axis=0), 0.0)
     share = over / max(float(over.sum()), 1e-12)
     rms = np.sqrt(square[own].sum(axis=0) / np.maximum(count[own].sum(axis=0), 1e-9))
     found = [
-        Cell(
+        GapCell(
             channel, REGIMES[regime][0], BANDS[band], float(share[i]),
             (1.0 + sum(t >= excess[i] for t in tops)) / (1.0 + len(tops)), float(rms[i]),
         )

@@ -1,13 +1,13 @@
-"""The candidates of a diagnosis: every effect with its forms, their parameters as columns, and priors.
+"""Candidate effects of a diagnosis: their functional forms, parameters and ranges.
 
-An effect is one hypothesis; its functional forms are alternatives within it. A column is one parameter,
-counted in its catalogue scale ("typical" size), so that all columns are comparable.
+An effect is one hypothesis and its forms are alternatives within it. A column is one parameter, measured in
+its typical size (`scale` of the catalogue), so that all columns are comparable.
 """
 
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,13 +19,15 @@ from terrafusion.twin.effects.form import Form
 
 Array = NDArray[np.float64]
 
-SOIL = "soil_strength"
-"""The effect that is a known parameter of the ground, not missing physics: verdict `parameters`."""
+SOIL_STRENGTH = "soil_strength"
+"""The effect that is a known parameter of the soil, not missing physics: verdict `parameters`."""
+RANGE_SHARE = 0.98
+"""Share of its range within which a parameter is sought."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One functional form of one effect: the columns (indices) that it may move."""
+    """One functional form of one effect and the indices of its columns."""
 
     effect: str
     form: str
@@ -34,15 +36,15 @@ class Hypothesis:
 
 @dataclass(frozen=True, eq=False)
 class Candidates:
-    """All effects that take part.
+    """All candidate effects.
 
     Attributes:
         keys: parameter keys of the catalogue, one a column.
         scale, low, high: typical size and range of each, in its unit.
         units: of each.
         hypotheses: the forms, in the order of the catalogue.
-        moving: keys that change how the robot moves, sorted as the engine wants them.
-        world_fixed: those of them that act by where in the plane the robot is or faces.
+        moving: keys that change the robot's motion, sorted as the engine expects them.
+        world_fixed: those of `moving` that depend on position or heading in the world.
     """
 
     keys: tuple[str, ...]
@@ -56,27 +58,27 @@ class Candidates:
 
     @classmethod
     def of(cls, effects: Iterable[str] | None = None, present: Iterable[str] = ()) -> Candidates:
-        """The named effects; None: all of the catalogue that are candidates, the user's own included.
+        """The named effects; None: all candidates of the catalogue, registered ones included.
 
         Args:
-            present: keys of what the twin has already: their forms take part.
+            present: keys of effects that the twin already has; their forms are always candidates.
 
         Raises:
-            ConfigError: no effect, or one that is unknown; the nearest ones are named.
+            ConfigError: no effect, or an unknown one; the nearest names are listed.
         """
-        effects = None if effects is None else tuple(effects)
-        _check(effects)
-        wanted, there = None if effects is None else set(effects), {lookup(key)[0].key for key in present}
+        wanted = None if effects is None else tuple(effects)
+        _check_names(wanted)
+        in_twin = {lookup(key)[0].key for key in present}
 
-        def taken(form: Form) -> bool:
-            return form.key in there or (form.candidate if wanted is None else form.effect in wanted)
+        def included(form: Form) -> bool:
+            return form.key in in_twin or (form.candidate if wanted is None else form.effect in wanted)
 
-        known = {k: v for k, v in parameters().items() if taken(v[0])}
+        known = {k: v for k, v in parameters().items() if included(v[0])}
         keys = tuple(known)
         forms = [
             Hypothesis(f.effect, f.name, tuple(i for i, key in enumerate(keys) if known[key][0].key == f.key))
             for f in catalogue().values()
-            if taken(f)
+            if included(f)
         ]
         numbers = [p for _, p in known.values()]
         return cls(
@@ -92,15 +94,21 @@ class Candidates:
         return tuple(dict.fromkeys(h.effect for h in self.hypotheses))
 
     def any_world_fixed(self, effects: Mapping[str, float]) -> bool:
-        """Whether these, by key, do something else at another place, or to a robot that faces elsewhere."""
+        """Whether one of these effects, by key, depends on position or heading in the world."""
         return any(value != 0.0 and key in self.world_fixed for key, value in effects.items())
 
     def columns(self, effect: str) -> tuple[int, ...]:
-        """All columns of an effect, whatever their form."""
+        """All columns of an effect, of all its forms."""
         return tuple(i for h in self.hypotheses if h.effect == effect for i in h.columns)
 
+    def bounds(self, columns: Sequence[int]) -> tuple[Array, Array]:
+        """Least and greatest values (k,) of some columns, in typical sizes."""
+        at = list(columns)
+        scale = self.scale[at]
+        return RANGE_SHARE * self.low[at] / scale, RANGE_SHARE * self.high[at] / scale
 
-def _check(effects: tuple[str, ...] | None) -> None:
+
+def _check_names(effects: tuple[str, ...] | None) -> None:
     if effects is not None and not effects:
         raise ConfigError("no effect is named", remedy="name some, or none at all for the whole catalogue")
     for name in effects or ():

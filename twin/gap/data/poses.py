@@ -1,8 +1,8 @@
-"""The pose at the start of each window, laid onto the fixes by what the twin itself has driven.
+"""Aligns the twin's track in each window with the GNSS track.
 
-The guess that a log comes with turns a path from wheels and gyro onto the fixes. Where wheels or gyro are at
-fault the guess is off by tenths of a radian, and what is linear in the pose does not take that up: a gyro's
-bias would show in positions that it has no part in. A run on level ground turns and shifts as a whole.
+The pose at a window's start comes from wheels and gyro and is off by tenths of a radian where these are at
+fault. A linearisation about that pose would show a gyro bias in GNSS positions. On level ground the track
+turns and shifts as a whole, so it is aligned with the fixes by a rigid transform instead.
 """
 
 from __future__ import annotations
@@ -16,22 +16,23 @@ from terrafusion.twin.calibrate.log import PreparedLog, window_of
 
 Array = NDArray[np.float64]
 
-PAIRS = (("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps"))
-"""East and north of positions (which shift, too) and of velocities."""
-TURN_SIGMA = 0.5
-"""1 sigma of the guess's heading, rad (assumed): a window in which the robot stands keeps it."""
+EAST_NORTH = (("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps"))
+"""Channels of positions (rotated and shifted) and of velocities (rotated only)."""
+HEADING_SIGMA_RAD = 0.5
+"""1 sigma of the initial heading (assumed): keeps it in a window without motion."""
 
 
-def turns(log: PreparedLog, values: Sequence[Array]) -> Array:
-    """Angles (W,) by which predicted tracks, a channel each of `log.observed`, turn onto those observed.
+def alignment_angles(log: PreparedLog, values: Sequence[Array]) -> Array:
+    """Angles (W,), rad, that rotate predicted tracks, one array a channel of `log.observed`, onto the
+    observed.
 
-    Least squares over rotation and shift of every window (Umeyama 1991, without scale), positions and
+    Least squares over rotation and shift of each window (Umeyama 1991, without scale), positions and
     velocities together.
     """
-    cross, dot = np.zeros(len(log.windows)), np.full(len(log.windows), TURN_SIGMA**-2.0)
-    for shifts, seen, told, of, sigma in _tracks(log, values):
+    cross, dot = np.zeros(len(log.windows)), np.full(len(log.windows), HEADING_SIGMA_RAD**-2.0)
+    for shifts, observed, predicted, window, sigma in _tracks(log, values):
         for k in range(len(log.windows)):
-            a, b = told[of == k], seen[of == k]
+            a, b = predicted[window == k], observed[window == k]
             if shifts and len(a):
                 a, b = a - a.mean(axis=0), b - b.mean(axis=0)
             cross[k] += float(np.sum(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0])) / sigma**2
@@ -39,31 +40,30 @@ def turns(log: PreparedLog, values: Sequence[Array]) -> Array:
     return np.arctan2(cross, dot)
 
 
-def settled(log: PreparedLog, values: Sequence[Array]) -> list[Array]:
-    """Predicted channels, the track of every window turned and shifted onto the one observed."""
-    out, angles = list(values), turns(log, values)
-    at = {o.channel: i for i, o in enumerate(log.observed)}
-    for shifts, seen, told, of, _ in _tracks(log, values):
-        turned = np.empty_like(told)
+def aligned(log: PreparedLog, values: Sequence[Array]) -> list[Array]:
+    """Predicted channels with the track of each window aligned with the observed one."""
+    out, angles = list(values), alignment_angles(log, values)
+    index = {o.channel: i for i, o in enumerate(log.observed)}
+    for shifts, observed, predicted, window, _ in _tracks(log, values):
+        turned = np.empty_like(predicted)
         for k, angle in enumerate(angles):
-            mine = of == k
-            turned[mine] = told[mine] @ _rotation(angle).T
+            mine = window == k
+            turned[mine] = predicted[mine] @ _rotation(angle).T
             if shifts and mine.any():
-                turned[mine] += (seen[mine] - turned[mine]).mean(axis=0)
-        for column, channel in enumerate(PAIRS[0 if shifts else 1]):
-            out[at[channel]] = turned[:, column]
+                turned[mine] += (observed[mine] - turned[mine]).mean(axis=0)
+        for column, channel in enumerate(EAST_NORTH[0 if shifts else 1]):
+            out[index[channel]] = turned[:, column]
     return out
 
 
-def settled_start(log: PreparedLog, values: Sequence[Array], start: Array) -> Array:
-    """Poses (W, 3) at the windows' starts from which the predicted tracks would lie on those observed, for
-    predictions from the poses `start`."""
-    out, angles = start.copy(), turns(log, values)
+def aligned_start(log: PreparedLog, values: Sequence[Array], start: Array) -> Array:
+    """Poses (W, 3) at the windows' starts that align the predictions, made from the poses `start`."""
+    out, angles = start.copy(), alignment_angles(log, values)
     out[:, 2] += angles
-    for shifts, seen, told, of, _ in _tracks(log, values):
-        for k in np.unique(of) if shifts else ():
-            middle = told[of == k].mean(axis=0)
-            out[k, :2] = seen[of == k].mean(axis=0) + _rotation(angles[k]) @ (start[k, :2] - middle)
+    for shifts, observed, predicted, window, _ in _tracks(log, values):
+        for k in np.unique(window) if shifts else ():
+            middle = predicted[window == k].mean(axis=0)
+            out[k, :2] = observed[window == k].mean(axis=0) + _rotation(angles[k]) @ (start[k, :2] - middle)
     return out
 
 
@@ -74,17 +74,17 @@ def _rotation(angle: float) -> Array:
 def _tracks(
     log: PreparedLog, values: Sequence[Array]
 ) -> list[tuple[bool, Array, Array, NDArray[np.int64], float]]:
-    """Of positions and velocities, where the log has them: whether they shift, observed and predicted
-    (n, 2), the window of each row and their sigma."""
-    at = {o.channel: i for i, o in enumerate(log.observed)}
+    """Of positions and velocities that the log has: whether they shift, observed and predicted values (n, 2),
+    window of each sample, sigma."""
+    index = {o.channel: i for i, o in enumerate(log.observed)}
     out = []
-    for pair in PAIRS:
-        if not all(channel in at for channel in pair):
+    for pair in EAST_NORTH:
+        if not all(channel in index for channel in pair):
             continue
-        rows = [at[channel] for channel in pair]
-        first = log.observed[rows[0]]
-        seen = np.stack([log.observed[i].value for i in rows], axis=1)
-        told = np.stack([values[i] for i in rows], axis=1)
-        of = window_of(first, log.windows)
-        out.append((pair == PAIRS[0], seen, told, of, float(np.median(first.sigma))))
+        both = [index[channel] for channel in pair]
+        first = log.observed[both[0]]
+        observed = np.stack([log.observed[i].value for i in both], axis=1)
+        predicted = np.stack([values[i] for i in both], axis=1)
+        window = window_of(first, log.windows)
+        out.append((pair == EAST_NORTH[0], observed, predicted, window, float(np.median(first.sigma))))
     return out

@@ -1,34 +1,34 @@
-"""The laws that are worth a fit through the twin, and the odds of all causes once they have one."""
+"""Candidate selection: the laws that are refitted through the twin, and the posterior of all causes."""
 
 from __future__ import annotations
 
-from terrafusion.twin.gap.data.candidates import SOIL, Hypothesis
-from terrafusion.twin.gap.infer.cause_posterior import Choice, Weights, linear, weights
-from terrafusion.twin.gap.infer.nonlinear_refit import Fitted, Fitter
-from terrafusion.twin.gap.infer.posterior import Beliefs
+from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Hypothesis
+from terrafusion.twin.gap.infer.cause_posterior import CausePosterior, linear_residuals
+from terrafusion.twin.gap.infer.nonlinear_refit import LawFit, NonlinearRefit
+from terrafusion.twin.gap.infer.posterior import bayes_factors
 from terrafusion.twin.gap.infer.refit import Refit
 
 BY_ODDS, BY_FACTOR, BY_SCREEN = 7, 4, 5
-"""Laws that are fitted: the best by what channels leave to first order, by Bayes factor, and by what they
-leave of one run at a few sizes; beside them those of which the first order says nothing."""
+"""Laws that are refitted: the best by what remains in the channels to first order, by Bayes factor, and by
+what remains of one run at a few sizes; also all insensitive ones."""
 
 
-def chosen(
-    fitter: Fitter, believed: Beliefs, detected: bool, by: Weights | None = None
-) -> tuple[Choice, dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
-    """The odds of all causes, the fits of the likeliest laws, and fits that failed; without a gap nothing is
-    fitted."""
-    by = weights() if by is None else by
-    candidates = fitter.bench.candidates
-    told, sizes = linear(fitter.table, fitter.pool, candidates)
+def select_and_refit(
+    refit: NonlinearRefit, detected: bool
+) -> tuple[CausePosterior, dict[Hypothesis, LawFit], dict[Hypothesis, Refit]]:
+    """The posterior of all causes, the fits of the most probable laws, and failed fits; without a gap nothing
+    is refitted."""
+    candidates, pooled = refit.evidence.candidates, refit.pooled
+    residuals, sizes = linear_residuals(refit.table, pooled, candidates)
     if not detected:
-        return Choice.of(fitter.pool, fitter.table, told, by=by), {}, {}
-    laws = [law for law in told if law.effect != SOIL]
-    best = sorted(laws, key=lambda law: told[law].total)[:BY_ODDS]
-    best += sorted(laws, key=lambda law: -believed.forms[law.effect, law.form])[:BY_FACTOR]
-    best += [law for law in told if law.effect == SOIL or fitter.silent(law)]
-    screened = fitter.screened()
-    seen = sorted(screened, key=lambda law: screened[law][1])[:BY_SCREEN]
-    further = [(law, screened[law][0]) for law in seen]
-    fitted, failed = fitter.fits([(law, sizes[law]) for law in dict.fromkeys([*best, *seen])], further)
-    return Choice.of(fitter.pool, fitter.table, told, fitted, by, fitter.gap), fitted, failed
+        return CausePosterior.of(pooled, refit.table, residuals), {}, {}
+    factors = bayes_factors(pooled, candidates).forms
+    laws = [law for law in residuals if law.effect != SOIL_STRENGTH]
+    best = sorted(laws, key=lambda law: residuals[law].total)[:BY_ODDS]
+    best += sorted(laws, key=lambda law: -factors[law.effect, law.form])[:BY_FACTOR]
+    best += [law for law in residuals if law.effect == SOIL_STRENGTH or refit.is_insensitive(law)]
+    screened = refit.screened()
+    by_screen = sorted(screened, key=lambda law: screened[law][1])[:BY_SCREEN]
+    further = [(law, screened[law][0]) for law in by_screen]
+    fits, failed = refit.fits([(law, sizes[law]) for law in dict.fromkeys([*best, *by_screen])], further)
+    return CausePosterior.of(pooled, refit.table, residuals, fits, gap=refit.gap), fits, failed

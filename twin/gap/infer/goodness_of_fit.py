@@ -1,18 +1,10 @@
-"""Does the best explanation fit at all: what it leaves in each channel beside what references leave.
+"""Goodness of fit: does the best explanation fit at all, channel by channel, beside the references.
 
-The odds between causes are relative: of many bad explanations one is always the best. So what the effects
-found leave is held against the references, each judged by the others (leave one out), channel by channel,
-apart inside and outside the candidates' space. A channel counts where its energy differs from the
-references' by more than chance (Student's t on its logarithm, with as many looks as there are channels:
-Bonferroni). Three numbers are told:
-
-- `above`: by how much the worst channel is above the references;
-- `left`: the share of the gap that is still there, of the logarithms by which channels are above them. A
-  significant rest alone says little: the law of a large effect is never quite the robot's, and what it
-  misses is then far beyond noise. A cause that is none leaves nearly all, so the two count as a product;
-- `quieter`: by how much a channel is below the references: no candidate takes noise away.
-
-What they say of an unknown cause is learnt with the odds (`choice.py`).
+The odds between causes are relative: of many bad explanations one is always best. So the errors that remain
+with the effects in the twin are compared with the references, each judged by the others, by channel and
+inside and outside the candidates' space. A channel counts where its energy differs by more than chance
+(Student's t on its logarithm, Bonferroni over channels). The effect of these numbers on the odds of an
+unknown cause is learnt (see `cause_posterior`).
 """
 
 from __future__ import annotations
@@ -24,30 +16,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.infer.channels import Products, Table, energy
+from terrafusion.twin.gap.infer.channels import ChannelTable, ErrorProducts, run_energy
 
 Array = NDArray[np.float64]
 
 LEVEL = 0.05
-"""Probability that a law that is right differs from the references so in some channel."""
+"""Probability that a correct law differs from the references in some channel."""
 LEAST_GAP = 1.0
-"""The gap that a share is taken of counts as no smaller, a sum of logarithms (assumed)."""
+"""Least gap that a share is taken of, a sum of logarithms (assumed)."""
 LEAST_SPREAD = 0.05
-"""1 sigma of the logarithm of a channel's energy from run to run is taken as no less (assumed)."""
+"""Least 1 sigma of the logarithm of a channel's energy from run to run (assumed)."""
 FEWEST = 4
-"""References without which nothing is known of the scatter."""
+"""References without which the scatter is unknown."""
 MOST_ABOVE, MOST_QUIETER = 3.0, 2.0
-"""`Goodness.above` and `Goodness.quieter` are no more (assumed)."""
+"""Limits of `GoodnessOfFit.above` and `quieter` (assumed)."""
 
 
 @dataclass(frozen=True)
-class Goodness:
-    """What an explanation leaves in channels that differ from the references by more than chance.
+class GoodnessOfFit:
+    """What remains in channels that differ from the references by more than chance.
 
     Attributes:
-        left: share of the gap, 0 to 1; 0 where no channel is above the references.
-        above: logarithm of the factor by which a channel is above them, the greatest; 0 where none is.
-        quieter: logarithm of the factor by which a channel is below them, the greatest; 0 where none is.
+        left: share of the gap, 0 to 1; 0 where no channel is above the references. The law of a large effect
+            is never quite right, so a significant rest alone means little; it counts as a product with
+            `above`.
+        above: logarithm of the factor by which the worst channel is above them; 0 where none is.
+        quieter: logarithm of the factor by which the worst channel is below them: no candidate reduces noise.
     """
 
     left: float
@@ -60,33 +54,32 @@ class Goodness:
         return self.left * self.above
 
 
-FITS = Goodness(0.0, 0.0, 0.0)
-"""Of effects after which nothing is left."""
+PERFECT_FIT = GoodnessOfFit(0.0, 0.0, 0.0)
 
 
-def goodness(table: Table, errors: Sequence[Products], weight: Array) -> Goodness:
-    """Of effects that leave these errors of the judged runs.
+def goodness_of_fit(table: ChannelTable, errors: Sequence[ErrorProducts], weight: Array) -> GoodnessOfFit:
+    """Of effects with which these errors of the judged runs remain.
 
     Args:
-        weight: (C,) of the channels, when the states of a run are adapted.
+        weight: (C,) of the channels, when the states of a run are fitted.
     """
     from scipy.special import stdtrit
 
-    count, runs, C = len(table.each), len(errors), len(weight)
+    count, runs, C = len(table.references), len(errors), len(weight)
     if count < FEWEST:
-        return FITS
-    usual = np.log(table.each)
-    sigma = np.maximum(usual.std(axis=0, ddof=1), LEAST_SPREAD) * math.sqrt(1.0 / runs + 1.0 / count)
+        return PERFECT_FIT
+    typical = np.log(table.references)
+    sigma = np.maximum(typical.std(axis=0, ddof=1), LEAST_SPREAD) * math.sqrt(1.0 / runs + 1.0 / count)
     chance = sigma * float(stdtrit(count - 1, 1.0 - LEVEL / (4 * C)))
 
-    def beyond(some: Sequence[Products]) -> Array:
-        pairs = zip(table.blocks, some, strict=True)
-        each = [np.log(energy(block, error, table.sigma, weight)) for block, error in pairs]
-        return np.asarray(np.mean(each, axis=0) - usual.mean(axis=0))
+    def beyond(some: Sequence[ErrorProducts]) -> Array:
+        pairs = zip(table.runs, some, strict=True)
+        each = [np.log(run_energy(run, error, table.sigma, weight)) for run, error in pairs]
+        return np.asarray(np.mean(each, axis=0) - typical.mean(axis=0))
 
-    gap, change = beyond([block.error for block in table.blocks]), beyond(errors)
+    gap, change = beyond([run.error for run in table.runs]), beyond(errors)
     whole, rest = (float(some[some > chance].sum()) for some in (gap, change))
     above = float(np.max(change, where=change > chance, initial=0.0))
     quieter = float(np.max(-change, where=change < -chance, initial=0.0))
     left = min(rest / max(whole, LEAST_GAP), 1.0)
-    return Goodness(left, min(above, MOST_ABOVE), min(quieter, MOST_QUIETER))
+    return GoodnessOfFit(left, min(above, MOST_ABOVE), min(quieter, MOST_QUIETER))

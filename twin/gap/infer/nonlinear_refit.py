@@ -1,9 +1,8 @@
-"""Fits through the twin itself, from several sizes up.
+"""Nonlinear refit: laws fitted through the twin itself, from several starting sizes.
 
-What an effect of real size does is not its signature times that size: a delay of a third of a second is no
-multiple of one of 15 ms. A fit that starts where the signature suggests often ends there, at a loss. So each
-law is driven at a ladder of sizes, the best of them is kept by what it leaves in each channel, and improved:
-along the signature, between the sizes tried, and by the ground on which each run is beside the law.
+A large effect is not its sensitivity times its size: a delay of a third of a second is no multiple of one of
+15 ms. So each law is simulated at several sizes, the best by what remains in each channel is selected and
+then improved: along the sensitivity, between the sizes tried, and by the soil of each run.
 """
 
 from __future__ import annotations
@@ -16,82 +15,74 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.data.candidates import Candidates, Hypothesis
-from terrafusion.twin.gap.infer.channels import Left, Table
-from terrafusion.twin.gap.infer.evidence import Bench
-from terrafusion.twin.gap.infer.posterior import Pool
-from terrafusion.twin.gap.infer.refit import Refit, Tried, effects_at, errors_of, scored
+from terrafusion.twin.gap.data.candidates import Hypothesis
+from terrafusion.twin.gap.infer.channels import ChannelTable, Unexplained
+from terrafusion.twin.gap.infer.posterior import PooledScores
+from terrafusion.twin.gap.infer.refit import Refit, RunWithEffects, effects_at, whitened_errors
+from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.null import Null
-from terrafusion.twin.gap.null.score import Score
+from terrafusion.twin.gap.null.score import Score, score_of_error
 from terrafusion.twin.gap.rollout.delay import DELAYS
-from terrafusion.twin.gap.rollout.residuals import SOIL_STATE, WITHIN
+from terrafusion.twin.gap.rollout.residuals import soil_columns
 
 Array = NDArray[np.float64]
+Point = tuple[Hypothesis, Array]
+"""A law and sizes (k,) of its parameters, in typical ones."""
 
-LADDER = (0.4, 1.0, 2.0, 4.0)
+MULTIPLES = (0.4, 1.0, 2.0, 4.0)
 """Sizes tried, in that of the linear fit."""
 SMALL, SIZES = 0.7, (1.0, 3.0, 8.0)
-"""Below that size of the linear fit, in typical ones, those tried beside it."""
-FURTHER, NEAR = 1.0, 0.05
-"""How far beyond the last size the next is tried, in the step to it; shares of an interval that are taken
-for its ends."""
+"""Below that size of the linear fit, these typical sizes are tried beside it."""
+EXTRAPOLATE, MARGIN = 1.0, 0.05
+"""Step beyond the last size, in the step to it; margin at the ends of an interval, as a share of it."""
 AS_GOOD = 0.5
-"""What the size of weighted least squares may leave more than the best one (assumed)."""
+"""Excess that the size of weighted least squares may leave over the best one (assumed)."""
 SAME_SIZE = 1e-3
-"""Sizes that are no nearer, typical ones, are tried apart."""
+"""Sizes closer than this, typical ones, are not tried again."""
 ROUNDS, IMPROVED = 3, 5
-"""Rounds of improvement, and how many laws, the best ones, take part in them."""
-LATE = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
-"""Sizes of a delay that are tried on both sides, in that of its range: what fits beyond half a swing of the
-drive has nothing to do with a signature, and no further run of the twin is needed."""
-CLOSER = ((-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (-0.05, -0.025, 0.025, 0.05))
-"""Shares of the best delay by which others are tried on both sides of it, those near the best of these after
-them; and of the best size of a silent law."""
-SILENT = 10.0
-"""A law is silent where its signature, at the ends of its range, makes a smaller square in all runs; what
-numbers of 32 bits round away makes 3 at most (docs/gap.md)."""
-SPREAD = (0.4, 0.7, 0.85, 1.0)
-"""Sizes of a silent law that are tried, in that of its range: it acts beyond a threshold, if at all."""
-SCREEN = (0.12, 0.4)
-"""Sizes, in that of its range, at which each law is tried on one run, as its first order may mislead
+"""Rounds of improvement, and how many of the best laws take part in them."""
+DELAY_SHARES = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+"""Sizes of a delay that are tried on both sides, in that of its range: beyond half a period of the motion the
+sensitivity is meaningless, and the shared run makes them cheap."""
+REFINEMENTS = ((-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (-0.05, -0.025, 0.025, 0.05))
+"""Relative offsets tried around the best size of a delay or of an insensitive law, in two rounds."""
+INSENSITIVE = 10.0
+"""A law is insensitive where its sensitivity, at the ends of its range, makes a smaller square in all runs;
+32-bit rounding makes 3 at most (docs/gap.md)."""
+INSENSITIVE_SHARES = (0.4, 0.7, 0.85, 1.0)
+"""Sizes of an insensitive law that are tried, in that of its range: it acts beyond a threshold, if at all."""
+SCREEN_SHARES = (0.12, 0.4)
+"""Sizes, in that of its range, at which each law is tried on one run, as its linearisation may mislead
 (assumed)."""
-SPEAKS = 0.5
-"""By how much less than the gap a silent law must leave for sizes near its best to be tried (assumed)."""
-
-
+LEAST_GAIN = 0.5
+"""By how much an insensitive law must reduce the gap for sizes near its best to be tried (assumed)."""
 DIVERGED = "the twin diverges at every size tried, its linear value stands"
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """One law at its best: the fit, what it leaves, and what any size (k,) that was tried left."""
+class LawFit:
+    """One law at its best: the refit, what remains unexplained, and that of every size (k,) tried."""
 
     fit: Refit
-    left: Left
+    left: Unexplained
     tried: tuple[tuple[Array, float], ...]
 
 
-def bounds(candidates: Candidates, columns: Sequence[int]) -> tuple[Array, Array]:
-    """Least and greatest sizes (k,) of some columns, in typical ones."""
-    at = np.asarray(columns, dtype=np.int64)
-    scale = candidates.scale[at]
-    return WITHIN * candidates.low[at] / scale, WITHIN * candidates.high[at] / scale
-
-
-def sizes(value: Array, low: Array, high: Array) -> list[Array]:
-    """Points (k,) to try for a linear fit (k,), within bounds."""
+def starting_sizes(value: Array, low: Array, high: Array) -> list[Array]:
+    """Sizes (k,) to try for a linear fit (k,), within bounds."""
     length = float(np.linalg.norm(value))
     if length > SMALL:
-        points = [share * value for share in LADDER]
+        points = [multiple * value for multiple in MULTIPLES]
     else:
-        way = value / length if length > 0.05 else np.eye(len(value))[0]
-        points = [length * way, *(size * way for size in SIZES)]
+        direction = value / length if length > 0.05 else np.eye(len(value))[0]
+        points = [length * direction, *(size * direction for size in SIZES)]
     inside = [np.clip(point, low, high) for point in points]
     return [p for i, p in enumerate(inside) if not any(np.array_equal(p, q) for q in inside[:i])]
 
 
-def between(tried: Sequence[tuple[Array, float]], before: float) -> float:
-    """A size beside the best so far: where a parabola through it and its neighbours is least, or beyond it.
+def line_search_size(tried: Sequence[tuple[Array, float]], before: float) -> float:
+    """Next size to try: the minimum of a parabola through the best size and its neighbours, or beyond the
+    last.
 
     Args:
         tried: sizes (1,) and what they leave.
@@ -103,240 +94,235 @@ def between(tried: Sequence[tuple[Array, float]], before: float) -> float:
     at = sorted(cost)
     i = min(range(len(at)), key=lambda k: cost[at[k]])
     if i in (0, len(at) - 1):
-        return at[i] + FURTHER * (at[i] - at[1 if i == 0 else -2])
+        return at[i] + EXTRAPOLATE * (at[i] - at[1 if i == 0 else -2])
     a, b, c = at[i - 1 : i + 2]
     up, down = (cost[a] - cost[b]) / (b - a), (cost[c] - cost[b]) / (c - b)
     found = 0.5 * (a + b) + 0.5 * (c - a) * up / (up + down) if up + down > 0.0 else b
-    if abs(found - b) < NEAR * (c - a):
+    if abs(found - b) < MARGIN * (c - a):
         found = b + 0.3 * max(c - b, a - b, key=abs)
-    return float(np.clip(found, a + NEAR * (b - a), c - NEAR * (c - b)))
+    return float(np.clip(found, a + MARGIN * (b - a), c - MARGIN * (c - b)))
 
 
 @dataclass(frozen=True, eq=False)
-class Fitter:
+class NonlinearRefit:
     """Fits laws to the judged runs."""
 
-    bench: Bench
+    evidence: GapEvidence
     scores: Sequence[Score]
     sigma: Array
     null: Null
-    pool: Pool
-    table: Table
+    pooled: PooledScores
+    table: ChannelTable
 
     def screened(self) -> dict[Hypothesis, tuple[Array, float]]:
-        """Laws of one parameter that move the robot: the best of a few sizes (1,) over their range, and what
-        it leaves of the first judged run."""
-        candidates, bench = self.bench.candidates, self.bench
-        moving = [
-            law for law in candidates.hypotheses if candidates.keys[law.columns[0]] in candidates.moving
-        ]
+        """Laws of one parameter that change the motion: the best of a few sizes (1,) over their range, and
+        what it leaves of the first judged run."""
+        candidates = self.evidence.candidates
         points = [
             (law, share * end)
-            for law in moving
-            if len(law.columns) == 1
-            for end in bounds(candidates, law.columns)
-            if end.any()
-            for share in SCREEN
+            for law in candidates.hypotheses
+            if candidates.keys[law.columns[0]] in candidates.moving and len(law.columns) == 1
+            for end in self._ends(law)
+            for share in SCREEN_SHARES
         ]
-        table = dataclasses.replace(self.table, columns=self.table.columns[:1], blocks=self.table.blocks[:1])
-        ground = np.zeros(len(bench.reach))
-        errors = errors_of(
-            bench, [Tried(0, effects_at(bench, law.columns, point), ground) for law, point in points]
-        )
+        table = dataclasses.replace(self.table, columns=self.table.columns[:1], runs=self.table.runs[:1])
+        soil = np.zeros(len(self.evidence.soil_limit))
+        sets = [effects_at(self.evidence, law.columns, point) for law, point in points]
+        errors = whitened_errors(self.evidence, [RunWithEffects(0, effects, soil) for effects in sets])
         out = dict[Hypothesis, tuple[Array, float]]()
         for (law, point), error in zip(points, errors, strict=True):
             if error is not None:
-                left = table.left(table.products([error])).total
+                left = table.unexplained(table.products([error])).total
                 if law not in out or left < out[law][1]:
                     out[law] = point, left
         return out
 
     def fits(
-        self,
-        laws: Sequence[tuple[Hypothesis, Array]],
-        further: Sequence[tuple[Hypothesis, Array]] = (),
-    ) -> tuple[dict[Hypothesis, Fitted], dict[Hypothesis, Refit]]:
-        """Laws with their linear fits (k,), side by side, and at `further` sizes; and those with which the
-        twin diverges at all sizes, as failures with their linear value."""
-        silent = [law for law, _ in laws if self.silent(law)]
-        ladder = [
+        self, laws: Sequence[Point], further: Sequence[Point] = ()
+    ) -> tuple[dict[Hypothesis, LawFit], dict[Hypothesis, Refit]]:
+        """Fits of laws, given their linear fits (k,), also tried at `further` sizes; and failures of those
+        with which the twin diverges at all sizes, with their linear value."""
+        insensitive = [law for law, _ in laws if self.is_insensitive(law)]
+        points = [
             (law, point)
             for law, value in laws
-            if law not in silent
-            for point in sizes(value, *bounds(self.bench.candidates, law.columns))
+            if law not in insensitive
+            for point in starting_sizes(value, *self.evidence.candidates.bounds(law.columns))
         ]
         delays = [law for law, _ in laws if self._is_delay(law)]
-        for law, shares in [*((law, LATE) for law in delays), *((law, SPREAD) for law in silent)]:
-            ends = [end for end in bounds(self.bench.candidates, law.columns) if end.any()]
-            ladder += [(law, share * end) for share in shares for end in ends]
-        best = self._better({}, [*ladder, *further])
-        most = self.gap.total - SPEAKS
-        speak = delays + [law for law in silent if law in best and best[law].left.total < most]
-        for shares in CLOSER:
-            found = {law: best[law].fit.value for law in speak if law in best}
+        for some, shares in ((delays, DELAY_SHARES), (insensitive, INSENSITIVE_SHARES)):
+            points += [(law, share * end) for law in some for share in shares for end in self._ends(law)]
+        best = self._try({}, [*points, *further])
+        most = self.gap.total - LEAST_GAIN
+        refine = delays + [law for law in insensitive if law in best and best[law].left.total < most]
+        for shares in REFINEMENTS:
+            found = {law: best[law].fit.value for law in refine if law in best}
             closer = [(law, (1.0 + share) * at) for law, at in found.items() for share in shares]
-            best = self._better(best, [(law, self._inside(law, point)) for law, point in closer])
+            best = self._try(best, [(law, self._inside(law, point)) for law, point in closer])
         best = self._improved(best)
         return best, {law: self._failed(law, value) for law, value in laws if law not in best}
 
-    def alone(self, law: Hypothesis) -> Fitted | Refit:
+    def single_fit(self, law: Hypothesis) -> LawFit | Refit:
         """One law by itself, or its failure."""
-        value, _ = self.table.linear(law.columns, *bounds(self.bench.candidates, law.columns))
+        value, _ = self.table.linear_fit(law.columns, *self.evidence.candidates.bounds(law.columns))
         best, failed = self.fits([(law, value)])
         return best[law] if law in best else failed[law]
 
-    def beside(self, found: Fitted, laws: Sequence[Hypothesis]) -> dict[Hypothesis, Fitted | Refit]:
-        """Laws of several effects, whose first columns are those of `found`: from there, the further ones at
-        a ladder of sizes along their signatures in what is left; or their failures."""
-        points = list[tuple[Hypothesis, Array]]()
+    def joint_fits(self, found: LawFit, laws: Sequence[Hypothesis]) -> dict[Hypothesis, LawFit | Refit]:
+        """Laws of several effects, whose first columns are those of `found`: from there, with the further
+        ones at several sizes along their sensitivities in what remains; or their failures."""
+        points = list[Point]()
         at, known = dict[Hypothesis, Array](), len(found.fit.columns)
         rest = self.table.products(found.fit.errors)
         for law in laws:
-            low, high = bounds(self.bench.candidates, law.columns)
-            more, _ = self.table.linear(law.columns[known:], low[known:], high[known:], rest)
+            low, high = self.evidence.candidates.bounds(law.columns)
+            more, _ = self.table.linear_fit(law.columns[known:], low[known:], high[known:], rest)
             at[law] = np.append(found.fit.value, np.zeros(len(more)))
-            step, _ = self.table.linear(law.columns, low - at[law], high - at[law], rest)
-            tried = [at[law] + step, *(np.append(found.fit.value, share * more) for share in LADDER)]
-            points += [(law, self._inside(law, point)) for point in tried]
-        best = self._improved(self._better({}, points, dict.fromkeys(laws, found.fit.grounds)))
+            step, _ = self.table.linear_fit(law.columns, low - at[law], high - at[law], rest)
+            multiples = [np.append(found.fit.value, multiple * more) for multiple in MULTIPLES]
+            points += [(law, self._inside(law, point)) for point in (at[law] + step, *multiples)]
+        best = self._improved(self._try({}, points, dict.fromkeys(laws, found.fit.soils)))
         return {law: best[law] if law in best else self._failed(law, at[law]) for law in laws}
 
-    def _improved(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
-        """The best laws, along their signatures from where they are, and between the sizes tried so far."""
-        before, best = self.gap.total, self._on_their_ground(best, len(best))
+    @functools.cached_property
+    def gap(self) -> Unexplained:
+        """What remains with no law in the twin, each run on the soil that fits it so."""
+        none = Hypothesis("", "", ())
+        best = self._try({}, [(none, np.zeros(0))])
+        for _ in range(ROUNDS if best else 0):
+            best = self._on_fitted_soil(best)
+        first = self.table.before()
+        found = best[none].left if best else first
+        return found if found.total < first.total else first
+
+    def is_insensitive(self, law: Hypothesis) -> bool:
+        """Whether the law's sensitivity vanishes, whatever its size."""
+        at = np.asarray(law.columns)
+        most = np.maximum(*np.abs(self.evidence.candidates.bounds(law.columns)))
+        runs = self.table.runs
+        squares = sum((r.gram.sum(axis=0).diagonal()[r.states + at] for r in runs), np.zeros(len(at)))
+        return bool(squares @ most**2 < INSENSITIVE)
+
+    def _is_delay(self, law: Hypothesis) -> bool:
+        return all(self.evidence.candidates.keys[i] in DELAYS for i in law.columns)
+
+    def _ends(self, law: Hypothesis) -> list[Array]:
+        return [end for end in self.evidence.candidates.bounds(law.columns) if end.any()]
+
+    def _inside(self, law: Hypothesis, point: Array) -> Array:
+        return np.asarray(np.clip(point, *self.evidence.candidates.bounds(law.columns)))
+
+    def _best(self, fits: Mapping[Hypothesis, LawFit], count: int = IMPROVED) -> list[Hypothesis]:
+        return sorted(fits, key=lambda law: fits[law].left.total)[:count]
+
+    def _improved(self, best: dict[Hypothesis, LawFit]) -> dict[Hypothesis, LawFit]:
+        """The best laws, along their sensitivities from where they are, and between the sizes tried so
+        far."""
+        before, best = self.gap.total, self._on_fitted_soil(best, len(best))
         for _ in range(ROUNDS):
-            first = sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]
-            steps = [(law, self._next(law, best[law])) for law in first]
-            steps += [
-                (law, self._inside(law, np.array([between(best[law].tried, before)])))
+            first = self._best(best)
+            points = [(law, self._gauss_newton(law, best[law])) for law in first]
+            points += [
+                (law, self._inside(law, np.array([line_search_size(best[law].tried, before)])))
                 for law in first
                 if len(law.columns) == 1
             ]
-            tried = [
+            new = [
                 (law, point)
-                for law, point in steps
+                for law, point in points
                 if all(np.abs(point - size).max() > SAME_SIZE for size, _ in best[law].tried)
             ]
-            if not tried:
+            if not new:
                 break
-            best = self._on_their_ground(self._better(best, tried))
-        return self._by_squares(best)
+            best = self._on_fitted_soil(self._try(best, new))
+        return self._by_least_squares(best)
 
-    def _on_their_ground(
-        self, best: dict[Hypothesis, Fitted], count: int = IMPROVED
-    ) -> dict[Hypothesis, Fitted]:
-        """The best laws with each run on the ground that suits it beside them: without the effect it looked
-        otherwise. Where the law is one of the ground itself, what the runs have in common is the law's."""
-        table, keys, most = self.table, self.bench.candidates.keys, self.bench.reach
-        grounds, points = dict[Hypothesis, tuple[Array, ...]](), []
-        soil = [keys.index(name) for name in SOIL_STATE if name in keys]
-        for law in sorted(best, key=lambda law: best[law].left.total)[:count]:
+    def _gauss_newton(self, law: Hypothesis, found: LawFit) -> Array:
+        low, high = self.evidence.candidates.bounds(law.columns)
+        at, rest = found.fit.value, self.table.products(found.fit.errors)
+        step, _ = self.table.linear_fit(law.columns, low - at, high - at, rest)
+        return self._inside(law, at + step)
+
+    def _on_fitted_soil(
+        self, best: dict[Hypothesis, LawFit], count: int = IMPROVED
+    ) -> dict[Hypothesis, LawFit]:
+        """The best laws with each run on the soil that fits it beside them. Where the law is one of the soil
+        itself, what the runs have in common belongs to the law."""
+        table, limit, soil = self.table, self.evidence.soil_limit, soil_columns(self.evidence.candidates)
+        soils, points = dict[Hypothesis, tuple[Array, ...]](), []
+        for law in self._best(best, count):
             errors, weight = table.products(best[law].fit.errors), best[law].left.weight
-            pairs = zip(table.blocks, errors, strict=True)
-            own = np.array([b.adapted(e, table.sigma, weight)[: len(most)] for b, e in pairs])
+            pairs = zip(table.runs, errors, strict=True)
+            own = np.array([r.fitted_states(e, table.sigma, weight)[: len(limit)] for r, e in pairs])
             value = best[law].fit.value.copy()
             for k, i in enumerate(law.columns):
                 if i in soil:
                     common = own[:, soil.index(i)].mean()
                     value[k] += common
                     own[:, soil.index(i)] -= common
-            grounds[law] = tuple(np.clip(own, -most, most))
+            soils[law] = tuple(np.clip(own, -limit, limit))
             points.append((law, self._inside(law, value)))
-        return self._better(best, points, grounds)
+        return self._try(best, points, soils)
 
-    def silent(self, law: Hypothesis) -> bool:
-        """Whether the law's signature says nothing, whatever its size."""
-        at = np.asarray(law.columns)
-        most = np.maximum(*np.abs(bounds(self.bench.candidates, law.columns)))
-        blocks = self.table.blocks
-        squares = sum((b.gram.sum(axis=0).diagonal()[b.states + at] for b in blocks), np.zeros(len(at)))
-        return bool(squares @ most**2 < SILENT)
+    def _by_least_squares(self, best: dict[Hypothesis, LawFit]) -> dict[Hypothesis, LawFit]:
+        """The best laws at the size of weighted least squares: the sum of logarithms identifies the law but
+        is flat near its minimum, where channels are back at their floor."""
+        points = []
+        for law in self._best(best):
+            fit, weight = best[law].fit, best[law].left.weight
+            step = self.table.least_squares(law.columns, self.table.products(fit.errors), weight)
+            points.append((law, self._inside(law, fit.value + step)))
+        return self._try(best, points, tolerance=AS_GOOD)
 
-    def _is_delay(self, law: Hypothesis) -> bool:
-        return all(self.bench.candidates.keys[i] in DELAYS for i in law.columns)
-
-    def _inside(self, law: Hypothesis, point: Array) -> Array:
-        return np.asarray(np.clip(point, *bounds(self.bench.candidates, law.columns)))
-
-    def _better(
+    def _try(
         self,
-        best: dict[Hypothesis, Fitted],
-        points: Sequence[tuple[Hypothesis, Array]],
-        grounds: Mapping[Hypothesis, tuple[Array, ...]] | None = None,
-        worse: float = 0.0,
-    ) -> dict[Hypothesis, Fitted]:
-        """The best of each law once these points are tried, too.
+        best: dict[Hypothesis, LawFit],
+        points: Sequence[Point],
+        soils: Mapping[Hypothesis, tuple[Array, ...]] | None = None,
+        tolerance: float = 0.0,
+    ) -> dict[Hypothesis, LawFit]:
+        """The best fit of each law once these points are simulated.
 
         Args:
-            grounds: other grounds of the runs beside a law than those that it has; to begin with it has that
-                of the references, as what a run takes for its own holds a part of the effect.
-            worse: by how much more a point may leave to be taken.
+            soils: of the runs beside a law, in place of those of its fit; a law without a fit starts on that
+                of the references, as a run's own fitted soil contains a part of the effect.
+            tolerance: by how much more a point may leave and still be accepted.
         """
         if not points:
             return best
-        bench, own = self.bench, {law: found.fit.grounds for law, found in best.items()} | dict(grounds or {})
-        sets = [effects_at(bench, law.columns, point) for law, point in points]
-        own = {law: (np.zeros(len(bench.reach)),) * len(bench.runs) for law, _ in points} | own
-        count = len(bench.runs)
-        errors = errors_of(
-            bench,
-            [
-                Tried(run, some, own[law][run])
-                for (law, _), some in zip(points, sets, strict=True)
-                for run in range(count)
-            ],
-        )
-        out = dict(best)
+        evidence, count = self.evidence, len(self.evidence.runs)
+        own = {law: (np.zeros(len(evidence.soil_limit)),) * count for law, _ in points}
+        own |= {law: found.fit.soils for law, found in best.items()} | dict(soils or {})
+        sets = [effects_at(evidence, law.columns, point) for law, point in points]
+        tried = [
+            RunWithEffects(run, effects, own[law][run])
+            for (law, _), effects in zip(points, sets, strict=True)
+            for run in range(count)
+        ]
+        errors, out = whitened_errors(evidence, tried), dict(best)
         for i, (law, point) in enumerate(points):
-            mine = errors[i * count : (i + 1) * count]
-            whole = [error for error in mine if error is not None]
-            if len(whole) < len(mine):
+            mine = [error for error in errors[i * count : (i + 1) * count] if error is not None]
+            if len(mine) < count:
                 continue
-            left = self.table.left(self.table.products(whole))
-            tried = (*(out[law].tried if law in out else ()), (point, left.total))
-            if law not in out or left.total < out[law].left.total + worse:
-                out[law] = Fitted(self._fit(law, point, whole, own[law]), left, tried)
+            left = self.table.unexplained(self.table.products(mine))
+            history = (*(out[law].tried if law in out else ()), (point, left.total))
+            if law not in out or left.total < out[law].left.total + tolerance:
+                out[law] = LawFit(self._refit(law, point, mine, own[law]), left, history)
             else:
-                out[law] = dataclasses.replace(out[law], tried=tried)
+                out[law] = dataclasses.replace(out[law], tried=history)
         return out
 
-    @functools.cached_property
-    def gap(self) -> Left:
-        """What is left with no law in the twin, each run on the ground that suits it so."""
-        none = Hypothesis("", "", ())
-        best = self._better({}, [(none, np.zeros(0))])
-        for _ in range(ROUNDS if best else 0):
-            best = self._on_their_ground(best)
-        first = self.table.before()
-        found = best[none].left if best else first
-        return found if found.total < first.total else first
-
-    def _by_squares(self, best: dict[Hypothesis, Fitted]) -> dict[Hypothesis, Fitted]:
-        """The best laws at the size of weighted least squares: logarithms say which law it is, but are flat
-        near their least sum, where channels are back at their floor."""
-        points = []
-        for law in sorted(best, key=lambda law: best[law].left.total)[:IMPROVED]:
-            found = best[law]
-            step = self.table.solved(law.columns, self.table.products(found.fit.errors), found.left.weight)
-            points.append((law, self._inside(law, found.fit.value + step)))
-        return self._better(best, points, worse=AS_GOOD)
-
-    def _failed(self, law: Hypothesis, value: Array) -> Refit:
-        _, covariance, _ = self.pool.fit(law.columns)
-        return Refit(law.columns, value, covariance, 0.0, [], (), np.zeros(0), DIVERGED)
-
-    def _next(self, law: Hypothesis, found: Fitted) -> Array:
-        low, high = bounds(self.bench.candidates, law.columns)
-        at = found.fit.value
-        step, _ = self.table.linear(law.columns, low - at, high - at, self.table.products(found.fit.errors))
-        return self._inside(law, at + step)
-
-    def _fit(self, law: Hypothesis, value: Array, errors: list[Array], grounds: tuple[Array, ...]) -> Refit:
-        square, gain = 0.0, np.zeros(self.pool.own)
-        for run, first, error in zip(self.bench.runs, self.scores, errors, strict=True):
-            x, U = self.null.standardised(scored(run, self.sigma, error, first.A))
+    def _refit(self, law: Hypothesis, value: Array, errors: list[Array], soils: tuple[Array, ...]) -> Refit:
+        square, gain = 0.0, np.zeros(self.pooled.own)
+        for run, first, error in zip(self.evidence.runs, self.scores, errors, strict=True):
+            x, U = self.null.standardised(score_of_error(run, self.sigma, error, first.A))
             square += float(x @ self.null.inverse @ x)
             gain += np.diag(U) * x
-        _, covariance, _ = self.pool.fit(law.columns)
-        squares = dataclasses.replace(self.pool.alone, gain=gain).squares()
-        return Refit(law.columns, value, covariance, self.pool.square - square, errors, grounds, squares, "")
+        _, covariance, _ = self.pooled.fit(law.columns)
+        squares = dataclasses.replace(self.pooled.marginal, gain=gain).squares()
+        explained = self.pooled.square - square
+        return Refit(law.columns, value, covariance, explained, errors, soils, squares, "")
+
+    def _failed(self, law: Hypothesis, value: Array) -> Refit:
+        _, covariance, _ = self.pooled.fit(law.columns)
+        return Refit(law.columns, value, covariance, 0.0, [], (), np.zeros(0), DIVERGED)

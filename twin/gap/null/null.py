@@ -1,7 +1,7 @@
 """The learned null: how scores scatter from run to run where nothing has changed.
 
-Commissioning errors and whatever the twin lacks anyway shift and correlate the scores of every run. Their
-mean and covariance come from reference runs; the covariance is shrunk to the Fisher form, which is what it
+Calibration errors and the twin's known deficiencies shift and correlate the scores of every run. Their mean
+and covariance are learnt from reference runs; the covariance is shrunk to the Fisher information, which it
 would be were the twin right (Ledoit and Wolf 2004: shrinkage to a structured target).
 """
 
@@ -19,9 +19,9 @@ from terrafusion.twin.gap.null.score import Score
 Array = NDArray[np.float64]
 
 SHRINK_RUNS = 8.0
-"""The Fisher form counts as much as so many reference runs (tuned on twin trials)."""
+"""Weight of the Fisher information, in reference runs (tuned on twin trials)."""
 JITTER = 0.02
-"""Added variance of a standardised score: no combination of scores is taken as exact."""
+"""Variance added to a standardised score: no combination of scores is taken as exact."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,10 +29,10 @@ class Null:
     """Standardised scores x = D^-1/2 (b - A phi0) are N(mean, covariance) in a reference run.
 
     Attributes:
-        offset: (P,) phi0, what all references have in common, in the columns' units.
-        mean: (P,) what is left of it.
-        covariance: (P, P), that of the mean's own error included.
-        runs: how many references it was learnt from.
+        offset: (P,) phi0, common to all references, in the columns' units.
+        mean: (P,) of x.
+        covariance: (P, P), including that of the mean.
+        runs: number of references.
     """
 
     offset: Array
@@ -51,29 +51,29 @@ class Null:
 
 
 def common_offset(references: Sequence[Score]) -> Array:
-    """Offset (P,) that all references have in common, in the columns' units (ridge, one unit)."""
+    """Offset (P,) common to all references, in the columns' units (ridge, one unit)."""
     P = len(references[0].b)
     total = sum((r.A for r in references), np.zeros((P, P)))
     shared = sum((r.b for r in references), np.zeros(P))
     return np.asarray(np.linalg.solve(total + np.eye(P), shared), dtype=np.float64)
 
 
-def learn(references: Sequence[Score], judged: int) -> Null:
-    """The null of the references, for a judgement of so many runs together."""
+def learn_null(references: Sequence[Score], judged: int) -> Null:
+    """The null of the references, for judging so many runs together."""
     count, P = len(references), len(references[0].b)
     offset = common_offset(references)
     x = np.array([r.root * (r.b - r.A @ offset) for r in references])
     fisher = sum((r.fisher for r in references), np.zeros((P, P))) / count
     mean: Array = np.asarray(x.mean(axis=0))
     centred = x - mean
-    shown = centred.T @ centred
-    # Inflation of each score's variance over the Fisher form, itself shrunk to their median.
-    ratio = (np.diag(shown) + SHRINK_RUNS * np.diag(fisher)) / (
+    observed = centred.T @ centred
+    # Inflation of each score's variance over the Fisher information, itself shrunk to their median.
+    ratio = (np.diag(observed) + SHRINK_RUNS * np.diag(fisher)) / (
         (count - 1 + SHRINK_RUNS) * np.maximum(np.diag(fisher), 1e-9)
     )
     stretch = np.sqrt(np.maximum(ratio, 0.25))
     target = stretch[:, None] * fisher * stretch
-    covariance = (shown + SHRINK_RUNS * target) / (count - 1 + SHRINK_RUNS)
+    covariance = (observed + SHRINK_RUNS * target) / (count - 1 + SHRINK_RUNS)
     covariance = covariance + JITTER * np.eye(P)
     covariance *= 1.0 + judged / count
     return Null(offset, mean, covariance, count)

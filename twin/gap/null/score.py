@@ -1,4 +1,4 @@
-"""Efficient scores: what a run says of every effect once theta is projected out.
+"""Efficient scores: what a run says about every effect with theta projected out.
 
 With V = I + J_theta Sigma J_theta' the score is b = P' V^-1 e and its information A = P' V^-1 P (Neyman 1959,
 C(alpha) tests; here theta is random with variance Sigma, so it is projected out as far as it varies).
@@ -13,34 +13,35 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.twin.gap.rollout.residuals import Evidence
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 
 Array = NDArray[np.float64]
 
 EM_STEPS = 6
 PRIOR_RUNS = 3.0
-"""The assumed variance of theta counts as much as that of so many runs."""
+"""Weight of the assumed variance of theta, in runs."""
 LEAST_SIGMA = 0.03
-"""Theta is never taken as known better than this share of its unit."""
+"""Least 1 sigma of theta, as a share of its unit."""
+REPLICATES = 20
+"""Twin replicates that stand in for references."""
 
 
 @dataclass(frozen=True, eq=False)
 class Score:
-    """Score b (P,), information A (P, P) of one run, and the sum of squares that theta leaves.
+    """Score b (P,) and information A (P, P) of one run, and the sum of squares that theta leaves.
 
-    `other` (P, K, F): how the score changes by laws of another form (see `discrepancy`); None where they are
-    not asked for.
+    `discrepancy` (P, K, F): change of the score by the model discrepancy (see there); None where not needed.
     """
 
     b: Array
     A: Array
     square: float
-    rows: int
-    other: Array | None = None
+    samples: int
+    discrepancy: Array | None = None
 
     @functools.cached_property
     def root(self) -> Array:
-        """(P,) factors that bring b to unit variance, and do not where it says nothing."""
+        """(P,) factors that scale b to unit variance, or to zero where there is no information."""
         return np.asarray(1.0 / np.sqrt(np.diag(self.A) + 1.0))
 
     @functools.cached_property
@@ -49,15 +50,45 @@ class Score:
         return self.root[:, None] * self.A * self.root
 
 
-def score(run: Evidence, sigma: Array) -> Score:
+def score(run: WhitenedRun, sigma: Array) -> Score:
     """The score of a run with theta of the given 1 sigma (T,)."""
     T, G = run.states, run.gram
-    solved = np.linalg.solve(G[:T, :T] + np.diag(sigma**-2.0), G[:T, T:])
-    left = G[T:, T:] - G[:T, T:].T @ solved
-    return Score(left[:-1, -1].copy(), left[:-1, :-1].copy(), float(left[-1, -1]), len(run.time_s))
+    solved = np.linalg.solve(run.state_information(sigma), G[:T, T:])
+    rest = G[T:, T:] - G[:T, T:].T @ solved
+    return Score(rest[:-1, -1].copy(), rest[:-1, :-1].copy(), float(rest[-1, -1]), len(run.time_s))
 
 
-def learnt_sigma(runs: Sequence[Evidence], first: Array) -> Array:
+def score_of_error(run: WhitenedRun, sigma: Array, error: Array, A: Array) -> Score:
+    """The score of another whitened error (n,) of the run, with its information A."""
+    T = run.states
+    inner = run.rows[:, :-1].astype(float).T @ error
+    solved = np.linalg.solve(run.state_information(sigma), inner[:T])
+    b = inner[T:] - run.gram[T:-1, :T] @ solved
+    return Score(b, A, float(error @ error - inner[:T] @ solved), len(error))
+
+
+def replicates(
+    templates: Sequence[WhitenedRun], sigma: Array, offset: Array | None, count: int, seed: int
+) -> list[Score]:
+    """Scores of twin replicates of the templates, which differ by noise and theta alone.
+
+    They show the scatter that the twin itself predicts; a diagnosis that relies on them is uncalibrated.
+
+    Args:
+        offset: (P,) parameters that all references share; None: zero.
+    """
+    rng, out = np.random.default_rng(seed), []
+    for i in range(count):
+        run = templates[i % len(templates)]
+        error = run.by_state @ (sigma * rng.standard_normal(run.states))
+        error += run.without_poses(rng.standard_normal(len(run.time_s)))
+        if offset is not None:
+            error += run.by_parameter @ offset
+        out.append(score_of_error(run, sigma, error, score(run, sigma).A))
+    return out
+
+
+def learn_state_sigma(runs: Sequence[WhitenedRun], first: Array) -> Array:
     """1 sigma (T,) of theta about its mean over the runs, by expectation-maximisation (Dempster et al.
     1977)."""
     sigma = first.copy()
@@ -67,11 +98,11 @@ def learnt_sigma(runs: Sequence[Evidence], first: Array) -> Array:
     for _ in range(EM_STEPS):
         means, spreads = [], []
         for run in runs:
-            H = np.linalg.inv(run.gram[:T, :T] + np.diag(sigma**-2.0))
+            H = np.linalg.inv(run.state_information(sigma))
             means.append(H @ run.gram[:T, -1])
             spreads.append(np.diag(H))
         centred = np.array(means) - np.mean(means, axis=0)
-        shown = (centred**2).sum(axis=0) + (len(runs) - 1) / len(runs) * np.sum(spreads, axis=0)
-        variance = (PRIOR_RUNS * first**2 + shown) / (PRIOR_RUNS + len(runs) - 1)
+        observed = (centred**2).sum(axis=0) + (len(runs) - 1) / len(runs) * np.sum(spreads, axis=0)
+        variance = (PRIOR_RUNS * first**2 + observed) / (PRIOR_RUNS + len(runs) - 1)
         sigma = np.maximum(np.sqrt(variance), LEAST_SIGMA * first)
     return sigma

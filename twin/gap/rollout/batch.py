@@ -1,8 +1,8 @@
-"""The twin run on a log with many sets of effects side by side, and what the sensors then read.
+"""Batched rollout: the twin driven along a log with many sets of effects at once, and its sensor readings.
 
-The run is that of `identify.predict`: open loop from window to window, inner states carried on, the pose set
-anew in each window. An effect that is in a compiled graph costs in every run of it, so each graph holds few;
-which they are follows from the candidates alone: graphs are compiled once.
+The run is that of `calibrate.predict`: open loop within each window, inner states carried on, the pose reset
+at each window. An effect in a compiled graph costs time in every run of it, so each graph holds a group of
+few effects; the groups follow from the candidates alone and each graph is compiled once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from terrafusion.twin.engine.lanes import Fleet, blank_what_diverged
 from terrafusion.twin.engine.native import driver
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.samples import samples_of
+from terrafusion.twin.gap.data.samples import Indices, grid_samples
 from terrafusion.twin.model.measurement import measured
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vectors import mounting_vector
@@ -36,75 +36,77 @@ from terrafusion.twin.scenario.commands import delayed_inputs
 from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 Effects = Mapping[str, float]
-Moved = tuple[tuple[str, float], ...]
-"""Effects of a set that move the robot, with their values."""
+MotionEffects = tuple[tuple[str, float], ...]
+"""Effects of a set that change the motion, with their values."""
 
-GROUND = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rolling")
-"""Parameters by which ground differs from run to run: every graph has them."""
-TOGETHER = 16
-"""Other effects in one graph: as many as vectors hold runs."""
-AS_IT_IS = ""
+SOIL_KEYS = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rolling")
+"""Parameters by which the soil differs from run to run: in every graph."""
+GROUP_SIZE = 16
+"""Other effects in one graph: the number of lanes of a vector."""
+NOMINAL = ""
 """Stands for the twin without a further effect, in the first group."""
-ORDER = 3
-"""Of the integrator's steps: on loose sand, where all is most sensitive, answers differ from those with steps
-of fourth order by no more than these do from those with half the step (docs/gap.md)."""
-SHORT = True
-"""Whether numbers have 32 bits: what they round away is less than the error of such steps (docs/gap.md)."""
-WHOLE = 1.8
-"""Time of a run in the graph of all effects, in that of one of a group (measured)."""
-TINY = 1e-12
-"""Share of its scale that an absent effect has in a run: all runs of a group share one compiled graph."""
+INTEGRATOR_ORDER = 3
+"""On loose sand, the most sensitive case, results differ from fourth order by no more than those from half
+the step do (docs/gap.md)."""
+SINGLE_PRECISION = True
+"""Rounding of 32-bit numbers is below the integration error (docs/gap.md)."""
+FULL_GRAPH_COST = 1.8
+"""Time of a run in the graph of all effects over that in the graph of one group (measured)."""
+ABSENT_SHARE = 1e-12
+"""Value of an absent effect, in typical sizes: so that all runs of a group share one compiled graph."""
 
 
-def groups(candidates: Candidates) -> list[tuple[str, ...]]:
-    """The twin as it is and the effects that move the robot, as they share graphs."""
-    keys = (AS_IT_IS, *candidates.moving)
-    return [keys[first : first + TOGETHER] for first in range(0, len(keys), TOGETHER)]
+def effect_groups(candidates: Candidates) -> list[tuple[str, ...]]:
+    """The nominal twin and the effects that change the motion, by shared graph."""
+    keys = (NOMINAL, *candidates.moving)
+    return [keys[first : first + GROUP_SIZE] for first in range(0, len(keys), GROUP_SIZE)]
 
 
-def graphs(candidates: Candidates, runs: Sequence[Moved]) -> dict[tuple[str, ...], list[int]]:
-    """Runs, by number, by the group of effects whose graph drives them.
+def assign_graphs(candidates: Candidates, runs: Sequence[MotionEffects]) -> dict[tuple[str, ...], list[int]]:
+    """Indices of runs by the group of effects whose graph drives them.
 
-    A graph of all effects takes all runs together, those of groups cost less a run: what is cheaper, counted
-    in vectors of `TOGETHER` runs.
+    One graph of all effects takes all runs together, those of groups cost less a run: the cheaper choice,
+    counted in vectors of `GROUP_SIZE` runs.
     """
-    named = [{k for k, _ in run} - {*GROUND} for run in runs]
+    named = [{k for k, _ in run} - {*SOIL_KEYS} for run in runs]
     if not any(named):
         return {(): list(range(len(runs)))}
-    apart: dict[tuple[str, ...], list[int]] = {}
+    by_group: dict[tuple[str, ...], list[int]] = {}
     for i in sorted(range(len(runs)), key=lambda i: not named[i]):
-        of = [g for g in (groups(candidates) if named[i] else apart) if named[i] <= {*g}]
-        group = max(of, key=lambda g: -len(apart.get(g, ())) % TOGETHER, default=candidates.moving)
-        apart.setdefault(group, []).append(i)
-    vectors = sum(
-        -(-len(some) // TOGETHER) * (WHOLE if g == candidates.moving else 1.0) for g, some in apart.items()
+        fitting = [g for g in (effect_groups(candidates) if named[i] else by_group) if named[i] <= {*g}]
+        group = max(fitting, key=lambda g: -len(by_group.get(g, ())) % GROUP_SIZE, default=candidates.moving)
+        by_group.setdefault(group, []).append(i)
+    cost = sum(
+        -(-len(some) // GROUP_SIZE) * (FULL_GRAPH_COST if g == candidates.moving else 1.0)
+        for g, some in by_group.items()
     )
-    few = vectors < WHOLE * -(-len(runs) // TOGETHER)
-    return apart if few else {candidates.moving: list(range(len(runs)))}
+    if cost < FULL_GRAPH_COST * -(-len(runs) // GROUP_SIZE):
+        return by_group
+    return {candidates.moving: list(range(len(runs)))}
 
 
-def in_threads(candidates: Candidates) -> bool:
-    """Whether all that drives the twin is compiled: CasADi's virtual machine is not safe in several threads.
+def is_thread_safe(candidates: Candidates) -> bool:
+    """Whether everything that drives the twin is compiled; CasADi's virtual machine is not thread-safe.
 
-    Effects of the catalogue are, where there is a compiler; one's own may hold what is not written as C.
+    Effects of the catalogue are compiled where there is a compiler; registered ones may not be expressible in
+    C.
     """
     if codegen.follows_from("", candidates.keys) is not None:
         return compiled()
-    whole = Variant(LANES_32 if SHORT else LANES, candidates.moving, fixed_ground=True)
-    return driver(whole) is not None and reader(tuple(sorted(candidates.keys)), True) is not None
+    lanes = LANES_32 if SINGLE_PRECISION else LANES
+    full = Variant(lanes, candidates.moving, fixed_ground=True)
+    return driver(full) is not None and reader(tuple(sorted(candidates.keys)), True) is not None
 
 
-def what_moves(candidates: Candidates, effects: Effects) -> Moved:
-    """The effects of a set that move the robot: sets that differ in the sensors alone share a run."""
+def motion_effects(candidates: Candidates, effects: Effects) -> MotionEffects:
+    """The effects that change the motion: sets that differ in the sensors alone share a run."""
     return tuple((k, v) for k, v in sorted(effects.items()) if v != 0.0 and k in candidates.moving)
 
 
 @dataclass(frozen=True, eq=False)
 class Lane:
-    """A run of the twin: on which log, by which plant, what it is told (N + 1, U), and its poses (W, 3) at
-    the windows' starts."""
+    """One run: its log, plant, inputs (N + 1, U) and poses (W, 3) at the windows' starts."""
 
     log: PreparedLog
     plant: Plant
@@ -112,47 +114,46 @@ class Lane:
     start: Array
 
 
-def lanes_of(
-    asked: Sequence[tuple[PreparedLog, Effects, Array]],
+def make_lanes(
+    runs: Sequence[tuple[PreparedLog, Effects, Array]],
     model: Model,
     candidates: Candidates,
     group: Sequence[str],
 ) -> list[Lane]:
-    """The twin on each log with the effects and from the poses (W, 3) asked for; those of the group and of
-    the ground are in its graph. Lanes that hear the same share the array."""
+    """Lanes of (log, effects, poses (W, 3)); effects of the group and of the soil are in the graph. Lanes
+    with equal inputs share the array."""
     scales = dict(zip(candidates.keys, candidates.scale, strict=True))
-    late = VEHICLE_PARAMETERS.index("dead_time_applied_s")
-    bases, heard, out = dict[int, Plant](), dict[tuple[int, float], Array](), list[Lane]()
-    for log, some, start in asked:
+    dead_time = VEHICLE_PARAMETERS.index("dead_time_applied_s")
+    bases, inputs, out = dict[int, Plant](), dict[tuple[int, float], Array](), list[Lane]()
+    for log, effects, start in runs:
         if id(log) not in bases:
             bases[id(log)], _ = plant_of(log, dataclasses.replace(model, effects={}), [])
-        named = {*group, *GROUND, *some} & {*candidates.moving}
-        vehicle = bases[id(log)].vehicle.copy()
-        vehicle[late] += some.get(DEAD_TIME, 0.0)
-        present = {k: some.get(k, 0.0) or TINY * float(scales[k]) for k in sorted(named)}
-        late_s = _late_s(log, model, some)
-        if (id(log), late_s) not in heard:
-            heard[id(log), late_s] = np.ascontiguousarray(delayed_inputs(log.sides, DT_S, late_s))
-        plant = Plant(vehicle, bases[id(log)].route, present)
-        out.append(Lane(log, plant, heard[id(log), late_s], start))
+        base = bases[id(log)]
+        vehicle = base.vehicle.copy()
+        vehicle[dead_time] += effects.get(DEAD_TIME, 0.0)
+        named = {*group, *SOIL_KEYS, *effects} & {*candidates.moving}
+        present = {k: effects.get(k, 0.0) or ABSENT_SHARE * float(scales[k]) for k in sorted(named)}
+        delay_s = _input_delay_s(log, model, effects)
+        if (id(log), delay_s) not in inputs:
+            inputs[id(log), delay_s] = np.ascontiguousarray(delayed_inputs(log.sides, DT_S, delay_s))
+        out.append(Lane(log, Plant(vehicle, base.route, present), inputs[id(log), delay_s], start))
     return out
 
 
-def _late_s(log: PreparedLog, model: Model, some: Effects) -> float:
-    """By how much what the twin is told is late."""
-    late = some.get(DEAD_TIME, 0.0)
-    return late if log.follows else as_driven(model.vehicle, {DEAD_TIME: late}).drive.dead_time_s
+def _input_delay_s(log: PreparedLog, model: Model, effects: Effects) -> float:
+    delay_s = effects.get(DEAD_TIME, 0.0)
+    return delay_s if log.follows else as_driven(model.vehicle, {DEAD_TIME: delay_s}).drive.dead_time_s
 
 
-def driven(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
-    """States (N, X) of each lane at every so many-th sample of all its windows.
+def simulate_lanes(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
+    """States (N, X) of each lane at every n-th sample of all its windows.
 
-    Lanes of several logs go on side by side, from where a window of one of them begins or ends to the next
-    such place; all their samples are kept, and no ground of theirs changes with time.
+    Lanes of several logs run together between places where a window of one of them begins or ends; all their
+    samples are stored, and the soil of none changes with time.
     """
     fleet = _fleet(lanes)
-    x, spans = _led_in(lanes, fleet), [lane.log.windows - lane.log.windows[0, 0] for lane in lanes]
-    out = [np.empty((len(samples_of(lane.log, every)), len(STATES))) for lane in lanes]
+    x, spans = _initial_states(lanes, fleet), [lane.log.windows - lane.log.windows[0, 0] for lane in lanes]
+    out = [np.empty((len(grid_samples(lane.log, every)), len(STATES))) for lane in lanes]
     row, pose = [0] * len(lanes), [INDEX[name] for name in POSE]
     borders = np.unique(np.concatenate([span.ravel() for span in spans]))
     for p, q in itertools.pairwise(borders.tolist()):
@@ -170,7 +171,7 @@ def driven(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
             parts.append(part)
             inputs.append(lanes[i].inputs[first : first + (count - 1) * every + 1])
             row[i] += count if q == spans[i][k, 1] else count - 1
-            x[i] = part[-1]  # once it is driven
+            x[i] = part[-1]  # a view, filled by `fleet.drive`
         fleet.drive(inputs, parts, (int(lanes[live[0]].log.windows[0, 0]) + p) * DT_S, every)
     for states in out:
         blank_what_diverged(states[None])
@@ -178,11 +179,11 @@ def driven(lanes: Sequence[Lane], every: int = 1) -> list[Array]:
 
 
 def _fleet(lanes: Sequence[Lane]) -> Fleet:
-    return Fleet.of([lane.plant for lane in lanes], DT_S, order=ORDER, short=SHORT)
+    return Fleet.of([lane.plant for lane in lanes], DT_S, order=INTEGRATOR_ORDER, short=SINGLE_PRECISION)
 
 
-def _led_in(lanes: Sequence[Lane], fleet: Fleet) -> list[Array]:
-    """State (X,) of each lane at its first window."""
+def _initial_states(lanes: Sequence[Lane], fleet: Fleet) -> list[Array]:
+    """State (X,) of each lane at its first window, after the run-up."""
     known: dict[int, tuple[Array, Array]] = {}
     for lane in lanes:
         if id(lane.inputs) not in known:
@@ -192,17 +193,17 @@ def _led_in(lanes: Sequence[Lane], fleet: Fleet) -> list[Array]:
     out[:, 0] = [x for x, _ in up]
     for length in dict.fromkeys(len(before) for _, before in up):
         some = [i for i, (_, before) in enumerate(up) if len(before) == length]
-        alike = fleet if len(some) == len(lanes) else _fleet([lanes[i] for i in some])
-        alike.drive([up[i][1] for i in some], [out[i] for i in some], -LEAD_S, length - 1)
+        part = fleet if len(some) == len(lanes) else _fleet([lanes[i] for i in some])
+        part.drive([up[i][1] for i in some], [out[i] for i in some], -LEAD_S, length - 1)
     return list(out[:, 1])
 
 
-class Sensors:
-    """The sensors' readings at the samples (N,) of the runs of one log."""
+class SampledSensors:
+    """Sensor readings at samples (N,) of the runs of one log."""
 
-    def __init__(self, log: PreparedLog, model: Model, candidates: Candidates, samples: Rows) -> None:
+    def __init__(self, log: PreparedLog, model: Model, candidates: Candidates, samples: Indices) -> None:
         self.keys, self.samples = frozenset(candidates.keys), samples
-        self.sensing = self.keys - {*candidates.moving} | {*GROUND} & self.keys
+        self.sensing = self.keys - {*candidates.moving} | {*SOIL_KEYS} & self.keys
         self.mounting = mounting_vector(model.vehicle)
         route = plant_of(log, dataclasses.replace(model, effects={}), [])[0].route
         self.fixed = route.is_fixed()
@@ -212,28 +213,28 @@ class Sensors:
     def read(
         self, states: Array, plant: Plant, inputs: Array, effects: Effects, group: Sequence[str] = ()
     ) -> Array:
-        """Outputs (N, Y) of the states (N, X) of a run that was told `inputs`.
+        """Outputs (N, Y) of the states (N, X) of a run with these inputs.
 
         Args:
-            group: effects that share a graph with those of the run; an effect that is in a graph costs, in
-                every run. Where it lacks one of the run's, all are in the graph.
+            group: effects that share a graph with those of the run; where it lacks one, a larger graph is
+                used.
         """
-        names = self._names(effects, group)
+        names = self._graph_effects(effects, group)
         values = np.array([effects.get(name, 0.0) for name in names])
         if id(inputs) not in self._inputs:
             self._inputs[id(inputs)] = inputs, inputs[self.samples]
-        heard = self._inputs[id(inputs)][1]
+        sampled = self._inputs[id(inputs)][1]
         native = reader(names, self.fixed)
         if native is not None:
-            return native(states, heard, self.soil, plant.vehicle, values, self.mounting)
+            return native(states, sampled, self.soil, plant.vehicle, values, self.mounting)
         ground = np.tile(np.atleast_2d(self.soil), (len(states) if self.fixed else 1, len(WHEELS)))
         named = dict(zip(names, values, strict=True))
-        return measured(states, heard, plant.vehicle, ground, self.mounting, named)
+        return measured(states, sampled, plant.vehicle, ground, self.mounting, named)
 
-    def _names(self, effects: Effects, group: Sequence[str]) -> tuple[str, ...]:
-        """Of the least graph that has all effects of a run."""
+    def _graph_effects(self, effects: Effects, group: Sequence[str]) -> tuple[str, ...]:
+        """Effects of the smallest graph that has all of a run's."""
         present = {k for k, value in effects.items() if value != 0.0} & self.keys
-        for some in ({*group, *GROUND} & self.keys, self.sensing):
+        for some in ({*group, *SOIL_KEYS} & self.keys, self.sensing):
             if present <= some:
                 return tuple(sorted(some))
         return tuple(sorted(self.keys))

@@ -1,9 +1,8 @@
-"""Readings that come late, by however much: a row is made of the run as it was so long before.
+"""Delayed readings: an observed sample is made of the twin's run as it was a delay earlier.
 
-The catalogue's law of a delay is its first order, y - e dy/dt: all that a signature needs, but not what a
-delay of a third of a second does to a rate that turns around in one. A fit through the twin takes the delay
-itself. What an IMU reads goes on from window to window; a position does not, as the pose is set anew, and
-goes straight on before its window's start.
+The catalogue's law of a delay is first order, y - e dy/dt: enough for a sensitivity, but wrong for a delay of
+a third of a second. A fit through the twin uses the delay itself. IMU readings continue across windows;
+positions are reset at each window and are extrapolated before its start.
 """
 
 from __future__ import annotations
@@ -18,50 +17,47 @@ from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.observations import Observed
 from terrafusion.twin.calibrate.predict import LEAD_S, averaging
 from terrafusion.twin.effects.sensing import CLOCK_S
-from terrafusion.twin.gap.data.samples import Layout, weighty
+from terrafusion.twin.gap.data.samples import Indices, drop_zero_weights, sample_map, window_starts
 
 Array = NDArray[np.float64]
 
 IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")
 FIXES = ("gnss_east_m", "gnss_north_m", *VELOCITY)
+CLOCK_DRIFT = "imu_time_offset/drift"
+"""The delay that grows with time: its value is that after `CLOCK_S`."""
 DELAYS = {
-    "imu_time_offset/shift": IMU, "imu_time_offset/drift": IMU, "gnss_latency/both": FIXES,
+    "imu_time_offset/shift": IMU, CLOCK_DRIFT: IMU, "gnss_latency/both": FIXES,
     "gnss_latency/velocity": VELOCITY,
 }  # fmt: skip
-"""Delays of the catalogue and the channels that they make late."""
-GROWING = "imu_time_offset/drift"
-"""The one that grows with the time driven: its value is that after `CLOCK_S`."""
+"""Delays of the catalogue and the channels that they delay."""
 
 
-def in_time(effects: Mapping[str, float]) -> dict[str, float]:
-    """The effects without delays."""
+def without_delays(effects: Mapping[str, float]) -> dict[str, float]:
+    """The effects that are no delays."""
     return {key: value for key, value in effects.items() if key not in DELAYS}
 
 
-def late_layout(
-    log: PreparedLog, effects: Mapping[str, float], rows: Layout
-) -> list[tuple[NDArray[np.int64], Array]]:
-    """`Layout.fine` of the log with the delays among the effects; `rows` is that without."""
-    late = {key: effects[key] for key in DELAYS if effects.get(key, 0.0) != 0.0}
-    shift = np.cumsum(np.append(0, np.diff(log.windows, axis=1).ravel() + 1))
-    out = list(rows.fine)
+def delayed_samples(log: PreparedLog, effects: Mapping[str, float]) -> list[tuple[Indices, Array]]:
+    """`SampleMap.fine` of the log with the delays among the effects."""
+    delays = {key: effects[key] for key in DELAYS if effects.get(key, 0.0) != 0.0}
+    out = list(sample_map(log).fine)
     for i, observed in enumerate(log.observed):
-        seconds = _lateness(observed, late)
-        if seconds.any():
+        delay_s = _delay_s(observed, delays)
+        if delay_s.any():
             before = dataclasses.replace(
-                observed, begin_s=observed.begin_s - seconds, end_s=observed.end_s - seconds
+                observed, begin_s=observed.begin_s - delay_s, end_s=observed.end_s - delay_s
             )
-            own = window_of(before if observed.channel in IMU else observed, log.windows)
-            out[i] = weighty(*averaging(before, log, shift, np.maximum(own, 0)))
+            window = window_of(before if observed.channel in IMU else observed, log.windows)
+            out[i] = drop_zero_weights(*averaging(before, log, window_starts(log), np.maximum(window, 0)))
     return out
 
 
-def _lateness(observed: Observed, late: Mapping[str, float]) -> Array:
-    """By how much each row (n,) of a channel is late, s."""
+def _delay_s(observed: Observed, delays: Mapping[str, float]) -> Array:
+    """Delay (n,) of each sample of a channel, s."""
     middle = 0.5 * (observed.begin_s + observed.end_s)
     out = np.zeros(len(middle))
-    for key, value in late.items():
+    for key, value in delays.items():
         if observed.channel in DELAYS[key]:
-            out += value * ((middle + LEAD_S) / CLOCK_S if key == GROWING else 1.0)
+            out += value * ((middle + LEAD_S) / CLOCK_S if key == CLOCK_DRIFT else 1.0)
     return out

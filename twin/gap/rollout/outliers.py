@@ -1,9 +1,9 @@
-"""Errors beyond what noise makes of them count as much as its limit, and no more (Huber 1964).
+"""Clips outliers of the whitened errors (Huber 1964).
 
-In the field a wheel hits a stone, a fix jumps, a skid starts a moment early: of a Warthog on asphalt every
-sixth whitened error is beyond three sigma. Squared, such moments decide what a run says; their scatter from
-run to run then hides changes that all other rows show. Only channels are bounded in which the references
-themselves have such moments: where noise is normal, a large error is news.
+In field logs a wheel hits a stone, a fix jumps, a skid starts early: on asphalt every sixth whitened error of
+a Warthog exceeds three sigma. Squared, such moments dominate a run, and their scatter from run to run hides
+changes in all other samples. Only channels in which the references have such outliers are clipped: where the
+noise is normal, a large error is a finding.
 """
 
 from __future__ import annotations
@@ -18,63 +18,62 @@ from numpy.typing import NDArray
 from terrafusion.twin.gap.rollout.residuals import (
     OUTLIER_SIGMAS,
     ROBUST_STEPS,
-    Evidence,
-    explained,
-    within_limits,
+    WhitenedRun,
+    clip_outliers,
+    explained_by_states,
 )
 
 Array = NDArray[np.float64]
 
-HEAVY = 0.02
-"""A channel is bounded where more than this share of the references' errors is beyond the limit."""
-STRONG = 1.5
-"""Where half of the judged runs' errors exceed by this factor what noise makes of them, the runs themselves
-have changed: their limit is in their own sigmas."""
-NORMAL = 1.4826
+HEAVY_TAILED = 0.02
+"""A channel is clipped where more than this share of the references' errors exceeds the limit."""
+CHANGED = 1.5
+"""Where half of the judged runs' errors exceed the noise by this factor, the runs themselves have changed:
+their limit is in their own sigmas."""
+NORMAL_MAD = 1.4826
 """Standard deviation over median absolute deviation of normal errors."""
 
 
-def bounded(
-    runs: Sequence[Evidence], references: Sequence[Evidence], sigma: Array, jobs: int = 1
-) -> tuple[list[Evidence], list[Evidence]]:
+def limit_outliers(
+    runs: Sequence[WhitenedRun], references: Sequence[WhitenedRun], sigma: Array, jobs: int = 1
+) -> tuple[list[WhitenedRun], list[WhitenedRun]]:
     """Judged runs and references, their errors within the limits of each channel.
 
     Args:
-        sigma: (T,) first 1 sigma of the states (ground, offsets): what these explain is no outlier.
+        sigma: (T,) first 1 sigma of the states (soil, offsets): what these explain is no outlier.
         jobs: threads.
     """
     channels = range(len(references[0].limit) if references else 0)
     every = (*runs, *references)
-    with ThreadPoolExecutor(jobs) as pool:
-        adapted = pool.map(lambda run: _adapted(run, sigma), every)
-        left = dict(zip(map(id, every), adapted, strict=True))
+    with ThreadPoolExecutor(jobs) as threads:
+        fits = threads.map(lambda run: _fit_states(run, sigma), every)
+        by_run = dict(zip(map(id, every), fits, strict=True))
 
-    def errors(group: Sequence[Evidence], channel: int) -> Array:
-        parts = [left[id(run)][1][run.channel == channel] for run in group]
-        return np.abs(np.concatenate(parts))
+    def errors(group: Sequence[WhitenedRun], channel: int) -> Array:
+        return np.abs(np.concatenate([by_run[id(run)][1][run.channel == channel] for run in group]))
 
-    heavy = [float(np.mean(errors(references, i) > OUTLIER_SIGMAS)) > HEAVY for i in channels]
-    own = [NORMAL * float(np.median(errors(runs, i))) for i in channels]
+    heavy = [float(np.mean(errors(references, i) > OUTLIER_SIGMAS)) > HEAVY_TAILED for i in channels]
+    own = [NORMAL_MAD * float(np.median(errors(runs, i))) for i in channels]
     normal = np.where(heavy, OUTLIER_SIGMAS, np.inf)
-    changed = np.where(np.array(own) > STRONG, own, 1.0) * normal
+    changed = np.where(np.array(own) > CHANGED, own, 1.0) * normal
     return (
-        [_bounded(run, left[id(run)][0], changed) for run in runs],
-        [_bounded(run, left[id(run)][0], normal) for run in references],
+        [_clipped(run, by_run[id(run)][0], changed) for run in runs],
+        [_clipped(run, by_run[id(run)][0], normal) for run in references],
     )
 
 
-def _adapted(run: Evidence, sigma: Array) -> tuple[Array, Array]:
-    """Gain (T, n) of the states, and what they leave (n,) of the error."""
-    J, e = run.rows[:, : run.states].astype(float), run.rows[:, -1].astype(float)
-    gain = np.linalg.solve(run.gram[: run.states, : run.states] + np.diag(sigma**-2.0), J.T)
-    return gain, e - explained(J, gain, e, OUTLIER_SIGMAS, ROBUST_STEPS)
+def _fit_states(run: WhitenedRun, sigma: Array) -> tuple[Array, Array]:
+    """Gain (T, n) of the states, and the error (n,) that they do not explain."""
+    J, e = run.by_state, run.error
+    gain = np.linalg.solve(run.state_information(sigma), J.T)
+    return gain, e - explained_by_states(J, gain, e, OUTLIER_SIGMAS, ROBUST_STEPS)
 
 
-def _bounded(run: Evidence, gain: Array, limit: Array) -> Evidence:
+def _clipped(run: WhitenedRun, gain: Array, limit: Array) -> WhitenedRun:
     if not np.isfinite(limit).any():
         return run
-    out, rows = dataclasses.replace(run, gain=gain, limit=limit), run.rows.astype(float)
-    rows[:, -1] = within_limits(out, rows[:, -1])
+    out, rows = dataclasses.replace(run, state_gain=gain, limit=limit), run.rows.astype(float)
+    rows[:, -1] = clip_outliers(out, rows[:, -1])
     gram = run.gram.copy()
     gram[:, -1] = gram[-1, :] = rows.T @ rows[:, -1]
     return dataclasses.replace(out, gram=gram, rows=rows.astype(np.float32))

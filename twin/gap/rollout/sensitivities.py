@@ -1,7 +1,6 @@
-"""What the twin says a log should read, and how that changes with every effect at once.
+"""Predicted channels of a log and their sensitivities to every candidate.
 
-The run is that of `identify.predict`: open loop from window to window, inner states carried on, the pose set
-anew in each window. Derivatives are differences of runs that are driven side by side, one an effect.
+Sensitivities are finite differences of a batched rollout with one run an effect.
 """
 
 from __future__ import annotations
@@ -17,167 +16,178 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.poses import PAIRS, settled, settled_start
-from terrafusion.twin.gap.data.samples import EVERY, among_all, coarse_counts, layout, means, samples_of
-from terrafusion.twin.gap.rollout.batch import (
-    AS_IT_IS,
-    TOGETHER,
-    Moved,
-    Sensors,
-    driven,
-    graphs,
-    groups,
-    lanes_of,
-    what_moves,
+from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned, aligned_start
+from terrafusion.twin.gap.data.samples import (
+    COARSE_STEP,
+    coarse_counts,
+    coarse_subset,
+    grid_samples,
+    sample_map,
+    weighted_means,
 )
-from terrafusion.twin.gap.rollout.delay import in_time, late_layout
+from terrafusion.twin.gap.rollout.batch import (
+    GROUP_SIZE,
+    NOMINAL,
+    MotionEffects,
+    SampledSensors,
+    assign_graphs,
+    effect_groups,
+    make_lanes,
+    motion_effects,
+    simulate_lanes,
+)
+from terrafusion.twin.gap.rollout.delay import delayed_samples, without_delays
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS
 
 Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 STEP = 0.3
-"""Step, in scales, of the differences: finite, because a tangent at a wheel that is just about to slide or to
-turn its direction says nothing about an effect of the size that is looked for."""
+"""Step of the differences, in typical sizes: finite, because the tangent at a wheel about to slide or to
+reverse does not represent an effect of the size that is sought."""
 
 _OUTPUTS = {name: (i,) for i, name in enumerate(OUTPUTS)} | {"wheel_mean_radps": (0, 1)}
 """Columns of the graph's outputs whose mean a channel is."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Drive:
-    """What the twin makes of one sequence of commands, whatever a log has measured of it.
+class Linearisation:
+    """The twin's run for one sequence of commands, with derivatives; independent of what the log measured.
 
     Attributes:
         start: (W, 3) pose at the start of each window.
         fine: (N, Y) outputs at every grid sample of all windows.
-        y, change, by_pose: outputs (n, Y) at every `EVERY`-th, derivatives (n, Y, K) by the candidates'
-            columns, in scales, and (n, Y, 3) by the pose of the window's start.
+        by_effect, by_pose: (n, Y, K) and (n, Y, 3) derivatives at every `COARSE_STEP`-th sample by the
+            candidates' columns, in typical sizes, and by the pose of the window's start.
         heading: (n,) yaw of the body.
     """
 
     start: Array
     fine: Array
-    y: Array
-    change: Array
+    by_effect: Array
     by_pose: Array
     heading: Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Signature:
-    """One channel: prediction (n,), derivatives by the columns (n, K), in scales, and the pose (n, 3)."""
+class Sensitivity:
+    """One channel: prediction (n,), derivatives by the columns (n, K), in typical sizes, and the pose (n, 3),
+    heading (n,)."""
 
     value: Array
-    change: Array
+    by_effect: Array
     by_pose: Array
     heading: Array
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Ask:
-    """What the twin is asked to predict: channels of a log with effects on top of the model's own, from poses
-    (W, 3) at the windows' starts; None: the log's own."""
+class Rollout:
+    """A prediction to make: a log, effects on top of the model's own, and poses (W, 3) at the windows' starts
+    (None: the log's own)."""
 
     log: PreparedLog
     effects: Mapping[str, float]
     start: Array | None = None
 
+    def poses(self) -> Array:
+        return self.log.start if self.start is None else self.start
 
-def settled_predictions(
-    asks: Sequence[Ask], model: Model, candidates: Candidates, jobs: int = 1
+
+def aligned_predictions(
+    rollouts: Sequence[Rollout], model: Model, candidates: Candidates, jobs: int = 1
 ) -> list[list[Array] | None]:
-    """As `predictions`, the track of every window turned and shifted onto the one observed.
+    """As `predictions`, with the track of each window aligned with the observed one.
 
-    What depends on place or heading is driven once more, from the poses at which its own track lies so: a
-    guess has the heading of the track, and a robot that slides down a slope points elsewhere.
+    World-fixed effects are simulated again from the aligned poses: a robot that slides down a slope does not
+    point along its track.
     """
-    told = predictions(asks, model, candidates, jobs)
-    fixed = [candidates.any_world_fixed({**model.effects, **ask.effects}) for ask in asks]
-    again = dict[int, Ask]()
-    for i, (ask, y) in enumerate(zip(asks, told, strict=True)):
-        if y is not None and fixed[i]:
-            start = ask.log.start if ask.start is None else ask.start
-            again[i] = dataclasses.replace(ask, start=settled_start(ask.log, y, start))
+    out = predictions(rollouts, model, candidates, jobs)
+    again = dict[int, Rollout]()
+    for i, (rollout, y) in enumerate(zip(rollouts, out, strict=True)):
+        if y is not None and candidates.any_world_fixed({**model.effects, **rollout.effects}):
+            start = aligned_start(rollout.log, y, rollout.poses())
+            again[i] = dataclasses.replace(rollout, start=start)
     for i, y in zip(again, predictions(list(again.values()), model, candidates, jobs), strict=True):
-        told[i] = y
-    return [None if y is None else settled(ask.log, y) for ask, y in zip(asks, told, strict=True)]
+        out[i] = y
+    return [None if y is None else aligned(r.log, y) for r, y in zip(rollouts, out, strict=True)]
 
 
 def predictions(
-    asks: Sequence[Ask], model: Model, candidates: Candidates, jobs: int = 1
+    rollouts: Sequence[Rollout], model: Model, candidates: Candidates, jobs: int = 1
 ) -> list[list[Array] | None]:
-    """Channels of what is asked, side by side; None in place of a run that diverged.
+    """Channels of each rollout; None in place of a run that diverged.
 
-    Those that differ in the sensors alone, of the same log and from the same array of poses, share a run.
-    Every answer is what it is alone.
+    Rollouts that differ in the sensors alone, of the same log and array of poses, share a run. Each result is
+    the same as if computed alone.
     """
-    sets = [{**model.effects, **ask.effects} for ask in asks]
-    starts = [ask.log.start if ask.start is None else ask.start for ask in asks]
-    alike: dict[tuple[int, Moved, int], list[int]] = {}
-    for i, (ask, some, start) in enumerate(zip(asks, sets, starts, strict=True)):
-        alike.setdefault((id(ask.log), what_moves(candidates, some), id(start)), []).append(i)
-    runs, moved = list(alike.values()), [key[1] for key in alike]
-    sensors = {id(a.log): Sensors(a.log, model, candidates, samples_of(a.log, 1)) for a in asks}
-    tasks = list[tuple[tuple[str, ...], list[int]]]()
-    for company in _companies([asks[some[0]].log for some in runs]):
-        apart = graphs(candidates, [moved[run] for run in company])
-        for group, mine in apart.items():
-            size = min(TOGETHER, -(-len(mine) // jobs)) if len(apart) == 1 else TOGETHER
-            whose = [company[i] for i in mine]
-            tasks += [(group, whose[k : k + size]) for k in range(0, len(whose), size)]
-    out: list[list[Array] | None] = [None] * len(asks)
+    effects = [{**model.effects, **r.effects} for r in rollouts]
+    starts = [r.poses() for r in rollouts]
+    shared: dict[tuple[int, MotionEffects, int], list[int]] = {}
+    for i, (r, some, start) in enumerate(zip(rollouts, effects, starts, strict=True)):
+        shared.setdefault((id(r.log), motion_effects(candidates, some), id(start)), []).append(i)
+    runs, moved = list(shared.values()), [key[1] for key in shared]
+    sensors = {id(r.log): SampledSensors(r.log, model, candidates, grid_samples(r.log, 1)) for r in rollouts}
+    out: list[list[Array] | None] = [None] * len(rollouts)
 
-    def one(task: tuple[tuple[str, ...], list[int]]) -> None:
+    def simulate(task: tuple[tuple[str, ...], list[int]]) -> None:
         group, some = task
         first = [runs[run][0] for run in some]
-        asked = [(asks[i].log, dict(moved[run]), starts[i]) for i, run in zip(first, some, strict=True)]
-        lanes = lanes_of(asked, model, candidates, group)
-        for run, lane, x in zip(some, lanes, driven(lanes), strict=True):
+        given = [(rollouts[i].log, dict(moved[run]), starts[i]) for i, run in zip(first, some, strict=True)]
+        lanes = make_lanes(given, model, candidates, group)
+        for run, lane, x in zip(some, lanes, simulate_lanes(lanes), strict=True):
             for i in runs[run] if np.isfinite(x).all() else ():
-                y = sensors[id(lane.log)].read(x, lane.plant, lane.inputs, in_time(sets[i]), group)
-                rows = late_layout(lane.log, sets[i], layout(lane.log))
-                by_channel = zip(lane.log.observed, rows, strict=True)
-                out[i] = [means(at, _channel(y, o.channel)) for o, at in by_channel]
+                y = sensors[id(lane.log)].read(x, lane.plant, lane.inputs, without_delays(effects[i]), group)
+                by_channel = zip(lane.log.observed, delayed_samples(lane.log, effects[i]), strict=True)
+                out[i] = [weighted_means(at, _channel(y, o.channel)) for o, at in by_channel]
 
     with ThreadPoolExecutor(jobs) as threads:
-        list(threads.map(one, tasks))
+        logs = [rollouts[some[0]].log for some in runs]
+        list(threads.map(simulate, _batches(logs, moved, candidates, jobs)))
     return out
 
 
-def _companies(logs: Sequence[PreparedLog]) -> list[list[int]]:
-    """Runs, by number, that may go side by side: those on one ground, and those of each log on several."""
-    out: dict[int, list[int]] = {}
+def _batches(
+    logs: Sequence[PreparedLog], moved: Sequence[MotionEffects], candidates: Candidates, jobs: int
+) -> list[tuple[tuple[str, ...], list[int]]]:
+    """Runs, by index, that are simulated together, with the effects of their graph: runs on a single soil,
+    and runs of the same log over several soils."""
+    together: dict[int, list[int]] = {}
     for i, log in enumerate(logs):
-        out.setdefault(id(log) if len(log.labels) > 1 else 0, []).append(i)
-    return list(out.values())
+        together.setdefault(id(log) if len(log.labels) > 1 else 0, []).append(i)
+    out = list[tuple[tuple[str, ...], list[int]]]()
+    for runs in together.values():
+        by_group = assign_graphs(candidates, [moved[run] for run in runs])
+        for group, some in by_group.items():
+            size = min(GROUP_SIZE, -(-len(some) // jobs)) if len(by_group) == 1 else GROUP_SIZE
+            mine = [runs[i] for i in some]
+            out += [(group, mine[k : k + size]) for k in range(0, len(mine), size)]
+    return out
 
 
-def drive(
+def linearise(
     log: PreparedLog, model: Model, candidates: Candidates, start: Array, only: Collection[str] | None = None
-) -> Drive:
+) -> Linearisation:
     """The twin's run at the model's own effects, with its derivatives.
 
     Args:
-        only: keys of the columns that are wanted, the others stay zero; None: all.
+        only: keys of the columns to compute, the others are zero; None: all.
 
     Raises:
         TerrafusionError: the run diverged.
     """
-    sets = {AS_IT_IS: dict(model.effects)}
+    sets = {NOMINAL: dict(model.effects)}
     steps = {k: _step(candidates, i, model.effects.get(k, 0.0)) for i, k in enumerate(candidates.keys)}
     for k, step in steps.items():
         if only is None or k in only:
             sets[k] = {**model.effects, k: model.effects.get(k, 0.0) + step}
     fine, coarse, read = _readings(log, model, candidates, start, sets)
-    y = read[AS_IT_IS]
-    change = np.zeros((*y.shape, len(candidates.keys)))
+    y = read[NOMINAL]
+    by_effect = np.zeros((*y.shape, len(candidates.keys)))
     for i, k in enumerate(candidates.keys):
         if k in read:
-            change[:, :, i] = (read[k] - y) * (candidates.scale[i] / steps[k])
-    failed = ~np.isfinite(change).all(axis=(0, 1))
-    change[:, :, failed] = 0.0  # a step that makes the twin diverge says nothing
-    return Drive(start, fine, y, change, _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]])
+            by_effect[:, :, i] = (read[k] - y) * (candidates.scale[i] / steps[k])
+    diverged = ~np.isfinite(by_effect).all(axis=(0, 1))
+    by_effect[:, :, diverged] = 0.0
+    return Linearisation(start, fine, by_effect, _by_pose(log, coarse, y), coarse[:, INDEX["yaw"]])
 
 
 def _readings(
@@ -187,24 +197,24 @@ def _readings(
     start: Array,
     sets: Mapping[str, Mapping[str, float]],
 ) -> tuple[Array, Array, dict[str, Array]]:
-    """Outputs of the twin as it is at every grid sample, its states (n, X) at every `EVERY`-th, and there the
-    outputs (n, Y) with each set of effects."""
-    sensors, read = Sensors(log, model, candidates, samples_of(log, EVERY)), dict[str, Array]()
-    for group in groups(candidates):
+    """Nominal outputs at every grid sample, nominal states (n, X) at the coarse ones, and there the outputs
+    (n, Y) with each set of effects."""
+    sensors, read = SampledSensors(log, model, candidates, grid_samples(log, COARSE_STEP)), dict[str, Array]()
+    for group in effect_groups(candidates):
         keys = [k for k in group if k in sets]
-        whole = AS_IT_IS in keys
-        lanes = lanes_of([(log, sets[k], start) for k in keys], model, candidates, group)
-        states = driven(lanes, 1 if whole else EVERY) if keys else []
-        if whole:
+        nominal = NOMINAL in keys
+        lanes = make_lanes([(log, sets[k], start) for k in keys], model, candidates, group)
+        states = simulate_lanes(lanes, 1 if nominal else COARSE_STEP) if keys else []
+        if nominal:
             if not np.isfinite(states[0]).all():
                 raise TerrafusionError(
                     "the twin diverges on this log",
                     file=log.name,
                     remedy="check the vehicle's and the soil's numbers",
                 )
-            every = Sensors(log, model, candidates, samples_of(log, 1))
-            fine = every.read(states[0], lanes[0].plant, lanes[0].inputs, sets[AS_IT_IS])
-            states = [x[among_all(log)] for x in states]
+            every = SampledSensors(log, model, candidates, grid_samples(log, 1))
+            fine = every.read(states[0], lanes[0].plant, lanes[0].inputs, sets[NOMINAL])
+            states = [x[coarse_subset(log)] for x in states]
             coarse, twin = states[0], lanes[0]
         for k, x, lane in zip(keys, states, lanes, strict=True):
             read[k] = sensors.read(x, lane.plant, lane.inputs, sets[k], group)
@@ -213,43 +223,43 @@ def _readings(
     return fine, coarse, read
 
 
-def placed(log: PreparedLog, found: Sequence[Signature], old: Array, new: Array) -> list[Signature]:
-    """Signatures of the channels of the log from other poses (W, 3) at the windows' starts than the old ones:
-    on a level plane the drive shifts and turns as a whole."""
+def channel_sensitivities(log: PreparedLog, run: Linearisation) -> list[Sensitivity]:
+    """Prediction and derivatives of every channel of the log, averaged over the samples' own intervals."""
+    at, out = sample_map(log), []
+    for observed, fine, coarse in zip(log.observed, at.fine, at.coarse, strict=True):
+        value = weighted_means(fine, _channel(run.fine, observed.channel))
+        by_effect, by_pose = (
+            weighted_means(coarse, _channel(part, observed.channel)) for part in (run.by_effect, run.by_pose)
+        )
+        out.append(Sensitivity(value, by_effect, by_pose, run.heading[coarse[0][:, 2]]))
+    return out
+
+
+def moved_to(log: PreparedLog, channels: Sequence[Sensitivity], old: Array, new: Array) -> list[Sensitivity]:
+    """Sensitivities from other poses (W, 3) at the windows' starts than the old ones: on a level plane the
+    run shifts and turns as a whole."""
     if np.array_equal(old, new):
-        return list(found)
-    at, out = {o.channel: i for i, o in enumerate(log.observed)}, list(found)
-    of = [np.clip(window_of(o, log.windows), 0, len(log.windows) - 1) for o in log.observed]
+        return list(channels)
+    at, out = {o.channel: i for i, o in enumerate(log.observed)}, list(channels)
+    window = [np.clip(window_of(o, log.windows), 0, len(log.windows) - 1) for o in log.observed]
     turn = new[:, 2] - old[:, 2]
-    for pair in PAIRS:
+    for pair in EAST_NORTH:
         if not all(channel in at for channel in pair):
             continue
         east, north = (at[channel] for channel in pair)
-        k = of[east]
-        shift = (old[k, :2], new[k, :2]) if pair == PAIRS[0] else (np.zeros((1, 2)), np.zeros((1, 2)))
+        k = window[east]
+        origins = (old[k, :2], new[k, :2]) if pair == EAST_NORTH[0] else (np.zeros((1, 2)), np.zeros((1, 2)))
         cos, sin = np.cos(turn[k]), np.sin(turn[k])
-        a, b = found[east], found[north]
-        x, y = a.value - shift[0][:, 0], b.value - shift[0][:, 1]
-        for i, s, (p, q), to in (
-            (east, a, (cos, -sin), shift[1][:, 0]), (north, b, (sin, cos), shift[1][:, 1])
+        a, b = channels[east], channels[north]
+        x, y = a.value - origins[0][:, 0], b.value - origins[0][:, 1]
+        for i, s, (p, q), origin in (
+            (east, a, (cos, -sin), origins[1][:, 0]), (north, b, (sin, cos), origins[1][:, 1])
         ):  # fmt: skip
-            by_pose = s.by_pose.copy()  # by x and y it is the same in all poses
+            by_pose = s.by_pose.copy()  # the derivatives by x and y do not depend on the pose
             by_pose[:, 2] = p * a.by_pose[:, 2] + q * b.by_pose[:, 2]
-            change = p[:, None] * a.change + q[:, None] * b.change
-            out[i] = Signature(p * x + q * y + to, change, by_pose, s.heading)
-    return [dataclasses.replace(s, heading=s.heading + turn[k]) for s, k in zip(out, of, strict=True)]
-
-
-def signatures(log: PreparedLog, drive: Drive) -> list[Signature]:
-    """Every channel of the log as the twin has it: means over the rows' own intervals."""
-    rows, out = layout(log), []
-    for observed, fine, coarse in zip(log.observed, rows.fine, rows.coarse, strict=True):
-        value = means(fine, _channel(drive.fine, observed.channel))
-        change, by_pose = (
-            means(coarse, _channel(part, observed.channel)) for part in (drive.change, drive.by_pose)
-        )
-        out.append(Signature(value, change, by_pose, drive.heading[coarse[0][:, 2]]))
-    return out
+            by_effect = p[:, None] * a.by_effect + q[:, None] * b.by_effect
+            out[i] = Sensitivity(p * x + q * y + origin, by_effect, by_pose, s.heading)
+    return [dataclasses.replace(s, heading=s.heading + turn[k]) for s, k in zip(out, window, strict=True)]
 
 
 def _channel(outputs: Array, channel: str) -> Array:
@@ -259,18 +269,15 @@ def _channel(outputs: Array, channel: str) -> Array:
 
 
 def _step(candidates: Candidates, i: int, at: float) -> float:
-    """Step of one parameter, in its unit, towards where its range leaves room."""
+    """Step of one parameter, in its unit, towards the side where its range leaves room."""
     step = STEP * float(candidates.scale[i])
     return step if at + step <= candidates.high[i] else -step
 
 
 def _by_pose(log: PreparedLog, states: Array, y: Array) -> Array:
-    """Derivatives (N, Y, 3) of the outputs by x, y and yaw of the window's start: the run shifts and
-    turns."""
+    """Derivatives (N, Y, 3) of the outputs by x, y and yaw of the window's start."""
     out = np.zeros((*y.shape, 3))
-    east, north, v_e, v_n = (
-        OUTPUTS.index(n) for n in ("gnss_east_m", "gnss_north_m", "gnss_v_e_mps", "gnss_v_n_mps")
-    )
+    east, north, v_e, v_n = (OUTPUTS.index(channel) for pair in EAST_NORTH for channel in pair)
     counts = coarse_counts(log)
     begin = np.repeat(np.cumsum(counts) - counts, counts)
     out[:, east, 0] = out[:, north, 1] = 1.0

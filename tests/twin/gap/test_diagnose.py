@@ -14,13 +14,14 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.fusion.reports.gap_text import sentences
 from terrafusion.fusion.reports.plots.gap import plot_shrink
-from terrafusion.twin.gap import GapDiagnosis, diagnose
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
+from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES
-from terrafusion.twin.gap.answer.verdict import LAW_MOVES, UNKNOWN
+from terrafusion.twin.gap.answer.verdict import LAW_SIGMA_MOTION, UNKNOWN
 from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
-from tests.twin.gap.drives import runs
+from tests.twin.gap.runs import runs
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
 VEHICLE = load_vehicle("elevate")
@@ -78,7 +79,7 @@ def test_ambiguous_larger_wheels_and_grousers(wide: GapDiagnosis) -> None:
     assert set(answer["causes"][0]["class"]) == {"wheel_radius", "grousers"}
     number = answer["causes"][0]["parameters"]["wheel_radius/scale"]
     assert number["value"] == pytest.approx(0.03, abs=0.004)
-    assert LAW_MOVES * number["value"] <= number["sigma"] < 0.02  # the robot's law may be another
+    assert LAW_SIGMA_MOTION * number["value"] <= number["sigma"] < 0.02  # the robot's law may be another
     following = answer["next_run"]
     assert following["scenario"] in DRIVES
     assert set(following["separates"]) == {"wheel_radius", "grousers"}
@@ -250,9 +251,9 @@ def test_the_corrected_twin_has_a_smaller_gap_on_fresh_runs(
     after = diagnose(fresh, [], corrected)
     assert unreferred.detected
     assert after.detection.statistic < 0.2 * unreferred.detection.statistic
-    assert unreferred.shrinking is not None
-    assert after.shrinking is not None
-    assert after.shrinking.before < 0.7 * unreferred.shrinking.before
+    assert unreferred.shrinkage is not None
+    assert after.shrinkage is not None
+    assert after.shrinkage.before < 0.7 * unreferred.shrinkage.before
     assert not after.detected
 
 
@@ -270,8 +271,8 @@ def test_a_slope_is_taken_in_the_direction_it_has_to_a_robot_that_crabs(across: 
     answer = checked(across)
     assert answer["named"] == ["cross_slope"]
     assert values_of(across)["cross_slope/uniform"] == pytest.approx(0.0873, abs=0.0015)
-    assert across.shrinking is not None
-    assert across.shrinking.after < 0.93
+    assert across.shrinkage is not None
+    assert across.shrinkage.after < 0.93
 
 
 def test_an_effect_that_is_no_number_of_the_vehicle_goes_into_its_file(
@@ -283,17 +284,17 @@ def test_an_effect_that_is_no_number_of_the_vehicle_goes_into_its_file(
     assert corrected.effects == values_of(across)
     before, after = (diagnose(fresh, [], vehicle) for vehicle in (VEHICLE, corrected))
     assert after.detection.statistic < 0.1 * before.detection.statistic
-    assert before.shrinking is not None
-    assert after.shrinking is not None
-    assert before.shrinking.before > 5.0
-    assert after.shrinking.before < 1.0  # noise variances
+    assert before.shrinkage is not None
+    assert after.shrinkage is not None
+    assert before.shrinkage.before > 5.0
+    assert after.shrinkage.before < 1.0  # noise variances
     assert not after.detected
 
 
 def test_what_the_twin_has_already_is_a_candidate_beside_those_named(across: GapDiagnosis) -> None:
     on_it = dataclasses.replace(VEHICLE, effects=values_of(across))
     found = diagnose(runs(330, 2, {"gyro_bias/constant": 0.05}), [], on_it, effects=("gyro_bias",))
-    assert found.bench.candidates.effects == ("gyro_bias", "cross_slope")
+    assert found.evidence.candidates.effects == ("gyro_bias", "cross_slope")
     assert {*found.verdict.named} == {"gyro_bias", "cross_slope"}
     assert values_of(found)["cross_slope/uniform"] < -0.07  # these runs are on level ground
 

@@ -11,11 +11,11 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.poses import PAIRS, settled, settled_start, turns
-from terrafusion.twin.gap.infer.evidence import prepared, starting_model
-from terrafusion.twin.gap.rollout.residuals import Drives, raw
+from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.poses import EAST_NORTH, aligned, aligned_start, alignment_angles
+from terrafusion.twin.gap.rollout.residuals import LinearisationCache, run_residuals
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.drives import run
+from tests.twin.gap.runs import run
 
 CANDIDATES = Candidates.of(["gyro_bias"])
 BIAS_RADPS = 0.03
@@ -35,9 +35,9 @@ def turned(log: PreparedLog, angle: float, shift: float) -> list[np.ndarray]:
     """What the log observed, its tracks turned and shifted as a whole."""
     at = {o.channel: i for i, o in enumerate(log.observed)}
     values = [o.value.copy() for o in log.observed]
-    for pair in PAIRS:
+    for pair in EAST_NORTH:
         east, north = (values[at[c]].copy() for c in pair)
-        values[at[pair[0]]] = np.cos(angle) * east - np.sin(angle) * north + shift * (pair == PAIRS[0])
+        values[at[pair[0]]] = np.cos(angle) * east - np.sin(angle) * north + shift * (pair == EAST_NORTH[0])
         values[at[pair[1]]] = np.sin(angle) * east + np.cos(angle) * north
     return values
 
@@ -45,8 +45,8 @@ def turned(log: PreparedLog, angle: float, shift: float) -> list[np.ndarray]:
 def test_a_turned_and_shifted_track_is_laid_back(recording: Recording) -> None:
     log, _ = log_of(recording)
     wrong = turned(log, 0.8, 3.0)
-    assert turns(log, wrong) == pytest.approx(-0.8, abs=0.01)
-    for now, then, observed in zip(settled(log, wrong), wrong, log.observed, strict=True):
+    assert alignment_angles(log, wrong) == pytest.approx(-0.8, abs=0.01)
+    for now, then, observed in zip(aligned(log, wrong), wrong, log.observed, strict=True):
         if observed.channel.startswith("gnss"):
             spread = float(np.std(observed.value))
             assert np.abs(now - observed.value).max() < 0.02 * spread + 0.02
@@ -58,7 +58,7 @@ def test_the_start_turns_about_the_track(recording: Recording) -> None:
     """From the new start, the same motion gives the track observed."""
     log, _ = log_of(recording)
     start = np.zeros_like(log.start)
-    found = settled_start(log, turned(log, 0.3, -2.0), start)
+    found = aligned_start(log, turned(log, 0.3, -2.0), start)
     assert found[:, 2] == pytest.approx(-0.3, abs=0.01)
     # The start (0, 0) of the turned track lies at R(-.3) (0 + 2, 0) in the one observed.
     assert found[:, :2] == pytest.approx(
@@ -75,7 +75,7 @@ def test_a_gyro_bias_does_not_show_in_positions(recording: Recording) -> None:
     for one in (recording, biased):
         log, model = log_of(one)
         channels = tuple(o.channel for o in log.observed)
-        found = raw(log, Drives(model, CANDIDATES), channels)
+        found = run_residuals(log, LinearisationCache(model, CANDIDATES), channels)
         errors.append(dict(zip(channels, found.error, strict=True)))
     sigma = {o.channel: o.sigma for o in log.observed}
     for channel in ("gnss_east_m", "gnss_north_m", "gnss_v_e_mps", "gnss_v_n_mps"):

@@ -7,7 +7,7 @@ import pytest
 
 from terrafusion.twin.gap.blind.rates import Rate
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.infer.detect import detect, judged
+from terrafusion.twin.gap.infer.detect import detect, scores_against
 from terrafusion.twin.gap.null.score import Score
 
 CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "wheel_radius_asymmetry", "slope"])
@@ -48,12 +48,12 @@ def test_the_more_an_effect_stands_out_the_less_is_chance() -> None:
     rng = np.random.default_rng(3)
     normal = scores(rng, 12)
     found = [detect(scores(rng, 3, size), normal, CANDIDATES, 0) for size in (0.0, 1.0, 10.0)]
-    tails = [d.tail(0.05) for d in found]
+    tails = [d.tail_probability(0.05) for d in found]
     assert tails[0] == found[0].p_value > 0.05  # no gap: nothing is carried on
     assert tails[0] > tails[1] > tails[2]
     assert tails[2] < 1e-4 < found[2].p_value
     assert found[2].statistic > 5.0 * found[1].statistic > 5.0 * found[0].statistic
-    assert found[2].scatter[COLUMN] < 3.0 < 0.1 * found[2].usual[COLUMN]  # the gap is no scatter
+    assert found[2].scatter[COLUMN] < 3.0 < 0.1 * found[2].typical[COLUMN]  # the gap is no scatter
 
 
 def test_a_choice_of_judged_runs_that_shows_more_of_the_gap_does_not_make_it_doubtful() -> None:
@@ -62,8 +62,8 @@ def test_a_choice_of_judged_runs_that_shows_more_of_the_gap_does_not_make_it_dou
     normal = scores(rng, 12)
     found = detect([*scores(rng, 2, 10.0), *scores(rng, 1)], normal, CANDIDATES, 0)
     assert 0.01 < found.p_value <= 0.05
-    assert found.tail(0.05) < 1e-4
-    assert found.tail(0.01) == found.p_value
+    assert found.tail_probability(0.05) < 1e-4
+    assert found.tail_probability(0.01) == found.p_value
 
 
 @pytest.mark.parametrize("size", [0.5, 3.0])
@@ -71,13 +71,16 @@ def test_taking_an_effect_out_leaves_what_references_leave(size: float) -> None:
     rng = np.random.default_rng(4)
     normal, runs = scores(rng, 12), scores(rng, 3)
     changed = [
-        Score(r.b + r.A[:, COLUMN] * size, r.A, r.square, r.rows) for r in runs
+        Score(r.b + r.A[:, COLUMN] * size, r.A, r.square, r.samples) for r in runs
     ]  # as the effect would change the same noise
-    alone = judged(changed, normal).alone
+    alone = scores_against(changed, normal).marginal
     whole = alone.squares()
     assert int(np.argmax(whole)) == COLUMN
     np.testing.assert_allclose(
-        alone.squares([COLUMN], np.array([size])), judged(runs, normal).alone.squares(), rtol=1e-9, atol=1e-12
+        alone.squares([COLUMN], np.array([size])),
+        scores_against(runs, normal).marginal.squares(),
+        rtol=1e-9,
+        atol=1e-12,
     )
 
 
@@ -86,7 +89,7 @@ def test_sigmas_are_how_sizes_scatter_from_run_to_run(scatter: float) -> None:
     """By each column's own score, fits of runs without an effect."""
     rng = np.random.default_rng(6)
     normal = scores(rng, 40, scatter=scatter)
-    groups = [judged(scores(rng, 3, scatter=scatter), normal).alone for _ in range(150)]
+    groups = [scores_against(scores(rng, 3, scatter=scatter), normal).marginal for _ in range(150)]
     sizes = np.array([g.gain / np.diag(g.moved) for g in groups])
     sigmas = np.array([g.sigmas(range(P)) for g in groups])
     z = (sizes / sigmas)[:, : len(CANDIDATES.keys)]

@@ -25,7 +25,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.blind.plant_against_twin import steady_differences
 
-PLANT = Path(__file__).parents[3] / "twin" / "gap" / "blind" / "plant"
+PLANT = Path(__file__).parents[4] / "twin" / "gap" / "blind" / "plant"
 DRIVE = (Segment(1.0), Segment(3.0, 1.0), Segment(3.0, 0.8, 0.5), Segment(2.0, 0.0, -0.8), Segment(1.0))
 
 

@@ -9,7 +9,7 @@ import jsonschema
 import pytest
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
-from tests.twin.gap.drives import runs
+from tests.twin.gap.runs import runs
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
 

@@ -8,18 +8,19 @@ import pytest
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.data.samples import layout
-from terrafusion.twin.gap.infer.channels import Table
-from terrafusion.twin.gap.infer.evidence import gather, prepared, starting_model
-from terrafusion.twin.gap.infer.nonlinear_refit import Fitter, bounds
-from terrafusion.twin.gap.infer.posterior import Pool
-from terrafusion.twin.gap.null.null import learn
-from terrafusion.twin.gap.null.score import learnt_sigma, score
-from terrafusion.twin.gap.rollout.delay import DELAYS, GROWING, IMU, in_time, late_layout
-from terrafusion.twin.gap.rollout.residuals import state_sigmas
-from terrafusion.twin.gap.rollout.sensitivities import Ask, predictions
+from terrafusion.twin.gap.data.logs import prepared, starting_model
+from terrafusion.twin.gap.data.samples import sample_map
+from terrafusion.twin.gap.infer.channels import ChannelTable
+from terrafusion.twin.gap.infer.nonlinear_refit import NonlinearRefit
+from terrafusion.twin.gap.infer.posterior import PooledScores
+from terrafusion.twin.gap.null.evidence import gather_evidence
+from terrafusion.twin.gap.null.null import learn_null
+from terrafusion.twin.gap.null.score import learn_state_sigma, score
+from terrafusion.twin.gap.rollout.delay import CLOCK_DRIFT, DELAYS, IMU, delayed_samples, without_delays
+from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
+from terrafusion.twin.gap.rollout.sensitivities import Rollout, predictions
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.drives import run, runs
+from tests.twin.gap.runs import run, runs
 
 CANDIDATES = Candidates.of(["imu_time_offset", "gnss_latency", "gyro_bias"])
 
@@ -38,7 +39,9 @@ def test_a_late_row_is_an_earlier_one(log_and_model, key: str, late_s: float) ->
     """By whole slots: an IMU's rows over the borders of windows, too, fixes within each."""
     log, model = log_and_model
     effects = {key: late_s, "gyro_bias/constant": 0.05}
-    plain, late = predictions([Ask(log, {"gyro_bias/constant": 0.05}), Ask(log, effects)], model, CANDIDATES)
+    plain, late = predictions(
+        [Rollout(log, {"gyro_bias/constant": 0.05}), Rollout(log, effects)], model, CANDIDATES
+    )
     assert plain is not None
     assert late is not None
     for observed, now, then in zip(log.observed, plain, late, strict=True):
@@ -58,7 +61,7 @@ def test_a_late_row_is_an_earlier_one(log_and_model, key: str, late_s: float) ->
 
 def test_a_fix_before_its_window_goes_straight_on(log_and_model) -> None:
     log, model = log_and_model
-    plain, late = predictions([Ask(log, {}), Ask(log, {"gnss_latency/both": 0.2})], model, CANDIDATES)
+    plain, late = predictions([Rollout(log, {}), Rollout(log, {"gnss_latency/both": 0.2})], model, CANDIDATES)
     assert plain is not None
     assert late is not None
     at = {o.channel: i for i, o in enumerate(log.observed)}
@@ -75,9 +78,8 @@ def test_an_offset_that_grows_is_that_of_its_row(log_and_model) -> None:
     """After a minute of driving it is the value given; the twin drives five seconds before a log."""
     log, _ = log_and_model
     rate = [o.channel for o in log.observed].index("yaw_rate_radps")
-    fine = layout(log)
-    grown = late_layout(log, {GROWING: 0.6}, fine)[rate]
-    constant = late_layout(log, {"imu_time_offset/shift": 0.25}, fine)[rate]
+    grown = delayed_samples(log, {CLOCK_DRIFT: 0.6})[rate]
+    constant = delayed_samples(log, {"imu_time_offset/shift": 0.25})[rate]
     middle = 0.5 * (log.observed[rate].begin_s + log.observed[rate].end_s)
     row = int(np.argmin(np.abs(middle - 20.0)))  # 0.6 s after 60 s, a quarter of a second after 25
 
@@ -85,25 +87,25 @@ def test_an_offset_that_grows_is_that_of_its_row(log_and_model) -> None:
         return float(rows[0][i] @ rows[1][i])
 
     assert time_of(grown, row) == pytest.approx(time_of(constant, row), abs=0.6)  # samples of 10 ms
-    assert late_layout(log, {"gyro_bias/constant": 0.1}, fine) == fine.fine
-    assert in_time({GROWING: 0.6, "gyro_bias/constant": 0.1}) == {"gyro_bias/constant": 0.1}
+    assert delayed_samples(log, {"gyro_bias/constant": 0.1}) == sample_map(log).fine
+    assert without_delays({CLOCK_DRIFT: 0.6, "gyro_bias/constant": 0.1}) == {"gyro_bias/constant": 0.1}
 
 
 def test_a_delay_beyond_its_signature_is_found() -> None:
     """An IMU .3 s late, fifteen typical sizes, on a drive whose turns change every two to three seconds."""
     candidates, key, truth = Candidates.of(["imu_time_offset"]), "imu_time_offset/shift", 0.3
     law = next(h for h in candidates.hypotheses if h.form == "shift")
-    bench = gather(
+    evidence = gather_evidence(
         runs(980, 1, {key: truth}), runs(985, 3), load_vehicle("elevate"), None, candidates, jobs=1
     )
-    sigma = learnt_sigma(bench.references, state_sigmas(candidates))
-    normal, scores = ([score(r, sigma) for r in some] for some in (bench.references, bench.runs))
-    null = learn(normal, 1)
-    pool = Pool.of(scores, null)
-    held = Table.of(bench.runs, bench.references, normal, sigma, len(candidates.keys))
-    value, _ = held.linear(law.columns, *bounds(candidates, law.columns))
-    best = Fitter(bench, scores, sigma, null, pool, held).fits([(law, value)])[0][law]
+    sigma = learn_state_sigma(evidence.references, initial_state_sigma(candidates))
+    normal, scores = ([score(r, sigma) for r in some] for some in (evidence.references, evidence.runs))
+    null = learn_null(normal, 1)
+    pooled = PooledScores.of(scores, null)
+    table = ChannelTable.of(evidence.runs, evidence.references, normal, sigma, len(candidates.keys))
+    value, _ = table.linear_fit(law.columns, *candidates.bounds(law.columns))
+    best = NonlinearRefit(evidence, scores, sigma, null, pooled, table).fits([(law, value)])[0][law]
     scale = float(candidates.scale[candidates.keys.index(key)])
     assert abs(float(value[0]) * scale - truth) > 0.1  # the signature misleads
     assert float(best.fit.value[0]) * scale == pytest.approx(truth, abs=0.015)
-    assert best.left.total < 0.25 * held.before().total
+    assert best.left.total < 0.25 * table.before().total

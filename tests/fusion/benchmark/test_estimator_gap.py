@@ -17,7 +17,7 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.infer.refit import Refit
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.drives import run
+from tests.twin.gap.runs import run
 
 MODEL = Model(load_vehicle("elevate"), {"loose_sand": load_soil("loose_sand")})
 

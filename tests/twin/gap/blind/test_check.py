@@ -28,7 +28,7 @@ from terrafusion.twin.gap.blind.severity import Observer, half_power, size_for
 from terrafusion.twin.gap.blind.shapes import IN_CATALOGUE, OUT_OF_CATALOGUE, SAME, SHIFTED, shapes
 from terrafusion.twin.gap.blind.verdicts import judge
 from tests.studies.blind.power import half_power_multiple
-from tests.twin import blind_answers as fake
+from tests.twin.gap.blind import blind_answers as fake
 
 BUILT_IN = tuple(dict.fromkeys(form.effect for form in built_in().values()))
 TINY = Scale(nulls=2, effects=1, outside=1, pairs=1, runs=1, references=1, severities=(4.0,))

@@ -13,7 +13,7 @@ from terrafusion.fusion.reports.blind import summary, write_blind
 from terrafusion.fusion.reports.plots import blind as plots
 from terrafusion.twin.gap.blind.plan import FULL, Scale, plan
 from terrafusion.twin.gap.blind.score import score
-from tests.twin import blind_answers as fake
+from tests.twin.gap.blind import blind_answers as fake
 
 
 def test_the_page_tells_every_score(tmp_path: Path) -> None:

@@ -11,17 +11,17 @@ from terrafusion.twin.engine import compiler, native
 from terrafusion.twin.engine.integrate import compiled
 from terrafusion.twin.engine.reader import reader
 from terrafusion.twin.gap.data.candidates import Candidates
-from terrafusion.twin.gap.infer.evidence import Bench, gather
+from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.drives import runs
+from tests.twin.gap.runs import runs
 
 
 @pytest.mark.skipif(not compiled(), reason="no C compiler")
 def test_evidence_is_the_same_from_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     given, candidates = (runs(970, 1), runs(975, 2)), Candidates.of(["gyro_bias"])
 
-    def evidence() -> Bench:
-        return gather(*given, load_vehicle("elevate"), None, candidates, jobs=2)
+    def evidence() -> GapEvidence:
+        return gather_evidence(*given, load_vehicle("elevate"), None, candidates, jobs=2)
 
     fast = evidence()
     monkeypatch.setattr(compiler, "find_compiler", lambda: None)
@@ -46,4 +46,4 @@ def test_an_effect_that_is_not_written_as_c_has_one_thread(monkeypatch: pytest.M
     body = {"body": lambda q, e: {"body_force_x_n": q["body_force_x_n"] - ca.if_else(q["u"] > 0.5, e, 0.0)}}
     catalogue.register(Form("trailer", "brake", one("N", 10.0, 0.0, 200.0), body, "force e beyond 0.5 m/s"))
     given = runs(970, 1), runs(975, 1), load_vehicle("elevate"), None
-    assert gather(*given, Candidates.of(["trailer"]), jobs=2).jobs == 1
+    assert gather_evidence(*given, Candidates.of(["trailer"]), jobs=2).jobs == 1

@@ -9,17 +9,24 @@ import jsonschema
 import numpy as np
 import pytest
 
-from terrafusion.twin.gap import diagnose
+from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.infer import refit
-from terrafusion.twin.gap.infer.channels import RIDGE, Block, Products, Table, energy
-from terrafusion.twin.gap.infer.goodness_of_fit import FEWEST, FITS, LEVEL, MOST_ABOVE, Goodness, goodness
+from terrafusion.twin.gap.infer.channels import RIDGE, ChannelTable, ErrorProducts, RunProducts, run_energy
+from terrafusion.twin.gap.infer.goodness_of_fit import (
+    FEWEST,
+    LEVEL,
+    MOST_ABOVE,
+    PERFECT_FIT,
+    GoodnessOfFit,
+    goodness_of_fit,
+)
 from terrafusion.twin.gap.infer.nonlinear_refit import DIVERGED
 from terrafusion.twin.model.vehicle import load_vehicle
-from tests.twin.gap.drives import runs
+from tests.twin.gap.runs import runs
 
 CHANNELS, ROWS, STATES, EFFECTS, RUNS, REFERENCES = 3, 300, 1, 4, 3, 14
 SIGMA, WEIGHT = np.ones(STATES), np.ones(CHANNELS)
-SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
+SCHEMA = json.loads((Path(__file__).parents[4] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
 
 
 def signatures(rng: np.random.Generator) -> np.ndarray:
@@ -29,11 +36,11 @@ def signatures(rng: np.random.Generator) -> np.ndarray:
     return J
 
 
-def block(J: np.ndarray, error: np.ndarray) -> Block:
+def block(J: np.ndarray, error: np.ndarray) -> RunProducts:
     gram = np.einsum("cni,cnj->cij", J, J)
-    made = Products(np.einsum("cni,cn->ci", J, error), (error**2).sum(axis=1))
+    made = ErrorProducts(np.einsum("cni,cn->ci", J, error), (error**2).sum(axis=1))
     inverse = np.linalg.inv(gram + RIDGE * np.eye(J.shape[2]))
-    return Block(gram, inverse, made, STATES, np.full(CHANNELS, float(ROWS)))
+    return RunProducts(gram, inverse, made, STATES, np.full(CHANNELS, float(ROWS)))
 
 
 def noise(rng: np.random.Generator) -> np.ndarray:
@@ -46,13 +53,13 @@ def judged(
     left: np.ndarray,
     quiet: float = 1.0,
     references: int = REFERENCES,
-) -> Goodness:
+) -> GoodnessOfFit:
     """Of runs whose gap is `gap` (C, N) times the signatures, beside noise, of which an explanation leaves
     `left` times them; channel 0 has `quiet` times the noise."""
     each = []
     for _ in range(references):
         b = block(signatures(rng), noise(rng))
-        each.append(energy(b, b.error, SIGMA, WEIGHT))
+        each.append(run_energy(b, b.error, SIGMA, WEIGHT))
     blocks, errors = [], []
     for _ in range(RUNS):
         J, e = signatures(rng), noise(rng)
@@ -60,8 +67,8 @@ def judged(
         blocks.append(block(J, e + np.einsum("cni,ci->cn", J, gap)))
         errors.append(block(J, e + np.einsum("cni,ci->cn", J, left)).error)
     floor = np.ones(CHANNELS)
-    table = Table((), tuple(blocks), SIGMA, floor, floor, SIGMA, np.reshape(each, (-1, 2 * CHANNELS)))
-    return goodness(table, errors, WEIGHT)
+    table = ChannelTable((), tuple(blocks), SIGMA, floor, floor, SIGMA, np.reshape(each, (-1, 2 * CHANNELS)))
+    return goodness_of_fit(table, errors, WEIGHT)
 
 
 def sizes(*values: float) -> np.ndarray:
@@ -73,7 +80,7 @@ def sizes(*values: float) -> np.ndarray:
 
 def test_runs_like_the_references_leave_nothing() -> None:
     rng = np.random.default_rng(1)
-    fits = sum(judged(rng, sizes(0, 0, 0), sizes(0, 0, 0)) == FITS for _ in range(200))
+    fits = sum(judged(rng, sizes(0, 0, 0), sizes(0, 0, 0)) == PERFECT_FIT for _ in range(200))
     assert fits >= (1.0 - 2 * LEVEL) * 200
 
 
@@ -108,19 +115,20 @@ def test_a_channel_that_became_quiet_is_told() -> None:
 
 def test_without_references_nothing_is_called_left() -> None:
     assert (
-        judged(np.random.default_rng(6), sizes(40, 40, 40), sizes(40, 40, 40), references=FEWEST - 1) == FITS
+        judged(np.random.default_rng(6), sizes(40, 40, 40), sizes(40, 40, 40), references=FEWEST - 1)
+        == PERFECT_FIT
     )
 
 
 def test_a_law_with_which_the_twin_diverges_is_told_as_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
     """It stays a cause, without sigma and share, and the notes say why."""
-    whole = refit.settled_predictions
+    whole = refit.aligned_predictions
 
     def diverging(asks, model, candidates, jobs):  # type: ignore[no-untyped-def]
         found = whole(asks, model, candidates, jobs)
         return [None if "wheel_radius/scale" in a.effects else y for a, y in zip(asks, found, strict=True)]
 
-    monkeypatch.setattr(refit, "settled_predictions", diverging)
+    monkeypatch.setattr(refit, "aligned_predictions", diverging)
     given = runs(300, 2, {"wheel_radius/scale": 0.03})
     found = diagnose(given, runs(100, 6), load_vehicle("elevate"), effects=["wheel_radius", "track_width"])
     answer = found.to_json()

@@ -1,0 +1,115 @@
+"""Evidence of a diagnosis: whitened residuals of all runs against one twin, set to the references."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.calibrate.noise import ResidualNoise
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.data.logs import Soils, prepared, starting_model, with_common_channels
+from terrafusion.twin.gap.null.channel_noise import learn_noise
+from terrafusion.twin.gap.null.reference_soil import all_residuals, set_soil
+from terrafusion.twin.gap.rollout.batch import is_thread_safe
+from terrafusion.twin.gap.rollout.outliers import limit_outliers
+from terrafusion.twin.gap.rollout.residuals import (
+    LinearisationCache,
+    RunResiduals,
+    WhitenedRun,
+    initial_state_sigma,
+    whitened,
+)
+from terrafusion.twin.gap.rollout.run_soil import at_run_soil, soil_limit
+from terrafusion.twin.gap.rollout.sensitivities import Linearisation
+from terrafusion.twin.model.vehicle import VehicleParams
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class GapEvidence:
+    """Everything that a diagnosis compares.
+
+    Attributes:
+        model: the twin, its soil set to the references.
+        candidates: effects.
+        channels: observed channels.
+        noise: of each channel.
+        runs, references: whitened residuals of each.
+        residuals: those of the judged runs before whitening.
+        soil_limit: (S,) how far a judged run's soil may lie from the model's, typical sizes.
+        cache: linearisations, shared by runs with equal commands.
+        notes: assumptions, in sentences.
+        jobs: threads.
+    """
+
+    model: Model
+    candidates: Candidates
+    channels: tuple[str, ...]
+    noise: dict[str, ResidualNoise]
+    runs: list[WhitenedRun]
+    references: list[WhitenedRun]
+    residuals: list[RunResiduals]
+    soil_limit: Array
+    cache: LinearisationCache
+    notes: tuple[str, ...]
+    jobs: int = 1
+
+
+def gather_evidence(
+    runs: Sequence[Recording],
+    references: Sequence[Recording],
+    vehicle: VehicleParams,
+    soils: Soils,
+    candidates: Candidates,
+    *,
+    source: str = "auto",
+    jobs: int = 2,
+    progress: Callable[[float], None] | None = None,
+    cache: dict[str, Linearisation] | None = None,
+) -> GapEvidence:
+    """Evidence of all runs; arguments as those of `diagnose`. One thread where not everything is compiled.
+
+    Raises:
+        DataError: a log lacks a channel that is needed.
+        TerrafusionError: the twin diverges on every reference.
+    """
+    jobs, R = jobs if is_thread_safe(candidates) else 1, len(runs)
+    model, soil, notes = starting_model([*runs, *references], vehicle, soils)
+    logs = with_common_channels(prepared([*runs, *references], model, soil, source))
+    channels = tuple(o.channel for o in logs[0].observed)
+    known = {} if cache is None else cache
+    if references:
+        model = set_soil(logs[R:], LinearisationCache(model, candidates, known), channels, jobs)
+    linearised, done = LinearisationCache(model, candidates, known), itertools.count(1)
+
+    def count() -> None:
+        if progress is not None:
+            progress(0.7 * next(done) / len(logs))
+
+    residuals = all_residuals(logs, linearised, channels, jobs, count)
+    first = learn_noise(residuals[R:], residuals[:R], candidates, jobs)
+    free = at_run_soil(residuals[R:], linearised, first, jobs=jobs)
+    limit = soil_limit(free, candidates)
+    # The same limit for all, or a run that is but a further reference would differ from them.
+    beyond = [not (abs(run.soil) <= limit).all() for run in free]
+    again = [*residuals[:R], *itertools.compress(residuals[R:], beyond)]
+    limited = iter(at_run_soil(again, linearised, first, limit, jobs))
+    judged = list(itertools.islice(limited, R))
+    normal = [next(limited) if far else run for run, far in zip(free, beyond, strict=True)]
+    noise = learn_noise(normal, judged, candidates, jobs, first)
+    with ThreadPoolExecutor(jobs) as threads:
+        white = list(threads.map(lambda run: whitened(run, noise), [*judged, *normal]))
+    clipped = limit_outliers(white[:R], white[R:], initial_state_sigma(candidates), jobs)
+    notes += [f"{log.name}: {note}" for log in logs for note in log.notes]
+    return GapEvidence(
+        model, candidates, channels, noise, *clipped, judged, limit, linearised,
+        tuple(dict.fromkeys(notes)), jobs,
+    )  # fmt: skip
