@@ -249,7 +249,7 @@ class OneOf:
         from pydantic_core import core_schema
 
         choices = {f"<{i}>": handler.generate_schema(kind) for i, kind in enumerate(self.kinds)}
-        return core_schema.tagged_union_schema(choices, lambda raw: f"<{self.pick(raw)}>")
+        return core_schema.tagged_union_schema(choices, lambda raw: f"<{int(self.pick(raw))}>")
 
 
 def structure(kind: type[T], raw: Any, *, file: Path | str, key: str = "", complete: bool = False) -> T:
@@ -372,7 +372,7 @@ def _one_error(error: Any, kind: Any, file: Path | str, key: str) -> ConfigError
     if error["type"] in ("dataclass_type", "dict_type"):
         names = _hints(_bare(hint))
         remedy = f"give keys from {', '.join(names)}" if names else "give a mapping"
-        return ConfigError(f"'{value}' is not a section", file=file, channel=key or None, remedy=remedy)
+        return ConfigError(f"'{key}' is '{value}', not a section", file=file, remedy=remedy)
     remedies = {
         "string_type": "give a text, in quotes",
         "tuple_type": "give a list",

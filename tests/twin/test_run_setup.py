@@ -215,7 +215,7 @@ def test_the_example_of_the_documents_drives(tmp_path) -> None:
         ("canopy: [{start_m: 0, length_m: 5, density: 2}]", r"'canopy\[0\].density' is 2, out of range"),
         ("canopy: [{start_m: 0, duration_s: 5, density: 1}]", r"unknown key 'canopy\[0\].duration_s'"),
         ("gnss_outages: [{start_m: 0}]", r"'gnss_outages\[0\].length_m' is missing"),
-        ("canopy: [[[[x]]]]", r"'canopy\[0\]' is '\[\[\[...\]\]\]'; give a mapping"),
+        ("canopy: [[[[x]]]]", r"'canopy\[0\]' is '\[\[\[...\]\]\]', not a section; give keys from"),
         ("gnss_fix: [[[[x]]]]", r"'gnss_fix' is '\[\[\[...\]\]\]'; give one of"),
         ("stops: [{start_s: 5, duration_s: 2}]", r"'stops\[0\].start_s' is 5, after the drive's 5 s"),
         ("gnss_outages: [{start_s: 9, duration_s: 2}]", r"'gnss_outages\[0\].start_s' is 9, after the drive"),
@@ -227,7 +227,7 @@ def test_the_example_of_the_documents_drives(tmp_path) -> None:
             "payload_kg: 5\npayload_at_m: [0, 0, -0.2]",
             "the payload is 0.2 m below the ground; give its height",
         ),
-        ("gnss_outages: [5]", r"'gnss_outages\[0\]' is '5'; give a mapping"),
+        ("gnss_outages: [5]", r"'gnss_outages\[0\]' is '5', not a section; give keys from"),
     ],
 )
 def test_a_wrong_option_in_a_file_is_told_by_key(tmp_path, text, message) -> None:

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import zlib
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.config import Quantity
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.plant import RouteTable, SoilField
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, SOIL_PARAMETERS, VEHICLE_PARAMETERS
@@ -43,8 +45,8 @@ Stiffness and cohesion follow in full; friction varies about 0.3 as much: coeffi
 class Variation:
     """Strength of the ground: sigma of its logarithm, and the distance at which correlation falls to 1/e."""
 
-    strength_sigma: float
-    length_m: float
+    strength_sigma: Annotated[float, Quantity("", 0.0, 1.0)]
+    length_m: Annotated[float, Quantity("m", 0.1, 1000.0)]
 
 
 @dataclass(frozen=True)
@@ -52,8 +54,8 @@ class SoilPatches:
     """Patches of `terrain` that cover `share` of the plane; `length_m` sets their size."""
 
     terrain: str
-    share: float
-    length_m: float
+    share: Annotated[float, Quantity("", 0.0, 1.0)]
+    length_m: Annotated[float, Quantity("m", 0.1, 1000.0)]
 
 
 def gaussian_field(cells: int, cell_m: float, length_m: float, rng: np.random.Generator) -> Array:

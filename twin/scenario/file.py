@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.config import Quantity, checked_number, shown
-from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.config import OneOf, Quantity, Word, refuse, structure
 from terrafusion.twin.model.ground import SoilPatches, Variation
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.scenario.scenario import (
@@ -16,43 +16,84 @@ from terrafusion.twin.scenario.scenario import (
     PLACE,
     Canopy,
     DriveSegment,
+    Duration,
     Interval,
     RouteLeg,
     Scenario,
     Stretch,
 )
 
-_SECONDS = Quantity("s", 0.0, 36000.0)
-_DURATION = Quantity("s", 0.01, 36000.0)
-_SPEED = Quantity("m/s", -20.0, 20.0)
-_YAW_RATE = Quantity("rad/s", -10.0, 10.0)
-_DRIVE = {
-    "duration_s": _DURATION,
-    "v_mps": _SPEED,
-    "yaw_rate_radps": _YAW_RATE,
-    "v_amplitude_mps": _SPEED,
-    "yaw_rate_amplitude_radps": _YAW_RATE,
-    "period_s": Quantity("s", 0.05, 36000.0),
-    "end_period_s": Quantity("s", 0.05, 36000.0),
-}
-_NUMBERS = {
-    "duration_s": _DURATION,
-    "waypoint_speed_mps": Quantity("m/s", 0.05, 20.0),
-    "max_accel_mps2": Quantity("m/s2", 0.01, 50.0),
-    "slope_deg": Quantity("deg", 0.0, MAX_SLOPE_DEG),
-    "cross_slope_deg": Quantity("deg", -MAX_SLOPE_DEG, MAX_SLOPE_DEG),
-    "payload_kg": Quantity("kg", 0.0, 5000.0),
-    "aspect_deg": Quantity("deg", -360.0, 360.0),
-    "heading_deg": Quantity("deg", -360.0, 360.0),
-    "transition": Quantity("m or s", 0.01, 100.0),
-}
-_INTERVAL = {"start_s": _SECONDS, "duration_s": _DURATION}
-_STRETCH = {"start_m": Quantity("m", 0.0, 1e6), "length_m": Quantity("m", 0.1, 1e6)}
-_DENSITY = {"density": Quantity("", 0.0, 1.0)}
-_LENGTH = Quantity("m", 0.1, 1000.0)
-_PERCENT = Quantity("%", 0.0, 500.0)
-_VARIATION = {"strength_sigma": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
-_PATCHES = {"share": Quantity("", 0.0, 1.0), "length_m": _LENGTH}
+_Degrees = Annotated[float, Quantity("deg", -360.0, 360.0)]
+_LegLength = Annotated[float, Quantity("", 0.1, 1e6)]
+_Density = Annotated[float, Quantity("", 0.0, 1.0)]
+
+
+@dataclass(frozen=True)
+class LegFile:
+    """A leg of `route`: its length in metres or seconds, as `route_over` has it; the last has none."""
+
+    terrain: str
+    length_m: _LegLength | None = None
+    length_s: _LegLength | None = None
+    moisture_percent: Annotated[float, Quantity("%", 0.0, 500.0)] | None = None
+
+
+@dataclass(frozen=True)
+class CanopyInterval(Interval):
+    """Trees from a time on."""
+
+    density: _Density
+
+
+@dataclass(frozen=True)
+class CanopyStretch(Stretch):
+    """Trees from a distance driven on."""
+
+    density: _Density
+
+
+def _by_travel(raw: Any) -> bool:
+    return isinstance(raw, dict) and "start_m" in raw
+
+
+@dataclass(frozen=True)
+class ScenarioFile:
+    """Keys of a scenario file; what is not given has the default of `Scenario`."""
+
+    name: str | None = None
+    description: str = ""
+    duration_s: Duration | None = None
+    drive: tuple[DriveSegment, ...] = ()
+    stops: tuple[Interval, ...] = ()
+    waypoints: tuple[Annotated[tuple[float, ...], Quantity("m", -1e4, 1e4, size=2)], ...] = ()
+    waypoint_speed_mps: Annotated[float, Quantity("m/s", 0.05, 20.0)] | None = None
+    max_accel_mps2: Annotated[float, Quantity("m/s2", 0.01, 50.0)] | None = None
+    route: tuple[LegFile, ...] | None = None
+    route_over: Annotated[str, Word(("travel", "time"))] = "travel"
+    transition: Annotated[float, Quantity("m or s", 0.01, 100.0)] | None = None
+    variation: Variation | None = None
+    patches: SoilPatches | None = None
+    slope_deg: Annotated[float, Quantity("deg", 0.0, MAX_SLOPE_DEG)] | None = None
+    cross_slope_deg: Annotated[float, Quantity("deg", -MAX_SLOPE_DEG, MAX_SLOPE_DEG)] | None = None
+    aspect_deg: _Degrees | None = None
+    heading_deg: _Degrees | None = None
+    payload_kg: Annotated[float, Quantity("kg", 0.0, 5000.0)] | None = None
+    payload_at_m: Annotated[tuple[float, ...], PLACE] | None = None
+    gnss_fix: Annotated[str, Word(("best", "fixed", "float", "single"))] = "best"
+    gnss_outages: tuple[Annotated[Interval | Stretch, OneOf(_by_travel, (Interval, Stretch))], ...] = ()
+    canopy: tuple[
+        Annotated[CanopyInterval | CanopyStretch, OneOf(_by_travel, (CanopyInterval, CanopyStretch))], ...
+    ] = ()
+
+    @property
+    def leg_key(self) -> str:
+        """Key of a leg's length."""
+        return "length_m" if self.route_over == "travel" else "length_s"
+
+    @property
+    def total_s(self) -> float:
+        """Duration of the drive; 0 where nothing says it."""
+        return self.duration_s or sum(segment.duration_s for segment in self.drive)
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -76,171 +117,56 @@ def scenario_of(raw: dict[str, Any], file: str, stem: str) -> Scenario:
     Raises:
         ConfigError: unknown or missing key, or a value of the wrong type or out of range.
     """
-    lists = ("drive", "stops", "waypoints", "route", "gnss_outages", "canopy")
-    words = ("name", "description", "route_over", "gnss_fix")
-    _known(raw, (*_NUMBERS, *lists, *words, "payload_at_m", "variation", "patches"), file, "")
-    values: dict[str, Any] = {
-        "name": _text(raw, "name", stem, file),
-        "description": _text(raw, "description", "", file),
-    }
-    values |= {
-        key: checked_number(raw[key], q, file=file, key=key) for key, q in _NUMBERS.items() if key in raw
-    }
-    values["drive"] = tuple(DriveSegment(**r) for r in _rows(raw, "drive", _DRIVE, ("duration_s",), file))
-    values["stops"] = tuple(Interval(**r) for r in _rows(raw, "stops", _INTERVAL, tuple(_INTERVAL), file))
-    values["gnss_outages"] = tuple(_zones(raw, "gnss_outages", {}, file))
-    values["canopy"] = tuple(Canopy(*row) for row in _zones(raw, "canopy", _DENSITY, file))
-    if "payload_at_m" in raw:
-        values["payload_at_m"] = checked_number(raw["payload_at_m"], PLACE, file=file, key="payload_at_m")
-    points = [
-        checked_number(point, Quantity("m", -1e4, 1e4, size=2), file=file, key=f"waypoints[{i}]")
-        for i, point in enumerate(_list(raw, "waypoints", file))
-    ]
-    values["waypoints"] = tuple(points)
-    values["route_over"] = _word(raw, "route_over", ("travel", "time"), file)
-    fix = _word(raw, "gnss_fix", ("best", "fixed", "float", "single"), file)
-    values["gnss_fix"] = None if fix == "best" else Fix[fix.upper()]
-    if "route" in raw:
-        values["route"] = _route(raw, values["route_over"], file)
-    if "variation" in raw:
-        values["variation"] = Variation(**_section(raw, "variation", _VARIATION, file))
-    if "patches" in raw:
-        values["patches"] = SoilPatches(**_section(raw, "patches", _PATCHES, file, "terrain"))
-    if not values["drive"] and not points:
-        raise ConfigError(
-            "the scenario drives nowhere", file=file, remedy="add 'drive' segments or 'waypoints'"
-        )
-    if values["drive"] and points:
-        raise ConfigError("'drive' and 'waypoints' exclude each other", file=file, remedy="keep one of them")
-    for key, missing in (("stops", "drive"), ("waypoint_speed_mps", "waypoints")):
-        if raw.get(key) and not values[missing]:
-            raise ConfigError(f"'{key}' has no effect without '{missing}'", file=file, remedy="leave it out")
-    if "duration_s" not in values:
-        if points:
-            raise ConfigError("'duration_s' is missing", file=file, remedy="say how long the robot may take")
-        values["duration_s"] = sum(segment.duration_s for segment in values["drive"])
-    scenario = Scenario(**values)
-    _check_times(scenario, file)
-    return scenario
+    found = structure(ScenarioFile, raw, file=file)
+    refuse(_problems(found), file)
+    values = {"name": stem} | {key: getattr(found, key) for key in raw}
+    values["duration_s"] = found.total_s
+    values["gnss_fix"] = None if found.gnss_fix == "best" else Fix[found.gnss_fix.upper()]
+    values["canopy"] = tuple(_canopy(trees) for trees in found.canopy)
+    if found.route is not None:
+        lengths = [*(getattr(leg, found.leg_key) for leg in found.route[:-1]), None]
+        legs = zip(found.route, lengths, strict=True)
+        values["route"] = tuple(RouteLeg(leg.terrain, length, leg.moisture_percent) for leg, length in legs)
+    return Scenario(**values)
 
 
-def _check_times(scenario: Scenario, file: str) -> None:
-    """Refuses what would begin after the drive: it would do nothing."""
-    canopy = tuple(trees.zone for trees in scenario.canopy)
-    for key, zones in (
-        ("stops", scenario.stops),
-        ("gnss_outages", scenario.gnss_outages),
-        ("canopy", canopy),
-    ):
-        for i, zone in enumerate(zones):
-            if isinstance(zone, Interval) and zone.start_s >= scenario.duration_s:
-                raise ConfigError(
-                    f"'{key}[{i}].start_s' is {zone.start_s:g}, after the drive's {scenario.duration_s:g} s",
-                    file=file,
-                    remedy="let it begin earlier, or leave it out",
-                )
+def _canopy(trees: CanopyInterval | CanopyStretch) -> Canopy:
+    if isinstance(trees, CanopyInterval):
+        return Canopy(Interval(trees.start_s, trees.duration_s), trees.density)
+    return Canopy(Stretch(trees.start_m, trees.length_m), trees.density)
 
 
-def _route(raw: dict[str, Any], over: str, file: str) -> tuple[RouteLeg, ...]:
-    key = "length_m" if over == "travel" else "length_s"
-    legs = []
-    rows = _list(raw, "route", file)
-    for i, row in enumerate(rows):
-        here = f"route[{i}]"
-        _known(row, ("terrain", key, "moisture_percent"), file, here)
-        if not isinstance(row.get("terrain"), str):
-            raise ConfigError(f"'{here}.terrain' is missing", file=file, remedy="name a terrain")
-        length = None
-        if i < len(rows) - 1:
-            if key not in row:
-                raise ConfigError(
-                    f"'{here}.{key}' is missing", file=file, remedy="only the last leg has no length"
-                )
-            length = float(checked_number(row[key], Quantity("", 0.1, 1e6), file=file, key=f"{here}.{key}"))  # type: ignore[arg-type]
-        wet = row.get("moisture_percent")
-        if wet is not None:
-            wet = float(checked_number(wet, _PERCENT, file=file, key=f"{here}.moisture_percent"))  # type: ignore[arg-type]
-        legs.append(RouteLeg(row["terrain"], length, wet))
-    if not legs:
-        raise ConfigError("'route' is empty", file=file, remedy="name at least one terrain")
-    return tuple(legs)
+def _problems(found: ScenarioFile) -> Iterator[tuple[str, str]]:
+    """What is wrong beyond single values, and the remedy."""
+    if not found.drive and not found.waypoints:
+        yield "the scenario drives nowhere", "add 'drive' segments or 'waypoints'"
+    if found.drive and found.waypoints:
+        yield "'drive' and 'waypoints' exclude each other", "keep one of them"
+    if found.stops and not found.drive:
+        yield "'stops' has no effect without 'drive'", "leave it out"
+    if found.waypoint_speed_mps and not found.waypoints:
+        yield "'waypoint_speed_mps' has no effect without 'waypoints'", "leave it out"
+    if found.waypoints and found.duration_s is None:
+        yield "'duration_s' is missing", "say how long the robot may take"
+    yield from _leg_problems(found)
+    zones = {"stops": found.stops, "gnss_outages": found.gnss_outages, "canopy": found.canopy}
+    for key, many in zones.items() if found.total_s else ():
+        for i, zone in enumerate(many):
+            if isinstance(zone, Interval) and zone.start_s >= found.total_s:
+                what = f"'{key}[{i}].start_s' is {zone.start_s:g}, after the drive's {found.total_s:g} s"
+                yield what, "let it begin earlier, or leave it out"
 
 
-def _zones(raw: dict[str, Any], key: str, more: dict[str, Quantity], file: str) -> list[Any]:
-    """Zones by time or by travel; with `more` quantities, tuples of the zone and their values."""
-    zones: list[Any] = []
-    for i, row in enumerate(_list(raw, key, file)):
-        over: dict[str, Quantity] = _STRETCH if isinstance(row, Mapping) and "start_m" in row else _INTERVAL
-        values = _row(row, f"{key}[{i}]", over | more, (*over, *more), file)
-        kind = Stretch if over is _STRETCH else Interval
-        zone = kind(**{name: values[name] for name in over})
-        zones.append((zone, *(values[name] for name in more)) if more else zone)
-    return zones
-
-
-def _rows(
-    raw: dict[str, Any], key: str, quantities: dict[str, Quantity], needed: tuple[str, ...], file: str
-) -> list[dict[str, Any]]:
-    rows = enumerate(_list(raw, key, file))
-    return [_row(row, f"{key}[{i}]", quantities, needed, file) for i, row in rows]
-
-
-def _row(
-    row: Any, here: str, quantities: dict[str, Quantity], needed: tuple[str, ...], file: str
-) -> dict[str, Any]:
-    _known(row, tuple(quantities), file, here)
-    for name in needed:
-        if name not in row:
-            raise ConfigError(f"'{here}.{name}' is missing", file=file, remedy="add it")
-    return {n: checked_number(v, quantities[n], file=file, key=f"{here}.{n}") for n, v in row.items()}
-
-
-def _section(
-    raw: dict[str, Any], key: str, quantities: dict[str, Quantity], file: str, word: str | None = None
-) -> dict[str, Any]:
-    """A mapping of numbers, and of one `word` where given; every entry is needed."""
-    words = () if word is None else (word,)
-    section = raw[key]
-    _known(section, (*words, *quantities), file, key)
-    for name in (*words, *quantities):
-        if name not in section:
-            raise ConfigError(f"'{key}.{name}' is missing", file=file, remedy="add it")
-    for name in words:
-        if not isinstance(section[name], str):
-            raise ConfigError(f"'{key}.{name}' is '{shown(section[name])}'", file=file, remedy="give a name")
-    numbers = {n: checked_number(section[n], q, file=file, key=f"{key}.{n}") for n, q in quantities.items()}
-    return numbers | {name: section[name] for name in words}
-
-
-def _list(raw: dict[str, Any], key: str, file: str) -> list[Any]:
-    value = raw.get(key, [])
-    if not isinstance(value, list):
-        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy="give a list")
-    return value
-
-
-def _word(raw: dict[str, Any], key: str, allowed: tuple[str, ...], file: str) -> str:
-    value = raw.get(key, allowed[0])
-    if value not in allowed:
-        raise ConfigError(
-            f"'{key}' is '{shown(value)}'", file=file, remedy=f"give one of {', '.join(allowed)}"
-        )
-    return str(value)
-
-
-def _text(raw: dict[str, Any], key: str, default: str, file: str) -> str:
-    value = raw.get(key, default)
-    if not isinstance(value, str):
-        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy="give a text")
-    return value
-
-
-def _known(row: Any, names: tuple[str, ...], file: str, here: str) -> None:
-    if not isinstance(row, Mapping):
-        raise ConfigError(
-            f"'{here}' is '{shown(row)}'", file=file, remedy=f"give a mapping of {', '.join(names)}"
-        )
-    for name in row:
-        if name not in names:
-            key = f"{here}.{shown(name)}" if here else shown(name)
-            raise ConfigError(f"unknown key '{key}'", file=file, remedy=f"known here: {', '.join(names)}")
+def _leg_problems(found: ScenarioFile) -> Iterator[tuple[str, str]]:
+    if found.route is not None and not found.route:
+        yield "'route' is empty", "name at least one terrain"
+    other = "length_s" if found.leg_key == "length_m" else "length_m"
+    for i, leg in enumerate(found.route or ()):
+        if getattr(leg, other) is not None:
+            yield (
+                f"unknown key 'route[{i}].{other}'",
+                f"the route is over {found.route_over}: '{found.leg_key}'",
+            )
+        last = i == len(found.route or ()) - 1
+        if not last and getattr(leg, found.leg_key) is None:
+            yield f"'route[{i}].{found.leg_key}' is missing", "only the last leg has no length"

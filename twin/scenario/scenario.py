@@ -18,6 +18,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +31,11 @@ from terrafusion.twin.model.ground import SoilPatches, Variation
 Array = NDArray[np.float64]
 
 MAX_SLOPE_DEG = 25.0
+Start = Annotated[float, Quantity("s", 0.0, 36000.0)]
+Duration = Annotated[float, Quantity("s", 0.01, 36000.0)]
+Speed = Annotated[float, Quantity("m/s", -20.0, 20.0)]
+YawRate = Annotated[float, Quantity("rad/s", -10.0, 10.0)]
+Period = Annotated[float, Quantity("s", 0.05, 36000.0)]
 PLACE = Quantity("m", -5.0, 5.0, size=3)
 """Where a payload may ride, body frame."""
 
@@ -42,13 +48,13 @@ class DriveSegment:
     `end_period_s` the frequency rises (or falls) linearly to 1/end_period_s.
     """
 
-    duration_s: float
-    v_mps: float = 0.0
-    yaw_rate_radps: float = 0.0
-    v_amplitude_mps: float = 0.0
-    yaw_rate_amplitude_radps: float = 0.0
-    period_s: float = 60.0
-    end_period_s: float = 0.0
+    duration_s: Duration
+    v_mps: Speed = 0.0
+    yaw_rate_radps: YawRate = 0.0
+    v_amplitude_mps: Speed = 0.0
+    yaw_rate_amplitude_radps: YawRate = 0.0
+    period_s: Period = 60.0
+    end_period_s: Period = 0.0
 
     def twist(self, t_s: Array) -> Array:
         """Twist (N, 2), m/s and rad/s, at times (N,) from the segment's start."""
@@ -75,8 +81,8 @@ class RouteLeg:
 class Interval:
     """From `start_s` for `duration_s` seconds."""
 
-    start_s: float
-    duration_s: float
+    start_s: Start
+    duration_s: Duration
 
     def covers(self, t_s: Array) -> NDArray[np.bool_]:
         """Which of the times lie inside."""
@@ -87,8 +93,8 @@ class Interval:
 class Stretch:
     """From `start_m` driven forward for `length_m` metres."""
 
-    start_m: float
-    length_m: float
+    start_m: Annotated[float, Quantity("m", 0.0, 1e6)]
+    length_m: Annotated[float, Quantity("m", 0.1, 1e6)]
 
     def covers(self, travel_m: Array) -> NDArray[np.bool_]:
         """Which of the distances lie inside."""

@@ -235,9 +235,9 @@ def test_a_hostile_catalogue_is_refused(
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("cases: [a]", r"cases: .* is not a section"),
-        ("cases: {f: text}", r"cases\.f: 'text' is not a section; give keys from conventions, note"),
-        ("conventions: [1]", r"conventions: '\[1\]' is not a section; give keys from vehicle"),
+        ("cases: [a]", r"cases' is .*, not a section; give a mapping"),
+        ("cases: {f: text}", r"cases\.f' is 'text', not a section; give keys from conventions, note"),
+        ("conventions: [1]", r"conventions' is '\[1\]', not a section; give keys from vehicle"),
         ("cases: {f: {notes: x}}", r"unknown key '.*cases\.f\.notes'; did you mean 'note'"),
         ("conventions: {gyro_z_sign: 1}", r"conventions.gyro_z_sign' is '1' without a source"),
     ],
