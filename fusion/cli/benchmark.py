@@ -11,16 +11,16 @@ from terrafusion.fusion.cli.common import progress_bar
 
 
 def benchmark(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the results; an unfinished run goes on.")],
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Few drives: two minutes on two processors.")
-    ] = False,
+    out: Annotated[
+        Path, typer.Option("--out", help="Folder for the results; an interrupted benchmark continues.")
+    ],
+    quick: Annotated[bool, typer.Option("--quick", help="Few runs: two minutes on two processors.")] = False,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes; by default one a processor.", show_default=False)
     ] = None,
     seeds: Annotated[
         int | None,
-        typer.Option(min=1, help="Drives of each family on each plant (20).", show_default=False),
+        typer.Option(min=1, help="Runs of each family on each plant (20).", show_default=False),
     ] = None,
     only: Annotated[
         list[str] | None,
@@ -32,10 +32,10 @@ def benchmark(
         Path | None, typer.Option(metavar="FILE", help="Put the tables into a document (docs/benchmark.md).")
     ] = None,
 ) -> None:
-    """Compare weightings on the same drives: twin, perturbed soils, another terramechanics, field logs.
+    """Compare weighting methods on the same runs: twin, perturbed soils, other terramechanics, field logs.
 
-    Arms: data sheet, fixed (tuned), robust, innovation, adaptive, and the same with true, shuffled and
-    adversarial labels. Writes benchmark.json, benchmark.md, ratios.png and report.html.
+    Methods: data sheet, fixed (tuned), robust, innovation, adaptive, and adaptive with true, shuffled and
+    adversarial ground labels. Writes benchmark.json, benchmark.md, ratios.png and report.html.
 
     Example: terrafusion benchmark --out results --quick
     """
@@ -59,13 +59,13 @@ def benchmark(
     command = " ".join(["terrafusion benchmark --out DIR", *words])
     origin = origin_of(plan, command)
     if docs is not None:
-        document_head(docs)  # refused now, not when all is computed
+        document_head(docs)  # refuse now, not after hours
     with progress_bar("benchmark") as progress:
-        found = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
+        result = run_benchmark(plan, out, jobs=jobs or joblib.cpu_count(), progress=progress)
     origin = at_the_end(origin)
-    made = write_benchmark(out, found, origin)
+    made = write_benchmark(out, result, origin)
     if docs is not None:
-        write_document(docs, made, found, origin)
+        write_document(docs, made, result, origin)
     for table in made[:3]:
         print("\n".join([*markdown(table), ""]))
     print(f"report: {out / 'report.html'}")

@@ -1,4 +1,4 @@
-"""`terrafusion policy fit`: the weighting policy from drives of the twin, and from labelled logs."""
+"""`terrafusion policy fit`: the weighting policy from simulated runs and labelled logs."""
 
 from __future__ import annotations
 
@@ -20,26 +20,26 @@ def fit(
     out: Annotated[Path, typer.Option("--out", help="Policy file (YAML) to write.")],
     logs: Annotated[
         list[str] | None,
-        typer.Argument(help="Labelled logs with a truth; what they tell of a ground goes before the twin."),
+        typer.Argument(help="Labelled logs with a truth; they update the noise fitted to simulated runs."),
     ] = None,
-    seeds: Annotated[
-        int, typer.Option(min=1, max=1000, help="Seeds: soil, heading and noise drawn anew.")
-    ] = 3,
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Seeds of soil, heading and sensor noise.")] = 3,
     ground: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="SOIL", help="Soil to drive on; repeat for more. By default the four the detector knows."
+            metavar="SOIL", help="Soil to drive on; repeat for more. By default the four of the detector."
         ),
     ] = None,
     vehicle: Annotated[
         str | None,
-        typer.Option(help="Vehicle of the library that drives (elevate), and of logs that do not name one."),
+        typer.Option(
+            help="Simulated vehicle of the library (elevate), and the vehicle of logs that name none."
+        ),
     ] = None,
 ) -> None:
     """Drive the twin over soils, slopes, payloads and speeds, and fit each sensor's noise on each ground.
 
-    The `fixed` row is fitted to the same drives, all grounds pooled. Made again
-    with the same parameter files and logs, the policy file has the same bytes.
+    The noise `fixed` is fitted to the same runs, all grounds pooled. The same
+    parameter files and logs give the same policy file, byte for byte.
 
     Example: terrafusion policy fit --out policy.yaml
     Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
@@ -53,7 +53,7 @@ def fit(
     grounds = chosen("soils", "soil", tuple(dict.fromkeys(ground or GROUNDS)))
     grid = default_grid(seeds, grounds, *chosen("vehicles", "vehicle", (vehicle or "elevate",)))
     logged = read_logs(logs, vehicle) if logs else LoggedSamples()
-    with progress("drives", len(grid.conditions())) as tick:
+    with progress("runs", len(grid.conditions())) as tick:
         fitted = fit_policy(grid, tick, logged)
     write_policy(fitted, out, made_by=made_by(seeds, ground, vehicle, logs))
     print(f"{'':12s} slip           a grade   time   wheel  side-slip  gyro   yaw  accel  GNSS")
@@ -69,11 +69,7 @@ def fit(
 
 
 def chosen(folder: str, kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
-    """The names, all of the library: the policy's hash is of its files.
-
-    Raises:
-        ConfigError: another name.
-    """
+    """Check that all names are of the library, whose files the hash of the policy covers."""
     from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.twin.model.library import known_names
 
@@ -85,7 +81,7 @@ def chosen(folder: str, kind: str, names: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def made_by(seeds: int, ground: list[str] | None, vehicle: str | None, logs: list[str] | None) -> str:
-    """The command, without the paths of logs: those differ from machine to machine."""
+    """The command without the paths of logs, equal on every machine."""
     words = [f"terrafusion policy fit --seeds {seeds}", *(f"--ground {name}" for name in ground or [])]
     words += [f"--vehicle {vehicle}"] if vehicle else []
     return " ".join(words) + (f", {len(logs)} logs" if logs else "")

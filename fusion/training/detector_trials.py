@@ -1,4 +1,4 @@
-"""The trials of `terrafusion terrain eval`: fresh drives, missing sensors, slow IMUs, a ground never seen."""
+"""Tests of the terrain detector for `terrafusion terrain eval`: new runs, missing sensors, unseen grounds."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from terrafusion.fusion.training.detector_scores import (
     splice,
 )
 from terrafusion.fusion.training.simulated_runs import GROUNDS, Condition, windows_of
-from terrafusion.fusion.training.train_detector import FRESH_SEED, PATCHES, TrainingPlan, drives_of
+from terrafusion.fusion.training.train_detector import FRESH_SEED, PATCHES, TrainingPlan, windows_by_run
 from terrafusion.twin.simulate import simulate
 
 MIXED_RUNS = 4
@@ -26,24 +26,24 @@ SLOW_HZ = 30.0
 
 
 def count(seeds: int) -> int:
-    """Number of drives `run` simulates."""
+    """Number of runs that `run` simulates."""
     return seeds * len(TrainingPlan().grid(0).conditions()) + seeds * MIXED_RUNS
 
 
 def run(
     model: TerrainModel, seeds: int, tick: Callable[[], None] = lambda: None
 ) -> dict[str, DetectorScores]:
-    """Scores by trial; `tick` is called after each drive.
+    """Scores by test; `tick` is called after each simulated run.
 
-    - spliced: patches of fresh drives on single grounds, cut together;
-    - no slip: the same in a GNSS outage, where the estimator supplies no slip;
-    - slow IMU: the same at 30 Hz, means of the samples between;
-    - foreign: the same as a robot the model does not know, shaking twice as much; firm ground is unknown;
-    - mixed route: the twin's own drive over several grounds;
-    - without X: X left out of the model, so that `unknown` is the right answer there.
+    - spliced: routes spliced from new runs on single grounds;
+    - no slip: the same without slip, as in a GNSS outage;
+    - slow IMU: the same with an IMU of 30 Hz;
+    - foreign: the same for a robot unknown to the model with twice the vibration; firm ground is unknown;
+    - mixed route: simulated runs over several grounds;
+    - without X: ground X left out of the model and expected to be unknown.
     """
     fresh = range(FRESH_SEED, FRESH_SEED + seeds)
-    routes = [splice(list(drives_of(TrainingPlan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
+    routes = [splice(list(windows_by_run(TrainingPlan().grid(seed), tick)), PATCHES, seed) for seed in fresh]
     mixed = [_mixed(MIXED_RUNS * FRESH_SEED + number, tick) for number in range(MIXED_RUNS * seeds)]
     foreign = model.for_vehicle(None)
     firm = sorted(set(model.classes) - set(foreign.classes))
@@ -83,14 +83,14 @@ def _without_slip(window: Window) -> Window:
 
 
 def _louder(window: Window) -> Window:
-    """Twice the vibration, the yaw rate as it was."""
+    """Twice the vibration, the same yaw rate."""
     accel = 2.0 * window.accel_mps2
     gyro = window.gyro_radps * np.array([2.0, 2.0, 1.0])
     return dataclasses.replace(window, accel_mps2=accel, gyro_radps=gyro)
 
 
 def _slow(window: Window) -> Window:
-    """The IMU at `SLOW_HZ`: each sample the mean over its interval, as an integrating sensor gives it."""
+    """The IMU at `SLOW_HZ`, each sample the mean over its interval, as of an integrating sensor."""
     t = window.imu_t_s
     if len(t) < 2:
         return window

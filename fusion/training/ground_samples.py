@@ -1,34 +1,22 @@
-"""What a drive says of its ground: the samples that the policy's rows are fitted to.
+"""Samples of slip and sensor errors on one ground, to which the policy's sensor noise is fitted.
 
-What counts, ground by ground, and how it is measured against the truth:
+Against the truth of a simulated run, only while the wheels turn:
 
-- slip: 1 - v / (omega R) of half-second means while the wheels turn faster than
-  0.15 m/s. A robot that spins on the spot has slip 1 for as long as it likes, so
-  of every immobilised spell only the first second counts: its onset is what a
-  policy must cover, its length is chance. A line over the grade (sine of the
-  pitch) is fitted by least absolute deviations, the standard deviation is the rms
-  about it; the correlation time is that of an Ornstein-Uhlenbeck process with this variance
-  that moves as much in 2 s as slip did: tau = -2 s / ln(rho), rho the
-  autocorrelation about the ground's line at a lag of 2 s.
-  A rolling radius is known to about 1 %, which the twin's odometry is not subject
-  to: that constant error is added to variance and autocorrelation alike.
-- wheel sigma: speed over 0.1 s that slip, averaged over 1 s, leaves unexplained,
-  in quadrature with the vehicle file's `speed_sigma_mps` (position error, backlash,
-  uneven ground: the twin's encoders are only quantised).
-- yaw scale: true over wheel yaw rate less one, half-second means, while the wheels turn the robot by more
-  than 0.1 rad/s: the median, and the rms about it.
-- side-slip: lateral over forward speed of the body origin, above 0.2 m/s, without the part that follows the
-  yaw rate (a centre of rotation ahead of the origin is a state of its own).
-- IMU: the mean error over tau less its 60 s running mean (the bias), rms over the
-  axes (gyro: roll and pitch, and yaw by itself), as a multiple of the data sheet's
-  density / sqrt(tau). Vibration has a band: its mean falls faster than that of white
-  noise, so the multiple falls with tau, and
-  tau must be the time over which the estimator integrates the sensor before another
-  corrects it: 2 s for the specific force (wheels and GNSS hold the speed), 5 s for
-  the rate (heading is corrected slowly).
-- GNSS: horizontal error over the reported sigma, rms, at least 1.
+- slip: 1 - v / (omega R) of 0.5 s means above 0.15 m/s. Of every immobilised spell only the first second counts:
+  a policy must cover its onset, while its length is arbitrary. `policy_fit` fits a line over the grade (sine of
+  the pitch) and the correlation time of an Ornstein-Uhlenbeck process, tau = -2 s / ln(rho), rho the
+  autocorrelation at a lag of 2 s. The error of the rolling radius, about 1 %, is added to both: the twin has none.
+- wheel sigma: speed over 0.1 s not explained by the slip averaged over 1 s, in quadrature with the vehicle
+  file's `speed_sigma_mps` (mounting, backlash, uneven ground: the twin's encoders are only quantised).
+- yaw scale: true over wheel yaw rate less one, 0.5 s means, while the wheels turn the robot faster than 0.1 rad/s.
+- side-slip: lateral over forward speed of the body origin above 0.2 m/s, less the part proportional to the yaw
+  rate (the centre of rotation is a state of the estimator).
+- IMU: mean error over tau less its 60 s running mean (the bias), as a multiple of the data sheet's density /
+  sqrt(tau). Vibration is band-limited, so the multiple falls with tau; tau is the time over which the estimator
+  integrates the sensor: 2 s for the specific force, 5 s for the rate.
+- GNSS: horizontal error over the reported sigma.
 
-Recorded drives tell less, see `policy_logs`.
+Recorded runs give slip, yaw scale and side-slip only, see `policy_logs`.
 """
 
 from __future__ import annotations
@@ -59,10 +47,10 @@ BIAS_S = 60.0
 
 @dataclass(frozen=True, eq=False)
 class GroundSamples:
-    """What one drive, or many, say of a ground: (n,) samples of each quantity.
+    """Samples (n,) of each quantity on one ground, of one run or several.
 
     `slip_pairs` and `grade_pairs` (n, 2) are slips and grades `LAG_S` apart; `gyro` (roll and pitch),
-    `gyro_yaw` and `accel` are errors over what the data sheet allows, `gnss` over the reported sigma.
+    `gyro_yaw` and `accel` are errors over those of the data sheet, `gnss` over the reported sigma.
     """
 
     slip: Array
@@ -79,19 +67,19 @@ class GroundSamples:
 
     @staticmethod
     def joined(parts: Iterable[GroundSamples]) -> GroundSamples:
-        """All of them together."""
+        """The samples of several runs together."""
         listed = list(parts)
         names = [f.name for f in dataclasses.fields(GroundSamples)]
         return GroundSamples(**{n: np.concatenate([getattr(p, n) for p in listed]) for n in names})
 
 
 def samples_of(recording: Recording) -> GroundSamples:
-    """Everything one simulated drive says of its ground."""
+    """The samples of a simulated run on one ground."""
     truth = recording.truth
     assert truth is not None
     assert truth.twist_body is not None
-    slip, grade, pairs, grade_pairs, wheel = _slip_evidence(recording)
-    gyro, gyro_yaw, accel = _imu_evidence(recording)
+    slip, grade, pairs, grade_pairs, wheel = _slip_samples(recording)
+    gyro, gyro_yaw, accel = _imu_samples(recording)
     return GroundSamples(
         slip,
         grade,
@@ -103,12 +91,12 @@ def samples_of(recording: Recording) -> GroundSamples:
         gyro,
         gyro_yaw,
         accel,
-        _gnss_evidence(recording),
+        _gnss_samples(recording),
     )
 
 
-def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array, Array, Array]:
-    """Slips and grades (n,), pairs of both (m, 2), and speed errors (k,) m/s that slip leaves."""
+def _slip_samples(recording: Recording) -> tuple[Array, Array, Array, Array, Array]:
+    """Slips and grades (n,), pairs of both (m, 2), and speed errors (k,) m/s not explained by slip."""
     samples = wheel_samples(recording)
     wheel, forward = samples.sides_mps.mean(axis=1), samples.forward_mps
     step = float(np.median(np.diff(samples.t_s)))
@@ -131,7 +119,7 @@ def _slip_evidence(recording: Recording) -> tuple[Array, Array, Array, Array, Ar
 def slips_of(wheel_mps: Array, forward_mps: Array, grade: Array) -> tuple[Array, Array, Array, Array]:
     """Slips and grades (n,), and pairs of both (m, 2), of speeds (k,) every `SLIP_S`.
 
-    Where a speed is NaN nothing is known.
+    Unknown speeds are NaN.
     """
     wheel, forward = wheel_mps, forward_mps
     counted = (np.abs(wheel) > TURNING_MPS) & np.isfinite(forward)
@@ -155,7 +143,7 @@ def _grades(recording: Recording, t_s: Array) -> Array:
 
 
 def _spell_age_s(stuck: NDArray[np.bool_]) -> Array:
-    """How long (n,), s, the robot has spun on the spot at each half second; 0 where it does not."""
+    """Time (n,), s, since the robot got stuck, at each half second; 0 if it is not stuck."""
     age, out = 0.0, np.zeros(len(stuck))
     for i, now in enumerate(stuck.tolist()):
         age = age + SLIP_S if now else 0.0
@@ -178,7 +166,7 @@ def yaw_scales_of(wheel_radps: Array, true_radps: Array) -> Array:
 
 
 def side_slips_of(forward_mps: Array, lateral_mps: Array, rate_radps: Array) -> Array:
-    """Lateral over forward speed (n,), without what turning about another point than the body origin does."""
+    """Lateral over forward speed (n,), less the effect of a centre of rotation off the body origin."""
     moving = np.abs(forward_mps) > SIDE_SLIP_FROM_MPS  # never so where it is NaN
     known = np.isfinite(forward_mps)
     lateral, rate = lateral_mps[known], rate_radps[known]
@@ -186,11 +174,10 @@ def side_slips_of(forward_mps: Array, lateral_mps: Array, rate_radps: Array) -> 
     return np.asarray((lateral_mps + icr * rate_radps)[moving] / forward_mps[moving])
 
 
-def _imu_evidence(recording: Recording) -> tuple[Array, Array, Array]:
+def _imu_samples(recording: Recording) -> tuple[Array, Array, Array]:
     """Errors of means over the data sheet's: gyro about roll and pitch (2 n,), yaw (n,), accelerometer (m,).
 
-    Each sample is compared with the rotation and the change of velocity over
-    the interval before it. Only while the wheels turn.
+    A sample is compared with the rotation and change of velocity over the interval that it ends.
     """
     imu, truth = recording.imu, recording.truth
     assert imu is not None
@@ -225,7 +212,7 @@ def _relative(error: Array, speed_mps: Array, step_s: float, tau_s: float, densi
 
 
 def _imu_velocity(twist: Array, R: Array, spec: ImuSpec) -> Array:
-    """World velocity (n, 3) of the IMU's place."""
+    """World velocity (n, 3) of the IMU."""
     return np.asarray(np.einsum("nij,nj->ni", R, twist[:, :3] + np.cross(twist[:, 3:], spec.position_m)))
 
 
@@ -244,7 +231,7 @@ def _unbiased(error: Array, tau_s: float) -> Array:
     return np.asarray(error - slow)
 
 
-def _gnss_evidence(recording: Recording) -> Array:
+def _gnss_samples(recording: Recording) -> Array:
     """Horizontal errors of the fixes over their reported sigma, east and north together (n,)."""
     gnss, truth = recording.gnss, recording.truth
     if gnss is None or truth is None:
@@ -259,6 +246,6 @@ def _vehicle(recording: Recording) -> VehicleParams:
 
 
 def _block_means(x: Array, count: int) -> Array:
-    """Means of `count` rows each, the rest left out."""
+    """Means of blocks of `count` rows; an incomplete last block is left out."""
     blocks = len(x) // count
     return np.asarray(x[: blocks * count].reshape(blocks, count, *x.shape[1:]).mean(axis=1))

@@ -1,8 +1,7 @@
-"""Fitting the class densities: Gaussian mixtures by EM over data with gaps.
+"""Gaussian mixtures fitted by EM to features with missing values, the class densities of the terrain model.
 
-Unobserved features are NaN. The E-step fills them with their conditional
-moments given the observed ones (Ghahramani and Jordan 1994), so a drive that
-never turned still teaches the vibration of its ground.
+Missing features are NaN; the E-step uses their conditional moments given the observed ones (Ghahramani and Jordan
+1994). scikit-learn's GaussianMixture takes no missing values.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ Array = NDArray[np.float64]
 ITERATIONS = 60
 TOLERANCE = 1e-5
 WINDOWS_PER_SAMPLE = 4
-"""Neighbouring windows overlap and repeat one another: so many of them count as one independent sample."""
+"""Overlapping, correlated windows that count as one independent sample."""
 
 
 def fit_best(x: Array, sigma_floor: Array, order_by: int, most: int = 3) -> Mixture:
@@ -26,7 +25,7 @@ def fit_best(x: Array, sigma_floor: Array, order_by: int, most: int = 3) -> Mixt
     Args:
         x: (n, d), NaN where not observed.
         sigma_floor: (d,) standard deviation added in quadrature to every Gaussian.
-        order_by: feature along whose quantiles the Gaussians are started (no chance is involved).
+        order_by: feature whose quantiles initialise the Gaussians (deterministic).
         most: largest number of Gaussians.
     """
     best: tuple[float, Mixture] | None = None
@@ -63,7 +62,7 @@ def fit(x: Array, parts: int, sigma_floor: Array, order_by: int) -> tuple[Mixtur
 
 
 def shrink(covariance: Array, samples: float) -> Array:
-    """A covariance (d, d) drawn towards its diagonal, as its number of samples warrants.
+    """A covariance (d, d) shrunk towards its diagonal by its number of samples.
 
     Oracle approximating shrinkage (Chen, Wiesel, Eldar and Hero 2010, eq. 23)
     of the correlation matrix towards the identity.
@@ -89,7 +88,7 @@ def _start(x: Array, parts: int, order_by: int) -> tuple[Array, Array, Array]:
 
 
 def _patterns(x: Array) -> list[tuple[Array, NDArray[np.intp], NDArray[np.intp]]]:
-    """Rows grouped by what was observed: (rows of observed values, observed columns, missing columns)."""
+    """Rows by missing pattern: (rows of observed values, observed columns, missing columns)."""
     codes, inverse = np.unique(np.isfinite(x), axis=0, return_inverse=True)
     groups = []
     for i, seen in enumerate(codes):
@@ -105,7 +104,7 @@ def _step(
     mean: Array,
     covariance: Array,
 ) -> tuple[Array, Array, Array, float]:
-    """One E and M step; also the log-likelihood of the parameters it was given."""
+    """One E and M step, and the log-likelihood of the given parameters."""
     parts, d = mean.shape
     mass, first = np.full(parts, 1e-9), np.zeros((parts, d))
     second = np.zeros((parts, d, d))

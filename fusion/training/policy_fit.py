@@ -1,10 +1,8 @@
-"""Fitting the weighting policy to drives of the twin, and to labelled logs.
+"""Fits the sensor noise of each ground to simulated runs and labelled logs.
 
-`policy_evidence` tells what is measured; here its samples become rows. Every rms is
-of errors winsorised at their 0.5 and 99.5 % quantiles. `fixed` is the same of all
-grounds pooled with equal weight, so that it is the best single row for the very same
-drives. `unknown` is the moment match of the grounds, its standard deviations (not the
-receiver's) `UNKNOWN_SPREAD` times wider: the row of any ground that has none.
+From the samples of `ground_samples`; every rms is of samples winsorised at 0.5 and 99.5 %. `fixed` is fitted to all
+grounds pooled with equal weight, the best single noise for the same runs. `unknown`, for any other ground, is
+the moment match of the grounds with standard deviations (but the receiver's) `UNKNOWN_SPREAD` times larger.
 """
 
 from __future__ import annotations
@@ -43,22 +41,19 @@ SCENARIOS = ("staircase", "figure_eight")
 SLOPES_DEG = (0.0, 3.0, 6.0)
 PAYLOADS_KG = (0.0, 30.0)
 UNSEEN_YAW_SCALE, LEAST_YAW_SCALE_SIGMA = (-0.4, 0.2), 0.02
-"""For drives without turns: robots turn at 0.44 to 0.71 of what their track says (`docs/planar.md`)."""
+"""Mean and sigma without turns: robots turn at 0.44 to 0.71 of the rate by their track (docs/planar.md)."""
 TAIL = 0.005
 GRADE_RIDGE, LAD_STEPS, LAD_FLOOR = 1e-5, 30, 5e-3
 RADIUS_SIGMA = 0.01
 UNKNOWN_SPREAD = 1.5
 HILLY = 0.05
-"""Standard deviation of the grade (sine of the pitch) from which logs tell how slip follows it."""
+"""Standard deviation of the grade (sine of the pitch) from which logs identify slip over grade."""
 DIGITS = 4
 
 
 @dataclass(frozen=True, eq=False)
 class LoggedSamples:
-    """What labelled logs say: evidence by ground, from means of `mean_s`.
-
-    `inputs` is file name -> SHA-256 of what was read.
-    """
+    """Samples by ground from labelled logs, of means over `mean_s`; `inputs` is file name -> SHA-256."""
 
     grounds: Mapping[str, GroundSamples] = dataclasses.field(default_factory=dict)
     inputs: Mapping[str, str] = dataclasses.field(default_factory=dict)
@@ -68,22 +63,24 @@ class LoggedSamples:
 def fit_policy(
     grid: Grid, tick: Callable[[], None] = lambda: None, logged: LoggedSamples = LoggedSamples()
 ) -> Policy:
-    """Simulate the drives of `grid` and fit a row to each ground; `tick` is called after each drive.
+    """Simulate the runs of `grid` and fit the sensor noise of each ground; `tick` is called after each run.
 
-    What logs say of a ground goes into the twin's row of it, or into the row of all grounds together where
-    the twin has none. With logs, `fixed` is the moment match of the rows so informed.
+    Logs update the twin's noise of their ground, or of all grounds pooled if the twin has no such ground. With
+    logs, `fixed` is the moment match of the updated noise.
 
     Raises:
-        TerrafusionError: on some ground the wheels hardly turned.
+        TerrafusionError: on a ground the wheels hardly turned.
     """
     drives: dict[str, list[GroundSamples]] = {ground: [] for ground in grid.grounds}
     for condition, recording in run_all(grid.conditions(), tick):
         drives[condition.terrain].append(samples_of(recording))
     grounds = {name: GroundSamples.joined(parts) for name, parts in drives.items()}
-    found = {name: _row_on(name, evidence) for name, evidence in grounds.items()}
-    fixed = row_of(list(grounds.values()))
-    found |= {name: informed(found.get(name, fixed), told) for name, told in sorted(logged.grounds.items())}
-    rows = {name: _rounded(row) for name, row in found.items()}
+    noise = {name: _noise_on(name, samples) for name, samples in grounds.items()}
+    fixed = noise_of(list(grounds.values()))
+    noise |= {
+        name: informed(noise.get(name, fixed), samples) for name, samples in sorted(logged.grounds.items())
+    }
+    rows = {name: _rounded(row) for name, row in noise.items()}
     matched = Policy(rows, fixed, "").blend(np.full(len(rows), 1.0 / len(rows)))
     return Policy(
         classes={**rows, "unknown": _rounded(_spread(matched))},
@@ -92,52 +89,52 @@ def fit_policy(
     )
 
 
-def informed(row: SensorNoise, told: GroundSamples) -> SensorNoise:
-    """A row of the twin with what logs tell: they move its means; a scatter they may widen, not narrow.
+def informed(row: SensorNoise, logged: GroundSamples) -> SensorNoise:
+    """Noise of the twin updated by logs: means are replaced, standard deviations may only grow.
 
-    Logs are few, and their means are long. The slope over the grade is theirs only where they were in hills.
+    Logs are few and their samples means over seconds. They give the slip over grade only if they are hilly.
     """
-    hilly = len(told.grade) > 0 and float(np.std(told.grade)) > HILLY
-    level, slope = _slip_line([told]) if hilly else (0.0, row.slip_per_grade)
-    level = level if hilly else float(np.median(told.slip - slope * told.grade))
-    left = told.slip - level - slope * told.grade
+    hilly = len(logged.grade) > 0 and float(np.std(logged.grade)) > HILLY
+    level, slope = _slip_line([logged]) if hilly else (0.0, row.slip_per_grade)
+    level = level if hilly else float(np.median(logged.slip - slope * logged.grade))
+    left = logged.slip - level - slope * logged.grade
     scatter = float(np.hypot(_rms([left]), RADIUS_SIGMA))
-    told_slip = dataclasses.replace(
+    slip = dataclasses.replace(
         row, slip_mean=level, slip_per_grade=slope, slip_sigma=max(row.slip_sigma, scatter)
     )
-    if not len(told.yaw_scale):
-        return told_slip  # a drive straight ahead tells nothing of turning, nor of skidding in it
-    scale, scatter = _yaw_scale_of([told.yaw_scale])
+    if not len(logged.yaw_scale):
+        return slip  # without turns, yaw scale and side-slip stay the twin's
+    scale, scatter = _yaw_scale_of([logged.yaw_scale])
     return dataclasses.replace(
-        told_slip,
+        slip,
         yaw_scale_mean=scale,
         yaw_scale_sigma=max(row.yaw_scale_sigma, scatter),
-        side_slip_sigma=max(row.side_slip_sigma, _rms([told.side_slip])),
+        side_slip_sigma=max(row.side_slip_sigma, _rms([logged.side_slip])),
     )
 
 
 def default_grid(seeds: int, grounds: tuple[str, ...] = GROUNDS, vehicle: str = "elevate") -> Grid:
-    """The drives of a policy, by default of the shipped one, with seeds 0 to `seeds` - 1."""
+    """The runs of a policy, by default of the shipped one, with seeds 0 to `seeds` - 1."""
     return Grid(SCENARIOS, SLOPES_DEG, PAYLOADS_KG, tuple(range(seeds)), grounds, vehicle)
 
 
-def _row_on(ground: str, evidence: GroundSamples) -> SensorNoise:
+def _noise_on(ground: str, samples: GroundSamples) -> SensorNoise:
     try:
-        return row_of([evidence])
+        return noise_of([samples])
     except ValueError as error:
         raise TerrafusionError(
             str(error), channel=ground, remedy="leave the ground out, or drive another vehicle"
         ) from None
 
 
-def row_of(grounds: list[GroundSamples]) -> SensorNoise:
-    """The row of one ground, or of several with equal weight.
+def noise_of(grounds: list[GroundSamples]) -> SensorNoise:
+    """Sensor noise of one ground, or of several with equal weight.
 
     Raises:
-        ValueError: a ground never moved its wheels.
+        ValueError: on a ground the wheels never turned.
     """
     if any(len(e.slip_pairs) < 2 for e in grounds):
-        raise ValueError("the wheels never turned long enough to tell the slip")
+        raise ValueError("the wheels never turned long enough to estimate the slip")
     mean, per_grade = _slip_line(grounds)
     left = [e.slip - mean - per_grade * e.grade for e in grounds]
     variance = float(np.mean([np.mean(x**2) for x in left])) + RADIUS_SIGMA**2
@@ -162,7 +159,7 @@ def row_of(grounds: list[GroundSamples]) -> SensorNoise:
 
 
 def _yaw_scale_of(found: list[Array]) -> tuple[float, float]:
-    """Mean and 1 sigma of the yaw scale; `UNSEEN_YAW_SCALE` where no drive turned."""
+    """Mean and 1 sigma of the yaw scale; `UNSEEN_YAW_SCALE` without turns."""
     if not found:
         return UNSEEN_YAW_SCALE
     mean = float(np.mean([np.median(scales) for scales in found]))
@@ -170,11 +167,10 @@ def _yaw_scale_of(found: list[Array]) -> tuple[float, float]:
 
 
 def _slip_line(grounds: list[GroundSamples]) -> tuple[float, float]:
-    """Slip on the level and its slope over the grade: the mean of the grounds' own lines.
+    """Slip on the level and its slope over the grade, means of the grounds' lines.
 
-    Least absolute deviations, by reweighted least squares: slip has a long tail
-    of bursts and of wheels digging in, which the IMU shows as they happen; the
-    line is to stand for steady driving. Grades all alike leave the slope at zero.
+    Least absolute deviations by reweighted least squares: the line stands for steady driving, and bursts of slip
+    (long tails) are seen by the IMU. A constant grade leaves the slope at zero.
     """
     lines = []
     for e in grounds:
@@ -192,7 +188,7 @@ def _slip_line(grounds: list[GroundSamples]) -> tuple[float, float]:
 
 
 def _rms(grounds: list[Array]) -> float:
-    """Root of the mean over grounds of the mean square, each winsorised at its tails; NaN-free by making."""
+    """Root of the mean over grounds of their winsorised mean squares."""
     squares = []
     for x in grounds:
         if len(x):
@@ -207,22 +203,19 @@ def _spread(row: SensorNoise) -> SensorNoise:
         for name, value in dataclasses.asdict(row).items()
         if name not in ("slip_mean", "slip_per_grade", "slip_time_s", "yaw_scale_mean", "gnss_inflation")
     }
-    # About which axis strange ground shakes most is not known either.
+    # Neither is the axis known about which an unknown ground shakes most.
     worst = max(changes["gyro_inflation"], changes["gyro_yaw_inflation"])
     return dataclasses.replace(row, **changes | {"gyro_yaw_inflation": worst})
 
 
 def _rounded(row: SensorNoise) -> SensorNoise:
-    """Four significant digits: the last bits of a sum differ from machine to machine, the file must not.
-
-    And inside the ranges of the file: a robot that does not turn at all in mud has a yaw scale of -1.
-    """
+    """Rounded to `DIGITS` significant digits, equal on every machine, and limited to the ranges of the file."""
     digits = (float(f"{value:.{DIGITS}g}") for value in dataclasses.astuple(row))
     return within_ranges(SensorNoise(*digits))
 
 
 def fingerprint_of(grid: Grid, logged: LoggedSamples = LoggedSamples()) -> str:
-    """SHA-256 of what a policy fitted on `grid` and logs depends on: parameter files, logs and settings."""
+    """SHA-256 of the parameter files, logs and settings that a policy depends on."""
     settings = {
         "schema": SCHEMA,
         "short_s": SHORT_S, "slip_s": SLIP_S, "lag_s": LAG_S, "turning_mps": TURNING_MPS,
@@ -238,7 +231,7 @@ def fingerprint_of(grid: Grid, logged: LoggedSamples = LoggedSamples()) -> str:
 
 
 def write_policy(policy: Policy, path: Path, made_by: str) -> None:
-    """Write a policy file: same policy, same bytes."""
+    """Write a policy file, byte for byte repeatable."""
     from ruamel.yaml import YAML
 
     content = {

@@ -1,16 +1,12 @@
-"""What labelled logs of a real robot say of its grounds, for the weighting policy.
+"""Slip, yaw scale and side-slip on the grounds of labelled logs, for the weighting policy.
 
-A log needs the wheels of both sides, a truth with position and orientation, and its
-ground, for the whole drive or over time. It tells slip, yaw scale and side-slip.
-Everything else of a row stays the twin's: a lidar or motion capture pose, which is what
-logs have for a truth, tells neither a tenth of a second of wheel speed nor the noise of
-an IMU, and a receiver's errors need a truth in the receiver's own frame.
+A log needs wheels of both sides, a truth with position and orientation, and ground labels. All other noise stays the
+twin's: a lidar or motion-capture truth shows neither wheel speed over 0.1 s nor IMU noise, and receiver errors
+need a truth in the receiver's frame.
 
-Speeds are means over `MEAN_S` of what the poses moved along the axes of the body, taken
-every half second. Six seconds, as a pose that is stamped to 50 ms tells the slip only to
-0.07 s over the mean's length at any speed, which would count as slip: of one Warthog on
-asphalt it makes a sigma of 0.071 in two seconds, 0.041 in six, 0.026 in ten. What changes
-within six seconds is not seen, so logs tell no correlation time, and narrow no scatter.
+Speeds are means over `MEAN_S` of the displacement in body axes, every 0.5 s. Pose time stamps good to 50 ms cause
+slip errors of 0.07 s over that length: the sigma of a Warthog on asphalt is 0.071 for 2 s, 0.041 for 6 s and 0.026
+for 10 s. Shorter variation is not seen, so logs give no correlation time and reduce no standard deviation.
 """
 
 from __future__ import annotations
@@ -40,19 +36,19 @@ Array = NDArray[np.float64]
 
 MEAN_S = 6.0
 GAP_S = 1.0
-"""Where wheels or truth are silent for longer, nothing is known."""
-LEAST_SLIPS = 60
-"""Half a minute of driving on a ground."""
+"""Means across longer gaps of wheels or truth are unknown."""
+MIN_SLIPS = 60
+"""Samples needed on a ground: half a minute of driving."""
 NEEDED = ("position", "yaw")
 _HALF_NS = round(0.5e9 * MEAN_S)
 
 
 @dataclass(frozen=True, eq=False)
 class MeasuredMotion:
-    """Means over `MEAN_S` every `SLIP_S`, NaN where not known, (n,) each.
+    """Means over `MEAN_S` every `SLIP_S`, NaN where unknown, (n,) each.
 
-    `t_ns` is the middle; speeds in m/s: of the wheels' mean, forward and to the left; yaw rates in rad/s by
-    wheels and truth; `grade` is the sine of the pitch.
+    `t_ns` is the middle; speeds: mean of the wheels, forward and to the left; yaw rates by wheels and truth;
+    `grade` is the sine of the pitch.
     """
 
     t_ns: NDArray[np.int64]
@@ -65,7 +61,7 @@ class MeasuredMotion:
 
 
 def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
-    """The evidence of logs: files, folders, or names of the catalogue; `vehicle` for those that name none.
+    """Samples of logs: files, folders, or names of the catalogue; `vehicle` for those that name none.
 
     Raises:
         DataError: a log lacks wheels, truth or labels, or moves too little on a ground.
@@ -81,9 +77,9 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
                 parts.setdefault(ground, []).append(evidence)
     grounds = {name: GroundSamples.joined(found) for name, found in parts.items()}
     for name, evidence in grounds.items():
-        if len(evidence.slip) < LEAST_SLIPS:
+        if len(evidence.slip) < MIN_SLIPS:
             raise DataError(
-                f"the logs hold {len(evidence.slip)} slips on '{name}', {LEAST_SLIPS} are needed",
+                f"the logs hold {len(evidence.slip)} slips on '{name}', {MIN_SLIPS} are needed",
                 channel="terrain",
                 remedy="give longer drives on that ground, or leave its logs out",
             )
@@ -91,7 +87,7 @@ def read_logs(logs: Sequence[str], vehicle: str | None = None) -> LoggedSamples:
 
 
 def logged_samples(recording: Recording, vehicle: str | None = None) -> dict[str, GroundSamples]:
-    """What a recorded drive says of each of its grounds."""
+    """Samples of a recorded run by ground."""
     motion, grounds = motion_of(recording, vehicle), grounds_of(recording)
     names = np.array([_ground_around(t, grounds) for t in motion.t_ns.tolist()])
     found = {}
@@ -107,10 +103,10 @@ def logged_samples(recording: Recording, vehicle: str | None = None) -> dict[str
 
 
 def grounds_of(recording: Recording) -> list[tuple[int, str]]:
-    """Begin (ns) and name of each stretch of ground of a labelled drive; "" is no label.
+    """Start (ns) and name of each ground of a labelled run; "" is no label.
 
     Raises:
-        DataError: the recording has no label that was there before the estimator.
+        DataError: the recording has no annotated or simulated ground.
     """
     terrain = recording.terrain
     if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
@@ -127,14 +123,14 @@ def grounds_of(recording: Recording) -> list[tuple[int, str]]:
 
 
 def _ground_around(t_ns: int, grounds: list[tuple[int, str]]) -> str:
-    """The ground over the whole mean about a time, or ""."""
+    """The ground of the mean about a time, or "" if it spans several."""
     last = [name for begin, name in grounds if begin <= t_ns - _HALF_NS][-1:]
     seen = {name for begin, name in grounds if t_ns - _HALF_NS < begin <= t_ns + _HALF_NS} | set(last)
     return seen.pop() if last and len(seen) == 1 else ""
 
 
 def motion_of(recording: Recording, vehicle: str | None = None) -> MeasuredMotion:
-    """Wheels and truth of a recorded drive.
+    """Motion of a recorded run by wheels and truth.
 
     Raises:
         DataError: no wheels of both sides, or no truth of the body with position and yaw.
@@ -145,8 +141,8 @@ def motion_of(recording: Recording, vehicle: str | None = None) -> MeasuredMotio
     if wheels is None or not wheels.has_sides():
         raise DataError(f"{recording.name}: the wheels of both sides are needed", channel="wheels")
     listed = recording.truth_channels or NEEDED
-    told = truth is not None and truth.quaternion is not None and set(NEEDED) <= set(listed)
-    if not told or recording.truth_frame != "base":
+    usable = truth is not None and truth.quaternion is not None and set(NEEDED) <= set(listed)
+    if not usable or recording.truth_frame != "base":
         raise DataError(
             f"{recording.name}: a truth with position and yaw of the body is needed", channel="truth"
         )
@@ -172,24 +168,24 @@ def motion_of(recording: Recording, vehicle: str | None = None) -> MeasuredMotio
 
 
 def _means(t_ns: NDArray[np.int64], path: Array, middle_ns: NDArray[np.int64]) -> Array:
-    """Rates (k, n) of what a path (m, k) at times (m,) gained over `MEAN_S` about `middle_ns` (n,)."""
+    """Mean rates (k, n) of a path (m, k) at times (m,) over `MEAN_S` about `middle_ns` (n,)."""
     begin, end = middle_ns - _HALF_NS, middle_ns + _HALF_NS
     rates = np.stack([(np.interp(end, t_ns, x) - np.interp(begin, t_ns, x)) / MEAN_S for x in path.T])
-    silent = (begin < t_ns[0]) | (end > t_ns[-1])
+    unknown = (begin < t_ns[0]) | (end > t_ns[-1])
     for i in np.flatnonzero(np.diff(t_ns) > GAP_S * 1e9):
-        silent |= (end > t_ns[i]) & (begin < t_ns[i + 1])
-    rates[:, silent] = np.nan
+        unknown |= (end > t_ns[i]) & (begin < t_ns[i + 1])
+    rates[:, unknown] = np.nan
     return rates
 
 
 def _rolled(t_ns: NDArray[np.int64], sides_mps: Array) -> Array:
-    """Metres (n, 2) that the sides have rolled since the first sample."""
+    """Distance (n, 2), m, rolled by each side since the first sample."""
     steps = 0.5 * (sides_mps[1:] + sides_mps[:-1]) * (np.diff(t_ns) * 1e-9)[:, None]
     return np.vstack([np.zeros(2), np.cumsum(steps, axis=0)])
 
 
 def _moved(truth: Trajectory) -> Array:
-    """Metres forward and to the left in body axes, and radians turned, (n, 3), since the first pose."""
+    """Displacement forward and to the left in body axes, m, and yaw, rad, (n, 3) since the first pose."""
     R = _rotations(truth)
     step = np.diff(np.nan_to_num(truth.position_m), axis=0)
     along = 0.5 * np.einsum("nij,ni->nj", R[:-1] + R[1:], step)[:, :2]

@@ -1,4 +1,4 @@
-"""Drives of the twin, cut into windows as the estimator would cut them."""
+"""Simulated runs for training, and their windows as the estimator forms them."""
 
 from __future__ import annotations
 
@@ -31,21 +31,20 @@ GROUNDS = ("asphalt", "medium_sand", "loose_sand", "mud")
 UPDATE_S = 0.5
 WINDOW_S = 1.0
 SLIP_SIGMA = 0.04
-"""1 sigma of the slip the estimator supplies at run time, and SLIP_ERROR_S the time its error lasts."""
+"""1 sigma of the estimator's slip at run time, and its correlation time `SLIP_ERROR_S`."""
 SLIP_ERROR_S = 2.0
-
 
 SOIL_SCATTER = {
     "pressure": {"k_c_n_per_m_n1": 0.2, "k_phi_n_per_m_n2": 0.2},
     "shear": {"cohesion_pa": 0.2, "friction_angle_rad": 0.1, "shear_modulus_m": 0.2, "friction_cap": 0.2},
     "vibration": {"accel_mps2_at_1mps": 0.2, "gyro_radps_at_1mps": 0.2},
 }
-"""No two patches of a ground are alike: each drive's soil is drawn from this relative range."""
+"""Relative range from which the soil of each run is drawn."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One drive of the twin; heading and soil are drawn from `seed` and the ground, so that drives differ."""
+    """One simulated run; heading and soil are drawn from the condition."""
 
     scenario: str
     terrain: str
@@ -72,16 +71,13 @@ class Condition:
             )
 
     def stream(self, name: str) -> np.random.Generator:
-        """A generator of its own for each condition and purpose."""
+        """Random numbers of this condition for one purpose."""
         text = json.dumps([*dataclasses.astuple(self), name])
         return np.random.default_rng(zlib.crc32(text.encode()))
 
 
 def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path:
-    """A soil file in `folder`: the library's `terrain` with its numbers scattered by `SOIL_SCATTER`.
-
-    A number stays inside the range its source covers.
-    """
+    """A soil file in `folder`: the library's `terrain` scattered by `SOIL_SCATTER` within the valid ranges."""
     from ruamel.yaml import YAML
 
     raw = copy.deepcopy(read_named("soils", terrain, kind="terrain")[0])
@@ -99,7 +95,7 @@ def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path
 
 @dataclass(frozen=True)
 class Grid:
-    """Drives on every ground: scenarios (they set the speeds) x slopes x payloads x seeds."""
+    """Runs on every ground: scenarios (they set the speeds) x slopes x payloads x seeds."""
 
     scenarios: tuple[str, ...]
     slopes_deg: tuple[float, ...]
@@ -120,7 +116,7 @@ class Grid:
         ]
 
     def fingerprint(self, **settings: Any) -> str:
-        """SHA-256 of the soil, scenario and vehicle files the drives are made from, and of all settings."""
+        """SHA-256 of the soil, scenario and vehicle files of the runs, and of all settings."""
         digest = hashlib.sha256()
         params = resources.files("terrafusion.twin.params")
         files = {"soils": self.grounds, "scenarios": self.scenarios, "vehicles": (self.vehicle,)}
@@ -138,7 +134,7 @@ class Grid:
 def run_all(
     conditions: Iterable[Condition], tick: Callable[[], None]
 ) -> Iterator[tuple[Condition, Recording]]:
-    """Simulate one after another; `tick` is called after each."""
+    """Simulate the conditions in turn; `tick` is called after each."""
     for condition in conditions:
         yield condition, condition.run()
         tick()
@@ -160,7 +156,7 @@ class WheelSamples:
 
 
 def wheel_samples(recording: Recording) -> WheelSamples:
-    """The wheels of a drive beside its truth.
+    """Wheels and truth of a run.
 
     Raises:
         ValueError: the recording has no wheels, or no truth with a body twist.
@@ -183,8 +179,8 @@ def windows_of(
 ) -> tuple[list[Window], NDArray[Any]]:
     """Windows every `UPDATE_S` and the ground (n,) at the end of each, by the recording's labels.
 
-    Speed and slip stand for the estimator's: the true ones, slip blurred by a
-    Gauss-Markov error of `SLIP_SIGMA` and `SLIP_ERROR_S`, speed by 0.03 m/s.
+    Speed and slip of the estimator are simulated: true slip with a Gauss-Markov error of `SLIP_SIGMA` and
+    `SLIP_ERROR_S`, true speed with a white error of 0.03 m/s.
     """
     imu, terrain = recording.imu, recording.terrain
     if imu is None or terrain is None:

@@ -1,11 +1,9 @@
-"""Features of a labelled drive, for a learner of one robot's own grounds.
+"""Surface features of a labelled log, for the ground classifier of one robot.
 
-The estimator's detector (`features.py`) has seven numbers that do not name the
-robot. A robot with labelled drives of its own can do better: here is what six
-axes of vibration, wheels, gyro and motor current tell in two seconds, as
-logarithms, so that another speed, load or sensor gain is a shift along a line.
-What a log does not have is NaN. Nothing that names a place or a day is among
-them: no bias, no tilt, no absolute heading.
+The detector of the estimator (`terrain.features`) has seven features that do not depend on the robot. With labelled
+logs of one robot more can be used: spectra of six vibration axes, wheels, gyro and motor current over two
+seconds, as logarithms, so that speed, load and sensor gain are shifts. Missing features are NaN. Bias, tilt and
+absolute heading, which would identify the place or day, are left out.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ Array = NDArray[np.float64]
 
 WINDOW_S = 2.0
 RECENT_S = 1.0
-"""What is judged by itself beside the window, as its end: a new ground fills it twice as soon."""
+"""Last part of a window, classified by itself: a new ground fills it twice as soon."""
 HOP_S = 0.5
 BANDS_HZ = ((1.5, 3.0), (3.0, 6.0), (6.0, 10.0), (10.0, 14.0), (14.0, 20.0), (20.0, 30.0), (30.0, 45.0))
 AXES = ("roll", "pitch", "yaw", "x", "y", "z")
@@ -41,18 +39,18 @@ GROUPS: dict[str, tuple[str, ...]] = {
     "gyro against wheels": YAW,
     "motor current": CURRENT,
 }
-"""What belongs to one input, for ablation."""
+"""Groups of features by sensor, for ablation."""
 
 _SPEED_FLOOR_MPS = 0.05
 _POWER_FLOOR = 1e-7
 _LEAST_SPAN = 0.9
 _SHORTEST_SPAN = 0.8
-"""Shares of a window that the samples of the IMU, and both sensors together, must span."""
+"""Shares of a window that IMU samples, and both sensors together, must span."""
 
 
 @dataclass(frozen=True, eq=False)
 class Signals:
-    """What a drive is judged by.
+    """Signals of a run from which features are computed.
 
     Times in s; `gyro_radps` and `accel_mps2` (n, 3) body axes, `sides_mps` (m, 2) circumferential speed
     left and right, `current_a` (k, 2).
@@ -81,7 +79,7 @@ class Signals:
         )  # fmt: skip
 
     def end_s(self) -> float:
-        """Until when both IMU and wheels reach."""
+        """End of the time covered by both IMU and wheels."""
         return float(min(self.imu_s[-1], self.wheels_s[-1]))
 
 
@@ -111,13 +109,13 @@ def signals_of(recording: Recording) -> Signals:
 
 @dataclass(frozen=True, eq=False)
 class SurfaceWindows:
-    """What a drive shows every `HOP_S`.
+    """Features every `HOP_S`.
 
     Attributes:
         end_s: (n,) ends of the windows.
         x: (n, d) features of the windows.
         recent: (n, d) features of the last `RECENT_S` of each.
-        rolled_m: (n,) distances rolled since the window before.
+        rolled_m: (n,) distances rolled since the previous window.
     """
 
     end_s: Array
@@ -135,10 +133,10 @@ class SurfaceWindows:
 
 
 def surface_windows(signals: Signals) -> SurfaceWindows:
-    """Cut a drive into windows."""
+    """Features of the windows of a run."""
     begin = max(float(signals.imu_s[0]), float(signals.wheels_s[0]))
     span = signals.end_s() - begin
-    # A log cut into windows of two seconds spans a sample less than that.
+    # A log of one window of two seconds spans a sample less.
     count = max(int((span - WINDOW_S) / HOP_S + 1.0), int(span > _SHORTEST_SPAN * WINDOW_S))
     ends: Array = begin + WINDOW_S + HOP_S * np.arange(count, dtype=np.float64)
     x: Array = np.full((len(ends), len(SURFACE_FEATURES)), np.nan)
@@ -179,7 +177,7 @@ def _vibration(window: Signals, rate_hz: float) -> dict[str, float]:
             continue
         rows = (frequency >= low) & (frequency < high)
         power = density[rows].mean(axis=0) * (high - low)
-        power[power == 0.0] = np.nan  # a channel the log does not have, filled in with a constant
+        power[power == 0.0] = np.nan  # a missing channel, filled in with a constant
         levels = 0.5 * np.log10(power + _POWER_FLOOR)
         values |= {f"{axis}_{low:g}_hz": float(level) for axis, level in zip(AXES, levels, strict=True)}
     spread = signals.std(axis=0)
@@ -207,12 +205,11 @@ def _motion(window: Signals) -> dict[str, float]:
     gyro = window.gyro_radps[:, 2]
     if len(gyro) and np.isfinite(gyro).all():
         rate = np.interp(window.wheels_s, window.imu_s, gyro)
-        asked = float(np.abs(wheel_rate).mean())
-        values["yaw_lost"] = (asked - float(np.abs(rate).mean())) / (asked + 0.1)
+        by_wheels = float(np.abs(wheel_rate).mean())
+        values["yaw_lost"] = (by_wheels - float(np.abs(rate).mean())) / (by_wheels + 0.1)
         values["yaw_scatter"] = float(np.log10(np.std(np.abs(rate - wheel_rate)) + 0.01))
     if len(window.current_a) >= 3:
-        # Mean current weighted by the speed of its side: a wheel that stands draws current, but tells
-        # nothing of the ground it does not roll on.
+        # Weighted by the speed of the side: the current of a standing wheel does not depend on the ground.
         current = np.abs(window.current_a).mean(axis=0)
         values["driving_current"] = float(np.log10((current @ rolling + 0.02) / (rolling.sum() + 0.02)))
     return values

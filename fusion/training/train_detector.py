@@ -1,7 +1,7 @@
-"""Training of the terrain model on drives of the twin.
+"""Training of the terrain model on simulated runs.
 
-Three sets of seeds: one for the densities, one to calibrate temperature and
-the weight of `unknown`, one for the scores. No set sees another's drives.
+Three disjoint sets of seeds: for the densities, for the calibration of temperature and weight of `unknown`, and for
+the scores.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from terrafusion.fusion.training.mixture import fit_best
 from terrafusion.fusion.training.simulated_runs import GROUNDS, Grid, run_all, windows_of
 
 Array = NDArray[np.float64]
-Drive = tuple[list[Window], str]
+LabelledWindows = tuple[list[Window], str]
 
 SCENARIOS = ("staircase", "figure_eight")
 SLOPES_DEG = (0.0, 3.0, 6.0)
@@ -33,16 +33,16 @@ CALIBRATION_SEED, SCORING_SEED, FRESH_SEED = 1000, 2000, 3000
 PATCH_LENGTH_M = 25.0
 SIGMA_FLOOR = np.array([0.03] * SLIP + [0.02, 0.05])
 UNKNOWN_SPREAD = 3.0
-"""`unknown` is as wide as all grounds together, times this."""
+"""Standard deviations of `unknown` over those of all grounds pooled."""
 UNKNOWN_SHARE = 0.03
 TEMPERATURES = np.round(np.geomspace(2.0, 20.0, 11), 3)
-"""From 2 up: windows overlap by half, so each moment is seen twice."""
+"""From 2 up: windows overlap by half."""
 PATCHES = 60
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """What a training runs: `seeds` seeds for the densities, one each to calibrate and to score."""
+    """Runs of a training: `seeds` seeds for the densities, one each for calibration and scores."""
 
     seeds: int = 3
     scenarios: tuple[str, ...] = SCENARIOS
@@ -50,26 +50,26 @@ class TrainingPlan:
     payloads_kg: tuple[float, ...] = PAYLOADS_KG
 
     def grid(self, *seeds: int) -> Grid:
-        """The drives of given seeds."""
+        """The runs of given seeds."""
         return Grid(self.scenarios, self.slopes_deg, self.payloads_kg, seeds, GROUNDS)
 
     def training(self) -> Grid:
-        """The drives the densities are fitted to."""
+        """The runs to which the densities are fitted."""
         return self.grid(*range(self.seeds))
 
-    def drives(self) -> int:
-        """Number of drives in all."""
+    def runs(self) -> int:
+        """Total number of runs."""
         return (self.seeds + 2) * len(self.grid(0).conditions())
 
 
 def train(plan: TrainingPlan, tick: Callable[[], None] = lambda: None) -> tuple[TerrainModel, DetectorScores]:
-    """Simulate, fit, calibrate and score; `tick` is called after each drive.
+    """Simulate, fit, calibrate and score; `tick` is called after each run.
 
     Raises:
-        TerrafusionError: a ground gave too few windows.
+        TerrafusionError: too few windows on a ground.
     """
     rows: dict[str, list[Array]] = {ground: [] for ground in GROUNDS}
-    for windows, ground in drives_of(plan.training(), tick):
+    for windows, ground in windows_by_run(plan.training(), tick):
         rows[ground].append(features_of(windows))
     mixtures = {}
     for ground, parts in rows.items():
@@ -90,7 +90,7 @@ def train(plan: TrainingPlan, tick: Callable[[], None] = lambda: None) -> tuple[
         inputs_sha256=fingerprint_of(plan),
         made_by=f"terrafusion terrain train --seeds {plan.seeds}",
     )
-    held_out = list(drives_of(plan.grid(CALIBRATION_SEED), tick))
+    held_out = list(windows_by_run(plan.grid(CALIBRATION_SEED), tick))
     model = calibrate(draft, splice(held_out, PATCHES, CALIBRATION_SEED))
     scores = evaluate(model, routes_of(plan, SCORING_SEED, tick))
     return dataclasses.replace(model, scores=_plain(scores)), scores
@@ -99,24 +99,24 @@ def train(plan: TrainingPlan, tick: Callable[[], None] = lambda: None) -> tuple[
 def routes_of(
     plan: TrainingPlan, first_seed: int, tick: Callable[[], None], seeds: int = 1
 ) -> list[LabelledRoute]:
-    """Spliced routes over drives of `seeds` seeds from `first_seed`, one a seed."""
+    """Spliced routes of `seeds` seeds from `first_seed`, one a seed."""
     return [
-        splice(list(drives_of(plan.grid(seed), tick)), PATCHES, seed)
+        splice(list(windows_by_run(plan.grid(seed), tick)), PATCHES, seed)
         for seed in range(first_seed, first_seed + seeds)
     ]
 
 
-def drives_of(grid: Grid, tick: Callable[[], None]) -> list[Drive]:
-    """The windows of every drive of a grid, with its ground."""
-    drives: list[Drive] = []
+def windows_by_run(grid: Grid, tick: Callable[[], None]) -> list[LabelledWindows]:
+    """The windows and ground of every run of a grid."""
+    runs: list[LabelledWindows] = []
     for condition, recording in run_all(grid.conditions(), tick):
         windows, _ = windows_of(recording, condition.stream("estimator"))
-        drives.append((windows, condition.terrain))
-    return drives
+        runs.append((windows, condition.terrain))
+    return runs
 
 
 def features_of(windows: list[Window]) -> Array:
-    """Features (n, 7) of the windows in which anything was observed."""
+    """Features (n, 7) of the moving windows with any observed feature."""
     x = np.array([extract(w)[0] for w in windows if w.ground_speed_mps() > MIN_SPEED_MPS])
     if not len(x):
         return np.empty((0, len(FEATURES)))
@@ -124,10 +124,9 @@ def features_of(windows: list[Window]) -> Array:
 
 
 def calibrate(model: TerrainModel, route: LabelledRoute) -> TerrainModel:
-    """Temperature by the filtered log-score of the true ground, then the weight of `unknown`.
+    """Temperature by the filtered log score of the true ground, then the weight of `unknown`.
 
-    The weight is the largest of a falling series for which at most
-    `UNKNOWN_SHARE` of the windows are called unknown.
+    The weight is the largest power of ten for which at most `UNKNOWN_SHARE` of the windows become unknown.
     """
     evidence = _evidence(model, route)
     temperature = min((float(t) for t in TEMPERATURES), key=lambda t: _log_loss(model, evidence, t, 0.0)[0])
@@ -156,7 +155,7 @@ def _log_loss(
     temperature: float,
     unknown_log_weight: float,
 ) -> tuple[float, float]:
-    """Mean -log posterior of the true ground along a route, and the share of windows called unknown."""
+    """Mean -log posterior of the true ground along a route, and the share of windows classified as unknown."""
     patch = PatchFilter(len(model.classes) + 1, model.patch_length_m)
     weight = np.append(np.zeros(len(model.classes)), unknown_log_weight)
     loss, unknown = 0.0, 0
@@ -169,7 +168,7 @@ def _log_loss(
 
 
 def _broad(mixtures: dict[str, Mixture]) -> Mixture:
-    """One Gaussian around all grounds alike: the moment match, `UNKNOWN_SPREAD` times wider."""
+    """Moment match of all grounds with equal weight, `UNKNOWN_SPREAD` times wider."""
     weight = np.concatenate([np.exp(m.log_weight) for m in mixtures.values()]) / len(mixtures)
     means = np.concatenate([m.mean for m in mixtures.values()])
     covariances = np.concatenate([m.covariance for m in mixtures.values()])
@@ -180,7 +179,7 @@ def _broad(mixtures: dict[str, Mixture]) -> Mixture:
 
 
 def fingerprint_of(plan: TrainingPlan) -> str:
-    """SHA-256 of what a model made by `plan` depends on: parameter files and settings."""
+    """SHA-256 of the parameter files and settings that a model of `plan` depends on."""
     settings = {
         "plan": dataclasses.asdict(plan),
         "features": list(FEATURES),
@@ -192,7 +191,7 @@ def fingerprint_of(plan: TrainingPlan) -> str:
 
 
 def _plain(scores: DetectorScores) -> dict[str, Any]:
-    """The figures that come out the same on every machine, rounded."""
+    """Scores that are equal on every machine, rounded."""
     median, p95, largest = scores.switch_delay_s
     return {
         "held_out_windows": scores.windows,
@@ -206,7 +205,7 @@ def _plain(scores: DetectorScores) -> dict[str, Any]:
 
 
 def write_model(model: TerrainModel, path: Path) -> None:
-    """Write the model as YAML, numbers with six significant digits: same model, same bytes."""
+    """Write the model as YAML, six significant digits, byte for byte repeatable."""
     from ruamel.yaml import YAML
 
     content = {

@@ -23,7 +23,7 @@ from terrafusion.fusion.training.policy_fit import (
     default_grid,
     fingerprint_of,
     fit_policy,
-    row_of,
+    noise_of,
     write_policy,
 )
 from terrafusion.fusion.training.simulated_runs import Grid
@@ -69,7 +69,7 @@ def ornstein_uhlenbeck(mean: float, sigma: float, tau_s: float, n: int, seed: in
 
 
 def test_a_known_process_is_found_again() -> None:
-    row = row_of([ornstein_uhlenbeck(0.2, 0.1, 6.0, 100_000, 0)])
+    row = noise_of([ornstein_uhlenbeck(0.2, 0.1, 6.0, 100_000, 0)])
     assert row.slip_mean == pytest.approx(0.2, abs=0.01)
     assert row.slip_sigma == pytest.approx(np.hypot(0.1, RADIUS_SIGMA), rel=0.03)
     assert row.slip_time_s == pytest.approx(6.0, rel=0.1)
@@ -96,11 +96,11 @@ def test_slip_that_follows_the_grade_is_told_from_scatter() -> None:
         slip=flat.slip + 1.5 * grade,
         slip_pairs=flat.slip_pairs + 1.5 * pairs,
     )
-    row = row_of([sloped])
+    row = noise_of([sloped])
     assert row.slip_per_grade == pytest.approx(1.5, abs=0.02)
     assert row.slip_mean == pytest.approx(0.1, abs=0.01)
     assert row.slip_sigma == pytest.approx(np.hypot(0.02, RADIUS_SIGMA), rel=0.05)
-    assert row.slip_time_s == pytest.approx(row_of([flat]).slip_time_s, rel=0.05)
+    assert row.slip_time_s == pytest.approx(noise_of([flat]).slip_time_s, rel=0.05)
 
 
 def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
@@ -108,8 +108,8 @@ def test_pooled_grounds_are_the_moment_match_of_their_rows() -> None:
         ornstein_uhlenbeck(0.0, 0.02, 3.0, 4000, 1),
         ornstein_uhlenbeck(0.4, 0.2, 9.0, 20_000, 2),  # more drives must not weigh more
     ]
-    rows = [row_of([ground]) for ground in grounds]
-    pooled = row_of(grounds)
+    rows = [noise_of([ground]) for ground in grounds]
+    pooled = noise_of(grounds)
     matched = Policy({"a": rows[0], "b": rows[1]}, rows[0], "").blend([0.5, 0.5])
     assert pooled.slip_mean == pytest.approx(matched.slip_mean, rel=1e-9)
     assert pooled.slip_sigma >= matched.slip_sigma * (1 - 1e-9)  # the rms is least about the mean
@@ -132,9 +132,9 @@ def test_any_soil_of_the_library_is_covered_by_the_row_of_unknown() -> None:
             evidence = samples_of(condition.run())
             away = (evidence.slip - row.slip_mean - row.slip_per_grade * evidence.grade) / row.slip_sigma
             assert np.mean(np.abs(away) < 2.0) > 0.95, (soil, condition.slope_deg)
-            assert row_of([evidence]).side_slip_sigma < row.side_slip_sigma
-            assert row_of([evidence]).gyro_inflation < row.gyro_inflation
-            assert row_of([evidence]).gyro_yaw_inflation < row.gyro_yaw_inflation
+            assert noise_of([evidence]).side_slip_sigma < row.side_slip_sigma
+            assert noise_of([evidence]).gyro_inflation < row.gyro_inflation
+            assert noise_of([evidence]).gyro_yaw_inflation < row.gyro_yaw_inflation
 
 
 def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
@@ -142,7 +142,7 @@ def test_a_ground_whose_wheels_never_turned_is_refused() -> None:
         *(np.empty(0), np.empty(0), np.empty((0, 2)), np.empty((0, 2)), *(np.empty(0) for _ in range(7)))
     )
     with pytest.raises(ValueError, match="never turned"):
-        row_of([nothing])
+        noise_of([nothing])
 
 
 def test_of_a_robot_that_spins_on_the_spot_only_the_onset_counts() -> None:

@@ -18,7 +18,7 @@ from terrafusion.fusion.terrain.detector import TerrainDetector
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window
 from terrafusion.fusion.training.detector_scores import LabelledRoute, changes_in, evaluate, splice
 from terrafusion.fusion.training.simulated_runs import Condition, Grid, windows_of
-from terrafusion.fusion.training.train_detector import TrainingPlan, calibrate, drives_of, train
+from terrafusion.fusion.training.train_detector import TrainingPlan, calibrate, train, windows_by_run
 from terrafusion.twin.simulate import simulate
 
 CLASSES = load_policy().names()
@@ -29,7 +29,7 @@ MODEL = load_terrain_model()
 def route() -> LabelledRoute:
     """Patches of eight drives with a seed that neither training, calibration nor scoring use."""
     grid = Grid(("figure_eight",), (0.0, 3.0), (15.0,), (77,))
-    return splice(list(drives_of(grid, lambda: None)), patches=30, seed=77)
+    return splice(list(windows_by_run(grid, lambda: None)), patches=30, seed=77)
 
 
 def window(seed: int = 0, **changes: float | None) -> Window:
@@ -79,7 +79,7 @@ def test_training_on_a_few_drives_tells_held_out_ones() -> None:
     )
     ticks: list[None] = []
     model, scores = train(plan, lambda: ticks.append(None))
-    assert len(ticks) == plan.drives() == 24
+    assert len(ticks) == plan.runs() == 24
     assert scores.macro_f1 > 0.85
     assert set(model.classes) == {"asphalt", "medium_sand", "loose_sand", "mud"}
     assert model.scores["macro_f1"] == round(scores.macro_f1, 4)

@@ -348,9 +348,9 @@ def test_a_learner_is_scored_on_grounds_it_knows(model: SoftmaxModel, runs: Sequ
 @pytest.mark.parametrize(
     ("words", "why"),
     [
-        (("train", "--seeds", "2"), "--seeds is of the twin's drives"),
-        (("eval", "--seeds", "2"), "--seeds is of the twin's drives"),
-        (("eval", "--model", "a.yaml", "--test", "b"), "--test is of a learner made here"),
+        (("train", "--seeds", "2"), "--seeds is for simulated runs"),
+        (("eval", "--seeds", "2"), "--seeds is for simulated runs"),
+        (("eval", "--model", "a.yaml", "--test", "b"), "--test needs a model trained by this command"),
     ],
 )
 def test_options_that_mean_nothing_beside_logs_are_refused(tmp_path: Path, words, why: str) -> None:
