@@ -1,9 +1,9 @@
 """The International Standard Atmosphere up to 11 km: pressure and height.
 
 p = p_0 (1 - L h / T_0)^(g / (R L)) (ISO 2533:1975, the troposphere; the same as ICAO Doc 7488). Heights
-are geopotential, which on the ground is a height above sea level to 0.02 % a kilometre. Air that is
-warmer than the standard's is thinner: a height difference is true times T_standard / T, 3.5 % less for
-each 10 K, and the weather moves all heights alike by 0.083 m/Pa at sea level.
+are geopotential, which on the ground is a height above sea level to 0.02 % a kilometre. In air
+warmer than the standard a computed height difference is the true one times T_standard / T, 3.5 % less for
+each 10 K; the weather shifts all heights by 0.083 m/Pa at sea level.
 """
 
 from __future__ import annotations

@@ -1,9 +1,8 @@
-"""Steps of a clock in recorded times: found, taken out, and told.
+"""Detection and removal of clock steps in recorded times.
 
-A clock that is set while it records makes time run back, or leap ahead. A step is taken out by
-shifting all later times so that the interval at the step is the nominal one, so a repaired clock is
-off by less than a sampling period. Messages that arrived out of order are a different thing: there
-no time is wrong, only the rows are; `in_order` sorts those.
+A clock that is set while it records makes time run back, or jump ahead. A step is removed by shifting
+all later times so that the interval at the step is the nominal one; the repaired clock is off by less
+than a sampling period. Messages that arrived out of order have correct times; `in_order` sorts them.
 """
 
 from __future__ import annotations
@@ -18,32 +17,32 @@ from terrafusion.datasets.core.recording import ClockJump
 
 TimesNs = NDArray[np.int64]
 Step = tuple[int, int]
-"""First row after a step, and the nanoseconds that its time and all later ones lack."""
+"""First row after a step, and the nanoseconds to add to its time and all later ones."""
 
 NEAR_ROWS = 25
-"""Intervals on either side of a step whose median is the nominal one there."""
+"""Intervals on either side of a step whose median is the nominal interval."""
 DISORDER_ROWS = 50
-"""Rows out of order over a longer stretch are not a matter of arrival."""
+"""Rows out of order over a longer stretch did not merely arrive late."""
 MARGIN_ROWS = 5
-"""Periods before and after a stretch that are counted with it."""
+"""Periods before and after a stretch that count as part of it."""
 SHARED_ROWS = 3
-"""Rows about a step of one channel among which another channel of that clock shows it."""
+"""Rows around a step of one channel in which another channel of that clock shows it."""
 LEAP_PERIODS, LEAP_S = 10, 0.5
-"""An interval longer than both is a leap ahead, where those are to be taken out."""
+"""An interval longer than both is a jump ahead, where those are removed."""
 MAX_STEPS = 1000
 
 
 def repair(t_ns: TimesNs, channel: str, *, forwards: bool = False) -> tuple[TimesNs, tuple[ClockJump, ...]]:
-    """Take the steps out of one channel's times.
+    """Remove the clock steps of one channel.
 
     Args:
         t_ns: (N,) int64 in the order of the rows.
         channel: its name, for the jumps and errors.
-        forwards: take out leaps ahead too. Times alone cannot tell a leap from a gap in the data.
+        forwards: remove jumps ahead too. Times alone do not distinguish a jump from a gap in the data.
 
     Returns:
-        The repaired times, and the steps that were taken out; `t_ns` itself where there are none.
-        Rows that merely arrived out of order are still so: sort them by `in_order`.
+        The repaired times, and the removed steps; `t_ns` itself where there are none. Rows that arrived
+        out of order stay so: sort them by `in_order`.
 
     Raises:
         DataError: more than 1000 steps, or steps too large for 64 bits.
@@ -59,17 +58,17 @@ def repair_together(
     forwards: bool = False,
     beside: Mapping[str, TimesNs] | None = None,
 ) -> tuple[dict[str, TimesNs], tuple[ClockJump, ...]]:
-    """Take the steps out of channels that may share a clock.
+    """Remove the clock steps of channels that may share a clock.
 
     The step is measured on the fastest channel that shows it. Every other one whose interval there
-    fits the step better than it fits its own period shares the clock and gets the same shift, also
-    where its times do not run back; the others keep theirs.
+    fits the step better than its own period shares the clock and gets the same shift, even where its
+    times do not run back; the others are unchanged.
 
     Args:
         times: (N,) int64 by channel, in the order of the rows.
         forwards: as in `repair`.
-        beside: times of the same rows on another clock of the same rate. What leaps ahead on the
-            first and not on this one is a step and no gap in the data, and is taken out too.
+        beside: times of the same rows on another clock of the same rate. A jump ahead of the first
+            that this one does not have is a step and no gap in the data, and is removed too.
 
     Returns:
         Repaired times by channel (the same arrays where nothing changed), and all jumps.
@@ -86,14 +85,14 @@ def repair_together(
             for other in fastest_first[i + 1 :]:
                 shared = _shared_row(times[other], fixed[other], int(fixed[name][row]), lack)
                 if shared is not None:
-                    kept = [step for step in steps[other] if step[0] != shared]
-                    steps[other] = sorted([*kept, (shared, lack)])
+                    remaining = [step for step in steps[other] if step[0] != shared]
+                    steps[other] = sorted([*remaining, (shared, lack)])
                     fixed[other] = _shifted(times[other], steps[other], other)
     return fixed, tuple(jump for name in times for jump in _jumps(name, fixed[name], steps[name]))
 
 
 def in_order(t_ns: TimesNs) -> NDArray[np.intp] | None:
-    """The order (N,) that sorts rows by time and keeps ties as they are; None where they are sorted."""
+    """Stable order (N,) that sorts rows by time; None where they are sorted."""
     return np.argsort(t_ns, kind="stable") if (t_ns[1:] < t_ns[:-1]).any() else None
 
 
@@ -123,7 +122,7 @@ def _steps(t_ns: TimesNs, channel: str, forwards: bool, beside: TimesNs | None) 
     steps: list[Step] = []
     for row in (suspects + 1).tolist():
         period = _period_ns(interval, row)
-        first = steps[-1][0] if steps else 0  # rows before an earlier step are of another clock
+        first = steps[-1][0] if steps else 0  # rows before an earlier step have another offset
         if interval[row - 1] < 0 and _is_disorder(t_ns[first:], row - first, period):
             continue
         steps.append((row, round(period) - int(interval[row - 1])))
@@ -143,16 +142,16 @@ def _period_ns(interval: TimesNs, row: int) -> float:
 
 
 def _is_disorder(t_ns: TimesNs, row: int, period: float) -> bool:
-    """Whether time only seems to run back at `row`, because rows came in another order.
+    """Whether time runs back at `row` only because rows arrived out of order.
 
-    Then the rows about the time in question span as much of it as their number takes. After a step
-    of the clock the same time is told twice, and they span less by the step.
+    Then the rows around that time span as many periods as they count. After a step of the clock the
+    same time is covered twice, and they span less by the step.
     """
     start, stop = max(row - DISORDER_ROWS, 0), min(row + DISORDER_ROWS, len(t_ns))
     t, at = t_ns[start:stop] - t_ns[row], row - start
     steady = np.diff(t)
     steady = steady[np.abs(steady - period) < 0.5 * period]
-    if steady.size:  # over many rows the mean counts them, where the median adds up its own error
+    if steady.size:  # over many rows the mean is exact, the error of the median adds up
         period = float(steady.mean())
     high = int(t[:at].max())
     has_earlier, has_later = bool((t[:at] < 0).any()), bool((t[at:] > high).any())
@@ -161,7 +160,7 @@ def _is_disorder(t_ns: TimesNs, row: int, period: float) -> bool:
     if not has_earlier and not has_later:
         return False  # all rows before are later than all rows after
     step = high + period
-    if not has_earlier:  # the rows before are all that could tell
+    if not has_earlier:  # only the rows before bound the step
         step = min(step, at * period)
     if not has_later:
         step = min(step, (len(t) - at) * period)

@@ -1,8 +1,7 @@
-"""What a log's numbers mean where its format leaves it open: axes, signs, held values, lags.
+"""Conventions that a log format leaves open: axes, signs, held values, lags.
 
-A reader gives the numbers of its file; `apply` turns them into a `Recording`'s terms. The conventions
-of a public set stand in the catalogue, each with where it was found; nothing is silent: every
-convention that was applied becomes a note.
+A reader returns the numbers of its file; `apply` converts them to the conventions of a `Recording`. Those
+of a public data set are in the catalogue, each with its source; every applied one becomes a note.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ class Conventions:
     """Conventions of a log.
 
     Attributes:
-        vehicle: name of the vehicle, "" where the log says it.
+        vehicle: name of the vehicle, "" where the log has it.
         imu_axes: sensor axes that point along body x (forward), y (left), z (up).
         gyro_z_sign: -1 where the yaw rate is positive to the right (after `imu_axes`).
         left_wheels_sign, right_wheels_sign: -1 where that side is negative when driving forward.
@@ -39,8 +38,8 @@ class Conventions:
         held: rows for which a channel holds a value, by channel name ("wheels", "imu", "gnss",
             "truth"); of a run of equal rows the first and then every so many rows are true updates.
         lag_s: seconds by which a channel's times are late, by channel name.
-        truth_channels: what of the truth can be scored against; () for all it holds.
-        terrain: name of the ground for the whole drive, "" where unknown.
+        truth_channels: channels of the truth that can be scored against; () for all.
+        terrain: name of the ground of the whole log, "" where unknown.
     """
 
     vehicle: str = ""
@@ -62,7 +61,7 @@ class Conventions:
 
 
 def apply(recording: Recording, conventions: Conventions) -> Recording:
-    """The recording in the terms of `Recording`, with a note for every convention that changed it."""
+    """The recording converted, with a note for every convention that changed it."""
     recording = _geometry(recording, conventions)
     recording = _inertial(recording, conventions)
     recording = _wheels(recording, conventions)
@@ -103,7 +102,7 @@ def _inertial(recording: Recording, c: Conventions) -> Recording:
 
 
 def _turned(R: Array, values: Array) -> Array:
-    """R @ v for signed permutations, which keeps NaN axes apart from known ones."""
+    """R @ v for signed permutations; NaN axes do not affect the others."""
     source = np.abs(R).argmax(axis=1)
     return values[:, source] * R[np.arange(3), source]
 
@@ -169,9 +168,9 @@ def _lags(recording: Recording, c: Conventions) -> Recording:
 
 def _truth_and_terrain(recording: Recording, c: Conventions) -> Recording:
     if c.truth_channels and recording.truth is not None:
-        kept = tuple(name for name in recording.truth_channels if name in c.truth_channels)
-        lost = [name for name in recording.truth_channels if name not in kept]
-        recording = dataclasses.replace(recording, truth_channels=kept)
+        usable = tuple(name for name in recording.truth_channels if name in c.truth_channels)
+        lost = [name for name in recording.truth_channels if name not in usable]
+        recording = dataclasses.replace(recording, truth_channels=usable)
         if lost:
             recording = recording.with_notes(f"truth: {', '.join(lost)} not good enough to score against")
     if c.terrain and not recording.terrain_name:

@@ -1,4 +1,4 @@
-"""Times as they were written, decimal or ISO 8601 -> whole nanoseconds, exactly and many at once."""
+"""Exact, vectorised conversion of decimal and ISO 8601 times to integer nanoseconds."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ _LIMIT_NS = 2**63 - 1
 FIRST_YEAR, LAST_YEAR = 1900, 2200
 
 
-class NotADecimal(ValueError):  # noqa: N818 - it names what the cell is
-    """The text at `row` is no decimal number or date, or none that fits into int64 nanoseconds."""
+class NotADecimal(ValueError):  # noqa: N818
+    """The text at `row` is no decimal number or date that fits into int64 nanoseconds."""
 
     def __init__(self, row: int) -> None:
         super().__init__(f"row {row}")
@@ -28,8 +28,8 @@ def to_ns(texts: Sequence[str], unit: str = "s") -> NDArray[np.int64]:
     """Decimal times as nanoseconds (N,) int64, without passing through a float.
 
     Args:
-        texts: N decimal numbers; blanks around them do not matter.
-        unit: "s", "ms", "us" or "ns"; what lies below a nanosecond is rounded half to even.
+        texts: N decimal numbers; surrounding blanks are ignored.
+        unit: "s", "ms", "us" or "ns"; fractions of a nanosecond are rounded half to even.
 
     Raises:
         NotADecimal: a text is no finite decimal number, or beyond int64.
@@ -66,7 +66,7 @@ def dates_to_ns(texts: Sequence[str]) -> NDArray[np.int64]:
 
 
 def _plain_to_ns(characters: NDArray[np.uint8], places: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Nanoseconds of texts like -12.345, given as (width, N) characters, and which are that plain."""
+    """Nanoseconds of texts like -12.345, given as (width, N) characters, and which texts have that form."""
     n = characters.shape[1]
     value, digits, decimals = (np.zeros(n, dtype=np.int64) for _ in range(3))
     seen_dot, ended, plain = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool), np.ones(n, dtype=bool)
@@ -80,7 +80,7 @@ def _plain_to_ns(characters: NDArray[np.uint8], places: int) -> tuple[NDArray[np
         decimals += digit & seen_dot
         seen_dot |= dot
         ended |= end
-    size = digits - decimals + places  # digits of the nanoseconds; int64 holds 19 that begin with 8 or less
+    size = digits - decimals + places  # digits of the nanoseconds; int64 holds 19 beginning with 8 or less
     signed = negative | (characters[0] == ord("+"))
     first = np.where(signed, characters[min(1, len(characters) - 1)], characters[0])
     plain &= (digits > 0) & (decimals <= places) & ((size <= 18) | ((size == 19) & (first <= ord("8"))))
@@ -90,7 +90,7 @@ def _plain_to_ns(characters: NDArray[np.uint8], places: int) -> tuple[NDArray[np
 
 
 def _one_to_ns(cell: str, ns: int, row: int) -> int:
-    """Any other way to write a number: exponents, more decimals than nanoseconds."""
+    """Any other decimal notation: exponents, more decimals than nanoseconds."""
     try:
         number = Decimal(cell)
         if "_" in cell or not number.is_finite() or number.adjusted() > 20:

@@ -1,4 +1,4 @@
-"""The one error type a user of terrafusion is meant to see."""
+"""Errors that a user of terrafusion may see."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from pathlib import Path
 
 
 class TerrafusionError(Exception):
-    """A known problem with an input or a request, told in one line.
+    """A known problem with an input or a request, in one line.
 
-    The command line prints the message and leaves with status 1; nothing else
-    is caught there, so every other exception is a defect of this library.
+    The command line prints the message and exits with status 1; every other exception is a defect of
+    this library.
 
     Args:
         what: what is wrong, with the offending value.
@@ -49,7 +49,7 @@ class DataError(TerrafusionError):
 
 
 class ClockError(DataError):
-    """Times that run backwards, where no repair of the clock was asked for."""
+    """Times that run backwards, where no repair of the clock was requested."""
 
 
 class ConfigError(TerrafusionError):
@@ -66,7 +66,7 @@ class ConfigError(TerrafusionError):
 
 @contextmanager
 def errors_of(file: str | Path) -> Iterator[None]:
-    """Names the file in every DataError raised inside that does not name one, as channels do not."""
+    """Adds the file to every DataError raised inside that does not name one."""
     try:
         yield
     except DataError as error:

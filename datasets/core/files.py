@@ -1,4 +1,4 @@
-"""Files that appear only when they are whole."""
+"""Atomic writing of files, and checks of output folders."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a folder for results before anything is computed; one that is not there is not made yet.
+    """Refuse an unusable output folder before anything is computed; a missing one is not created yet.
 
     Raises:
         TerrafusionError: it cannot be made or written.
@@ -43,7 +43,7 @@ def check_folder(path: Path) -> None:
 
 
 def unwritable(path: Path, error: OSError) -> TerrafusionError:
-    """The error that tells why `path` cannot be written."""
+    """The error that states why `path` cannot be written."""
     return TerrafusionError(
         f"cannot be written: {error.strerror or error}",
         file=path,

@@ -1,11 +1,11 @@
-"""Frames, rotations and geodesy, stated once for the whole library.
+"""Frames, rotations and geodesy of the library.
 
 World frame: local east-north-up (ENU) at a datum on WGS-84 (REP-105 `map`).
 Body frame: x forward, y left, z up (REP-103 `base_link`). Yaw is zero facing
 east and grows to the left. `R_world_body` takes body vectors to the world.
 Quaternions are (x, y, z, w). Tangent order of pose covariances: GTSAM's Pose3
 has rotation first and is expressed in the body; ROS has translation first and
-is expressed in the parent frame. `gtsam_to_ros_covariance` is the one bridge.
+is expressed in the parent frame. `gtsam_to_ros_covariance` converts.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def wrap_angle(angle_rad: ArrayLike) -> Array:
 
 
 def quaternion_to_matrix(q_xyzw: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4); norms are divided out."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4); they are normalised first."""
     q = np.asarray(q_xyzw, dtype=float)
     x, y, z, w = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
     rows = [

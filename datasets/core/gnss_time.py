@@ -10,7 +10,7 @@ GPS_EPOCH_S = 315_964_800
 
 WEEK_S = 604_800
 FULL_WEEK_MIN = 1024
-"""Weeks before this one (August 1999) are taken for weeks counted modulo 1024."""
+"""Weeks before this one (August 1999) are treated as counted modulo 1024."""
 
 LEAP_SECONDS = (
     ("1981-07-01", 1), ("1982-07-01", 2), ("1983-07-01", 3), ("1985-07-01", 4), ("1988-01-01", 5),
@@ -30,7 +30,7 @@ _OFFSET_S = np.array([0, *(offset for _, offset in LEAP_SECONDS)], dtype=np.int6
 def gps_to_unix_ns(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Unix nanoseconds (N,) of GPS time, given as nanoseconds since the GPS epoch.
 
-    Inside a leap second Unix time repeats a second, as it does everywhere.
+    Unix time repeats a second during a leap second.
     """
     without = gps_ns + GPS_EPOCH_S * 10**9
     starts = _FROM_UNIX_NS + _OFFSET_S[1:] * 10**9  # in GPS time, counted from the Unix epoch
@@ -38,7 +38,7 @@ def gps_to_unix_ns(gps_ns: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def leap_note(unix_ns: NDArray[np.int64]) -> str:
-    """One sentence that tells which leap seconds were taken off."""
+    """A note on the leap seconds that were subtracted."""
     taken = np.unique(_OFFSET_S[np.searchsorted(_FROM_UNIX_NS, unix_ns[[0, -1]], side="right")])
     seconds = " and ".join(str(int(s)) for s in taken)
     late = int(unix_ns[-1]) > int(np.datetime64(KNOWN_UNTIL, "ns").astype(np.int64))

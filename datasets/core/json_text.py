@@ -1,4 +1,4 @@
-"""Results as strict JSON: what is not a number is null."""
+"""Strict JSON: numbers that are not finite are null."""
 
 from __future__ import annotations
 

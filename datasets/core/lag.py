@@ -1,4 +1,4 @@
-"""The lag between two signals of different clocks, by correlation, with its interval."""
+"""Lag between two signals on different clocks, by cross-correlation, with its interval."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ STEP_S = 0.02
 LONGEST_GRID = 1 << 18
 LEAST_COMMON_S, LEAST_SAMPLES = 10.0, 20
 GAP_PERIODS, GAP_S = 5.0, 0.2
-"""Longer intervals between samples are gaps: what lies inside is not known."""
+"""Longer intervals between samples are gaps, in which the signal is unknown."""
 WIDEST_MEAN_S = 1.0
 """Both signals are averaged over the period of the slower one, but no longer than this."""
 PEAK_SHARES, PEAK_LAGS = (0.3, 0.1, 0.03), 10
-"""Parabolas are fitted to these upper shares of the peak, at so many lags on each side; the one that
-the blocks agree on best is taken: wide against noise, narrow where the signal moves seldom."""
+"""Parabolas are fitted to these upper shares of the peak, at this many lags on each side; the one with the
+smallest interval is used: wide against noise, narrow where the signal changes seldom."""
 CHOICE = 1.15
-"""By which the interval is widened because the best of several was taken."""
+"""Factor on the interval because the best of several fits is selected."""
 RESAMPLES, LEAST_BLOCKS, MOST_BLOCKS, BLOCK_S = 400, 10, 60, 3.0
 SEED = 20_240_607
 RESOLUTION_S = 0.001
-"""What the grid and the parabola may cost where there is no noise; part of every interval."""
+"""Error of grid and parabola without noise; part of every interval."""
 
 
 @dataclass(frozen=True)
@@ -43,23 +43,23 @@ class Lag:
 def lag_between(
     t_a_s: Array, a: Array, t_b_s: Array, b: Array, *, reach_s: float = 2.0, least_r: float = 0.0
 ) -> Lag | None:
-    """How much later `b` tells what `a` tells.
+    """Lag of signal `b` behind signal `a`.
 
     Args:
         t_a_s, a: times (N,) s and values (N,) of the first signal, in any order; NaN is left out.
         t_b_s, b: the same of the second, (M,).
-        reach_s: largest lag that is looked for, either way; at most a quarter of the common time.
-        least_r: correlation below which nothing is told, which is quicker.
+        reach_s: largest lag searched, in either direction; at most a quarter of the common time.
+        least_r: correlation below which the result is None, which is quicker.
 
     Returns:
-        Lag, or None where the common time is below 10 s, a signal is constant, or no peak stands
-        inside the reach. A positive lag is repaired by subtracting it from the times of `b`. The
-        peak is that of positive correlation: signals of opposite sign have none.
+        Lag, or None where the common time is below 10 s, a signal is constant, or no peak lies inside
+        the reach. A positive lag is removed by subtracting it from the times of `b`. Only positive
+        correlation counts: signals of opposite sign have no peak.
 
-    Both signals are averaged over the period of the slower one; of values that are held over rows only
-    the updates count. The lag is the vertex of a parabola through Pearson's r over the peak. The
-    interval is a bootstrap over blocks of the common time (Carlstein 1986), which keeps the
-    correlation inside a block; it widens the spread by Student's t for the number of blocks.
+    Both signals are averaged over the period of the slower one; of held values only the updates count.
+    The lag is the vertex of a parabola through Pearson's r over the peak. The
+    interval is a bootstrap over blocks of the common time (Carlstein 1986), widened by Student's t
+    for the number of blocks.
     """
     first, second = _cleaned(t_a_s, a), _cleaned(t_b_s, b)
     if min(len(first[0]), len(second[0])) < LEAST_SAMPLES:
@@ -89,7 +89,7 @@ def lag_between(
 
 
 def _cleaned(t_s: Array, values: Array) -> tuple[Array, Array]:
-    """Known samples in order of time, one a time, updates only."""
+    """Known samples in order of time, without repeated times and held values."""
     t_s, values = np.asarray(t_s, dtype=float), np.asarray(values, dtype=float)
     known = np.isfinite(t_s) & np.isfinite(values)
     t_s, index = np.unique(t_s[known], return_index=True)
@@ -101,7 +101,7 @@ def _cleaned(t_s: Array, values: Array) -> tuple[Array, Array]:
 def held_rows(values: Array) -> int:
     """Rows for which `values` (N, k) hold each update; 1 where they are not held.
 
-    Runs of equal rows have about one length where a slower sensor is held, any length where a slow
+    Runs of equal rows have similar lengths where a slower sensor is held, any length where a slow
     signal is quantised.
     """
     if len(values) < LEAST_SAMPLES:
@@ -121,7 +121,7 @@ def _period(t_s: Array) -> float:
 
 
 def _resampled(grid: Array, t_s: Array, values: Array, width_s: float) -> Array:
-    """Means over `width_s` about the times of the grid; NaN inside gaps."""
+    """Means over `width_s` around the times of the grid; NaN inside gaps."""
     dt = np.diff(t_s)
     values = values - values.mean()
     area = np.concatenate([[0.0], np.cumsum(0.5 * (values[1:] + values[:-1]) * dt)])
@@ -134,7 +134,7 @@ def _resampled(grid: Array, t_s: Array, values: Array, width_s: float) -> Array:
 
 
 def _integral(at: Array, t_s: Array, values: Array, area: Array) -> Array:
-    """Integral of the broken line through the samples, from the first to the times `at`."""
+    """Integral of the piecewise linear signal from its first sample to the times `at`."""
     i = np.clip(np.searchsorted(t_s, at, side="right") - 1, 0, len(t_s) - 2)
     since = at - t_s[i]
     slope = (values[i + 1] - values[i]) / (t_s[i + 1] - t_s[i])
@@ -158,7 +158,7 @@ def _moments(a: Array, b: Array) -> tuple[Array, Array] | None:
 
 
 PAIRS = ((0, 0), (1, 0), (2, 0), (0, 1), (0, 2), (1, 1))
-"""Powers of a and of b whose products Pearson's r is made of."""
+"""Powers of a and of b whose products give Pearson's r."""
 
 
 def _at_all_lags(a: Array, b: Array, reach: int) -> Array:
@@ -195,7 +195,7 @@ def _correlation(sums: Array) -> Array:
 
 
 def _peaks(r: Array) -> list[NDArray[np.int64]]:
-    """Lags about the highest r to fit, wider and narrower; none at the edge or where r is flat."""
+    """Ranges of lags around the highest r to fit, widest first; none at the edge or where r is flat."""
     centre, reach = int(np.argmax(r)), len(r) // 2
     room = min(centre, len(r) - 1 - centre)
     if not r[centre] > 0.0 or room < 2:
@@ -210,7 +210,7 @@ def _peaks(r: Array) -> list[NDArray[np.int64]]:
 
 
 def _fit(a: Array, b: Array, lags: NDArray[np.int64], blocks: int) -> tuple[float, float, float] | None:
-    """Vertex and half of its interval, in steps, and the highest r; None where the blocks see no peak."""
+    """Vertex and half of its interval, in steps, and the highest r; None where the blocks have no peak."""
     parts = _in_blocks(a, b, lags, blocks)
     r = _correlation(parts.sum(axis=1))
     vertex, spread = float(_vertex(lags, r)), _spread(lags, parts)
@@ -228,7 +228,7 @@ def _vertex(lags: NDArray[np.int64], r: Array) -> Array:
 
 
 def _spread(lags: NDArray[np.int64], parts: Array) -> float | None:
-    """Half of the 95 % interval of the vertex, in steps; None where the blocks do not agree on a peak."""
+    """Half of the 95 % interval of the vertex, in steps; None where resamples often have no peak."""
     from scipy.special import stdtrit
 
     blocks = parts.shape[1]

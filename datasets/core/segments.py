@@ -1,7 +1,7 @@
-"""Pieces of a long recording as runs of their own.
+"""Segments of a long recording as separate runs.
 
-Field logs often hold one long drive, while the diagnosis compares runs: `LOG@60-105` is the piece from 60
-to 105 s after the log's start, `LOG@/45` are all pieces of 45 s, one after the other.
+Field logs are often one long run, while the diagnosis compares several: `LOG@60-105` is the segment from 60
+to 105 s after the log's start, `LOG@/45` are all consecutive segments of 45 s.
 """
 
 from __future__ import annotations
@@ -17,36 +17,36 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 
 LEAST_S = 5.0
-"""No piece is shorter; what a cut leaves over at the end, if shorter, is left out."""
+"""Shortest segment; a shorter remainder at the end is dropped."""
 _CUT = re.compile(r"^(?P<log>.+)@(?:/(?P<every>[\d.]+)|(?P<begin>[\d.]+)-(?P<end>[\d.]+))$")
 
 
 @dataclasses.dataclass(frozen=True)
 class Cut:
-    """Which part of a log is meant: `begin_s` to `end_s` after its start, or pieces of `every_s` seconds."""
+    """The selected part of a log: `begin_s` to `end_s` after its start, or segments of `every_s` seconds."""
 
     begin_s: float | None = None
     end_s: float | None = None
     every_s: float | None = None
 
     def of(self, recording: Recording) -> list[Recording]:
-        """The recording's pieces.
+        """The selected segments of a recording.
 
         Raises:
             DataError: there is none.
         """
         if self.every_s is not None:
-            return pieces(recording, self.every_s)
+            return segments_of(recording, self.every_s)
         assert self.begin_s is not None
         assert self.end_s is not None
-        return [piece(recording, self.begin_s, self.end_s)]
+        return [segment(recording, self.begin_s, self.end_s)]
 
 
 def split_name(text: str) -> tuple[str, Cut | None]:
-    """The log and what of it is meant: `LOG`, `LOG@60-105` or `LOG@/45`.
+    """Split `LOG`, `LOG@60-105` or `LOG@/45` into the log and the selected part.
 
     Raises:
-        DataError: no number, or a piece shorter than `LEAST_S`.
+        DataError: no number, or a segment shorter than `LEAST_S`.
     """
     found = _CUT.match(text)
     if found is None:
@@ -61,8 +61,8 @@ def split_name(text: str) -> tuple[str, Cut | None]:
     return found["log"], Cut(numbers.get("begin"), numbers.get("end"), numbers.get("every"))
 
 
-def piece(recording: Recording, begin_s: float, end_s: float) -> Recording:
-    """The recording from `begin_s` to `end_s` after its start; the ground label holds on from before.
+def segment(recording: Recording, begin_s: float, end_s: float) -> Recording:
+    """The recording from `begin_s` to `end_s` after its start, with the ground label valid at its start.
 
     Raises:
         DataError: nothing was recorded then.
@@ -73,10 +73,10 @@ def piece(recording: Recording, begin_s: float, end_s: float) -> Recording:
     if terrain is not None and len(terrain):
         first = max(0, int(np.searchsorted(terrain.t_ns, start, side="right")) - 1)
         last = max(first + 1, int(np.searchsorted(terrain.t_ns, end)))
-        held = terrain.select(slice(first, last))
-        parts["terrain"] = dataclasses.replace(held, t_ns=np.maximum(held.t_ns, start))
-    left: dict[str, Any] = {name: channel if len(channel) else None for name, channel in parts.items()}
-    if not any(channel is not None for name, channel in left.items() if name != "terrain"):
+        labels = terrain.select(slice(first, last))
+        parts["terrain"] = dataclasses.replace(labels, t_ns=np.maximum(labels.t_ns, start))
+    present: dict[str, Any] = {name: channel if len(channel) else None for name, channel in parts.items()}
+    if not any(channel is not None for name, channel in present.items() if name != "terrain"):
         raise DataError(
             f"nothing was recorded from {begin_s:g} to {end_s:g} s",
             file=recording.name, remedy=f"the log lasts {recording.duration_s():.0f} s",
@@ -88,22 +88,24 @@ def piece(recording: Recording, begin_s: float, end_s: float) -> Recording:
     jumps = tuple(j for j in recording.clock_jumps if start <= j.t_ns < end)
     name = f"{recording.name}@{begin_s:g}-{end_s:g}"
     return dataclasses.replace(
-        recording, name=name, start_ns=start, truth=truth, clock_jumps=jumps, **left
+        recording, name=name, start_ns=start, truth=truth, clock_jumps=jumps, **present
     )  # fmt: skip
 
 
-def pieces(recording: Recording, length_s: float) -> list[Recording]:
-    """All pieces of `length_s` seconds (see `spans`).
+def segments_of(recording: Recording, length_s: float) -> list[Recording]:
+    """All segments of `length_s` seconds (see `segment_spans`).
 
     Raises:
         DataError: the log is shorter than `LEAST_S`.
     """
-    return [piece(recording, begin, end) for begin, end in spans(recording, length_s)]
+    return [segment(recording, begin, end) for begin, end in segment_spans(recording, length_s)]
 
 
-def spans(recording: Recording, length_s: float) -> list[tuple[float, float]]:
-    """Begin and end of all pieces in seconds from the log's start: from the first input of the twin (wheels
-    or commands) to the log's end; the last may be shorter.
+def segment_spans(recording: Recording, length_s: float) -> list[tuple[float, float]]:
+    """Begin and end of all segments in seconds from the log's start.
+
+    They cover the time from the first wheel or command sample (the inputs of the twin) to the end of the
+    log; the last may be shorter.
 
     Raises:
         DataError: the log is shorter than `LEAST_S`.
@@ -115,7 +117,7 @@ def spans(recording: Recording, length_s: float) -> list[tuple[float, float]]:
     found = [(round(a, 2), round(b, 2)) for a, b in itertools.pairwise(edges) if b - a >= LEAST_S]
     if not found:
         raise DataError(
-            f"lasts {end_s - begin_s:.1f} s: too short for a piece", file=recording.name,
+            f"lasts {end_s - begin_s:.1f} s: too short for a segment", file=recording.name,
             remedy=f"give a log of at least {LEAST_S:g} s",
         )  # fmt: skip
     return found

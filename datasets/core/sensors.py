@@ -1,4 +1,4 @@
-"""What is known of a robot's sensors: where they sit and how good they are.
+"""Sensor specifications: mounting positions, axes and noise.
 
 Positions are in the body frame (`base_link`: x forward, y left, z up), metres.
 Noise densities follow the Allan-variance convention (IEEE Std 952-1997): the
@@ -23,7 +23,7 @@ AXES = {
 }  # fmt: skip
 
 ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
-"""Sigma of each horizontal axis by class of fix, where neither log nor vehicle says it; up takes twice that.
+"""Sigma of each horizontal axis by class of fix, where neither log nor vehicle gives it; up has twice that.
 Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""
 
 
@@ -51,8 +51,8 @@ class ImuSpec:
     """Inertial measurement unit: mounting and noise.
 
     `axes` lists the sensor axes that point along body x, y and z; a husky whose
-    body x is minus the sensor's z reads `["-z", "-x", "+y"]`. It is applied only
-    to messages whose `frame_id` is the one given here.
+    body x is minus the sensor's z reads `["-z", "-x", "+y"]`. It applies only
+    to messages with this `frame_id`.
     """
 
     rate_hz: Annotated[float, Sourced("Hz", 1.0, 5000.0)]
@@ -97,7 +97,7 @@ class GnssSpec:
 
 @dataclass(frozen=True)
 class BarometerSpec:
-    """Barometer: white noise of a sample (1 sigma), and the random walk of weather and wind on top."""
+    """Barometer: white noise of a sample (1 sigma), and the random walk of weather and wind."""
 
     rate_hz: Annotated[float, Sourced("Hz", 0.05, 500.0)]
     noise_pa: Annotated[float, Sourced("Pa", 0.0, 1000.0)]
@@ -107,8 +107,7 @@ class BarometerSpec:
 
 @dataclass(frozen=True)
 class MagnetometerSpec:
-    """Magnetometer in body axes: white noise of a sample and axis, and the hard iron that its calibration
-    leaves on each axis (1 sigma)."""
+    """Magnetometer in body axes: white noise per sample and axis, residual hard iron per axis (1 sigma)."""
 
     rate_hz: Annotated[float, Sourced("Hz", 0.05, 1000.0)]
     noise_t: Annotated[float, Sourced("T", 0.0, 1e-4)]
@@ -128,10 +127,10 @@ class SensorSuite:
 
 @dataclass(frozen=True)
 class Rig:
-    """The geometry a reader or an estimator needs to interpret a recording.
+    """The geometry that readers and estimators need to interpret a recording.
 
-    `track_m` is the track the log's wheel odometry was made with: a body twist
-    (v, yaw rate) stands for the side speeds v -+ yaw rate * track / 2.
+    `track_m` is the track of the log's wheel odometry: a body twist (v, yaw rate) has the side speeds
+    v -+ yaw rate * track / 2.
     """
 
     wheel_radius_m: float

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -86,7 +85,7 @@ class Trajectory:
         return out
 
     def quaternions_at(self, t_ns: NDArray[np.int64]) -> Array:
-        """Orientations (M, 4) at the times (M,), slerped; NaN outside the span or when unknown."""
+        """Orientations (M, 4) at the times (M,), interpolated by slerp; NaN outside the span or when unknown."""
         out = np.full((len(t_ns), 4), np.nan)
         if self.quaternion is None or len(self) < 2:
             return out
@@ -122,29 +121,3 @@ class Trajectory:
             names = ("vx_mps", "vy_mps", "vz_mps", "wx_radps", "wy_radps", "wz_radps")
             table |= {name: self.twist_body[:, i] for i, name in enumerate(names)}
         return pd.DataFrame(table, index=pd.Index(self.t_ns, name="t_ns"))
-
-
-def write_tum(trajectory: Trajectory, path: Path) -> None:
-    """Write `t x y z qx qy qz qw` lines, 9 decimals, time in seconds exact to the nanosecond.
-
-    An unknown height is written as 0, an unknown orientation as the identity:
-    the format has no missing values.
-    """
-    q = (
-        trajectory.quaternion
-        if trajectory.quaternion is not None
-        else np.tile([0.0, 0, 0, 1], (len(trajectory), 1))
-    )
-    rows = np.hstack([np.nan_to_num(trajectory.position_m), q])
-    with path.open("w", encoding="utf-8") as out:
-        out.write("# timestamp_s x_m y_m z_m qx qy qz qw\n")
-        for t_ns, row in zip(trajectory.t_ns.tolist(), rows.tolist(), strict=True):
-            numbers = " ".join(f"{value:.9f}" for value in row)
-            out.write(f"{t_ns // 10**9}.{t_ns % 10**9:09d} {numbers}\n")
-
-
-def seconds_to_ns(text: str) -> int:
-    """Decimal seconds as written -> nanoseconds, without passing through a float."""
-    from decimal import ROUND_HALF_EVEN, Decimal
-
-    return int((Decimal(text) * 10**9).to_integral_value(rounding=ROUND_HALF_EVEN))

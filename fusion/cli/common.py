@@ -108,7 +108,7 @@ def reading(
 
 
 def opened(names: Sequence[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
-    """The logs of some names, of which `LOG@60-105` is a piece and `LOG@/45` are all pieces of 45 s."""
+    """The logs of some names, of which `LOG@60-105` is a segment and `LOG@/45` are all segments of 45 s."""
     from terrafusion.datasets.core.segments import split_name
     from terrafusion.datasets.readers import open_recordings
 

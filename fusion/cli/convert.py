@@ -1,4 +1,4 @@
-"""`terrafusion convert LOG OUT`: any readable log -> log folder or MCAP, mended where that is asked for."""
+"""`terrafusion convert LOG OUT`: any readable log to log folder or MCAP, repaired on request."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ def convert(
     repair_clock: RepairClockOption = False,
     apply_fixes: Annotated[
         bool,
-        typer.Option("--apply-fixes", help="Make the repairs that `inspect` offers, and say each."),
+        typer.Option("--apply-fixes", help="Apply the repairs that `inspect` offers, and list them."),
     ] = False,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an .mcap that exists.")] = False,
 ) -> None:
     """Convert a log to a log folder, or to a ROS 2 MCAP file when OUT ends in .mcap.
 
-    Numbers stay as they are unless `--apply-fixes` asks for the input doctor's
-    repairs. Each repair is printed and kept as a note of the log; what could
-    not be mended is printed, too.
+    Numbers are unchanged unless `--apply-fixes` requests the repairs of the
+    log checks. Each repair is printed and written as a note of the log; what
+    cannot be repaired is printed, too.
 
     Examples:
 
@@ -53,7 +53,7 @@ def convert(
 
       terrafusion convert drive_folder drive.mcap
 
-      terrafusion convert odd_log mended_log --apply-fixes
+      terrafusion convert raw_log repaired_log --apply-fixes
     """
     import dataclasses
 
@@ -70,20 +70,22 @@ def convert(
     for note in recording.notes:
         print(f"note: {note}")
     if apply_fixes:
-        recording, mended = repair(recording, rig)
-        for finding in mended:
-            print(f"repaired: {_told(finding)}")
+        recording, repaired = repair(recording, rig)
+        for finding in repaired:
+            print(f"repaired: {_line(finding)}")
     for part in _write(log, recording, rig, out, overwrite):
         print(f"not in standard messages: {part}")
     for finding in run_checks(recording, rig):
         if apply_fixes or finding.severity == "error":
-            print(f"{finding.severity}: {_told(finding)}{_why_left(finding, apply_fixes)}")
-    held = ", ".join(f"{name} {len(channel)}" for name, channel in recording.channels().items())
-    print(f"{out}: {held}{f', truth {len(recording.truth)}' if recording.truth is not None else ''}")
+            print(f"{finding.severity}: {_line(finding)}{_why_left(finding, apply_fixes)}")
+    rows = {name: len(channel) for name, channel in recording.channels().items()}
+    if recording.truth is not None:
+        rows["truth"] = len(recording.truth)
+    print(f"{out}: {', '.join(f'{name} {count}' for name, count in rows.items())}")
 
 
 def _write(log: str, recording: Recording, rig: Rig | None, out: Path, overwrite: bool) -> list[str]:
-    """Write the log; what ROS has no standard message for is returned."""
+    """Write the log; returns what ROS has no standard message for."""
     from terrafusion.datasets.writers import write_log_folder, write_mcap
 
     if out.suffix != ".mcap":
@@ -93,12 +95,12 @@ def _write(log: str, recording: Recording, rig: Rig | None, out: Path, overwrite
     return list(write_mcap(recording, out, rig=rig, overwrite=overwrite))
 
 
-def _told(finding: Finding) -> str:
+def _line(finding: Finding) -> str:
     return f"{finding.code}, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}"
 
 
 def _why_left(finding: Finding, apply_fixes: bool) -> str:
-    """Why a finding is left in a log that was written."""
+    """Why a finding remains in the written log."""
     if finding.repair is None:
-        return " [left: no repair can know the true numbers]" if apply_fixes else ""
-    return " [left: its repair did not mend it]" if apply_fixes else " [--apply-fixes does it]"
+        return " [remains: the correct values are unknown]" if apply_fixes else ""
+    return " [remains after its repair]" if apply_fixes else " [--apply-fixes repairs it]"

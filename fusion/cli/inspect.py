@@ -1,4 +1,4 @@
-"""`terrafusion inspect LOG`: what a log holds and what is odd about it, on one page."""
+"""`terrafusion inspect LOG`: contents of a log and findings of the log checks, on one page."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ def inspect(
     columns: ColumnsOption = None,
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="Print JSON instead of a page; its keys stand in docs/conventions.md."),
+        typer.Option("--json", help="Print JSON instead of a page; its keys are in docs/conventions.md."),
     ] = False,
 ) -> None:
-    """Show what a log holds, what its channels say of each other, and what the input doctor finds.
+    """Show the contents of a log, measures between its channels, and the findings of the log checks.
 
-    Changes nothing; `terrafusion convert --apply-fixes` makes the repairs that
-    are offered. Steps of a clock are findings, too. Several recordings in one
-    file are summed up; LOG#0 shows the first alone.
+    Changes nothing; `terrafusion convert --apply-fixes` applies the repairs.
+    Clock steps are findings, too. Several recordings in one file are
+    summarised; LOG#0 shows the first alone.
 
     Examples:
 
@@ -51,16 +51,16 @@ def inspect(
     from terrafusion.fusion.cli.single_wheel_page import trials_lines, trials_of
 
     load_rig(vehicle)
-    reading(None, topic, stamps, columns, repair_clock=True)  # wrong usage is told whatever the log is
+    reading(None, topic, stamps, columns, repair_clock=True)  # reports wrong usage for any kind of log
     trials = trials_of(log) if columns is None else None
-    page = trials or examined(log, vehicle, topic, stamps, columns)
+    page = trials or inspected(log, vehicle, topic, stamps, columns)
     if as_json:
         print(json.dumps(page, indent=2, allow_nan=False))
     else:
         print_lines(trials_lines(page) if trials else page_lines(page))
 
 
-def examined(
+def inspected(
     log: str,
     vehicle: str | None = None,
     topic: list[str] | None = None,

@@ -1,7 +1,7 @@
-"""The page of `terrafusion inspect` as lines of text, none wider than 100 columns.
+"""The page of `terrafusion inspect` as lines of text, at most 100 columns wide.
 
-Made of the data that `--json` prints, so that the two cannot differ. A line is a text with the
-style of its first word; styles show on a terminal only.
+It is made of the data that `--json` prints. A line is a text with the style of its first word; styles
+show on a terminal only.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 WIDTH = 100
 INDENT = 10
 MOST_WORDS = 12
+GLUE = "\N{NO-BREAK SPACE}"
 Line = tuple[str, str]
 
 
@@ -33,30 +34,31 @@ def page_lines(page: dict[str, Any]) -> Iterator[Line]:
     """The whole page."""
     yield from _title(page)
     yield from _channels(page["channels"])
-    yield from _measured(page["measured"])
+    measured = list(_measured(page["measured"]))
+    if measured:
+        yield "", ""
+    for name, text in measured:
+        yield from _entry(name, "", text)
     for note in page["notes"]:
         yield from _entry("note", "dim", _note(note, page["recordings"]))
     yield from _findings(page)
 
 
 def _title(page: dict[str, Any]) -> Iterator[Line]:
-    duration = page["duration_s"]
-    about = []
-    if page["recordings"] == 1:
-        about += [f"{duration:.1f} s", _utc(page["start_ns"])]
+    duration, count = page["duration_s"], page["recordings"]
+    if count == 1:
+        about = [f"{duration:.1f} s", _utc(page["start_ns"])]
     else:
-        about += [
-            f"{page['recordings']} recordings of {_spread(duration, 'g')} s, {duration['total']:.0f} s in all"
-        ]
+        about = [f"{count} recordings of {_spread(duration, 'g')} s, {duration['total']:.0f} s in all"]
     for key in ("vehicle", "terrain"):
-        found = page[key]
-        if isinstance(found, dict):
-            found = ", ".join(f"{word} {count}" for word, count in found.items())
-        about += [f"{key} {found}"] if found else []
+        value = page[key]
+        if isinstance(value, dict):
+            value = ", ".join(f"{word} {count}" for word, count in value.items())
+        about += [f"{key} {value}"] if value else []
     yield from _wrapped(page["name"], "bold", f"  {'; '.join(about)}", 4)
-    given = [text for text in (page["licence"] and f"licence {page['licence']}", page["source"]) if text]
-    if given:
-        yield from _wrapped(" " * 3, "", f" {'; '.join(given)}", 4)
+    origin = [text for text in (page["licence"] and f"licence {page['licence']}", page["source"]) if text]
+    if origin:
+        yield from _wrapped(" " * 3, "", f" {'; '.join(origin)}", 4)
 
 
 def _channels(channels: dict[str, Any]) -> Iterator[Line]:
@@ -65,14 +67,14 @@ def _channels(channels: dict[str, Any]) -> Iterator[Line]:
     rows = [heads]
     for name, c in channels.items():
         rate, gap = c["rate_hz"], c["longest_gap_s"]
-        ticks = name != "terrain"  # labels come when they come
+        sampled = name != "terrain"  # labels are irregular
         rows.append([
             name,
             str(c["samples"]),
-            "-" if not rate or not ticks else _spread(rate, ".4g") if pooled else f"{rate:.4g}",
+            "-" if not rate or not sampled else _spread(rate, ".4g") if pooled else f"{rate:.4g}",
             f"{c['recordings']}" if pooled else f"{c['start_s']:.1f} to {c['end_s']:.1f}",
-            str(c["gaps"]) if ticks else "-",
-            f"{gap:.2g}" if c["gaps"] and ticks else "-",
+            str(c["gaps"]) if sampled else "-",
+            f"{gap:.2g}" if c["gaps"] and sampled else "-",
         ])  # fmt: skip
     widths = [max(len(row[k]) for row in rows) for k in range(len(heads))]
     yield "", ""
@@ -90,83 +92,47 @@ def _ranges(channel: dict[str, Any]) -> str:
         path = "unknown" if channel["path_m"] is None else f"{channel['path_m']:.1f} m"
         return f"{', '.join(channel['holds']) or 'nothing to score'} of {channel['frame']}, path {path}"
     parts = []
-    for column, found in channel["ranges"].items():
-        if isinstance(found, dict):
-            parts.append(f"{column}{GLUE}{_words(found)}")
+    for column, values in channel["ranges"].items():
+        if isinstance(values, dict):
+            parts.append(f"{column}{GLUE}{_words(values)}")
         else:
-            low, high = (format(value, ".3g") for value in found)
+            low, high = (format(value, ".3g") for value in values)
             parts.append(_glued(f"{column} {low}" if low == high else f"{column} {low} to {high}"))
     return "; ".join(parts)
 
 
 def _words(counts: dict[str, int]) -> str:
     """The most frequent words of a column."""
-    told = sorted(counts, key=lambda word: -counts[word])[:MOST_WORDS]
-    more = [f"{len(counts) - len(told)} more"] if len(told) < len(counts) else []
-    return ", ".join([*(_glued(f"{word[:40]} {counts[word]}") for word in counts if word in told), *more])
+    frequent = sorted(counts, key=lambda word: -counts[word])[:MOST_WORDS]
+    words = [_glued(f"{word[:40]} {counts[word]}") for word in counts if word in frequent]
+    omitted = len(counts) - len(frequent)
+    return ", ".join([*words, *([f"{omitted} more"] if omitted else [])])
 
 
-def _measured(measured: dict[str, Any]) -> Iterator[Line]:
-    lines = [*_inertial(measured), *_scales(measured), *_times(measured)]
-    if lines:
-        yield "", ""
-    for name, text in lines:
-        yield from _entry(name, "", text)
-
-
-def _inertial(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    gravity, yaw = measured["gravity"], measured["yaw"]
+def _measured(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    gravity, yaw, sigma = measured["gravity"], measured["yaw"], measured["sigma_m"]
     if gravity:
         vector = ", ".join(f"{value:.2f}" for value in gravity["mean_mps2"])
-        yield (
-            "gravity",
-            (
-                f"({vector}) m/s2, size {gravity['size_mps2']:.2f}: along {gravity['axis']}, "
-                f"{gravity['tilt_deg']:.1f} deg off"
-            ),
-        )
+        text = f"({vector}) m/s2, size {gravity['size_mps2']:.2f}: along {gravity['axis']}"
+        yield "gravity", f"{text}, {gravity['tilt_deg']:.1f} deg off"
     if yaw:
         track = yaw["effective_track_m"]
         width = f", effective track {track:.2f} m" if track else ""
         yield "yaw", f"gyro z against wheels: r {yaw['r']:.3f}{width} ({yaw['seconds']:.0f} s in common)"
-
-
-def _scales(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
     for name, ratio in measured["speed_ratio"].items():
-        yield (
-            "speed",
-            (
-                f"{name} over wheels {ratio['ratio']:.3f} ({ratio['low']:.3f} to {ratio['high']:.3f}; "
-                f"{ratio['stretches']} stretches)"
-            ),
-        )
+        interval = f"{ratio['low']:.3f} to {ratio['high']:.3f}; {ratio['stretches']} stretches"
+        yield "speed", f"{name} over wheels {ratio['ratio']:.3f} ({interval})"
     if measured["path_m"]:
         yield "path", ", ".join(f"{name} {length:.1f} m" for name, length in measured["path_m"].items())
-    sigma = measured["sigma_m"]
     if sigma:
-        yield (
-            "sigma",
-            (
-                f"of the fixes, horizontal, {sigma['min']:.3g} to {sigma['max']:.3g} m, "
-                f"median {sigma['median']:.3g} m"
-            ),
-        )
-
-
-def _times(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+        spread = f"{sigma['min']:.3g} to {sigma['max']:.3g} m, median {sigma['median']:.3g} m"
+        yield "sigma", f"of the fixes, horizontal, {spread}"
     for lag in measured["lags"]:
-        yield (
-            "lag",
-            (
-                f"{lag['later']} after {lag['earlier']} by {lag['seconds']:.3f} s ({lag['low_s']:.3f} to "
-                f"{lag['high_s']:.3f}), by the {lag['quantity']}, r {lag['r']:.2f}"
-            ),
-        )
-    for name, updates in measured["held"].items():
-        yield (
-            "held",
-            (f"{name}: {updates['update_hz']:.3g} new values in {updates['rate_hz']:.3g} rows a second"),
-        )
+        text = f"{lag['later']} after {lag['earlier']} by {lag['seconds']:.3f} s"
+        interval = f"({lag['low_s']:.3f} to {lag['high_s']:.3f})"
+        yield "lag", f"{text} {interval}, by the {lag['quantity']}, r {lag['r']:.2f}"
+    for name, rate in measured["held"].items():
+        yield "held", f"{name}: {rate['update_hz']:.3g} new values in {rate['rate_hz']:.3g} rows a second"
 
 
 def _note(note: str | dict[str, Any], recordings: int) -> str:
@@ -187,8 +153,8 @@ def _findings(page: dict[str, Any]) -> Iterator[Line]:
         if "recordings" in f:
             yield from _entry("", "", f"in {f['recordings']} of {page['recordings']}, first in #{f['first']}")
         yield from _entry("", "", f["evidence"])
-        hand = "convert --apply-fixes" if f["repairable"] else "by hand"
-        yield from _entry("", "", f"{_glued(hand)}: {f['fix']}")
+        remedy = "convert --apply-fixes" if f["repairable"] else "to do"
+        yield from _entry("", "", f"{_glued(remedy)}: {f['fix']}")
 
 
 def _entry(name: str, style: str, text: str) -> Iterator[Line]:
@@ -196,18 +162,12 @@ def _entry(name: str, style: str, text: str) -> Iterator[Line]:
 
 
 def _wrapped(head: str, style: str, text: str, indent: int) -> Iterator[Line]:
-    """`head` and `text` on as many lines as needed; what is glued stays on one line."""
+    """`head` and `text` on as many lines as needed; glued words stay on one line."""
     lines = textwrap.wrap(
-        head.replace(" ", GLUE) + text,
-        WIDTH,
-        subsequent_indent=" " * indent,
-        break_on_hyphens=False,
+        head.replace(" ", GLUE) + text, WIDTH, subsequent_indent=" " * indent, break_on_hyphens=False
     )
     for number, line in enumerate(lines):
         yield (style if number == 0 else ""), line.replace(GLUE, " ")
-
-
-GLUE = "\N{NO-BREAK SPACE}"
 
 
 def _glued(text: str) -> str:

@@ -1,4 +1,4 @@
-"""The page of `terrafusion inspect` for trials of a single wheel, which are no drive."""
+"""The page of `terrafusion inspect` for single-wheel trials."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from terrafusion.fusion.cli.inspect_page import Line
 
 
 def trials_of(log: str) -> dict[str, Any] | None:
-    """What the trials at `log` cover, as plain data; None where the log is something else.
+    """Summary of the trials at `log` as plain data; None where the log has another format.
 
     Raises:
         TerrafusionError: the log cannot be read.

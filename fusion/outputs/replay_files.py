@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.trajectory import write_tum
+from terrafusion.datasets.writers.tum import write_tum
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
 from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.metrics.scores import Scores

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.readers.text.tum import read_tum
+from terrafusion.datasets.writers.tum import write_tum
 
 POSE = "1.0 2.0 3.0 0 0 0.6 0.8"
 

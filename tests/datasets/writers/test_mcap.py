@@ -25,10 +25,10 @@ from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig
-from terrafusion.datasets.core.trajectory import write_tum
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import ros_messages, write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
+from terrafusion.datasets.writers.tum import write_tum
 
 
 def test_round_trip(drive: Recording, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""`convert --apply-fixes`: each repair is told, kept as a note, and leaves a log that replays."""
+"""`convert --apply-fixes`: each repair is lines, kept as a note, and leaves a log that replays."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ def test_repairs_are_told_and_kept(log: Path, good_log: Path, terrafusion) -> No
     corrupt(log, "imu", ACCEL, 1 / 9.80665)
     outcome = terrafusion("convert", "log", "out", "--apply-fixes")
     assert (outcome.status, outcome.err) == (0, "")
-    told = [line for line in outcome.out.splitlines() if line.startswith("repaired: ")]
-    assert len(told) == 1
-    assert told[0].startswith("repaired: accel-in-g, imu: ")
-    assert "9.80665" in told[0]
+    lines = [line for line in outcome.out.splitlines() if line.startswith("repaired: ")]
+    assert len(lines) == 1
+    assert lines[0].startswith("repaired: accel-in-g, imu: ")
+    assert "9.80665" in lines[0]
     assert "error" not in outcome.out
     repaired, good = open_recording("out"), open_recording(good_log)
     assert repaired.imu is not None
@@ -59,22 +59,24 @@ def test_nothing_is_changed_unasked(log: Path, terrafusion) -> None:
     outcome = terrafusion("convert", "log", "copy")
     assert (outcome.status, outcome.err) == (0, "")
     assert "error: accel-in-g, imu: " in outcome.out
-    assert "--apply-fixes does it" in outcome.out
+    assert "--apply-fixes repairs it" in outcome.out
     before, after = open_recording("log"), open_recording("copy")
     assert before.imu is not None
     assert after.imu is not None
     np.testing.assert_array_equal(before.imu.accel_mps2, after.imu.accel_mps2)
 
 
-def test_what_is_left_is_told(log: Path, terrafusion) -> None:
+def test_unrepaired_findings_are_reported(log: Path, terrafusion) -> None:
     table = pd.read_csv(log / "imu.csv")
     table["accel_z_mps2"] -= 9.80665
     table.to_csv(log / "imu.csv", index=False)
     outcome = terrafusion("convert", "log", "out", "--apply-fixes")
     assert outcome.status == 0
     assert "repaired: " not in outcome.out
-    left = next(line for line in outcome.out.splitlines() if line.startswith("error: accel-magnitude, imu"))
-    assert left.endswith("[left: no repair can know the true numbers]")
+    remaining = next(
+        line for line in outcome.out.splitlines() if line.startswith("error: accel-magnitude, imu")
+    )
+    assert remaining.endswith("[remains: the correct values are unknown]")
     terrafusion("replay", "out", "--out", "results").refused("gravity has been removed")
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.files import check_folder
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.segments import piece, spans
+from terrafusion.datasets.core.segments import segment, segment_spans
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.rollout.sensitivities import Linearisation
@@ -96,8 +96,8 @@ class Source:
             recordings = [pose_as_gnss(r, logs.pose_sigma_m) for r in recordings]
         found = []
         for i, recording in enumerate(recordings):
-            for begin, end in spans(recording, logs.piece_s):
-                if driven(piece(recording, begin, end), vehicle):
+            for begin, end in segment_spans(recording, logs.piece_s):
+                if driven(segment(recording, begin, end), vehicle):
                     found.append((i, begin, end))
         return cls(vehicle, recordings, found)
 
@@ -126,7 +126,7 @@ class Source:
             else injection.into(self.recordings[i], self.vehicle, severity)
             for i in dict.fromkeys(logs)
         }
-        return [piece(changed[i], begin, end) for i, begin, end in (self.spans[k] for k in numbers)]
+        return [segment(changed[i], begin, end) for i, begin, end in (self.spans[k] for k in numbers)]
 
 
 def driven(run: Recording, vehicle: VehicleParams) -> bool:
