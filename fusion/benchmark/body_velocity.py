@@ -1,10 +1,8 @@
-"""Body velocity from poses: forward and sideways speed that best explain positions under a gyro's heading.
+"""Forward and sideways body velocity from noisy poses and a gyro.
 
-Lidar, motion-capture and GNSS poses are noisy and unevenly stamped; their differences are useless at 10 Hz.
-Here the two speeds are piecewise linear between knots and found by penalised least squares on the
-positions themselves (Whittaker 1923, penalty on the second difference, that is on the change of
-acceleration), with Huber's weights (1964) against poses that jump. The heading comes from the gyro,
-turned once a chunk to the poses' own yaw: over two seconds it is far better than a lidar's.
+The two speeds are piecewise linear between knots and fitted to the positions by penalised least squares (Whittaker
+1923; penalty on the change of acceleration) with Huber weights (1964) against outliers. The heading is the
+gyro's, rotated once a chunk to the yaw of the poses: over two seconds it is better than a lidar's.
 """
 
 from __future__ import annotations
@@ -18,16 +16,16 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 KNOT_S = 0.25
-"""Velocity is linear between knots this far apart (assumed: half of what errors are averaged over)."""
+"""Knot spacing of the velocity (assumed: half of the averaging time of errors)."""
 CHUNK_S = 2.0
-"""Positions are compared within a chunk only: an offset a chunk takes out the drift of map and gyro."""
+"""Positions have a free offset a chunk, which removes the drift of map and gyro."""
 ACCEL_WALK = 2.0
-"""Assumed random walk of the body's acceleration, m/s2 a square root of a second: sets the smoothing."""
-LEAST_SIGMA_M = 0.003
-"""Poses are not taken as better than this (assumed)."""
+"""Assumed random walk of the acceleration, m/s2/sqrt(s): sets the smoothing."""
+MIN_SIGMA_M = 0.003
+"""Smallest sigma of a pose (assumed)."""
 MOVING_MPS = 0.2
 HUBER, ROUNDS = 1.5, 5
-"""Residuals beyond so many sigma are weighed down (Huber 1964), in so many reweighted fits."""
+"""Residual in sigma beyond which weights fall (Huber 1964), and number of reweighted fits."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,7 +36,7 @@ class Poses:
         t_s: (M,) times.
         xy_m: (M, 2) positions in some level frame.
         yaw_rad: (M,) headings, NaN throughout where the source has none.
-        chunk: (M,) chunks; every chunk may have an origin of its own.
+        chunk: (M,) chunk numbers; every chunk may have its own origin.
     """
 
     t_s: Array
@@ -64,8 +62,7 @@ def body_velocity(t_s: Array, yaw_rate_radps: Array, poses: Poses, rolled_mps: A
         t_s: uniform times, s.
         yaw_rate_radps: (N,) of the gyro.
         poses: at least two.
-        rolled_mps: (N,) mean speed of the wheels; where the poses have no yaw it tells which way a
-            chunk's track points, else it is not used.
+        rolled_mps: (N,) mean speed of the wheels; gives the direction of a chunk if the poses have no yaw.
 
     The speeds are those of the point whose positions are given.
     """
@@ -77,9 +74,9 @@ def body_velocity(t_s: Array, yaw_rate_radps: Array, poses: Poses, rolled_mps: A
 
 
 def speed_noise(t_s: Array, yaw_rate_radps: Array, poses: Poses, rolled_mps: Array) -> Array:
-    """(N,) difference of the speeds from even and from odd poses, halved: the noise of those from all.
+    """(N,) half the difference of the speeds from even and from odd poses, m/s: the noise of those from all.
 
-    It sees what is independent from pose to pose (scatter, stamps), not a scale or a lag they share.
+    Only errors that are independent between poses (scatter, time stamps), not a common scale or lag.
     """
     even = np.arange(len(poses.t_s)) % 2 == 0
     one, two = (
@@ -89,7 +86,7 @@ def speed_noise(t_s: Array, yaw_rate_radps: Array, poses: Poses, rolled_mps: Arr
 
 
 def _turned(t_s: Array, psi: Array, poses: Poses, rolled_mps: Array) -> Array:
-    """Positions (M, 2) turned into the frame in which the gyro's heading is `psi` (N,)."""
+    """Positions (M, 2) rotated into the frame of the gyro's heading `psi` (N,)."""
     at = np.interp(poses.t_s, t_s, psi)
     off = np.zeros(len(poses.t_s))
     if np.isfinite(poses.yaw_rad).all():
@@ -105,7 +102,7 @@ def _turned(t_s: Array, psi: Array, poses: Poses, rolled_mps: Array) -> Array:
 
 
 def _track_direction(t_s: Array, psi: Array, poses: Poses, rolled_mps: Array) -> Array:
-    """(M,) angle from the wheels' dead reckoning to the track, least squares a chunk (Procrustes)."""
+    """(M,) angle from wheel odometry to the track, least squares a chunk (Procrustes)."""
     steps = rolled_mps * np.exp(1j * psi) * float(t_s[1] - t_s[0])
     walked = np.cumsum(steps)
     at = np.interp(poses.t_s, t_s, walked.real) + 1j * np.interp(poses.t_s, t_s, walked.imag)
@@ -167,7 +164,7 @@ def _solved(design: tuple[Any, Any], turned: Array, rolled: Array, size: int) ->
     bend = sparse.diags([1.0, -2.0, 1.0], [0, 1, 2], shape=(size - 2, size)) / (ACCEL_WALK * KNOT_S**1.5)
     smooth = sparse.block_diag([bend, bend])
     penalty = sparse.block_diag([smooth.T @ smooth, sparse.csr_matrix((2 * chunks, 2 * chunks))])
-    # A whisper of a prior on rest and on the origins keeps stretches without poses solvable.
+    # A weak prior on speeds and origins keeps spans without poses solvable.
     penalty = penalty + 1e-6 * sparse.identity(A.shape[1])
     speed = np.abs(rolled)
     sigma, weight = np.full(len(turned), 0.05), np.ones(len(turned))
@@ -175,8 +172,8 @@ def _solved(design: tuple[Any, Any], turned: Array, rolled: Array, size: int) ->
     for _ in range(ROUNDS):
         w = np.tile(weight / sigma**2, 2)
         x = spsolve((A.T @ sparse.diags(w) @ A + penalty).tocsc(), A.T @ (w * b))
-        rest = b - A @ x
-        off = np.hypot(rest[: len(turned)], rest[len(turned) :])
+        residual = b - A @ x
+        off = np.hypot(residual[: len(turned)], residual[len(turned) :])
         sigma = _sigma(off, speed)
         weight = np.minimum(1.0, HUBER * sigma / np.maximum(off, 1e-12))
     return np.stack([x[:size], x[size : 2 * size]])
@@ -187,7 +184,7 @@ def _sigma(off: Array, speed: Array) -> Array:
     # The median length of a 2-D Gaussian is 1.18 sigma, the median size of a 1-D one 0.67 sigma.
     slow = speed < MOVING_MPS
     if min(slow.sum(), (~slow).sum()) < 10:
-        return np.full(len(off), max(float(np.median(off)) / 1.18, LEAST_SIGMA_M))
-    still = max(float(np.median(off[slow])) / 1.18, LEAST_SIGMA_M)
+        return np.full(len(off), max(float(np.median(off)) / 1.18, MIN_SIGMA_M))
+    still = max(float(np.median(off[slow])) / 1.18, MIN_SIGMA_M)
     jitter_s = float(np.median(np.maximum(off[~slow] - still, 0.0) / speed[~slow])) / 0.67
     return np.sqrt(still**2 + (jitter_s * speed) ** 2)

@@ -1,4 +1,4 @@
-"""Measured drives on one clock: what the wheels did, what was commanded, how the body really moved."""
+"""Measured runs on one clock: wheel speeds, commands, gyro and true body velocity."""
 
 from __future__ import annotations
 
@@ -17,32 +17,32 @@ Array = NDArray[np.float64]
 
 DT_S = 0.05
 JOIN_RADPS, JOIN_WHEEL_RADPS = 0.25, 1.5
-"""Two windows follow each other where gyro and wheels go on within these steps."""
+"""Largest steps of gyro and wheel speed between consecutive windows."""
 HELD_S = 0.2
-"""A wheel speed that stays the same this long was measured again."""
+"""A wheel speed constant for longer counts as measured again."""
 POSE_GAP_S = 0.6
-"""Over longer gaps between poses nothing is scored."""
-LEAST_POSES = 20
+"""The true velocity is unknown in longer gaps between poses."""
+MIN_POSES = 20
 FIX_SIGMA_M = 0.1
-"""Fixes worse than this cannot tell the speed over 5 s (measured: see docs/field.md)."""
+"""Fixes with a larger sigma do not determine the speed over 5 s (docs/field.md)."""
 
 
 @dataclass(frozen=True, eq=False)
 class FieldRun:
-    """One unbroken drive at `DT_S`.
+    """One continuous run sampled at `DT_S`.
 
     Attributes:
-        name: recording and number of the stretch.
-        recording: what it is a stretch of; never on both sides of a split.
+        name: recording and number of the run in it.
+        recording: its recording; runs of one recording are never on both sides of a split.
         ground: terrain, "" where unknown.
         vehicle: nominal parameters.
         t_s: (N,) from 0.
         sides_radps: (N, 2) measured speed of left and right wheels.
-        told_radps: (N, 2) commanded speed of left and right, NaN where no command is in the log.
+        commanded_radps: (N, 2) commanded speed of left and right, NaN where no command is in the log.
         yaw_rate_radps: (N,) of the gyro.
         velocity_mps: (N, 2) true forward and sideways speed, NaN where no pose is near.
         noise_mps: (N,) see `truth.speed_noise`.
-        has_sides: whether left and right are told apart; where not, the turn is the gyro's.
+        has_sides: whether the log has left and right wheels; if not, the yaw rate is the gyro's.
     """
 
     name: str
@@ -51,7 +51,7 @@ class FieldRun:
     vehicle: VehicleParams
     t_s: Array
     sides_radps: Array
-    told_radps: Array
+    commanded_radps: Array
     yaw_rate_radps: Array
     velocity_mps: Array
     noise_mps: Array
@@ -59,7 +59,7 @@ class FieldRun:
 
 
 def field_runs(name: str, recordings: Sequence[Recording]) -> list[FieldRun]:
-    """Stretches of what one file holds: windows that go on from each other are joined.
+    """The runs of one file; consecutive windows are joined.
 
     Raises:
         DataError: the log has no wheels or no gyro, or does not say which vehicle it is.
@@ -71,17 +71,17 @@ def field_runs(name: str, recordings: Sequence[Recording]) -> list[FieldRun]:
 
 
 def chains_of(recordings: Sequence[Recording]) -> list[list[Recording]]:
-    """The recordings, in their order, as chains of those that go on from each other."""
+    """Chains of consecutive recordings, in their order."""
     chains: list[list[Recording]] = []
     for recording in recordings:
-        if chains and _goes_on(chains[-1][-1], recording):
+        if chains and _continues(chains[-1][-1], recording):
             chains[-1].append(recording)
         else:
             chains.append([recording])
     return chains
 
 
-def _goes_on(before: Recording, after: Recording) -> bool:
+def _continues(before: Recording, after: Recording) -> bool:
     if not (before.imu and after.imu and before.wheels and after.wheels):
         return False
     turn = abs(float(after.imu.gyro_radps[0, 2] - before.imu.gyro_radps[-1, 2]))
@@ -90,7 +90,7 @@ def _goes_on(before: Recording, after: Recording) -> bool:
 
 
 def field_run(name: str, recording: str, chain: Sequence[Recording]) -> FieldRun:
-    """One stretch from the recordings of its chain."""
+    """One run from the recordings of its chain."""
     first = chain[0]
     if first.imu is None or first.wheels is None or first.vehicle is None:
         raise DataError(
@@ -104,19 +104,19 @@ def field_run(name: str, recording: str, chain: Sequence[Recording]) -> FieldRun
     sides = _sides(t, chain, starts, vehicle)
     velocity, noise = np.full((len(t), 2), np.nan), np.full(len(t), np.nan)
     poses = _poses(chain, starts)
-    if len(poses.t_s) >= LEAST_POSES:
+    if len(poses.t_s) >= MIN_POSES:
         rolled = sides.mean(axis=1) * vehicle.wheel.radius_m
         near = _near(t, poses.t_s)
         velocity = np.where(near[:, None], body_velocity(t, rate, poses, rolled), np.nan)
         noise = np.where(near, speed_noise(t, rate, poses, rolled), np.nan)
     return FieldRun(
-        name, recording, first.terrain_name, vehicle, t, sides, _told(t, chain, starts, vehicle), rate,
+        name, recording, first.terrain_name, vehicle, t, sides, _commanded(t, chain, starts, vehicle), rate,
         velocity, noise, first.wheels.has_sides(),
     )  # fmt: skip
 
 
 def chain_starts(chain: Sequence[Recording]) -> tuple[list[float], float]:
-    """When each recording of a chain begins, s from the first, and when the last one ends."""
+    """Start of each recording of a chain, s from the first, and end of the last one."""
     starts, at = [], 0.0
     for recording in chain:
         starts.append(at)
@@ -141,7 +141,7 @@ def _joined(chain: Sequence[Recording], starts: Sequence[float], part) -> tuple[
 
 
 def _means(t: Array, at: Array, values: Array) -> Array:
-    """(N,) means over `DT_S` about each time where the samples are denser than that, else interpolated."""
+    """(N,) means over `DT_S` about each time if the samples are denser, else interpolated."""
     known = np.isfinite(values)
     at, values = at[known], values[known]
     if float(np.median(np.diff(at))) > 0.5 * DT_S:
@@ -153,7 +153,7 @@ def _means(t: Array, at: Array, values: Array) -> Array:
 
 
 def _sides(t: Array, chain: Sequence[Recording], starts: Sequence[float], vehicle: VehicleParams) -> Array:
-    """(N, 2) wheel speeds, linear between the true updates of each side."""
+    """(N, 2) wheel speeds, linear between the updates of each side."""
     radius = vehicle.odometry.wheel_radius_m
 
     def part(r: Recording) -> tuple[NDArray[np.int64], Array] | None:
@@ -174,7 +174,9 @@ def _sides(t: Array, chain: Sequence[Recording], starts: Sequence[float], vehicl
     return out
 
 
-def _told(t: Array, chain: Sequence[Recording], starts: Sequence[float], vehicle: VehicleParams) -> Array:
+def _commanded(
+    t: Array, chain: Sequence[Recording], starts: Sequence[float], vehicle: VehicleParams
+) -> Array:
     """(N, 2) commanded side speeds, each held until the next, for three samples at most; else NaN."""
 
     def part(r: Recording) -> tuple[NDArray[np.int64], Array] | None:
@@ -191,7 +193,7 @@ def _told(t: Array, chain: Sequence[Recording], starts: Sequence[float], vehicle
 
 
 def _poses(chain: Sequence[Recording], starts: Sequence[float]) -> Poses:
-    """Truth, or fixes that are good enough; windows have an origin each, long drives a chunk every 2 s."""
+    """Truth or good fixes; every window, and every `CHUNK_S` of a long run, is a chunk with its own origin."""
     times, places, yaws, chunks = (
         [np.zeros(0)],
         [np.zeros((0, 2))],
@@ -205,7 +207,7 @@ def _poses(chain: Sequence[Recording], starts: Sequence[float]) -> Poses:
             continue
         t_ns, xy, yaw = found
         t = (t_ns - recording.imu.t_ns[0]) * 1e-9
-        if len(chain) > 1:  # the first pose of a window is an old one that is held
+        if len(chain) > 1:  # the first pose of a window repeats an old one
             t, xy, yaw = t[1:], xy[1:], yaw[1:]
         times.append(start + t)
         places.append(xy)
@@ -233,7 +235,7 @@ def _positions(recording: Recording) -> tuple[NDArray[np.int64], Array, Array] |
 
 
 def _near(t: Array, poses: Array) -> NDArray[np.bool_]:
-    """Whether poses stand on both sides, no further apart than `POSE_GAP_S`."""
+    """Whether times lie between poses no further apart than `POSE_GAP_S`."""
     after = np.searchsorted(poses, t)
     inside = (after > 0) & (after < len(poses))
     a, b = poses[np.clip(after - 1, 0, len(poses) - 1)], poses[np.clip(after, 0, len(poses) - 1)]

@@ -1,10 +1,8 @@
-"""Windows that go on from each other as one drive: for what must drive on longer than a window.
+"""Consecutive windows of a log joined into one run.
 
-Public sets hold drives cut into windows of two seconds, whose truth starts at an origin of its own in each
-of them. Joined, wheels and IMU are the windows' own samples; the truth is a path whose heading is that of
-the gyro and whose speeds along and across are those that best explain the poses of every window
-(`truth.body_velocity`). It tells how far and which way the body moved under that heading; an error of the
-gyro is in it as in everything that uses the gyro.
+Public sets cut runs into windows of two seconds, each with a truth in a frame of its own. Wheels and IMU of the joined
+run are the samples of the windows; its truth is the path with the gyro's heading and the forward and sideways
+speeds that best explain the poses of every window (`body_velocity`). It contains the error of the gyro.
 """
 
 from __future__ import annotations
@@ -24,15 +22,15 @@ from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun, chain_starts
 
 Array = NDArray[np.float64]
 
-LONGEST_HOLE_S = 1.0
-"""Over longer holes in the truth of a drive nothing is joined."""
+MAX_TRUTH_GAP_S = 1.0
+"""A joined run with a longer gap in its truth gets no truth."""
 
 
 def joined_runs(name: str, recordings: Sequence[Recording]) -> list[Recording]:
-    """The drives of two windows and more that `recordings`, in their order, make.
+    """The runs of two or more consecutive windows among `recordings`, in their order.
 
-    Each starts at time 0, heading along x from the origin, and has wheels, IMU and truth; other channels are
-    left out. A drive whose truth has a hole of more than `LONGEST_HOLE_S` comes without truth.
+    A run starts at time 0 in the origin, heading along x, and has wheels, IMU and truth only; no truth if that
+    has a gap of more than `MAX_TRUTH_GAP_S`.
 
     Raises:
         DataError: the windows have no wheels or no gyro, or do not say which vehicle it is.
@@ -46,7 +44,7 @@ def _joined(name: str, recording: str, chain: Sequence[Recording]) -> Recording:
     run = field_run(name, recording, chain)
     first = chain[0]
     imu = _channel(chain, starts, lambda r: r.imu, ("gyro_radps", "accel_mps2"))
-    # The first wheel speed of a window is an old one that is held, as its first pose is.
+    # The first wheel speed of a window repeats an old one, as does its first pose.
     wheels = _channel(chain, starts, lambda r: r.wheels, ("speed",), held=True)
     assert first.wheels is not None
     truth = _path(run)
@@ -95,9 +93,9 @@ def _channel(
 
 
 def _path(run: FieldRun) -> Trajectory | None:
-    """The path of the run's speeds under the gyro's heading, from its first to its last known speed."""
+    """The run's path by its speeds and the gyro's heading, from the first to the last known speed."""
     known = np.flatnonzero(np.isfinite(run.velocity_mps).all(axis=1))
-    if len(known) < 2 or float(np.diff(run.t_s[known]).max()) > LONGEST_HOLE_S:
+    if len(known) < 2 or float(np.diff(run.t_s[known]).max()) > MAX_TRUTH_GAP_S:
         return None
     rows = slice(known[0], known[-1] + 1)
     t = run.t_s[rows]

@@ -1,19 +1,18 @@
-"""Is the estimator as good as it says? Errors over their own covariance, by terrain and over time.
+"""Consistency of the estimator: NEES and NIS by terrain and over time, with the band of a consistent estimator.
 
-An error e with covariance P is *whitened*, u = L^-1 e with P = L L'. Where the estimator is honest u has
-zero mean and unit variance, so that |u|^2 is chi-square with d degrees of freedom (Bar-Shalom, Li,
-Kirubarajan 2001, sec. 5.4.2): NEES for errors against a reference, NIS for innovations. Both are given
-per dimension, |u|^2 / d: 1 is consistent, above 1 overconfident, below 1 cautious.
+An error e with covariance P is whitened, u = L^-1 e with P = L L'. For a consistent estimator u has zero mean and
+unit variance and |u|^2 is chi-square with d degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001, sec. 5.4.2):
+NEES for errors against a reference, NIS for innovations. Both per dimension, |u|^2 / d: 1 is consistent, above 1
+overconfident, below 1 cautious.
 
-The samples of one drive are correlated, and a band for independent ones would be far too narrow. For a
-Gaussian process with autocorrelation rho the variance of the mean square of N samples is that of
+Samples of one run are correlated. For a Gaussian process with autocorrelation rho the mean square of N samples has
+the variance of N_eff independent ones,
 
     1 / N_eff = sum over all pairs (s, t) of rho(|s - t|)^2 / N^2
 
-independent ones (Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8(2), for variances), and the mean
-is close to chi-square with d N_eff degrees of freedom over that number: the same mean and variance. rho is
-estimated about zero (under the hypothesis the mean is known to be zero, so a constant error counts as
-one sample) and cut at its first value that is not positive (Geyer 1992, initial positive sequence).
+(Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8(2)), and N_eff d times the mean is close to chi-square with
+d N_eff degrees of freedom. rho is estimated about zero, the known mean (a constant error counts as one sample), and
+truncated at its first value that is not positive (Geyer 1992, initial positive sequence).
 """
 
 from __future__ import annotations
@@ -42,11 +41,11 @@ ALL = "all"
 
 @dataclass(frozen=True, eq=False)
 class Whitened:
-    """Errors of one quantity over their own covariance.
+    """Errors of one quantity, whitened by their covariance.
 
     Attributes:
         quantity: "position", "heading" or "nis <sensor>".
-        t_ns: (N,), evenly spaced but for gaps.
+        t_ns: (N,), evenly spaced except for gaps.
         values: (N, d), unit variance and zero mean where the estimator is consistent; NaN where unknown.
     """
 
@@ -59,19 +58,19 @@ class Whitened:
         return np.asarray((self.values**2).mean(axis=1))
 
     def known(self) -> Rows:
-        """Which rows hold numbers, (N,)."""
+        """Rows with finite values, (N,)."""
         return np.asarray(np.isfinite(self.values).all(axis=1))
 
 
 @dataclass(frozen=True)
 class Consistency:
-    """Mean NEES or NIS per dimension over a set of samples, and where it would fall by chance.
+    """Mean NEES or NIS per dimension over a set of samples, with the band of a consistent estimator.
 
     Attributes:
         quantity: as in `Whitened`.
         terrain: the class, or "all".
         start_s, end_s: first and last sample, from the start of the recording.
-        samples, effective: their number, and the number of independent ones that they are worth.
+        samples, effective: their number, and the equivalent number of independent samples.
         mean: per dimension.
         low, high: a consistent estimator's mean lies between them with probability `CONFIDENCE`.
     """
@@ -92,12 +91,12 @@ class Consistency:
 
 
 def verdict(mean: float, low: float, high: float) -> str:
-    """What a mean NEES says, given the band of a consistent estimator."""
+    """Verdict on a mean NEES by the band of a consistent estimator."""
     return "overconfident" if mean > high else "cautious" if mean < low else "consistent"
 
 
 def position(errors: Errors) -> Whitened:
-    """Horizontal position errors by the Cholesky factor of their covariance; NaN where it is not proper."""
+    """Horizontal position errors by the Cholesky factor of their covariance; NaN where it is not positive definite."""
     e, P = errors.position_error_m(), errors.covariance_m2
     off = 0.5 * (P[:, 0, 1] + P[:, 1, 0])
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -138,12 +137,12 @@ def innovations(found: Sequence[Innovation]) -> tuple[Whitened, ...]:
 
 
 def pair_counts(rows: Rows) -> Array:
-    """How many pairs of the chosen rows (N,) stand k rows apart, (N,), k = 0 ... N - 1; exact."""
+    """Number of pairs of the chosen rows (N,) that are k rows apart, (N,), k = 0 ... N - 1; exact."""
     return np.rint(_correlate(rows.astype(float)))
 
 
 def squared_correlation(values: Array, rows: Rows) -> Array:
-    """rho(k)^2 (N,) of whitened errors (N, d) over the chosen rows, cut as said above; mean over d."""
+    """rho(k)^2 (N,) of whitened errors (N, d) over the chosen rows, truncated; mean over d."""
     pairs = pair_counts(rows)
     total = np.zeros(len(rows))
     for column in np.where(rows[:, None], values, 0.0).T:
@@ -159,7 +158,7 @@ def squared_correlation(values: Array, rows: Rows) -> Array:
 
 
 def effective_samples(rows: Rows, correlation: Array) -> float:
-    """Independent samples that the chosen rows are worth, 1 to their number.
+    """Equivalent number of independent samples of the chosen rows, 1 to their number.
 
     `correlation` is rho(k)^2 at lag k rows, from `squared_correlation`.
     """
@@ -183,9 +182,9 @@ def band(degrees: float, confidence: float = CONFIDENCE) -> tuple[float, float]:
 def summarise(
     whitened: Whitened, rows: Rows, start_ns: int, terrain: str = ALL, correlation: Array | None = None
 ) -> Consistency | None:
-    """Mean and band over the chosen rows (N,), or None where none of them is known.
+    """Mean and band over the chosen rows (N,), or None if none of them is known.
 
-    `correlation` is taken from these rows where it is not given.
+    Without `correlation` it is estimated from these rows.
     """
     rows = rows & whitened.known()
     if not rows.any():
@@ -202,16 +201,16 @@ def summarise(
 
 
 def by_terrain(whitened: Whitened, label: NDArray[np.str_], start_ns: int) -> tuple[Consistency, ...]:
-    """The whole drive, then each terrain of the labels (N,) in order of appearance."""
+    """The whole run, then each terrain of the labels (N,) in order of appearance."""
     everything = np.ones(len(label), dtype=bool)
-    found = [summarise(whitened, everything, start_ns)]
+    rows = [summarise(whitened, everything, start_ns)]
     names = list(dict.fromkeys(label.tolist()))
-    found += [summarise(whitened, label == name, start_ns, name) for name in names]
-    return tuple(one for one in found if one is not None)
+    rows += [summarise(whitened, label == name, start_ns, name) for name in names]
+    return tuple(row for row in rows if row is not None)
 
 
 def over_time(whitened: Whitened, start_ns: int, window_s: float = WINDOW_S) -> tuple[Consistency, ...]:
-    """Window by window from the start of the recording; the correlation is that of the whole drive."""
+    """Window by window from the start of the recording, with the correlation of the whole run."""
     if not whitened.known().any():
         return ()
     correlation = squared_correlation(whitened.values, whitened.known())
@@ -224,9 +223,9 @@ def over_time(whitened: Whitened, start_ns: int, window_s: float = WINDOW_S) -> 
 
 
 def ground_at(recording: Recording, estimate: Estimate, t_ns: TimesNs) -> NDArray[np.str_]:
-    """The terrain (N,) at each time: annotated or simulated where the recording says it, else as estimated.
+    """The terrain (N,) at each time: annotated or simulated if the recording has it, else as estimated.
 
-    A label holds until the next; before the first the first holds.
+    A label holds until the next one, the first also before its time.
     """
     terrain = recording.terrain
     if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
@@ -248,7 +247,7 @@ def _held(clock: TimesNs, label: NDArray[np.object_] | NDArray[np.str_], t_ns: T
 def whitened_series(
     estimate: Estimate, position_errors: Errors | None, heading_errors: Errors | None
 ) -> tuple[Whitened, ...]:
-    """All that can be tested: position and heading against their references, innovations by sensor."""
+    """Whitened position and heading errors against their references, and innovations by sensor."""
     against = [] if position_errors is None else [position(position_errors)]
     against += [] if heading_errors is None else [heading(heading_errors)]
     return tuple(one for one in (*against, *innovations(estimate.innovations)) if one.known().any())

@@ -1,7 +1,6 @@
-"""An estimate beside its reference at common times: the series behind every score.
+"""Errors of an estimate against a reference at common times, in the horizontal plane.
 
-The reference is a recording's truth, or GNSS fixes that were kept from the
-estimator. Everything is horizontal. `metrics` turns the series into numbers.
+The reference is the truth of a recording or held-out GNSS fixes. `scores` condenses the series.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
 MIN_STEP_M = 0.1
-"""Shorter moves of a reference do not count as distance travelled: they may be its noise at rest."""
+"""Shorter displacements of a reference do not count as distance: they may be its noise at rest."""
 
 ALIGN_M = 10.0
-"""Length of path to which a drive without GNSS is fitted when the reference has no heading."""
+"""Path over which a run without GNSS is aligned if the reference has no heading."""
 
 NOT_SCORED = ("waiting", "aligning")
-"""Status of keyframes at which the estimator says that it does not know the pose yet."""
+"""Status of keyframes before the pose is initialised."""
 
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Estimate and reference side by side at M common times.
+    """Estimate and reference at M common times.
 
     Attributes:
         t_ns: (M,).
@@ -43,7 +42,7 @@ class Errors:
         velocity_error_mps: (M, 2); body axes against truth, east-north against fixes; NaN where unknown.
         covariance_m2: (M, 2, 2) of the position error; NaN where unknown.
         yaw_sigma_rad: (M,).
-        min_step_m: moves of the reference shorter than this may be its noise.
+        min_step_m: shorter displacements of the reference may be its noise.
     """
 
     t_ns: TimesNs
@@ -61,7 +60,7 @@ class Errors:
         return self.estimate_m - self.reference_m
 
     def distance_m(self) -> Array:
-        """Size of the position error, (M,)."""
+        """Length of the position error, (M,)."""
         error = self.position_error_m()
         return np.asarray(np.hypot(error[:, 0], error[:, 1]))
 
@@ -86,11 +85,10 @@ class Errors:
 def errors_against_truth(
     estimate: Estimate, recording: Recording, antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> Errors | None:
-    """The error series against the truth, or None when nothing of it can be compared.
+    """The error series against the truth, or None if nothing can be compared.
 
-    The denser of the two is interpolated at the times of the sparser; times
-    inside a gap of either are left out. Channels that the recording does not
-    list as true are not used, even where the arrays hold numbers.
+    The denser of the two is interpolated at the times of the sparser, except inside gaps. Only channels listed
+    in `truth_channels`, if any, are used.
     """
     truth, listed = recording.truth, set(recording.truth_channels)
     if truth is None or len(truth) < 2 or len(estimate.trajectory) < 2:
@@ -126,7 +124,7 @@ def errors_against_truth(
 def errors_against_fixes(
     estimate: Estimate, held_out: Gnss | None, antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0)
 ) -> Errors | None:
-    """The error series of the antenna against GNSS fixes, or None when no fix falls inside the estimate."""
+    """The error series of the antenna against GNSS fixes, or None if no fix lies within the estimate."""
     if held_out is None or len(estimate.trajectory) < 2:
         return None
     valid = np.isfinite(held_out.enu_m[:, :2]).all(axis=1) & (held_out.fix != Fix.NONE)
@@ -157,8 +155,8 @@ def errors_against_fixes(
 def travelled_m(position_m: ArrayLike, min_step_m: float = MIN_STEP_M) -> Array:
     """Distance (N,) travelled up to each of the horizontal positions (N, 2 or more).
 
-    A move counts once it is at least `min_step_m` away from the last point
-    that counted, so that the noise of a robot at rest adds up to nothing.
+    A position counts once it is `min_step_m` away from the last one that counted, so that noise at rest does
+    not add up.
     """
     total = 0.0
     out = np.zeros(len(np.asarray(position_m)))
@@ -177,7 +175,7 @@ def travelled_m(position_m: ArrayLike, min_step_m: float = MIN_STEP_M) -> Array:
 
 
 def known_keyframes(estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
-    """The keyframes with a pose, and notes on those left out."""
+    """The keyframes with a pose, and notes on the excluded ones."""
     path = estimate.trajectory
     status = estimate.status.astype(str)
     early, local = np.isin(status, NOT_SCORED), status == "no_gnss"
@@ -195,20 +193,20 @@ def known_keyframes(estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
     rows = sound & ~early & ~local
     if rows.all():
         return estimate, notes
-    kept = dataclasses.replace(
+    selected = dataclasses.replace(
         estimate,
         trajectory=path.select(rows),
         velocity_mps=estimate.velocity_mps[rows],
         status=estimate.status[rows],
     )
-    return kept, notes
+    return selected, notes
 
 
 def _point_at(
     estimate: Estimate, t_ns: TimesNs, lever_m: tuple[float, ...]
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
-    """Of a body-fixed point: position (M, 2), velocity (M, 3, world), covariance of the position (M, 2, 2);
-    of the body: yaw and its sigma (M,), rotation to the world (M, 3, 3)."""
+    """Position (M, 2), world velocity (M, 3) and position covariance (M, 2, 2) of a body-fixed point;
+    yaw and its sigma (M,) and rotation to the world (M, 3, 3) of the body."""
     path = estimate.trajectory
     nearest = np.searchsorted((path.t_ns[1:] + path.t_ns[:-1]) // 2, t_ns)
     quaternion = path.quaternions_at(t_ns)
@@ -236,7 +234,7 @@ def _point_at(
 
 
 def _yaw_at(truth: Trajectory, t_ns: TimesNs) -> Array:
-    """Yaw (M,) of the truth, slerped between the two known orientations next to each time."""
+    """Yaw (M,) of the truth, slerp between the known orientations next to each time."""
     known = np.isfinite(truth.quaternion).all(axis=1) if truth.quaternion is not None else np.zeros(0, bool)
     if not known.any():
         return np.full(len(t_ns), np.nan)
@@ -247,7 +245,7 @@ def _yaw_at(truth: Trajectory, t_ns: TimesNs) -> Array:
 
 
 def _common_times(estimate_ns: TimesNs, truth_ns: TimesNs) -> TimesNs:
-    """Times of the sparser of two clocks that lie inside the other and in none of its gaps."""
+    """Times of the sparser of two clocks that lie inside the other, but not in its gaps."""
     if len(truth_ns) < 2:
         return np.zeros(0, dtype=np.int64)
     sparse, dense = estimate_ns, truth_ns
@@ -258,7 +256,7 @@ def _common_times(estimate_ns: TimesNs, truth_ns: TimesNs) -> TimesNs:
 
 
 def _bracketed(t_ns: TimesNs, grid_ns: TimesNs) -> NDArray[np.bool_]:
-    """Which times have grid points close enough on both sides to interpolate between them."""
+    """Whether times have grid points close enough on both sides for interpolation."""
     limit_ns = max(0.25e9, 2.5 * float(np.median(np.diff(grid_ns))))
     after = np.clip(np.searchsorted(grid_ns, t_ns, side="left"), 1, len(grid_ns) - 1)
     exact = (grid_ns[after] == t_ns) | (grid_ns[after - 1] == t_ns)
@@ -285,11 +283,10 @@ def align_both(
 
 
 def align_start(errors: Errors) -> tuple[Errors, str]:
-    """Fit the start of the estimate to the reference by one rigid motion in the plane, and say how.
+    """Align the start of the estimate with the reference by a rigid motion in the plane; also describe how.
 
-    With a reference heading: its first position and the mean heading of the
-    first metre. Without: least squares (Umeyama 1991, no scale) over the first
-    `ALIGN_M` of path.
+    With a reference heading by its first position and the mean heading over the first metre, else by least
+    squares (Umeyama 1991, no scale) over the first `ALIGN_M` of path.
     """
     path = errors.path_m()
     finite = np.isfinite(errors.distance_m())
@@ -303,7 +300,7 @@ def align_start(errors: Errors) -> tuple[Errors, str]:
         how = "its first position and the mean heading over its first metre"
     else:
         p0, q0 = p.mean(axis=0), q.mean(axis=0)
-        turn = planar_rotation(p @ [1.0, 1j], q @ [1.0, 1j])[0] if path[-1] >= 1.0 else 1.0
+        turn = planar_rotation(p[:, 0] + 1j * p[:, 1], q[:, 0] + 1j * q[:, 1])[0] if path[-1] >= 1.0 else 1.0
         how = f"a least-squares fit over the first {min(ALIGN_M, float(path[-1])):.1f} m"
     angle = float(np.angle(turn))
     R = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])

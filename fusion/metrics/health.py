@@ -1,4 +1,4 @@
-"""Whether an estimate can be of the drive at all: what can be said without a reference."""
+"""Plausibility of an estimate without a reference: finite numbers, speed and path against the wheels."""
 
 from __future__ import annotations
 
@@ -12,15 +12,15 @@ from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.error_series import travelled_m
 
 SPEED_FACTOR, SPEED_SLACK_MPS = 1.5, 1.0
-"""A robot is not faster than so many times its fastest wheel, and this much (rolling down a hill)."""
+"""Largest plausible speed: a multiple of the fastest wheel speed plus a margin for rolling downhill."""
 LEAST_PATH, MOST_PATH, PATH_SLACK_M = 0.2, 1.2, 5.0
-"""Bounds of the estimated path over the wheels'. Measured slip on ice is 0.64 in the median
-(docs/field.md), which leaves 0.36 of the path; the slack holds for drives of a few metres."""
+"""Plausible path as a share of the wheels' path, with a margin for short runs. Median measured slip on ice is 0.64
+(docs/field.md), a share of 0.36."""
 
 
 @dataclass(frozen=True)
 class Health:
-    """Top horizontal speed, path, and the path the wheels rolled; `why` it diverged, "" where it did not."""
+    """Top horizontal speed, path, path rolled by the wheels; `why` the estimate is implausible, or ""."""
 
     top_speed_mps: float
     path_m: float
@@ -28,12 +28,12 @@ class Health:
     why: str
 
     def path_ratio(self) -> float | None:
-        """Estimated path over rolled path; None where the wheels hardly turned."""
+        """Estimated path over rolled path; None if the wheels hardly turned."""
         return self.path_m / self.rolled_m if self.rolled_m >= 1.0 else None
 
 
 def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Health:
-    """Check numbers, speed and path of an estimate against its wheels."""
+    """Check that an estimate is finite and that its speed and path agree with the wheels."""
     path = estimate.trajectory
     P = path.covariance
     finite = bool(np.isfinite(path.position_m).all() and np.isfinite(estimate.velocity_mps).all())
@@ -58,12 +58,12 @@ def examine_estimate(estimate: Estimate, wheels: Wheels, radius_m: float) -> Hea
 
 
 def rolled_m(wheels: Wheels, radius_m: float) -> float:
-    """Path that the mean of the wheels rolled, m; both ways count."""
+    """Path of the mean of the wheels, m; forward and backward both count."""
     return float(rolled_until_m(wheels, radius_m)[-1]) if len(wheels) else 0.0
 
 
 def rolled_until_m(wheels: Wheels, radius_m: float) -> NDArray[np.float64]:
-    """Path (N,) that the mean of the wheels rolled up to each sample, m; unknown speeds count as none."""
+    """Path (N,) of the mean of the wheels up to each sample, m; unknown speeds count as zero."""
     speed = np.abs(np.nan_to_num(wheels.side_speeds_mps(radius_m)).mean(axis=1))
     steps = 0.5 * (speed[1:] + speed[:-1]) * np.diff(wheels.t_ns) * 1e-9
     return np.concatenate([np.zeros(min(1, len(speed))), np.cumsum(steps)])

@@ -1,23 +1,15 @@
-"""Scores of an estimate against truth or against GNSS fixes it never saw.
+"""Scores of an estimate against truth or held-out GNSS fixes, in the horizontal plane.
 
-Definitions, all for the horizontal plane (ground robots; heights are mostly
-unknown or of another quality):
-
-- ATE: root mean square of the position error. Unlike Sturm et al. (2012,
-  "A benchmark for the evaluation of RGB-D SLAM systems", IROS, eq. 5) nothing
-  is aligned first, because estimate and reference share the ENU frame. Only a
-  drive without GNSS is aligned, once, at its start.
-- RPE: Sturm et al. (2012), eq. 2, over pairs a path length of 10, 50 or 100 m
-  apart, as percent of that length and averaged over all pairs as in Geiger et
-  al. (2012, KITTI). Where the reference has no heading, displacements are
-  compared in the world frame instead, so heading errors count in full.
-- NEES: mean of e' P^-1 e / 2 for the 2-D position error e and its covariance
-  P (Bar-Shalom, Li, Kirubarajan 2001, sec. 5.4.2, divided by the dimension):
-  1 is consistent, above 1 overconfident. Against fixes, P holds the fix's own
-  covariance too. By terrain and over time, with bands: `consistency`.
-- Outage: errors inside a stretch without GNSS. Segments are never realigned:
-  an error that was there before the outage counts in full, and so does the
-  heading error with which it began.
+- ATE: rms of the position error (Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", IROS,
+  eq. 5) without alignment, because estimate and reference share the ENU frame. Only a run without GNSS is aligned,
+  once, at its start.
+- RPE: Sturm et al. (2012), eq. 2, over pairs 10, 50 or 100 m of path apart, as percent of that length, averaged over
+  all pairs as in Geiger et al. (2012, KITTI). Without a reference heading, displacements are compared in the
+  world frame, so heading errors count in full.
+- NEES: mean of e' P^-1 e / 2 for the 2-D position error e and its covariance P (Bar-Shalom, Li, Kirubarajan 2001,
+  sec. 5.4.2, divided by the dimension): 1 is consistent, above 1 overconfident. Against fixes, P includes the
+  covariance of the fix. By terrain and over time: `consistency`.
+- Outage: errors inside a span without GNSS, never realigned: position and heading errors at its start count.
 
 Times in seconds count from the start of the recording.
 """
@@ -55,25 +47,25 @@ TimesNs = NDArray[np.int64]
 Rows = NDArray[np.int64]
 
 RPE_LENGTHS_M = (10, 50, 100)
-"""Path lengths over which the relative pose error is taken."""
+"""Path lengths of the relative pose error."""
 
 
 @dataclass(frozen=True)
 class Outage:
-    """A stretch of `seconds` from `start_s` in which the estimator gets no GNSS fix."""
+    """A span of `seconds` from `start_s` in which the estimator gets no GNSS fix."""
 
     start_s: float
     seconds: float
 
     def covers(self, t_ns: TimesNs, start_ns: int) -> NDArray[np.bool_]:
-        """Which times (N,) lie in start <= t < end; `start_ns` is the start of the recording."""
+        """Whether times (N,) lie in start <= t < end; `start_ns` is the start of the recording."""
         t_s = (t_ns - start_ns) * 1e-9
         return np.asarray((t_s >= self.start_s) & (t_s < self.start_s + self.seconds))
 
 
 @dataclass(frozen=True)
 class OutageScore:
-    """Drift in one outage; None where there is no reference inside it.
+    """Drift in one outage; None without a reference inside it.
 
     `max_m` is the largest error, `end_yaw_error_rad` the size of the heading error at the end,
     `nees_mean` that of the position inside.
@@ -92,7 +84,7 @@ class OutageScore:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Horizontal distance of the estimated antenna from the fixes kept back."""
+    """Horizontal distance of the estimated antenna from the held-out fixes."""
 
     fixes: int
     median_m: float
@@ -101,10 +93,10 @@ class HeldOut:
 
 @dataclass(frozen=True, eq=False)
 class Scores:
-    """All scores of one run; None where there is nothing to score against.
+    """All scores of one run; None without a reference.
 
-    `errors` are the series behind the numbers, `notes` say how they were made. `consistency` holds
-    NEES and NIS of the whole drive and by terrain, `consistency_over_time` the same in windows.
+    `errors` are the underlying series, `notes` describe alignment and exclusions. `consistency` holds NEES and
+    NIS of the whole run and by terrain, `consistency_over_time` the same in windows.
     """
 
     against: str | None
@@ -151,21 +143,21 @@ def score(
     antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0),
     aligned: bool = False,
 ) -> Scores:
-    """Score `estimate` against the truth of `recording`, else against the fixes kept back.
+    """Score `estimate` against the truth of `recording`, else against the held-out fixes.
 
     Args:
-        held_out: fixes the estimator did not see.
-        outages: stretches that are scored on their own.
-        antenna_m: (3,) antenna in the body frame; the point that fixes, and a truth of the antenna, show.
-        aligned: the estimate's start and heading are arbitrary (a drive without GNSS): fit them, once,
-            to the start of the reference.
+        held_out: fixes not given to the estimator.
+        outages: spans that are also scored separately.
+        antenna_m: (3,) antenna in the body frame, the point of fixes and of a truth of the antenna.
+        aligned: start and heading of the estimate are arbitrary (a run without GNSS) and fitted once to the
+            start of the reference.
     """
     known, notes = known_keyframes(estimate)
     truth = errors_against_truth(known, recording, antenna_m)
     fixes = errors_against_fixes(known, held_out, antenna_m)
     if aligned:
-        truth, fixes, said = align_both(truth, fixes)
-        notes += said
+        truth, fixes, aligned_by = align_both(truth, fixes)
+        notes += aligned_by
     has_position = truth is not None and bool(np.isfinite(truth.reference_m).any())
     main = truth if has_position or fixes is None else fixes
     attitude = truth if truth is not None else fixes
@@ -195,7 +187,7 @@ def score(
 def rpe_percent(errors: Errors, lengths_m: Sequence[float] = RPE_LENGTHS_M) -> dict[str, float | None]:
     """Mean relative position error over all pairs a length of path apart, percent of that path.
 
-    One number for each length; None where the drive is shorter.
+    One number for each length; None if the run is shorter.
     """
     path = errors.path_m()
     out: dict[str, float | None] = {}
@@ -218,8 +210,8 @@ def path_pairs(errors: Errors, length_m: float, path_m: Array | None = None) -> 
 def relative_error_m(errors: Errors, first: Rows, last: Rows) -> Array:
     """RPE of chosen pairs, (n,): the translation of Sturm et al. (2012), eq. 2, in the plane.
 
-    Each displacement is seen from its own heading at the pair's start; where the reference has no
-    heading at one of them, all are compared in the world frame instead.
+    Displacements are rotated into the frame at the start of the pair, or compared in the world frame if the
+    reference lacks a heading at one of the starts.
     """
     estimate = errors.estimate_m[last] - errors.estimate_m[first]
     reference = errors.reference_m[last] - errors.reference_m[first]

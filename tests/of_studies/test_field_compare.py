@@ -186,7 +186,7 @@ def test_a_simulated_drive_is_read_as_it_was_driven():
         told = np.interp(one.t_s, clock, truth.twist_body[:, channel])
         assert np.sqrt(np.mean((found[inner] - told[inner]) ** 2)) < 0.01
         assert np.abs(found[inner] - told[inner]).max() < 0.1  # a corner of the speed, between knots
-    assert np.isfinite(one.told_radps[inner]).all()
+    assert np.isfinite(one.commanded_radps[inner]).all()
     still = dataclasses.replace(made, imu=None)
     with pytest.raises(DataError, match="no gyro"):
         field_runs("made", [still])
@@ -223,7 +223,9 @@ def test_windows_of_a_step_are_joined_and_their_speed_is_near_the_wheels(drives)
 def test_calibrated_twin_beats_the_fitted_centres_of_rotation_on_ice(drives):
     name = "norlab_drive/ice_2024_7_30_16h30s21/windows"
     runs = field_runs(name, open_recordings(name))
-    wheels = [dataclasses.replace(r, told_radps=np.full_like(r.told_radps, np.nan)) for r in runs[:8]]
+    wheels = [
+        dataclasses.replace(r, commanded_radps=np.full_like(r.commanded_radps, np.nan)) for r in runs[:8]
+    ]
     lines = {line.model: line for line in summary.lines("warthog", compare.compare(wheels))}
     twin = lines[TWIN]
     for metric in ("speed_rms_5s_mps", "turn_rms_5s_radps", "position_m"):

@@ -105,7 +105,7 @@ def forks_of(runs: Sequence[FieldRun], inputs: str) -> Forks | None:
     """
     parts: list[tuple[FieldRun, int]] = []
     for run in runs:
-        given = run.sides_radps if inputs == "wheels" else run.told_radps
+        given = run.sides_radps if inputs == "wheels" else run.commanded_radps
         first = N_PAST
         while first + N_FUTURE < len(run.t_s):
             span = slice(first - N_PAST, first + N_FUTURE + 1)
@@ -136,7 +136,7 @@ def _stacked(parts: Sequence[tuple[FieldRun, int]], inputs: str) -> Forks:
     for run, first in parts:
         velocity = _filled(cut(run.velocity_mps, first))
         motion.append(np.column_stack([velocity, cut(run.yaw_rate_radps, first)]))
-        given.append(cut(run.sides_radps if inputs == "wheels" else run.told_radps, first))
+        given.append(cut(run.sides_radps if inputs == "wheels" else run.commanded_radps, first))
         scatter = run.noise_mps[first : first + N_FUTURE].reshape(BINS, N_BIN).mean(axis=1)
         noise.append(float(np.sqrt(np.nanmean(scatter**2))) if np.isfinite(scatter).any() else np.nan)
     return Forks(
