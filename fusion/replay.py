@@ -8,9 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -25,8 +23,6 @@ from terrafusion.fusion.metrics.scores import Outage, Scores, score
 from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import VehicleParams
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)

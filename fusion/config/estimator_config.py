@@ -15,16 +15,16 @@ from terrafusion.fusion.noise.policy import Policy, load_policy
 
 @dataclass(frozen=True)
 class EstimatorConfig:
-    """What an `Estimator` is built from.
+    """Settings of an `Estimator`.
 
     Attributes:
         rig: geometry and sensors of the robot.
         vehicle: its name, for what the terrain model knows of single robots.
-        mode: "adaptive" (noise follows the detected terrain), "fixed" (one row for all grounds), "robust"
-            (that row, single measurements under a robust loss) or "innovation" (that row, the noise of
-            wheels and GNSS followed by their innovations).
-        policy: noise rows by terrain.
-        tuning: the few numbers of the modes.
+        mode: "adaptive" (noise follows the detected terrain), "fixed" (one noise for all grounds),
+            "robust" (fixed, with a robust loss) or "innovation" (fixed, wheels and GNSS adapted by
+            their innovations).
+        policy: noise by terrain.
+        tuning: of the modes.
         robust_loss: mode "robust": "cauchy" or "gnc".
         innovation_method: mode "innovation": "sage_husa" or "variational".
         keyframe_s: time between keyframes.
@@ -33,12 +33,13 @@ class EstimatorConfig:
         gnss_gate: chi-square probability beyond which a fix is rejected.
         wheel_gate_sigma: normalised wheel innovation beyond which an increment is rejected.
         yaw_sigma_start_rad: heading uncertainty at which the graph is started.
-        start_without_gnss_s: with no fix for so long, start in a local frame (at once if `inputs` has none).
-        inputs: what the estimator will be given; without all six IMU axes the graph is planar.
+        start_without_gnss_s: time without a fix after which the start is in a local frame (at once if
+            `inputs` has none).
+        inputs: sensors that the estimator will be given; without all six IMU axes the graph is planar.
         calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
-        declination_rad: magnetic north at the place, east of true north; with it a magnetometer tells the
-            heading, without it holds the one that GNSS or the start has told.
-        labels: the ground over time, told in place of what the detector finds; None: it detects.
+        declination_rad: magnetic north, east of true north; with it a magnetometer measures the
+            heading, without it it holds that of GNSS or the start.
+        labels: the ground over time, in place of the detector; None: it detects.
     """
 
     rig: Rig

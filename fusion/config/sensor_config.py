@@ -1,9 +1,8 @@
-"""What a log holds, and the graph that follows from it.
+"""Sensor configuration: the channels of a log, and the graph that follows from them.
 
-A log with all six IMU axes gets the full graph. Without them the robot is
-taken to drive on level ground (the planar graph, `graph/planar.py`): yaw from
-the gyro's z axis, else from the difference of the wheels, else from GNSS alone.
-What was chosen is said in notes.
+A log with all six IMU axes gets the full graph. Otherwise the robot is taken to drive on level ground (the
+planar graph, `graph/planar.py`): yaw from the gyro's z axis, else from the difference of the wheels, else
+from GNSS alone. Notes tell which.
 """
 
 from __future__ import annotations
@@ -22,23 +21,23 @@ from terrafusion.fusion.graph.preintegration import Preintegrator
 
 IMU_KINDS = ("six_axis", "gyro_z", "none")
 YAW_RATIO = 0.6
-"""Yaw rate over what the geometric track says, for skid steer: measured 0.44 to 0.71 (`docs/planar.md`)."""
+"""True yaw rate over that by the geometric track, for skid steer: measured 0.44 to 0.71 (`docs/planar.md`)."""
 COMPLETE_SHARE = 0.5
-"""Least share of the IMU's rows with all six axes for which the log counts as a six-axis one."""
+"""Least share of IMU samples with all six axes for which the log counts as a six-axis one."""
 
 
 @dataclass(frozen=True)
 class SensorConfig:
-    """What an estimator is given; declared, never guessed from single samples.
+    """The sensors of an estimator; declared, never guessed from single samples.
 
     Attributes:
         imu: "six_axis", "gyro_z" (other axes may be NaN, the accelerometer too) or "none".
-        sides: left and right wheels are told apart; else body speed alone.
+        sides: left and right wheels are distinguished; else body speed alone.
         gnss: fixes will come. Without them the graph starts at once, in a local frame.
 
     Raises:
         ConfigError: an unknown kind of IMU.
-        DataError: nothing tells the heading.
+        DataError: no source of heading.
     """
 
     imu: str = "six_axis"
@@ -62,13 +61,13 @@ class SensorConfig:
 
     @property
     def yaw(self) -> str:
-        """Who tells the yaw rate: "gyro", "wheels" or "nobody"."""
+        """Source of the yaw rate: "gyro", "wheels" or "nobody"."""
         if self.imu != "none":
             return "gyro"
         return "wheels" if self.sides else "nobody"
 
     def rig(self, rig: Rig) -> Rig:
-        """The robot as the graph sees it: the effective track where the wheels tell yaw."""
+        """The robot as the graph sees it: the effective track where yaw is the wheels'."""
         if not self.planar:
             return rig
         imu = planar_spec(rig.sensors.imu, self.yaw)
@@ -76,7 +75,7 @@ class SensorConfig:
         return dataclasses.replace(rig, track_m=track, sensors=dataclasses.replace(rig.sensors, imu=imu))
 
     def preintegrator(self, spec: ImuSpec) -> Preintegrator:
-        """What makes the link between keyframes."""
+        """Maker of the link between keyframes."""
         return PlanarPreintegrator(spec, self.yaw) if self.planar else Preintegrator(spec)
 
     def notes(self, recording: Recording) -> tuple[str, ...]:
@@ -100,10 +99,10 @@ class SensorConfig:
 
 
 def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
-    """What `recording` holds, with the fixes `gnss` that the estimator is to be given.
+    """Sensors of `recording`, with the fixes `gnss` for the estimator.
 
     Raises:
-        DataError: nothing tells the heading.
+        DataError: no source of heading.
     """
     wheels = recording.wheels
     fixes = gnss is not None and bool(((gnss.fix > 0) & np.isfinite(gnss.enu_m[:, :2].sum(axis=1))).any())
@@ -111,7 +110,7 @@ def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
 
 
 def complete_samples(imu: Imu, kind: str) -> np.ndarray:
-    """Which rows (N,) of the IMU hold all that its kind asks for."""
+    """Which samples (N,) of the IMU have all values that its kind needs."""
     z = np.isfinite(imu.gyro_radps[:, 2])
     if kind == "six_axis":
         return np.asarray(np.isfinite(imu.gyro_radps.sum(axis=1) + imu.accel_mps2.sum(axis=1)))

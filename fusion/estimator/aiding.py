@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.estimate.estimate import Innovation
@@ -17,8 +17,6 @@ from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.magnetometer import MagnetometerAiding
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream
-
-Array = NDArray[np.float64]
 
 
 class AidingSensors:

@@ -9,6 +9,7 @@ import gtsam
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.planar_alignment import planar_rotation
@@ -17,8 +18,6 @@ from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 STILL_MPS = 0.01
 STILL_RADPS = 0.05

@@ -14,16 +14,14 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.atmosphere import height_of, height_per_pa
 from terrafusion.datasets.core.sensors import BarometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.slow_bias import SlowBias, split_by_time
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE, KeyState
-
-Array = NDArray[np.float64]
 
 GENERIC = BarometerSpec(rate_hz=10.0, noise_pa=10.0, walk_paps_sqrthz=0.5, position_m=(0.0, 0.0, 0.0))
 """For a vehicle whose file has no barometer (assumed: a MEMS sensor outdoors)."""

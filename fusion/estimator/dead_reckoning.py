@@ -13,13 +13,11 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.streams import GnssFix
-
-Array = NDArray[np.float64]
 
 KEPT_S = 30.0
 SCATTER_FIXES = 21

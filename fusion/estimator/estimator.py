@@ -16,8 +16,9 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
@@ -58,8 +59,6 @@ from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
-Array = NDArray[np.float64]
-
 LONGEST_IMU_GAP_S, OUTAGE_S = 0.5, 2.0
 SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
@@ -92,8 +91,8 @@ class Estimator:
         self.wheels = WheelStream()
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
-        self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.note))
-        self.gnss = GnssUpdater(config, self._report, self.weights.single, self._skid)
+        self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
+        self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
         self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
@@ -388,7 +387,7 @@ class Estimator:
         accepted, nis = gate.test(innovation, float(np.sqrt(variance)), wheels, robot, dt)
         self._report(Innovation(t_ns, "wheels", np.array([innovation]), nis, 1, accepted))
         if accepted:
-            return self.weights.single.wheels(t_ns, wheels, innovation, variance, dt)
+            return self.weights.per_measurement.wheels(t_ns, wheels, innovation, variance, dt)
         self.wheels_rejected += not self._silent
         return wheels.doubted(variance, gate.doubt(nis))
 

@@ -16,8 +16,8 @@ from collections.abc import Callable
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
@@ -30,8 +30,6 @@ from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 FRICTION_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
 """Friction limits of the models: mu g from ice to dry ground."""

@@ -7,14 +7,12 @@ from dataclasses import dataclass, field
 from enum import Enum
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.graph.key_state import SLIP, VELOCITY, KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 FAULT = 3.0
 """A wheel increment this many limits off is no measurement at all (a counter that jumps)."""

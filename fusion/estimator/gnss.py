@@ -7,9 +7,10 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
@@ -29,8 +30,6 @@ from terrafusion.fusion.inputs.streams import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
 from terrafusion.twin.sensors.gnss import best_fix
-
-Array = NDArray[np.float64]
 
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
@@ -141,8 +140,8 @@ class GnssUpdater:
                 self._update_scale(self.track.scatter(), self.track.white_share())
                 if self.skid.friction is not None:
                     self.skid.friction.score_fix(fix, self.scale)
-                renewed = self._change_class(chain, k, fix)
-                if renewed or used or k < chain.last:
+                restarted = self._change_class(chain, k, fix)
+                if restarted or used or k < chain.last:
                     chain.smooth(max(chain.last - k + 2, 1))
                     covariance = chain.covariance_at(k)
                 used |= self._add_fix(chain, k, fix, covariance, noise)
@@ -180,7 +179,7 @@ class GnssUpdater:
         step = chain.nodes[k - chain.first].markov
         if first or step is None:
             return False
-        chain.revise(k, step.renewed(slice(1, 3)))
+        chain.revise(k, step.restarted(slice(1, 3)))
         return True
 
     def correct_heading(self, chain: Chain, noise: SensorNoise) -> bool:

@@ -7,14 +7,12 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import gtsam_to_ros_covariance
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.graph.body_twist import bias_sigma, twist_covariance
 from terrafusion.fusion.graph.key_state import POSE, SLIP, VELOCITY, KeyState, linear_sigma, quaternion_of
-
-Array = NDArray[np.float64]
 
 
 def key_state_of(state: State) -> KeyState:

@@ -20,8 +20,9 @@ from collections.abc import Callable
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import MagnetometerSpec
 from terrafusion.fusion.estimate.estimate import Innovation
@@ -29,8 +30,6 @@ from terrafusion.fusion.estimator.alignment import WINDOW_NS, Start
 from terrafusion.fusion.estimator.slow_bias import SlowBias, split_by_time
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import POSE
-
-Array = NDArray[np.float64]
 
 GENERIC = MagnetometerSpec(rate_hz=10.0, noise_t=3e-7, hard_iron_sigma_t=3e-6)
 """For a vehicle whose file has no magnetometer (assumed: calibrated once)."""

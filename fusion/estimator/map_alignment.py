@@ -12,16 +12,14 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import DRIFT, quaternion_of
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.inputs.streams import GnssFix
-
-Array = NDArray[np.float64]
 
 PLACE = (2, 3, 4, 5)
 """Tangent of heading and position: what a local frame leaves open."""

@@ -21,16 +21,14 @@ import math
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.key_states import covariance_fields, key_state_of
 from terrafusion.fusion.graph.key_state import DIM, NAV, quaternion_of, skew
 from terrafusion.fusion.graph.preintegration import Preintegrator
 from terrafusion.fusion.inputs.streams import ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 
 class Propagator:

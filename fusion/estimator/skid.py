@@ -14,16 +14,14 @@ import math
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimator.friction import FrictionEstimator
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 SAME_SIDE = 0.5
 """Least cosine between the offsets of two rejected fixes that lie on one side."""

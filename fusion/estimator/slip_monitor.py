@@ -14,14 +14,10 @@ import math
 from collections import deque
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.graph.key_state import KeyState
-
-Array = NDArray[np.float64]
 
 WINDOWS_S = (1.0, 2.0, 4.0)
 SIGMAS = 4.0

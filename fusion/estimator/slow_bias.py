@@ -24,9 +24,9 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
+
 T = TypeVar("T")
 
 LEAST_GAIN = 0.03

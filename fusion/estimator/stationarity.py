@@ -17,15 +17,13 @@ import math
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec, Rig
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import no_motion_factor
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
-
-Array = NDArray[np.float64]
 
 CREEP_MPS = 0.02
 """The slowest motion that the wheels must show within a window."""

@@ -1,10 +1,9 @@
 """Gauss-Newton over a whole chain at once: what `Chain` does keyframe by keyframe, on arrays.
 
-The factors are those of the chain. All of GTSAM's are linearised in one call, the
-others (wheels, GNSS positions, linear states) by array operations, and the chain
-is eliminated in time order by one QR a keyframe, as in `chain`. QR, since the
-normal equations of a chain with the noise of a data sheet cannot be factored in
-double precision (its links are 1e9 times tighter than what ties it to the world).
+All factors of GTSAM are linearised in one call, the others (wheels, GNSS positions, linear states) by
+array operations, and the chain is eliminated in time order by one QR per keyframe. QR, since the normal
+equations of a chain with the noise of a data sheet cannot be factored in double precision (its links are
+1e9 times tighter than what ties it to the world).
 """
 
 from __future__ import annotations
@@ -14,15 +13,13 @@ from collections.abc import Sequence
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.chain import Chain, carried_prior
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.triangular import back_substitute, eliminated, triangular
-
-Array = NDArray[np.float64]
 
 BLOCK = 500
 """Keyframes whose rows are held at a time."""
@@ -59,10 +56,10 @@ class BatchSmoother:
         self._root = np.zeros((self.dim, self.dim + 1))
 
     def optimise(self, iterations: int = 30, tolerance: float = 0.1) -> int:
-        """Gauss-Newton with step halving; gives the iterations taken.
+        """Gauss-Newton with step halving; returns the iterations taken.
 
         It ends with the first step shorter than `tolerance`, in sigmas of the whole solution (the root of
-        the sum of squares that the step takes off): the next would be shorter by an order of magnitude.
+        the decrease of the sum of squares).
         """
         error = self.linearise()
         for taken in range(1, iterations + 1):
@@ -109,11 +106,12 @@ class BatchSmoother:
         return out
 
     def linearise(self) -> float:
-        """Linearise and eliminate everything where it is; the sum of squares of all whitened residuals."""
+        """Linearise and eliminate everything at the present values; the sum of squares of all whitened
+        residuals.
+        """
         return self._linearise(self.values, self.linear)
 
     def _linearise(self, values: gtsam.Values, linear: Array) -> float:
-        """Linearise and eliminate everything; the sum of squares of all whitened residuals."""
         self.iterations += 1
         dim = self.dim
         poses = gtsam.utilities.extractPose3(values)
@@ -151,7 +149,7 @@ class BatchSmoother:
         return out
 
     def _step_length(self) -> float:
-        """What the whole step takes off the sum of squares, as its root."""
+        """Root of the decrease of the sum of squares by the whole step."""
         right = self._conditionals[:, :, -1]
         return float(np.sqrt(np.einsum("kr,kr->", right, right) + np.sum(self._root[:, -1] ** 2)))
 

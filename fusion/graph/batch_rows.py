@@ -1,8 +1,8 @@
 """Whitened rows of many keyframes at once, for `batch`.
 
 Rows of keyframe k are those of `Chain`: over k and k + 1, shape (m, 2 dim + 1), the last column being the
-right-hand side. They lie in a block (n, m, 2 dim + 1): room for the prior (dim rows, left free), the linear
-states' steps, the wheels (4), then whatever else a keyframe has.
+right-hand side. They lie in a block (n, m, 2 dim + 1): room for the prior (dim rows, left free), the
+linear states' steps, the wheels (4), then whatever else a keyframe has.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import numpy as np
 from gtsam.symbol_shorthand import V
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import (
@@ -39,7 +40,6 @@ from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
-Array = NDArray[np.float64]
 Places = NDArray[np.intp]
 T = TypeVar("T")
 
@@ -48,7 +48,7 @@ _PLACES = {ord("x"): POSE, ord("v"): VELOCITY, ord("b"): BIAS}
 
 @dataclass(frozen=True, eq=False)
 class _Group:
-    """Factors of GTSAM over the same states: where in the graph, whose rows, from which row on."""
+    """Factors of GTSAM over the same states: indices in the graph, keyframes, first rows, rows per factor."""
 
     columns: Places
     factors: list[int]
@@ -84,7 +84,7 @@ class RowBlock:
     def rows(
         self, values: gtsam.Values, linear: Array, poses: Array | None = None
     ) -> tuple[Array, list[int]]:
-        """All rows, and how many there are of each keyframe.
+        """All rows, and their number per keyframe.
 
         Args:
             values: poses, velocities and biases at which to linearise, of all keyframes of the chain.
@@ -247,16 +247,16 @@ class _Wheels:
         return out
 
 
-def _placed(told: list[list[T]], used: Places) -> tuple[list[T], Places, Places]:
+def _first_rows(measurements: list[list[T]], used: Places) -> tuple[list[T], Places, Places]:
     """Measurements of three rows each: all, their keyframes, their first rows; `used` moves on."""
     keyframes: list[int] = []
     first_row: list[int] = []
-    for i, here in enumerate(told):
+    for i, here in enumerate(measurements):
         for _ in here:
             keyframes.append(i)
             first_row.append(int(used[i]))
             used[i] += 3
-    flat = [one for here in told for one in here]
+    flat = [one for here in measurements for one in here]
     return flat, np.array(keyframes, dtype=np.intp), np.array(first_row, dtype=np.intp)
 
 
@@ -264,7 +264,7 @@ class _Fixes:
     """`gnss_factor.residual` and `jacobians` of many fixes."""
 
     def __init__(self, fixes: list[list[GnssPosition]], used: Places) -> None:
-        flat, self._at, self._row = _placed(fixes, used)
+        flat, self._at, self._row = _first_rows(fixes, used)
         self._enu, self._lever, self._sigma, self._velocity = (
             np.array([getattr(fix, name) for fix in flat]).reshape(-1, 3)
             for name in ("enu_m", "lever_m", "sigma_m", "velocity_mps")
@@ -302,8 +302,8 @@ class _Fixes:
 class _Velocities:
     """`velocity_factor.residual` and `jacobians` of many velocities; only a calibration has them."""
 
-    def __init__(self, told: list[list[GnssVelocity]], used: Places) -> None:
-        flat, self._at, self._row = _placed(told, used)
+    def __init__(self, measurements: list[list[GnssVelocity]], used: Places) -> None:
+        flat, self._at, self._row = _first_rows(measurements, used)
         self._velocity, self._lever = (
             np.array([getattr(one, name) for one in flat]).reshape(-1, 3)
             for name in ("velocity_mps", "lever_m")

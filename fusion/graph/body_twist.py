@@ -5,13 +5,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph.key_state import DIM, VELOCITY, skew
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 _ROTATION, _GYRO_BIAS = slice(0, 3), slice(12, 15)
 

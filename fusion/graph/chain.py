@@ -1,17 +1,14 @@
 """Square-root smoothing of a chain of keyframes made of GTSAM factors.
 
-A localisation graph is a chain: every factor touches one keyframe or two that
-follow each other. Eliminating keyframes in time order by QR therefore costs
-the same at every step, and only keyframes whose factors or linearisation
-changed have to be eliminated again (the idea of iSAM2, Kaess et al. 2012, IJRR
-31(2), on its simplest graph). This is the fixed-lag filter: old keyframes are
-dropped, what they say stays as a prior (exact marginalisation). With nothing
-dropped the chain is what `batch` solves.
+A localisation graph is a chain: every factor touches one keyframe or two that follow each other.
+Eliminating keyframes in time order by QR costs the same at every step, and only keyframes whose factors or
+linearisation changed are eliminated again (the idea of iSAM2, Kaess et al. 2012, IJRR 31(2)). Old
+keyframes of the fixed lag are dropped, their information stays as a prior (exact marginalisation). With
+nothing dropped the chain is what `batch` solves.
 
-Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world
-(m/s), B(k) IMU bias (accelerometer, gyro), then the linear states of
-`key_state.LINEAR`; the tangent has this order. Pose, velocity and bias are GTSAM
-variables; the linear states live in the chain alone.
+Keyframe k has the state X(k) Pose3 body to world, V(k) velocity in the world (m/s), B(k) IMU bias
+(accelerometer, gyro), then the linear states of `key_state.LINEAR`; the tangent has this order. Pose,
+velocity and bias are GTSAM variables; the linear states live in the chain alone.
 """
 
 from __future__ import annotations
@@ -24,9 +21,9 @@ from typing import Any
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph import gnss_factor, velocity_factor
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
@@ -46,8 +43,6 @@ from terrafusion.fusion.graph.triangular import back_substitute, covariance_befo
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
 
-Array = NDArray[np.float64]
-
 _ZERO = np.zeros(3)
 
 
@@ -57,17 +52,16 @@ _SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
 class Chain:
     """Keyframes `first` ... `last`, solved by sequential QR.
 
-    A keyframe is appended with the factors that link it to its predecessor;
-    unary factors may be added to any keyframe still held. `solve` brings the
-    newest keyframe up to date, `smooth` the newest few.
-    `archive` is a second chain that is given the same factors and keeps them
-    all, for a `BatchSmoother` solution afterwards. Only with `calibrate` are the last linear
-    states, those of a calibration, estimated; without, tangents end before them.
+    A keyframe is appended with the factors that link it to its predecessor; unary factors may be added to
+    any keyframe still held. `solve` updates the newest keyframe, `smooth` the newest few. `archive` is a
+    second chain that keeps all factors, for a batch solution. The states of a calibration are estimated
+    only with `calibrate`; without, tangents end before them.
     """
 
     RELINEARISE = np.array([0.02] * 3 + [np.inf] * 6 + [0.5] * 3 + [0.05] * 3)
     """Change of a state (rad, m, m/s, m/s2, rad/s) beyond which its factors are linearised again. Position,
-    velocity and the linear states enter the factors linearly (nearly), so they never ask for it."""
+    velocity and the linear states enter the factors (nearly) linearly and never require it.
+    """
 
     def __init__(self, archive: Chain | None = None, calibrate: bool = False) -> None:
         self.archive = archive
@@ -95,7 +89,7 @@ class Chain:
         accel_mps2: Array = _ZERO,
         preintegrated: bool = False,
     ) -> int:
-        """Add a keyframe with its initial state and its factors to the one before; gives its index.
+        """Add a keyframe with its initial state and its factors to the one before; returns its index.
 
         `link` must touch X, V and B of both keyframes; `markov` links the linear states.
         """
@@ -125,15 +119,15 @@ class Chain:
         if self.archive is not None:
             self.archive.add_fix(k, fix)
 
-    def add_velocity(self, k: int, told: GnssVelocity) -> None:
+    def add_velocity(self, k: int, velocity: GnssVelocity) -> None:
         """Add a GNSS velocity to keyframe k; without a calibration it is a prior of the velocity instead."""
-        self.nodes[k - self.first].velocities.append(told)
+        self.nodes[k - self.first].velocities.append(velocity)
         self._dirty = min(self._dirty, k)
         if self.archive is not None:
-            self.archive.add_velocity(k, told)
+            self.archive.add_velocity(k, velocity)
 
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
-        """Put another weight on a GNSS position of keyframe k."""
+        """Replace a GNSS position of keyframe k by one of another weight."""
         fixes = self.nodes[k - self.first].fixes
         fixes[fixes.index(old)] = new
         self._dirty = min(self._dirty, k)
@@ -141,7 +135,9 @@ class Chain:
             self.archive.replace_fix(k, old, new)
 
     def at_or_after(self, t_ns: int) -> int | None:
-        """The first keyframe held at or after a time; None when none is, or when older ones were dropped."""
+        """The first keyframe held at or after a time; None when there is none, or when older ones were
+        dropped.
+        """
         i = bisect.bisect_left(self.nodes, t_ns, key=lambda node: node.t_ns)
         if i == len(self.nodes) or (i == 0 and self.nodes[0].t_ns != t_ns):
             return None
@@ -168,20 +164,16 @@ class Chain:
         return covariance
 
     def solve(self, window: int) -> None:
-        """Bring the newest keyframe up to date; if that moves it far, the newest `window` of them.
-
-        Keyframes are linearised again together or not at all: a factor between one that has moved and
-        one that has not would be linearised about a motion that nobody believes in.
-        """
+        """Update the newest keyframe; if that moves it far, the newest `window` of them."""
         self._eliminate_all()
         if (np.abs(self.nodes[-1].delta[NAV]) > self.RELINEARISE).any():
             self.smooth(window)
 
     def smooth(self, window: int, iterations: int = 4) -> None:
-        """Bring the newest `window` keyframes up to date; if one has moved far, linearise all held again.
+        """Update the newest `window` keyframes; if one has moved far, linearise all held again.
 
-        All, because a factor between a keyframe that was moved and one that was not would
-        be linearised about a step that nobody took; far from the start that step is metres.
+        All, because a factor between a keyframe that was moved and one that was not would be linearised
+        about a step that nobody took; far from the start that step is metres.
         """
         begin = max(self.last - window + 1, self.first)
         for _ in range(iterations):
@@ -214,10 +206,11 @@ class Chain:
             self.first += 1
 
     def restart(self, extra_variance: Array, k: int | None = None, anew: Sequence[int] = ()) -> None:
-        """Drop all before keyframe k (by default the newest); its marginal, of it and all before, stays as
-        prior, less sure by `extra_variance` (dim,). Of the states `anew` that is all that stays.
+        """Drop all before keyframe k (by default the newest); its marginal stays as prior, with
+        `extra_variance` (dim,) added. Of the states `anew` only that variance stays.
 
-        For an estimate that has proved wrong: what comes next may move it freely, and does not bend the past.
+        For an estimate that has proved wrong: what comes next may move it freely, and does not bend the
+        past.
         """
         self._eliminate_all()
         k = self.last if k is None else k
@@ -242,7 +235,7 @@ class Chain:
     def turn(self, yaw_rad: float, from_m: Array, to_m: Array) -> None:
         """Turn the whole window about the vertical, and shift it so that the point `from_m` comes to `to_m`.
 
-        Motion between keyframes is the same in every frame, so only the prior of the first keyframe knows.
+        Motion between keyframes is the same in every frame: only the prior of the first keyframe changes.
         """
         R = gtsam.Rot3.Rz(yaw_rad).matrix()
         moved = gtsam.Pose3(gtsam.Rot3(R), to_m - R @ from_m)
@@ -262,7 +255,7 @@ class Chain:
         wheels: WheelIncrement | None = None,
         link: gtsam.NonlinearFactorGraph | None = None,
     ) -> None:
-        """Another step of slip and drift, increment of the wheels, or link into keyframe k, not the first."""
+        """Another Markov step, wheel increment or link into keyframe k, not the first."""
         node = self.nodes[k - self.first]
         node.markov, node.wheels = markov or node.markov, wheels or node.wheels
         node.link = node.link if link is None else link
@@ -271,7 +264,7 @@ class Chain:
             self.archive.revise(k, markov, wheels, link)
 
     def rebuild(self) -> None:
-        """Make the variables of GTSAM anew from the keyframes, which hold the same."""
+        """Rebuild the variables of GTSAM from the keyframes."""
         self.values = gtsam.Values()
         for k, node in enumerate(self.nodes, self.first):
             self._insert(k, node.point)
@@ -291,10 +284,10 @@ class Chain:
         self.values.insert(B(k), point.bias)
 
     def _carry_prior(self) -> None:
-        """Carry the prior of the first keyframe to its estimate.
+        """Move the prior of the first keyframe to its estimate.
 
-        It is no factor that could be linearised again: it stays a Gaussian in the tangent space
-        where it was made (GTSAM's LinearContainerFactor, with the derivative of the logarithm).
+        It cannot be linearised again: it stays a Gaussian in the tangent space where it was made (GTSAM's
+        LinearContainerFactor, with the derivative of the logarithm).
         """
         node = self.nodes[0]
         if self._anchor is None or self._anchor[0] != self.first:
@@ -342,7 +335,7 @@ class Chain:
         node = self.nodes[k - self.first]
         blocks = [self._gtsam_rows(k)] if node.unary_keys else []
         blocks += [gnss_factor.rows(fix, node.point, self.dim) for fix in node.fixes]
-        blocks += [velocity_factor.rows(told, node.point, self.dim) for told in node.velocities]
+        blocks += [velocity_factor.rows(velocity, node.point, self.dim) for velocity in node.velocities]
         return np.vstack(blocks) if blocks else np.zeros((0, self.dim + 1))
 
     def _gtsam_rows(self, k: int) -> Array:

@@ -1,13 +1,13 @@
-"""Coulomb friction under four wheels: how fast a robot comes to go where its wheels go.
+"""Coulomb friction under four wheels: the motion of a skidding robot.
 
-Each wheel drags its quarter of the robot against the way in which it slips over the ground (Coulomb; the
-circle of friction, Wong 2008, Theory of Ground Vehicles, sec. 1.4)::
+Each wheel drags its quarter of the robot against its slip velocity over the ground (the circle of friction,
+Wong 2008, Theory of Ground Vehicles, sec. 1.4)::
 
-    du/dt = - grip / 4 sum_i s_i / sqrt(|s_i|^2 + s0^2),   s_i = u + omega x r_i - (wheel speed, 0)
+    du/dt = - friction / 4 sum_i s_i / sqrt(|s_i|^2 + s0^2),   s_i = u + omega x r_i - (wheel speed, 0)
 
-with `grip` = mu g. Below `SLIP_SPEED_MPS` the drag is as of a damper, so that a robot whose wheels hold goes
-as they roll. In a turn the wheels of a skid-steered robot slip already, and hold the less against sliding on
-outwards.
+with `friction` = mu g. Below `SLIP_SPEED_MPS` the drag acts as a damper, so that a robot whose wheels hold
+moves as they roll. In a turn the wheels of a skid-steered robot slip already, and hold less against
+sliding outwards.
 """
 
 from __future__ import annotations
@@ -15,14 +15,13 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
 
 SLIP_SPEED_MPS = 0.2
-"""Speed of slip, s0, below which friction acts as a damper (assumed)."""
+"""Slip speed s0 below which friction acts as a damper (assumed)."""
 SUBSTEPS = 2
-"""Steps a keyframe is taken in."""
+"""Integration steps per keyframe."""
 
 
 def skid_motion(
@@ -30,23 +29,24 @@ def skid_motion(
     left_mps: float,
     right_mps: float,
     yaw_rate_radps: float,
-    grip_mps2: Array,
+    friction_mps2: Array,
     track_m: float,
     dt_s: float,
 ) -> tuple[Array, Array]:
-    """Velocities at the end, in the body frame there, and ways, in the body frame at the start, of K robots.
+    """Velocities at the end, in the body frame there, and displacements, in the body frame at the start, of K
+    robots.
 
-    Linearly implicit Euler steps (Hairer and Wanner 1996, sec. IV.7), which are stable for any grip. The
+    Linearly implicit Euler steps (Hairer and Wanner 1996, sec. IV.7), stable for any friction. The
     wheelbase is taken to be the track.
 
     Args:
         velocity_mps: (K, 2), in the body frame at the start.
         left_mps, right_mps: circumferential speed of the wheels, their slip without force removed.
         yaw_rate_radps: rate at which the body turns.
-        grip_mps2: (K,) most that friction changes the velocity by in a second.
+        friction_mps2: (K,) largest acceleration by friction.
     """
     h, half = dt_s / SUBSTEPS, 0.5 * track_m
-    pull = 0.25 * grip_mps2
+    pull = 0.25 * friction_mps2
     turn = yaw_rate_radps * h
     c, s = math.cos(turn), math.sin(turn)
     u, v = velocity_mps[:, 0], velocity_mps[:, 1]

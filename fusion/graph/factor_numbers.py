@@ -1,9 +1,8 @@
-"""Factors as their numbers, and back: for files that must not be able to do harm.
+"""Factors as numbers, and back: for files that must not be able to do harm.
 
-GTSAM writes a factor as text: structure (classes, keys, counts) and numbers.
-Reading such a text from an untrusted file would let the file say what is built
-and how large. Here a file holds the numbers alone; the structure is that of a
-factor of the same kind which this process has made and written itself.
+GTSAM writes a factor as text: structure (classes, keys, counts) and numbers. Reading such a text from an
+untrusted file would let the file determine what is built and how large. Here a file holds the numbers
+alone; the structure is that of a factor of the same kind which this process has made and written itself.
 """
 
 from __future__ import annotations
@@ -16,16 +15,14 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
 class FactorNumbers:
-    """One factor: its GTSAM class `kind`, its keys, its noise model and its size, and every number in it."""
+    """One factor: GTSAM class `kind`, keys, noise model, its size, and all numbers."""
 
     kind: str
     keys: list[int]

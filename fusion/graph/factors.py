@@ -8,15 +8,13 @@ import math
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.inputs.streams import ImuSegment
 from terrafusion.fusion.noise.policy import SensorNoise
-
-Array = NDArray[np.float64]
 
 NO_MOTION_SIGMAS = np.array([2e-4, 2e-4, 2e-4, 1e-3, 1e-3, 1e-3])
 """Motion of a robot at rest between two keyframes: rotation (rad), then translation (m)."""

@@ -1,20 +1,14 @@
-"""States that forget: slip and the slow drift of GNSS positions.
-
-Each is a first-order Gauss-Markov (Ornstein-Uhlenbeck) process with a mean, a
-stationary standard deviation and a correlation time (Uhlenbeck and Ornstein
-1930, Phys. Rev. 36), stepped exactly.
-"""
+"""Gauss-Markov steps of the linear states; see `datasets.core.gauss_markov`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,15 +23,15 @@ class MarkovStep:
         """Noise (n,) that leads from `before` to `now`, unwhitened."""
         return np.asarray(now - self.mean - self.decay * (before - self.mean))
 
-    def renewed(self, states: slice) -> MarkovStep:
-        """The same step, but `states` start anew: from their mean, with their stationary spread."""
+    def restarted(self, states: slice) -> MarkovStep:
+        """The step with `states` restarted: from their mean, with their stationary spread."""
         decay, sigma = self.decay.copy(), self.sigma.copy()
         sigma[states] /= np.sqrt(1.0 - decay[states] ** 2)
         decay[states] = 0.0
         return MarkovStep(decay, self.mean, sigma)
 
-    def opened(self, other: MarkovStep, states: Array) -> MarkovStep:
-        """The same step, but `states` (indices) go as in `other` where that forgets more of them."""
+    def inflated(self, other: MarkovStep, states: Array) -> MarkovStep:
+        """The step with `states` (indices) as in `other` where that forgets more of them."""
         taken = states[other.decay[states] < self.decay[states]]
         decay, mean, sigma = self.decay.copy(), self.mean.copy(), self.sigma.copy()
         decay[taken], mean[taken], sigma[taken] = other.decay[taken], other.mean[taken], other.sigma[taken]
@@ -49,8 +43,8 @@ def markov_step(
 ) -> MarkovStep:
     """Exact step over `dt_s` of processes with the given moments and correlation times.
 
-    `forget` in [0, 1] is the probability that the process has just started
-    anew, as slip does where the ground changes.
+    `forget` in [0, 1] is the probability that the process has just restarted, as slip does where the
+    ground changes.
     """
     means, sigmas = np.asarray(mean, dtype=float), np.asarray(sigma, dtype=float)
     kept = 1.0 - np.clip(np.asarray(forget, dtype=float), 0.0, 1.0)

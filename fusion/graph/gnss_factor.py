@@ -4,13 +4,11 @@ Residual (3,), world frame, metres::
 
     r = p + R (lever + antenna) - (delay - allowed) v + share (drift, 0) - fix
 
-A receiver repeats its error for tens of seconds (atmosphere, multipath). Were
-its fixes taken for independent, their average would turn the heading and the
-gyro bias after it; as a Gauss-Markov state the drift takes the blame instead
-(Schmidt-Kalman tradition; Groves 2013, Principles of GNSS, ch. 14.2.6). The drift is that of a fix of
-the receiver's data sheet; one of a far better class has a small `share` of it.
-`antenna` is what the vehicle file's lever arm lacks, `delay` how late the stamps of
-the receiver are while the antenna moves with v; both are states.
+A receiver repeats its error for tens of seconds (atmosphere, multipath). Were its fixes independent, their
+average would turn the heading and the gyro bias; as a Gauss-Markov state the drift absorbs the error
+instead (Groves 2013, Principles of GNSS, ch. 14.2.6). A fix of a far better class than the data sheet's
+has a small `share` of the drift. `antenna` corrects the lever arm of the vehicle file, `delay` is the
+lateness of the receiver's stamps while the antenna moves with v; both are states.
 """
 
 from __future__ import annotations
@@ -19,8 +17,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.key_state import (
     ANTENNA,
     DRIFT,
@@ -32,8 +30,6 @@ from terrafusion.fusion.graph.key_state import (
     skew,
 )
 
-Array = NDArray[np.float64]
-
 _DRIFT, _ANTENNA = (slice(s.start - NAV.stop, s.stop - NAV.stop) for s in (DRIFT, ANTENNA))
 _DELAY = GNSS_DELAY - NAV.stop
 
@@ -43,8 +39,8 @@ class GnssPosition:
     """A fix at a keyframe: antenna `enu_m`, `lever_m` in the body frame, white 1 `sigma_m`, each (3,).
 
     `velocity_mps` (3,) of the antenna in the world, `drift_share` of the receiver's drift in this fix;
-    `delay_s` is the delay of its stamp that `lever_m` allows for already; `weight` is what a robust loss
-    leaves of its horizontal part; `sigma_m` holds it already.
+    `delay_s` is the delay that `lever_m` allows for already; `weight` is that of a robust loss on the
+    horizontal part, included in `sigma_m`.
     """
 
     enu_m: Array

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
 
 LINEAR = (
     "slip",
@@ -32,18 +31,17 @@ LINEAR = (
 - slip: 1 - v / (omega R), one for the robot; wanders about the ground's mean.
 - gnss_drift: slow error of the receiver's positions, east and north.
 - yaw_scale: true over wheel yaw rate, less one; negative where skid steering widens the effective track.
-- icr_x: place of the centre of rotation ahead of the body origin; v_lateral = -icr_x yaw_rate.
-- side_slip: lateral over forward speed, what the ground's slope and ruts do.
+- icr_x: centre of rotation ahead of the body origin; v_lateral = -icr_x yaw_rate.
+- side_slip: lateral over forward speed, by slope and ruts.
 - radius_scale: true over nominal wheel radius, less one.
-- antenna: place of the GNSS antenna beyond the vehicle file's.
-- imu: small rotation that brings the IMU's axes onto the body's, beyond the vehicle file's.
-- wheel_delay, gnss_delay: how much later than the IMU's the stamps of a sensor are.
-- surge_slip: slip beside `slip` while the wheels accelerate by one gravity.
-"""
+- antenna: correction of the vehicle file's lever arm.
+- imu: small rotation from the IMU's axes to the body's, beyond the vehicle file's.
+- wheel_delay, gnss_delay: lateness of a sensor's stamps against the IMU's.
+- surge_slip: additional slip per gravity of wheel acceleration."""
 ON_DEMAND = LINEAR[LINEAR.index("radius_scale") :]
 """The states that only a calibration estimates."""
 CALIBRATION = ON_DEMAND[: ON_DEMAND.index("surge_slip")]
-"""Those of them that stay as they are: what a calibration of the robot would tell."""
+"""Those of them that are constant."""
 
 DIM = 15 + len(LINEAR)
 """Length of the whole tangent; without calibration it ends before `ON_DEMAND`."""
@@ -81,12 +79,12 @@ class KeyState:
 
     @property
     def rolling(self) -> float:
-        """Distance over what the wheels say, longitudinally: of slip and radius."""
+        """Distance over wheel distance, longitudinally: by slip and radius."""
         return float((1.0 - self.linear[0]) * (1.0 + self.linear[RADIUS - NAV.stop]))
 
     @property
     def turning(self) -> float:
-        """Angle turned over what the wheels say."""
+        """Angle turned over that of the wheels."""
         return float(1.0 + self.linear[YAW_SCALE - NAV.stop])
 
     @property
@@ -120,15 +118,15 @@ class KeyState:
         )
 
     def rate(self, gyro_radps: Array) -> Array:
-        """Angular rate (3,) of the body behind a reading of the gyro: without bias, mounting set right."""
+        """Angular rate (3,) of the body from a gyro reading: bias and mounting corrected."""
         return np.asarray(gyro_radps - self.bias.gyroscope() + self._mounting(gyro_radps))
 
     def specific_force(self, accel_mps2: Array) -> Array:
-        """Specific force (3,) of the body behind a reading of the accelerometer, likewise."""
+        """Specific force (3,) of the body from an accelerometer reading, likewise."""
         return np.asarray(accel_mps2 - self.bias.accelerometer() + self._mounting(accel_mps2))
 
     def reading(self, rate_radps: Array) -> Array:
-        """The reading (3,) of the gyro behind an angular rate; the inverse of `rate` to first order."""
+        """The gyro reading (3,) of an angular rate; the inverse of `rate` to first order."""
         reading = rate_radps + self.bias.gyroscope()
         return np.asarray(reading - self._mounting(reading))
 
@@ -137,7 +135,7 @@ class KeyState:
         return np.cross(turn, reading) if turn.any() else np.zeros(3)
 
     def bias_seen(self, gyro_radps: Array, accel_mps2: Array) -> gtsam.imuBias.ConstantBias:
-        """The bias that stands for bias and mounting: a small rotation d adds d x measured to a reading."""
+        """The bias equivalent to bias and mounting: a small rotation d adds d x measured to a reading."""
         return gtsam.imuBias.ConstantBias(
             self.bias.accelerometer() - self._mounting(accel_mps2),
             self.bias.gyroscope() - self._mounting(gyro_radps),

@@ -5,25 +5,22 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import gtsam
-import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
-Array = NDArray[np.float64]
-
 
 @dataclass(eq=False)
 class Node:
     """A keyframe in the chain: its factors, its linearisation point and the result of its elimination.
 
-    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before; `preintegrated`
-    tells that `link` is one `CombinedImuFactor` made of them. `prior` (m, dim + 1) are whitened rows of all
-    that went before, `delta` (dim,) leads from `point` to the estimate.
+    `gyro_radps` and `accel_mps2` (3,) are the mean IMU readings since the keyframe before;
+    `preintegrated`: `link` is one `CombinedImuFactor` of them. `prior` (m, dim + 1) are whitened rows of
+    all older keyframes, `delta` (dim,) leads from `point` to the estimate.
     """
 
     point: KeyState

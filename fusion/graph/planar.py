@@ -1,14 +1,11 @@
-"""The planar link: what joins two keyframes of a log that has no six-axis IMU.
+"""The planar link between two keyframes of a log without a six-axis IMU.
 
-It is the preintegrated factor of the full graph, fed with what a robot reads
-that drives on level ground: yaw rate from the gyro's z axis or from the
-wheels, no roll or pitch rate, the centripetal specific force v omega to its left,
-gravity upwards. The noise says what that is worth: the yaw rate has the noise
-of its source, speed is a random walk (white acceleration; Bar-Shalom, Li and
-Kirubarajan 2001, sec. 6.2.2), roll and pitch are held level by an attitude
-factor at every keyframe. Nothing is estimated of them, nor of the
-accelerometer's bias. Height follows GNSS where it has heights, and stays at
-its start where it has none.
+It is the preintegrated factor of the full graph, fed with the readings of a robot on level ground: yaw
+rate from the gyro's z axis or from the wheels, no roll or pitch rate, the centripetal specific force v
+omega to its left, gravity upwards. Its noise: the yaw rate has that of its source, speed is a random walk
+(white acceleration; Bar-Shalom, Li and Kirubarajan 2001, sec. 6.2.2), roll and pitch are held level by an
+attitude factor. They and the accelerometer's bias are not estimated. Height follows GNSS, or stays at its
+start.
 """
 
 from __future__ import annotations
@@ -18,8 +15,8 @@ import dataclasses
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import X
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph.key_state import KeyState
@@ -27,23 +24,21 @@ from terrafusion.fusion.graph.preintegration import INTEGRATION_SIGMA_M, Preinte
 from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
-Array = NDArray[np.float64]
-
 ACCEL_DENSITY_MPS2 = 2.0
-"""White acceleration, m/s2/sqrt(Hz) (assumed): speed may change by 0.6 m/s (1 sigma) in a keyframe of 0.1 s,
-twice what a skid-steer robot brakes. The wheels, not this, set the speed."""
+"""White acceleration, m/s2/sqrt(Hz) (assumed): speed changes by 0.6 m/s (1 sigma) per keyframe of 0.1 s,
+twice what a skid-steer robot brakes. The wheels, not this, determine the speed."""
 TILT_SIGMA_RAD = 0.1
-"""Roll and pitch of the ground that is taken to be level, 1 sigma (assumed)."""
+"""Roll and pitch of ground taken for level, 1 sigma (assumed)."""
 TILT_DENSITY_RADPS = 0.1
-"""Rate at which the ground's tilt changes, rad/s/sqrt(Hz) (assumed): 0.03 rad (1 sigma) a keyframe."""
+"""Change of the ground's tilt, rad/s/sqrt(Hz) (assumed): 0.03 rad (1 sigma) per keyframe."""
 TURN_SHARE = 0.4
-"""Error of the yaw rate from the wheels, as a share of it (1 sigma, assumed)."""
+"""Relative error of the wheels' yaw rate (1 sigma, assumed)."""
 TURN_TIME_S = 10.0
-"""How long that error lasts, s (assumed): a long turn."""
+"""Correlation time of that error, s (assumed): a long turn."""
 WHEEL_YAW_DENSITY_RADPS = 0.02
-"""Yaw the wheels do not show on a straight, rad/s/sqrt(Hz) (assumed)."""
+"""Yaw noise of the wheels on a straight, rad/s/sqrt(Hz) (assumed)."""
 UNKNOWN_YAW_DENSITY_RADPS = 0.5
-"""Yaw of a robot whose log does not tell it, rad/s/sqrt(Hz) (assumed): half a rad/s for a second."""
+"""Yaw noise without any yaw source, rad/s/sqrt(Hz) (assumed): half a rad/s for a second."""
 
 _LEVEL = gtsam.Unit3(np.array([0.0, 0.0, 1.0]))
 _TILT_NOISE = gtsam.noiseModel.Isotropic.Sigma(2, TILT_SIGMA_RAD)
@@ -56,20 +51,20 @@ def level_factor(k: int) -> gtsam.NonlinearFactor:
 
 
 def with_centripetal_force(segments: list[ImuSegment], before: KeyState) -> list[ImuSegment]:
-    """The segments of a level robot that keeps its forward speed: centripetal force v omega is added."""
+    """The segments with the specific force of a level robot at constant forward speed."""
     speed = before.forward_mps
     bias = float(before.bias.gyroscope()[2])
     return [
         dataclasses.replace(
-            piece,
-            accel_mps2=np.array([0.0, speed * (float(piece.gyro_radps[2]) - bias), GRAVITY_MPS2]),
+            segment,
+            accel_mps2=np.array([0.0, speed * (float(segment.gyro_radps[2]) - bias), GRAVITY_MPS2]),
         )
-        for piece in segments
+        for segment in segments
     ]
 
 
 def yaw_of_wheels(wheels: WheelStream, track_m: float) -> Array:
-    """Angular rate (3,) since the wheels' last sample but one, rad/s; x and y are NaN."""
+    """Angular rate (3,) between the wheels' last two samples, rad/s; x and y are NaN."""
     rate = 0.0
     if len(wheels.t_ns) > 1 and wheels.t_ns[-1] > wheels.t_ns[-2]:
         dt = (wheels.t_ns[-1] - wheels.t_ns[-2]) * 1e-9
@@ -79,11 +74,11 @@ def yaw_of_wheels(wheels: WheelStream, track_m: float) -> Array:
 
 
 class PlanarPreintegrator(Preintegrator):
-    """Makes the planar link; takes the place of `Preintegrator`.
+    """Makes the planar link, in place of `Preintegrator`.
 
     Args:
         spec: noise of the gyro, where yaw is the gyro's.
-        yaw: who tells the yaw rate: "gyro", "wheels" or "nobody".
+        yaw: source of the yaw rate: "gyro", "wheels" or "nobody".
     """
 
     def __init__(self, spec: ImuSpec, yaw: str) -> None:
@@ -96,15 +91,15 @@ class PlanarPreintegrator(Preintegrator):
         bias: gtsam.imuBias.ConstantBias,
         noise: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; of the noise only the inflation about yaw acts."""
-        turned = sum(float(piece.gyro_radps[2]) * piece.dt_s for piece in segments)
-        total = sum(piece.dt_s for piece in segments)
+        """Preintegrate the segments about `bias`; of `noise` only the inflation about yaw acts."""
+        turned = sum(float(segment.gyro_radps[2]) * segment.dt_s for segment in segments)
+        total = sum(segment.dt_s for segment in segments)
         density = self.yaw_density(turned / total if total > 0.0 else 0.0, noise.gyro_yaw_inflation)
         forces = segments[0].accel_density_mps2 if segments else None
         params = self._planar(density, forces or (ACCEL_DENSITY_MPS2, ACCEL_DENSITY_MPS2))
         measured = gtsam.PreintegratedCombinedMeasurements(params, bias)
-        for piece in segments:
-            measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
+        for segment in segments:
+            measured.integrateMeasurement(segment.accel_mps2, segment.gyro_radps, segment.dt_s)
         return measured
 
     def yaw_density(self, rate_radps: float, inflation: float) -> float:
@@ -129,10 +124,7 @@ class PlanarPreintegrator(Preintegrator):
 
 
 def planar_spec(spec: ImuSpec, yaw: str) -> ImuSpec:
-    """The IMU's specification as the planar graph uses it: biases it cannot see are zero.
-
-    The yaw rate is the same everywhere on a rigid body, so the IMU sits at the origin.
-    """
+    """The IMU's specification for the planar graph: unobservable biases are zero, and it sits at the origin."""
     seen = yaw == "gyro"
     return dataclasses.replace(
         spec,

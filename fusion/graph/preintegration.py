@@ -17,13 +17,13 @@ INTEGRATION_SIGMA_M = 1e-4
 """Position error of the integration itself, m/sqrt(s): keeps the square root full rank."""
 STEP = math.log(1.05)
 HELD_INFLATION = 5.0
-"""Noise of a keyframe's IMU over its usual, where a sample is missing (assumed)."""
+"""Noise inflation of a keyframe's IMU with a replaced sample (assumed)."""
 
 
 class Preintegrator:
     """Makes preintegrated measurements of `CombinedImuFactor` (Forster et al. 2017, IEEE T-RO 33(1)).
 
-    The specific force at the IMU is carried to the body origin by its lever arm.
+    The specific force at the IMU is transferred to the body origin by its lever arm.
     """
 
     def __init__(self, spec: ImuSpec) -> None:
@@ -36,15 +36,14 @@ class Preintegrator:
         bias: gtsam.imuBias.ConstantBias,
         noise: SensorNoise,
     ) -> gtsam.PreintegratedCombinedMeasurements:
-        """Preintegrate the segments about `bias`; the noise's inflations multiply the data sheet's noise.
+        """Preintegrate the segments about `bias`; the inflations of `noise` multiply the data sheet's noise.
 
-        With a spike that another sample stands for, what its sensor tells in the whole is `HELD_INFLATION`
-        times less certain.
+        With a replaced spike the sensor's noise is inflated by `HELD_INFLATION`.
         """
         noise = _less_sure(noise, any(p.gyro_held for p in segments), any(p.accel_held for p in segments))
         measured = gtsam.PreintegratedCombinedMeasurements(self._scaled(noise), bias)
-        for piece in segments:
-            measured.integrateMeasurement(piece.accel_mps2, piece.gyro_radps, piece.dt_s)
+        for segment in segments:
+            measured.integrateMeasurement(segment.accel_mps2, segment.gyro_radps, segment.dt_s)
         return measured
 
     def _scaled(self, noise: SensorNoise) -> gtsam.PreintegrationCombinedParams:

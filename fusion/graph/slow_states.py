@@ -1,12 +1,12 @@
-"""Priors and processes of the linear states: what wanders with the ground, and what a robot keeps."""
+"""Priors and processes of the linear states."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.gauss_markov import MarkovStep, markov_step
 from terrafusion.fusion.graph.key_state import LINEAR, NAV, SIDE_SLIP, SLIP, SURGE_SLIP, YAW_SCALE
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
@@ -15,16 +15,14 @@ from terrafusion.fusion.noise.policy import SensorNoise
 if TYPE_CHECKING:
     from terrafusion.fusion.graph.chain import Chain
 
-Array = NDArray[np.float64]
 
 SLIP_STEADY = 30.0
-"""Slip lasts so many correlation times of the policy's while the wheels keep their speed: those are of whole
-drives, with starts, stops and hills. A compromise: on one soil the longer the better, where grounds change
-without GNSS the shorter; see docs/monitor.md."""
+"""Correlation time of slip at constant wheel speed over the policy's, which is that of whole runs with
+starts, stops and hills. Longer is better on one soil, shorter where grounds change without GNSS; see
+docs/monitor.md."""
 SLIP_RENEWAL = 1.1
-"""Slip is what traction asks for, and traction changes with speed: where the wheels change theirs by a
-share x, `SLIP_RENEWAL x^2` of the slip is new. Tuned likewise,
-as 2 of an x that was seen a quarter too small."""
+"""Where the wheels change their speed by a share x, `SLIP_RENEWAL x^2` of the slip is new, as traction
+changes with speed (tuned)."""
 GROUND_STATES = np.array([SLIP, YAW_SCALE, SIDE_SLIP, SURGE_SLIP]) - NAV.stop
 """What another ground changes; the receiver's drift and the calibration stay."""
 CRAWL_MPS = 0.1
@@ -33,18 +31,16 @@ ICR_SIGMA_M, ICR_TIME_S = 0.10, 60.0
 """Centre of rotation along the body: a few tenths of the wheelbase, moving with the load (assumed)."""
 YAW_SCALE_TIME_S = 60.0
 YAW_SCALE_ROBOT = 0.2
-"""Yaw scales of robots on one ground differ by so much from that of the policy's (assumed)."""
+"""Spread of the yaw scale between robots on one ground (assumed)."""
 SIDE_SLIP_TIME_S = 5.0
 SIDE_SLIP_SHARE = 0.3
 """Share of the ground's side-slip that lasts; all of it is new at every keyframe besides. Tuned on the twin:
-what lasts cannot be told from heading on a straight drive, and 0.8 doubled the heading's error there."""
+more cannot be told from heading on a straight drive."""
 SIDE_SLIP_PER_GRADE, SIDE_SLIP_DOUBT = 0.7, 0.3
-"""One shear law carries the robot along and across: on a cross slope it slips downhill by so much of the slip
-it has on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69 on medium sand across 15 deg), give
-or take a share of it (assumed)."""
+"""Side-slip on a cross slope over the slip on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69
+on medium sand across 15 deg), and its relative error (assumed)."""
 SURGE_TIME_S, SURGE_DOUBT = 60.0, 0.5
-"""An acceleration asks for the thrust of a grade as steep as it is over gravity, and so for its slip, give or
-take a share of it (assumed; in turns the twin slips more)."""
+"""An acceleration needs the thrust, and so the slip, of a grade of a / g; relative error of that (assumed)."""
 CALIBRATION_SIGMA = {
     "radius_scale": 0.02,
     "antenna_x_m": 0.05,
@@ -55,10 +51,10 @@ CALIBRATION_SIGMA = {
     "wheel_delay_s": 0.03,
     "gnss_delay_s": 0.1,
 }
-"""How well a vehicle file is trusted, 1 sigma (assumed: tyre wear and pressure, a tape measure, a mounting
-plate, clocks of drivers)."""
+"""Prior 1 sigma of a vehicle file (assumed: tyre wear and pressure, tape measure, mounting plate, driver
+clocks)."""
 _WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
-"""Walk of the calibration, per sqrt(s): hardly any, but what is certain for ever cannot be whitened."""
+"""Random walk of the calibration per sqrt(s), so that its covariance stays positive."""
 
 
 def prior(noise: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
@@ -88,7 +84,7 @@ def step(
     downhill = -SIDE_SLIP_PER_GRADE * noise.slip_per_grade * float(up[1]) * (-1.0 if backwards else 1.0)
     sigma = _stationary(noise, drift_sigma_m)
     sigma[-1] = float(np.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill))
-    renewed = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
+    restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     wandering = markov_step(
         dt_s,
         mean=[noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill],
@@ -101,7 +97,7 @@ def step(
             ICR_TIME_S,
             SIDE_SLIP_TIME_S,
         ],
-        forget=[renewed, 0.0, 0.0, switch, 0.0, switch],
+        forget=[restarted, 0.0, 0.0, switch, 0.0, switch],
     )
     walk = np.array(list(_WALK.values())) * np.sqrt(dt_s)
     surge = markov_step(dt_s, [noise.slip_per_grade], [_surge_sigma(noise)], [SURGE_TIME_S], [switch])
@@ -121,10 +117,10 @@ def inflate_slip_covariance(
     drift_time_s: float,
     switch: float,
 ) -> None:
-    """Let the share `switch` of the slip start anew at the keyframe of `t_ns`, or the oldest that still can.
+    """Restart the share `switch` of the slip at the keyframe of `t_ns`, or the oldest that still can.
 
-    The ground changed there, and is seen only now. What wheels and IMU told since then was explained by
-    a speed that fits the old slip; with the slip free from there on, they tell the new one.
+    A change of ground is detected late; until then the measurements were explained by a speed that fits
+    the old slip.
     """
     k = chain.at_or_after(t_ns)
     k = chain.first + 1 if k is None else max(k, chain.first + 1)
@@ -132,11 +128,11 @@ def inflate_slip_covariance(
         node = chain.nodes[k - chain.first]
         up = node.point.pose.rotation().matrix()[2]
         anew = step(dt_s, noise, up, drift_sigma_m, drift_time_s, switch, node.wheels)
-        chain.revise(k, anew if node.markov is None else node.markov.opened(anew, GROUND_STATES))
+        chain.revise(k, anew if node.markov is None else node.markov.inflated(anew, GROUND_STATES))
 
 
 def _traction_change(dt_s: float, wheels: WheelIncrement | None) -> float:
-    """Share in [0, 1] of the slip that a change of the wheels' speed made anew."""
+    """Share in [0, 1] of the slip that a change of wheel speed renews."""
     if wheels is None:
         return 0.0
     speed_mps = max(abs(wheels.distance_m) / dt_s, CRAWL_MPS)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-Array = NDArray[np.float64]
-
+from terrafusion.datasets.core.arrays import Array
 
 _UPPER = np.triu(np.ones((64, 65)))
 """Keeps the upper triangle; for two states of 30 at most."""

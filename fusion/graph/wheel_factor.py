@@ -1,20 +1,19 @@
-"""The wheel factor: displacement and turn between two keyframes, as slipping wheels tell them.
+"""The wheel factor: displacement and turn between two keyframes by slipping wheels.
 
 Residual (4,): three in the body frame of keyframe i, metres, and the turn, radians::
 
-    r[:3] = R_i' (p_j - p_i) - (1 - slip) (1 + radius) (d + delay dv e_x) + surge_slip surge e_x - lateral e_y
+    r[:3] = R_i' (p_j - p_i) - (1 - slip) (1 + radius) (d + delay dv e_x) + surge_slip surge e_x -
+        lateral e_y
     r[3]  = yaw(R_i' R_j) - (1 + yaw_scale) turn
     lateral = side_slip distance - icr_x yaw
 
-`d` is what the wheels say: their travelled distance turned by the gyro while
-it was travelled; `dv` is how much their speed changed meanwhile, which tells a
-delay of their clock; `surge` is a / g (|d| + v0 dt) of wheels that accelerate by a. They
-ask for the thrust, and so the slip, of a grade as steep as a / g: left out, that would
-look like a delay of surge_slip v / g. The first row is odometry with slip, the second
-and third are the non-holonomic constraint (Dissanayake et al. 2001, IEEE T-RA 17(5)),
-freed of what a skid-steered robot does in every turn (instantaneous centres of rotation:
-Martinez et al. 2005, IJRR 24(10); Pentzer, Brennan, Reichard 2014, J. Field Robotics
-31(3)). Slip is v = (1 - slip) omega R (Wong 2008, Theory of Ground Vehicles).
+`d` is the travelled distance turned by the gyro; `dv` the change of wheel speed, which shows a delay of
+their clock; `surge` is a / g (|d| + v0 dt) of wheels that accelerate by a: they need the thrust, and so
+the slip, of a grade a / g, which would otherwise look like a delay of surge_slip v / g. The first
+component is odometry with slip, the second and third are the non-holonomic constraint (Dissanayake et al.
+2001, IEEE T-RA 17(5)), corrected for the turning of skid-steered robots (instantaneous centres of
+rotation: Martinez et al. 2005, IJRR 24(10); Pentzer, Brennan, Reichard 2014, J. Field Robotics 31(3)).
+Slip is v = (1 - slip) omega R (Wong 2008, Theory of Ground Vehicles).
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.graph.key_state import (
     ICR_X,
     MARKOV,
@@ -38,29 +37,28 @@ from terrafusion.fusion.graph.key_state import (
     YAW_SCALE,
 )
 
-Array = NDArray[np.float64]
-
 _S, _K, _I, _B, _R, _T, _A = (
     i - NAV.stop for i in (SLIP, YAW_SCALE, ICR_X, SIDE_SLIP, RADIUS, WHEEL_DELAY, SURGE_SLIP)
 )
 
 MOVED_M = 0.01
-"""A keyframe's distance below which slip is not asked what acceleration adds to it."""
+"""Distance per keyframe below which the slip of acceleration is ignored."""
 
 
 @dataclass(frozen=True, eq=False)
 class WheelIncrement:
-    """What the wheels measured between two keyframes.
+    """Measurement of the wheels between two keyframes.
 
     Attributes:
         displacement_m: (3,) in the body frame of the first keyframe, slip not removed.
-        sigma: (4,) 1 sigma along body x, y, z (m) and of the turn (rad; infinite where it is not measured).
+        sigma: (4,) 1 sigma along body x, y, z (m) and of the turn (rad; infinite where it is not
+            measured).
         distance_m: mean travelled wheel distance, signed.
         turn_rad: right minus left distance over the track, signed.
         yaw_rad: turn by the gyro, bias removed.
         speed_change_mps: wheel speed at the end less that at the start.
         surge_m: a / g (|distance| + v0 dt) of wheels that accelerate by a; 0 unless calibrated.
-        skid_m: way along body x that the wheels rolled and the robot, by friction, did not go.
+        skid_m: distance along body x that the wheels rolled and the robot, by friction, did not move.
     """
 
     displacement_m: Array
@@ -73,26 +71,27 @@ class WheelIncrement:
     skid_m: float = 0.0
 
     def without_turn(self) -> WheelIncrement:
-        """The same, but the turn tells nothing: the sides are not told apart, or stand for the gyro."""
+        """The increment without a measurement of the turn."""
         return dataclasses.replace(self, sigma=np.append(self.sigma[:3], np.inf))
 
     def doubted(self, variance_m2: float, times: float) -> WheelIncrement:
-        """The same, so much less sure of distance and turn that an innovation along body x of `variance_m2`
-        has `times` of it; the non-holonomic constraint stays."""
+        """The increment with distance and turn so uncertain that the variance `variance_m2` of the innovation
+        along body x grows by the factor `times`; the non-holonomic constraint stays.
+        """
         scale = float(np.sqrt(1.0 + (times - 1.0) * variance_m2 / self.sigma[0] ** 2))
         change = self.speed_change_mps if np.isfinite(scale) else 0.0
         sigma = self.sigma * np.array([scale, 1.0, 1.0, scale])
         return dataclasses.replace(self, sigma=sigma, speed_change_mps=change)
 
     def with_extra_variance(self, variance_m2: float) -> WheelIncrement:
-        """The same, less sure of the way along body x and y by `variance_m2` each."""
+        """The increment with `variance_m2` added along body x and y each."""
         sigma = self.sigma.copy()
         sigma[:2] = np.sqrt(sigma[:2] ** 2 + variance_m2)
         return dataclasses.replace(self, sigma=sigma)
 
 
 def slip_of(linear: Array, wheels: WheelIncrement) -> float:
-    """Slip over the interval of `wheels`, what their acceleration asks for and a slide included."""
+    """Slip over the interval of `wheels`, those of acceleration and skid included."""
     asked_m = float(linear[_A]) * wheels.surge_m + (1.0 - float(linear[_S])) * wheels.skid_m
     return float(linear[_S]) + (asked_m / wheels.distance_m if abs(wheels.distance_m) > MOVED_M else 0.0)
 

@@ -1,4 +1,4 @@
-"""Sensor samples on their way into the graph: buffered, checked, cut at keyframes."""
+"""Buffers of sensor samples: checked, ordered by time, cut at keyframes."""
 
 from __future__ import annotations
 
@@ -7,19 +7,20 @@ import itertools
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, eq=False)
 class ImuSegment:
-    """A piece of time (s) with constant angular rate (3,) and specific force (3,); either is held where
-    samples before stand for a spike. A force that is reasoned, not measured, brings its density on x, y."""
+    """A time (s) of constant angular rate (3,) and specific force (3,).
+
+    `gyro_held`, `accel_held`: earlier samples replace a spike. A modelled force has its density on x, y.
+    """
 
     dt_s: float
     gyro_radps: Array
@@ -33,7 +34,7 @@ class ImuSegment:
 class GnssFix:
     """One fix: antenna position (3,) and sigma (3,), ENU m; velocity (3,) m/s and its sigma where known.
 
-    `fix` is the receiver's class of fix, None where it does not say.
+    `fix` is the receiver's class of fix, None where it reports none.
     """
 
     t_ns: int
@@ -45,27 +46,27 @@ class GnssFix:
 
 
 SPIN_RADPS, SHOCK_MPS2 = 10.0, 50.0
-"""Beyond these, on any axis, a sample tells more of the sensor than of a wheeled robot (assumed): a shock
-lasts for less than a sample, and taken for all of it, at 100 Hz, it is half a metre a second."""
-CALM_NS = 500_000_000
-"""Where half the samples of so long a time are like that, they are believed all the same."""
-RECENT = 10
-"""So many samples before a spike stand for it: fewer would still hold much of the robot's shaking."""
-LATEST_S = 5.0
-"""A sample so much older than its stream's newest is no late message: the clock has jumped."""
+"""Beyond these, on any axis, a sample is a spike (assumed): a shock lasts for less than a sample, and taken
+for all of it, at 100 Hz, it is half a metre a second."""
+SPIKE_WINDOW_NS = 500_000_000
+"""Where half the samples of this time are spikes, they are believed."""
+REPLACED_BY = 10
+"""Number of samples before a spike whose mean replaces it: fewer would contain too much vibration."""
+MOST_LATE_S = 5.0
+"""A sample this much older than its stream's newest is no late message: the clock has jumped."""
 LONGEST_WAIT_S = 0.5
 
 
 class Lateness:
-    """How out of order a stream is, and what of it came too late to be used.
+    """Disorder of a stream in time, and samples that came too late.
 
-    A keyframe waits for as long as the stream has been seen to be late (a stream in
-    order costs no waiting), and takes what came. A sample before it is then too late.
+    A keyframe waits for as long as the stream has been late (an ordered stream costs no waiting). A sample
+    before it is then too late.
 
     Attributes:
-        wait_ns: longest lateness seen so far, at most `LONGEST_WAIT_S`.
-        used_ns: end of what the keyframes have taken.
-        too_late: samples left out because their keyframe had been made.
+        wait_ns: longest lateness so far, at most `LONGEST_WAIT_S`.
+        used_ns: end of what the keyframes have used.
+        too_late: number of samples left out because their keyframe had been made.
     """
 
     def __init__(self, channel: str) -> None:
@@ -75,7 +76,7 @@ class Lateness:
         self.too_late = 0
 
     def place(self, t_ns: int, times: list[int]) -> int | None:
-        """Where in `times` a sample belongs, or None when it is too late.
+        """Index in `times` where a sample belongs, or None when it is too late.
 
         Raises:
             DataError: the sample is so old that the clock must have jumped.
@@ -83,11 +84,11 @@ class Lateness:
         if not times or t_ns >= times[-1]:
             return len(times)
         late_ns = times[-1] - t_ns
-        if late_ns > LATEST_S * 1e9:
+        if late_ns > MOST_LATE_S * 1e9:
             raise DataError(
                 f"sample at {t_ns} ns comes {late_ns * 1e-9:.3f} s after a newer one",
                 channel=self.channel,
-                remedy=f"more than {LATEST_S:g} s is no late message: start anew where a clock jumps",
+                remedy=f"more than {MOST_LATE_S:g} s is no late message: start anew where a clock jumps",
             )
         self.wait_ns = max(self.wait_ns, min(late_ns, round(LONGEST_WAIT_S * 1e9)))
         if self.used_ns is not None and t_ns <= self.used_ns:
@@ -99,18 +100,17 @@ class Lateness:
 class ImuStream:
     """IMU samples; the sample at t stands for the time since the one before it.
 
-    With `six_axis` False the stream is declared to tell the yaw rate alone: any
-    other axis may be NaN, and `segments` has in their place, present or not,
-    what a robot reads that drives straight on level ground.
+    Without `six_axis` only the yaw rate is used: any other axis may be NaN, and `segments` has in their
+    place the readings of a robot that drives straight on level ground.
 
-    A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is not believed: the mean of the samples
-    before stands for it. `spikes` counts them.
+    A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
+    before; `spikes` counts them.
     """
 
     def __init__(self, six_axis: bool = True) -> None:
         self.six_axis = six_axis
         self.spikes = 0
-        self._wild_ns: list[int] = []
+        self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
         self._accel_held_ns: list[int] = []
         self.late = Lateness("imu")
@@ -132,26 +132,26 @@ class ImuStream:
             )
         i = self.late.place(t_ns, self.t_ns)
         if i is not None:
-            wild = _beyond(gyro, SPIN_RADPS), _beyond(accel, SHOCK_MPS2)
-            if any(wild):
-                if self._alone(i, t_ns):
-                    recent = slice(max(i - RECENT, 0), i)
-                    if wild[0]:
+            spike = _beyond(gyro, SPIN_RADPS), _beyond(accel, SHOCK_MPS2)
+            if any(spike):
+                if self._is_spike(i, t_ns):
+                    recent = slice(max(i - REPLACED_BY, 0), i)
+                    if spike[0]:
                         gyro = np.mean(self.gyro[recent], axis=0)
                         self._gyro_held_ns.append(t_ns)
-                    if wild[1]:
+                    if spike[1]:
                         accel = np.mean(self.accel[recent], axis=0)
                         self._accel_held_ns.append(t_ns)
                     self.spikes += 1
-                self._wild_ns.append(t_ns)
+                self._spike_ns.append(t_ns)
             self.t_ns.insert(i, t_ns)
             self.gyro.insert(i, gyro)
             self.accel.insert(i, accel)
 
-    def _alone(self, i: int, t_ns: int) -> bool:
-        """Whether most samples before a wild one, which goes to place i, are not like it."""
-        since = bisect.bisect_left(self.t_ns, t_ns - CALM_NS, hi=i)
-        return 2 * sum(t_ns - CALM_NS <= t < t_ns for t in self._wild_ns) < i - since
+    def _is_spike(self, i: int, t_ns: int) -> bool:
+        """Whether most samples before an extreme one at index i are not extreme."""
+        since = bisect.bisect_left(self.t_ns, t_ns - SPIKE_WINDOW_NS, hi=i)
+        return 2 * sum(t_ns - SPIKE_WINDOW_NS <= t < t_ns for t in self._spike_ns) < i - since
 
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
@@ -159,16 +159,16 @@ class ImuStream:
     def segments(self, start_ns: int, end_ns: int) -> list[ImuSegment]:
         """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
         i = bisect.bisect_right(self.t_ns, start_ns)
-        pieces, t = [], start_ns
+        segments, t = [], start_ns
         while t < end_ns:
             until = min(self.t_ns[i], end_ns)
             if until > t:
                 held = self.t_ns[i] in self._gyro_held_ns, self.t_ns[i] in self._accel_held_ns
                 readings = self._for_graph(self.gyro[i], self.accel[i])
-                pieces.append(ImuSegment((until - t) * 1e-9, *readings, *held))
+                segments.append(ImuSegment((until - t) * 1e-9, *readings, *held))
             t = until
             i += 1
-        return pieces
+        return segments
 
     def _for_graph(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
         if self.six_axis:
@@ -199,7 +199,7 @@ class ImuStream:
         i = bisect.bisect_left(self.t_ns, before_ns)
         if i > 256:
             del self.t_ns[:i], self.gyro[:i], self.accel[:i]
-            for times in (self._wild_ns, self._gyro_held_ns, self._accel_held_ns):
+            for times in (self._spike_ns, self._gyro_held_ns, self._accel_held_ns):
                 times[:] = [t for t in times if t >= before_ns]
 
 
@@ -225,7 +225,7 @@ class WheelStream:
         left_m: float | None = None,
         right_m: float | None = None,
     ) -> None:
-        """Side speeds, and, where encoders count angle, the travelled distances, used instead."""
+        """Side speeds and, where encoders count angle, the travelled distances, used instead."""
         if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
             raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
         i = self.late.place(t_ns, self.t_ns)
@@ -274,8 +274,8 @@ class WheelStream:
     def speed_change_mps(self, start_ns: int, end_ns: int, over_ns: int = 100_000_000) -> float:
         """Speed of both sides at the end less that at the start, m/s; 0 where samples are missing.
 
-        Each speed is a mean about its time; where the newest sample cuts the last one short, its middle
-        is earlier, and the change is that of a steady acceleration between the two middles.
+        Each speed is a mean about its time; where the newest sample cuts the last one short, the change is
+        that of a steady acceleration between the two middles.
         """
         half, newest = over_ns // 2, self.t_ns[-1] if self.t_ns else 0
         if newest <= end_ns - half:

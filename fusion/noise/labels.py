@@ -1,4 +1,4 @@
-"""Ground labels that are told to the estimator in place of what its detector finds."""
+"""Ground labels for the estimator, in place of its terrain detector."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from terrafusion.fusion.terrain.classifier import UNKNOWN
 class GroundLabels:
     """The ground over time: label k holds from `t_ns[k]` to the next, the first also before it.
 
-    For comparisons ("what would the true ground be worth?") and for robots that know it from a map.
+    For comparisons with the true ground, and for robots that know it from a map.
 
     Attributes:
         t_ns: increasing times.

@@ -1,4 +1,4 @@
-"""The few numbers of each estimator mode, as `python -m tests.studies.mode_tuning` finds them."""
+"""Tuning of the estimator modes, as found by `python -m tests.studies.mode_tuning`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class NoiseTuning:
 
 @dataclass(frozen=True)
 class RobustTuning:
-    """Scales c of the losses, in sigmas, and how many sigmas off a fix is left out whatever the loss says."""
+    """Scales c of the losses, in sigmas, and the gate beyond which a fix is left out in any case."""
 
     wheel_c: Annotated[float, Quantity("", 0.1, 1e6)] = 3.0
     gnss_c: Annotated[float, Quantity("", 0.1, 1e6)] = 4.0
@@ -51,7 +51,9 @@ class RobustTuning:
 
 @dataclass(frozen=True)
 class InnovationTuning:
-    """Memory, in measurements, and by what factor the wheels' sigma may leave the row's, up and down."""
+    """Memory, in measurements, and the factor by which the wheels' sigma may leave the tuned one, up and
+    down.
+    """
 
     wheel_memory: Annotated[float, Quantity("", 2.0, 1e6)] = 100.0
     gnss_memory: Annotated[float, Quantity("", 2.0, 1e6)] = 50.0
@@ -60,10 +62,10 @@ class InnovationTuning:
 
 @dataclass(frozen=True)
 class ModeTuning:
-    """What was tuned, mode by mode.
+    """Tuning by mode.
 
-    `fixed` is also the row from which "robust" and "innovation" start, and that of "adaptive" on a robot
-    that the terrain model does not know, until its slip tells the ground.
+    `fixed` is also the noise from which "robust" and "innovation" start, and that of "adaptive" on a robot
+    that the terrain model does not know, until its slip shows the ground.
     """
 
     fixed: NoiseTuning = NoiseTuning()

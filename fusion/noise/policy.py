@@ -1,9 +1,8 @@
 """The weighting policy: terrain class -> noise of each sensor.
 
-A policy is one YAML file made by `terrafusion policy fit` from twin drives,
-with the hash of its inputs. Where the class is uncertain, the noise is the
-moment match of the mixture: its variance includes the spread of the class
-means (law of total variance), so doubt about the ground widens the weights.
+A policy is one YAML file made by `terrafusion policy fit` from twin runs, with the hash of its inputs.
+Where the class is uncertain, the noise is the moment match of the mixture: its variance includes the
+spread of the class means (law of total variance).
 """
 
 from __future__ import annotations
@@ -28,14 +27,11 @@ SCHEMA = "terrafusion.policy/2"
 class SensorNoise:
     """Noise of the sensors on one ground (1 sigma).
 
-    Slip is i = 1 - v / (omega R), positive when driving wheels outrun the
-    robot. It is modelled as an Ornstein-Uhlenbeck process about
-    `slip_mean + slip_per_grade * grade`, grade being the sine of the pitch
-    (uphill positive), with the standard deviation and the correlation time
-    given here. Yaw scale is true over wheel yaw rate, less one. Side-slip is the lateral over
-    the forward displacement. The inflations multiply the standard deviations
-    of the data sheet (IMU) or of the receiver's own report (GNSS); the gyro has one about
-    roll and pitch and one about yaw, for rough ground shakes those more.
+    Slip is i = 1 - v / (omega R), positive when driving wheels outrun the robot: an Ornstein-Uhlenbeck
+    process about `slip_mean + slip_per_grade * grade` (grade: sine of the pitch, uphill positive). Yaw
+    scale is true over wheel yaw rate, less one. Side-slip is the lateral over the forward displacement.
+    The inflations multiply the standard deviations of the data sheet (IMU) or of the receiver's report
+    (GNSS); roll and pitch rate have another one than yaw rate, as rough ground shakes them more.
     """
 
     slip_mean: Annotated[float, Quantity("", -1.0, 1.0)]
@@ -78,12 +74,12 @@ def within_ranges(noise: SensorNoise) -> SensorNoise:
 
 @dataclass(frozen=True)
 class Policy:
-    """Noise rows of the terrain classes, and the one row that fixed weighting uses.
+    """Noise of the terrain classes, and the one noise of fixed weighting.
 
     Attributes:
-        classes: class name -> row; "unknown" is one of them.
-        fixed: the row fitted to all grounds together, on the same training drives.
-        inputs_sha256: hash of what the rows were fitted to.
+        classes: class name -> noise; "unknown" is one of them.
+        fixed: pooled noise, fitted to all grounds together on the same training runs.
+        inputs_sha256: hash of the training inputs.
         name: file name, for messages and reports.
     """
 
@@ -101,11 +97,11 @@ class Policy:
         return np.array([dataclasses.astuple(row) for row in self.classes.values()])
 
     def blend(self, probabilities: ArrayLike, grade: float = 0.0) -> SensorNoise:
-        """The moment-matched row for class probabilities (k,) that sum to one, at a grade.
+        """The moment-matched noise for class probabilities (k,) that sum to one, at a grade.
 
-        Slip and yaw scale have the mean and the variance of the mixture (law of total
-        variance: mean of the variances plus variance of the means); the other
-        errors have zero mean in every class, so their variances average.
+        Slip and yaw scale have the mean and the variance of the mixture (law of total variance: mean of
+        the variances plus variance of the means); the other errors have zero mean in every class, so their
+        variances average.
         """
         p = np.asarray(probabilities, dtype=float)
         mean = p @ self._table

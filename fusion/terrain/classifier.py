@@ -1,12 +1,11 @@
-"""How probable the features of a window are on each ground.
+"""Likelihood of a window's features on each ground.
 
-Every class is a small mixture of Gaussians over the features, because a ground
-looks different flat and on a slope. Features that were not observed are
-marginalised (dropped from mean and covariance, which is exact for Gaussians);
-the variance of the slip estimate is added to that of its class. `unknown` is
-one broad Gaussian around all grounds: it wins where every class fits badly.
-The logarithms are divided by a temperature calibrated on drives held out from
-training (Guo et al. 2017), as neighbouring windows repeat one another.
+Every class is a small mixture of Gaussians over the features, because a ground looks different flat and on
+a slope. Features that were not observed are marginalised (dropped from mean and covariance, which is exact
+for Gaussians); the variance of the slip estimate is added to that of its class. `unknown` is one broad
+Gaussian around all grounds: it wins where every class fits badly. Log-likelihoods are divided by a
+temperature calibrated on runs held out from training (Guo et al. 2017), as neighbouring windows repeat one
+another.
 """
 
 from __future__ import annotations
@@ -19,25 +18,22 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import Quantity, Word, read_yaml, refuse, structure
 from terrafusion.fusion.terrain.features import FEATURES, SLIP
-
-Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.terrain/1"
 UNKNOWN = "unknown"
 FOREIGN_SLIP = 0.03
-"""1 sigma of the relative error of the rolling radius of a robot not trained on: it looks like slip.
+"""1 sigma of the relative error of the rolling radius of a robot not trained on, which looks like slip.
 
-Assumed; tyre pressure and load move the rolling radius of a pneumatic wheel by a few per cent.
-"""
+Assumed; tyre pressure and load change the rolling radius of a pneumatic wheel by a few per cent."""
 FOREIGN_UNKNOWN = 0.96
-"""Share of `unknown` where a robot not trained on has not been seen to slip."""
+"""Prior of `unknown` for a robot not trained on that has not been seen to slip."""
 SLIP_TEMPERATURE = 20.0
-"""Windows that are one observation where slip alone is judged: its estimate stays as it is for about 10 s
-(`slip_time_s` of the policy's fixed row, and receivers wander as slowly), windows come twice a second."""
+"""Windows per independent observation where slip alone is used: its estimate is correlated over about 10 s
+(`slip_time_s` of the policy's fixed noise, and receivers drift as slowly), windows come twice a second."""
 _BROAD_SHARE = 0.1
 
 
@@ -60,12 +56,12 @@ class TerrainModel:
     """Class densities and what the sequence filter needs.
 
     Attributes:
-        classes: class name -> density of its features, `unknown` not among them.
+        classes: class name -> density of its features, without `unknown`.
         unknown: the broad density; its weight is calibrated, so it need not be 1.
-        temperature: what log-likelihoods are divided by (>= 1).
+        temperature: divisor of log-likelihoods (>= 1).
         patch_length_m: expected distance between two changes of ground.
         vehicles: names of the vehicles whose vibration the model knows.
-        slip_only: judge by the slip alone; see `for_vehicle`.
+        slip_only: use the slip alone; see `for_vehicle`.
         scores: held-out figures of the training.
     """
 
@@ -80,13 +76,11 @@ class TerrainModel:
     slip_only: bool = False
 
     def for_vehicle(self, name: str | None) -> TerrainModel:
-        """The model as it holds for a robot.
+        """The model for a robot.
 
-        How much a robot trembles, and how it skids in a turn, says more of its
-        tyres, its chassis and where its IMU sits than of the ground. A robot
-        the model was not trained on is therefore judged by its slip alone, and
-        only grounds it is known to slip on can be named: the others look like
-        any firm ground, which for such a robot is `unknown`.
+        Vibration and skidding in turns depend more on tyres, chassis and IMU mounting than on the ground.
+        A robot the model was not trained on is therefore classified by its slip alone, among the grounds
+        that are known to slip: the others look like any firm ground, which is `unknown` for such a robot.
         """
         if name in self.vehicles:
             return self
@@ -111,7 +105,7 @@ class TerrainModel:
         )
 
     def prior(self, classes: tuple[str, ...]) -> Array:
-        """Probabilities (k,) of the named classes before anything was observed."""
+        """Prior probabilities (k,) of the named classes."""
         k = len(classes)
         if not self.slip_only or k == 1:
             return np.full(k, 1.0 / k)
@@ -131,8 +125,7 @@ def _pooled(mixtures: list[Mixture], weights: list[float]) -> Mixture:
 class LikelihoodTable:
     """The densities of the named classes in one stack, evaluated together.
 
-    A name the model has no density for (a ground only a camera knows) gets the
-    broad density of `unknown`.
+    A name the model has no density for (a ground only a camera knows) gets the broad density of `unknown`.
     """
 
     def __init__(self, model: TerrainModel, classes: tuple[str, ...]) -> None:

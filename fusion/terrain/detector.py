@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.fusion.terrain.classifier import UNKNOWN, LikelihoodTable, TerrainModel
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, extract
@@ -14,21 +13,20 @@ from terrafusion.fusion.terrain.sequence import PatchFilter
 
 __all__ = ["TerrainDetector", "Window"]
 
-Array = NDArray[np.float64]
 
 EXTERNAL_TRUST = 0.3
 """Exponent on the evidence of an external source: its frames repeat one another as windows do."""
 EXTERNAL_ERROR = 0.1
-"""Share of an external source's answers taken to be arbitrary, so that none of them rules a class out."""
+"""Share of an external source's answers taken to be arbitrary, so that none excludes a class."""
 
 
 class TerrainDetector:
-    """Filters the terrain class along a drive.
+    """Filters the terrain class along a run.
 
     Args:
         model: densities and patch length; `TerrainModel.for_vehicle` adapts it to a robot.
-        classes: the classes to tell apart, `unknown` among them, in the order
-            of all probabilities given and taken (`Policy.names()`).
+        classes: the classes, `unknown` among them, in the order of all probabilities given and
+            returned (`Policy.names()`).
 
     Raises:
         ConfigError: `classes` has no `unknown`, or a name twice.
@@ -58,10 +56,10 @@ class TerrainDetector:
         return self.probabilities
 
     def fuse(self, probabilities: ArrayLike) -> Array:
-        """Class probabilities (k,) after an external source (a camera) gave its own (k,) for now.
+        """Class probabilities (k,) after an external source (a camera) gave its own (k,).
 
-        They multiply in as evidence relative to equal probabilities, tempered
-        by `EXTERNAL_TRUST`, after a share `EXTERNAL_ERROR` of them is spread evenly.
+        They multiply in as evidence relative to equal probabilities, tempered by `EXTERNAL_TRUST`, after a
+        share `EXTERNAL_ERROR` of them is spread evenly.
 
         Raises:
             DataError: not k finite, non-negative numbers with a positive sum.
@@ -77,21 +75,3 @@ class TerrainDetector:
         q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
         self._filter.update(EXTERNAL_TRUST * np.log(q))
         return self.probabilities
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` needs to go on with the same bits: plain lists and texts."""
-        return {"classes": list(self.classes), "probabilities": self._filter.probabilities.tolist()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Take up a state of a detector with the same classes.
-
-        Raises:
-            DataError: the state is of other classes.
-        """
-        if tuple(state["classes"]) != self.classes:
-            raise DataError(
-                f"the state is of the classes {', '.join(state['classes'])}",
-                channel="terrain",
-                remedy=f"this detector has {', '.join(self.classes)}",
-            )
-        self._filter.probabilities = np.array(state["probabilities"], dtype=float)

@@ -1,4 +1,4 @@
-"""Class probabilities that a log brings along from a source of its own, such as a camera."""
+"""Class probabilities of a log's external source, such as a camera."""
 
 from __future__ import annotations
 
@@ -6,29 +6,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from terrafusion.datasets.core.channels import Terrain
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
 TRUE_SOURCES = ("annotation", "simulation")
-"""Sources that were not there when the robot drove: they are for scoring, not for the estimator."""
-
-
-def external_probabilities(
-    terrain: Terrain | None, known: tuple[str, ...]
-) -> list[tuple[int, dict[str, float]]]:
-    """Time and probabilities by class, for `Estimator.add_terrain`; empty where the log has none.
-
-    What the source gives to classes the policy does not know counts as `unknown`.
-    Rows that are not finite, negative or all zero are left out.
-    """
-    if terrain is None or terrain.probabilities is None or terrain.source in TRUE_SOURCES:
-        return []
-    rows = []
-    for t_ns, p in zip(terrain.t_ns.tolist(), terrain.probabilities.tolist(), strict=True):
-        named = known_probabilities(dict(zip(terrain.classes, p, strict=True)), known)
-        if named is not None:
-            rows.append((int(t_ns), named))
-    return rows
+"""Sources that did not exist while driving: they are for scoring, not for the estimator."""
 
 
 def known_probabilities(

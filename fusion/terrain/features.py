@@ -1,22 +1,16 @@
-"""What the ground does to a robot, as a few numbers that do not name the robot.
+"""Terrain features: vibration levels, slip and yaw slip of a window of about one second.
 
-Seven features a window of about one second: five vibration levels, the slip
-and the yaw slip. A feature that cannot be observed is NaN; the classifier
-marginalises it.
+A feature that cannot be observed is NaN; the classifier marginalises it.
 
-Vibration is the RMS inside fixed bands of physical frequency, from a Hann
-periodogram after removing the line through the window. Bands and not the RMS
-of samples or of their differences: a 30 Hz and a 400 Hz stream of one motion
-have the same power below 14 Hz (Nyquist of 30 Hz is 15 Hz), while an RMS over
-all frequencies counts whatever the faster stream resolves and differences
-shrink with the sampling interval. The one band above 14 Hz is missing for
-slow streams. What no representation mends is a slow stream sampled without an
-anti-aliasing filter: its higher vibration is folded into the low bands.
+Vibration is the RMS inside fixed bands of physical frequency, from a Hann periodogram after removing the
+line through the window. A 30 Hz and a 400 Hz stream of one motion have the same power below 14 Hz, while
+an RMS over all frequencies depends on the rate. The one band above 14 Hz is missing for slow streams. A
+slow stream sampled without an anti-aliasing filter still has its higher vibration folded into the low
+bands.
 
-Speed: on a random profile of displacement spectrum S(n) ~ 1/n^2 (ISO 8608:2016,
-waviness 2) driven at v, the spectrum over time at f is v/f^2 times a constant,
-so the RMS in a fixed band grows with v^(1/2). That factor is divided out, v
-being the faster of robot and wheels: wheels that spin on the spot shake, too.
+Speed: on a random profile of displacement spectrum S(n) ~ 1/n^2 (ISO 8608:2016, waviness 2) driven at v,
+the spectrum over time at f is v/f^2 times a constant, so the RMS in a fixed band grows with v^(1/2). That
+factor is divided out, v being the faster of robot and wheels: wheels that spin on the spot shake, too.
 """
 
 from __future__ import annotations
@@ -24,9 +18,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
 
 FEATURES = ("z_low", "z_mid", "z_high", "xy", "roll_pitch", "slip", "yaw_slip")
 """log10 of band RMS at 1 m/s (m/s2; roll_pitch rad/s), then the slips (-)."""
@@ -35,7 +28,7 @@ SLIP = FEATURES.index("slip")
 YAW_SLIP = FEATURES.index("yaw_slip")
 LOW_HZ, MID_HZ, HIGH_HZ = (3.0, 8.0), (8.0, 14.0), (14.0, 45.0)
 MIN_SPEED_MPS = 0.15
-"""Below this the ground says nothing: no vibration, and slip is a quotient of two noises."""
+"""Below this the ground is unobservable: no vibration, and slip is a quotient of two noises."""
 
 _MIN_YAW_RATE_RADPS = 0.15
 _MIN_SPAN_S = 0.6
@@ -49,14 +42,15 @@ _SLIP_RANGE = (-1.0, 1.2)
 
 @dataclass
 class Window:
-    """The last second or so of a drive, as the estimator hands it over.
+    """The last second or so of a run.
 
     Attributes:
         dt_s: time since the previous update.
-        imu_t_s: (n,) sample times, s. gyro_radps, accel_mps2: (n, 3) body axes; NaN where the log has none.
+        imu_t_s: (n,) sample times, s. gyro_radps, accel_mps2: (n, 3) body axes; NaN where the log has
+            none.
         wheel_speed_mps: mean forward circumferential speed of the wheels; wheel_speed_rate_mps2: its rate.
         speed_mps: the estimator's forward speed.
-        yaw_rate_wheels_radps: yaw rate the wheels alone imply, or None where sides are not told apart.
+        yaw_rate_wheels_radps: yaw rate of the wheels alone, or None where sides are not distinguished.
         yaw_rate_gyro_radps: mean yaw rate of the gyroscope, bias removed; NaN where unknown.
         slip, slip_sigma: slip 1 - v / (omega R) and its 1 sigma, of measurements alone: see
             `slip_without_prior` (the class prior would confirm itself); None where there are none.
@@ -80,10 +74,9 @@ class Window:
 
 
 def extract(window: Window) -> tuple[Array, Array]:
-    """Features (7,) in the order of `FEATURES`, and the variance (7,) of each one's own measurement.
+    """Features (7,) in the order of `FEATURES`, and the measurement variance (7,) of each.
 
-    The variance is that of the slip estimate and of the yaw slip; the scatter
-    of the vibration levels is part of the class densities.
+    Variances are those of slip and yaw slip; the scatter of vibration is part of the class densities.
     """
     values = np.full(len(FEATURES), np.nan)
     variances = np.zeros(len(FEATURES))
@@ -107,11 +100,11 @@ def extract(window: Window) -> tuple[Array, Array]:
 def slip_without_prior(
     slip: float, sigma: float, prior_slip: float, prior_sigma: float
 ) -> tuple[float, float] | None:
-    """What the measurements alone say of the slip: its value and 1 sigma, or None where they say little.
+    """Slip and 1 sigma by the measurements alone, or None where they carry little information.
 
-    An estimate made under a prior is the product of prior and likelihood; the
-    prior comes from the class the slip is to judge, and is divided out again
-    (the cavity of Minka 2001): 1/s^2 = 1/sigma^2 - 1/prior_sigma^2.
+    An estimate made under a prior is the product of prior and likelihood; the prior comes from the class
+    that the slip is to classify, and is divided out again (the cavity of Minka 2001): 1/s^2 = 1/sigma^2 -
+    1/prior_sigma^2.
     """
     left = 1.0 / max(sigma, 1e-6) ** 2 - 1.0 / prior_sigma**2
     if not left > _LEAST_INFORMATION / prior_sigma**2:
@@ -122,8 +115,8 @@ def slip_without_prior(
 def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
     """log10 band RMS (5,) of one window of samples (n,), (n, 3), (n, 3); NaN where not observed.
 
-    Times jitter more than the sampling of an IMU does: samples are taken as
-    evenly spaced, unless a gap shows that some are missing.
+    Recorded times jitter more than the sampling of an IMU: samples are taken as evenly spaced, unless a
+    gap shows that some are missing.
     """
     levels = np.full(SLIP, np.nan)
     n = len(t_s)

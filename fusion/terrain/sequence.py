@@ -1,20 +1,19 @@
-"""The ground comes in patches: a hidden Markov model over the terrain classes.
+"""Hidden Markov model over the terrain classes: the ground comes in patches.
 
-The class changes with the distance driven, not with time: a robot that stands
-still stays where it is. Patches are L long on average, and what follows is
-drawn from the prior (Rabiner 1989, forward recursion, of a chain continuous
-in distance). Driven far without looking, the filter is back at the prior.
+The class changes with the distance driven, not with time. Patches are L long on average, and what follows
+is drawn from the prior (Rabiner 1989, forward recursion, of a chain continuous in distance). Driven far
+without observation, the filter returns to the prior.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
 
 FLOOR = 1e-5
-"""Smallest probability of a class: what lets the filter leave a class it was sure of."""
+"""Probability floor, so that no single window excludes a class."""
 
 
 class PatchFilter:
@@ -26,7 +25,7 @@ class PatchFilter:
         self.probabilities: Array = self.prior.copy()
 
     def predict(self, distance_m: float) -> Array:
-        """Drive on by `distance_m` (>= 0) without looking."""
+        """Drive on by `distance_m` (>= 0) without an observation."""
         k = len(self.probabilities)
         # The ground is drawn anew from the prior, which may give the same one again: k / (k - 1)
         # makes a patch `patch_length_m` long where all are equally likely.
@@ -35,12 +34,8 @@ class PatchFilter:
             self._set(self.probabilities * (1.0 - drawn) + self.prior * drawn)
         return self.probabilities
 
-    def forget(self, share: float) -> None:
-        """Fall back to the prior by a share (0 to 1): something tells that the ground has changed."""
-        self._set(self.probabilities * (1.0 - share) + self.prior * share)
-
     def update(self, log_likelihood: ArrayLike) -> Array:
-        """Weigh the classes by log-evidence (k,), known up to a constant; with NaN or +inf there is none."""
+        """Weight the classes by log-evidence (k,), known up to a constant; NaN or +inf count as none."""
         evidence = np.asarray(log_likelihood, dtype=float)
         top = evidence.max()
         if np.isfinite(top):

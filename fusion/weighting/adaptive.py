@@ -1,4 +1,4 @@
-"""From the detected terrain to the noise row in force, with a reason for every change."""
+"""Sensor noise in force by the detected terrain, with a reason for every change."""
 
 from __future__ import annotations
 
@@ -7,8 +7,8 @@ from collections import deque
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
@@ -18,15 +18,14 @@ from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
 from terrafusion.fusion.terrain.detector import TerrainDetector, Window
 from terrafusion.fusion.terrain.features import slip_without_prior
-from terrafusion.fusion.weighting.modes import weighting_for
-from terrafusion.fusion.weighting.weighting import NOTEWORTHY
-
-Array = NDArray[np.float64]
+from terrafusion.fusion.weighting.innovation import InnovationWeighting
+from terrafusion.fusion.weighting.robust import RobustWeighting
+from terrafusion.fusion.weighting.weighting import NOTEWORTHY, NoiseInForce, Weighting
 
 UPDATE_NS = 500_000_000
 WINDOW_NS = 1_000_000_000
-KEPT_CHANGES = 1000
-"""Records kept where nobody takes them: a robot that runs for days must not grow."""
+MOST_CHANGES = 1000
+"""Records kept where nobody takes them: memory must not grow over days."""
 
 _RECORDED = {
     "slip_mean": ("wheels", ""),
@@ -41,15 +40,15 @@ _RECORDED = {
 
 
 class TerrainNoise:
-    """Runs the detector along the drive and blends the policy by its posterior.
+    """Runs the terrain detector and blends the policy by its posterior.
 
-    In the other modes the terrain is still detected and reported, but the row
-    stays the policy's fixed one, as tuned ("innovation" moves it from there).
+    In the other modes the terrain is still detected and reported, but the noise stays the policy's fixed
+    one, as tuned ("innovation" adapts it from there).
 
     Attributes:
-        row: the noise in force.
-        single: what the mode makes of single measurements.
-        changes: what changed since `take_changes` was last called, the newest `KEPT_CHANGES` of it.
+        noise: the noise in force.
+        per_measurement: what the mode makes of single measurements.
+        changes: what changed since `take_changes` was last called, the newest `MOST_CHANGES` of it.
     """
 
     def __init__(self, config: EstimatorConfig) -> None:
@@ -58,27 +57,27 @@ class TerrainNoise:
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
-        self._told: Array | None = None
+        self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
-        self._pooled = model.slip_only
-        if self._pooled:
-            # Such a robot is on `unknown` ground as a rule, no exception: the pooled row, not the wider one.
+        self._starts_pooled = model.slip_only
+        if self._starts_pooled:
+            # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
             self.policy = dataclasses.replace(self.policy, classes=classes)
         self.noise = self.policy.blend(self._shares) if self.adaptive else fixed
-        self.changes: deque[WeightChange] = deque(maxlen=KEPT_CHANGES)
-        self._noted: SensorNoise | None = None
+        self.changes: deque[WeightChange] = deque(maxlen=MOST_CHANGES)
+        self._recorded: SensorNoise | None = None
         self._rig = config.rig
-        # Only where gyro and wheels both tell yaw does their difference say something of the ground.
-        self._two_yaws = config.inputs.sides and config.inputs.yaw == "gyro"
-        self.single = weighting_for(config, self)
+        # Yaw slip needs both gyro and wheels as yaw sources.
+        self._has_yaw_slip = config.inputs.sides and config.inputs.yaw == "gyro"
+        self.per_measurement = _weighting_for(config, self)
         self._before = self._shares
         self._next_ns = 0
         self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
 
-    def note(self, change: WeightChange) -> None:
+    def record(self, change: WeightChange) -> None:
         """Record a change that another part made."""
         self.changes.append(change)
 
@@ -98,10 +97,10 @@ class TerrainNoise:
         return moved
 
     def begin(self, t_ns: int) -> None:
-        """Start the clock; the first row is a change from the policy's fixed one."""
+        """Start the clock; the first noise is a change from the policy's fixed one."""
         self._next_ns = t_ns + WINDOW_NS
-        self._noted = self.policy.fixed
-        self._listen(t_ns)
+        self._recorded = self.policy.fixed
+        self._apply_labels(t_ns)
         self._reweight(t_ns)
 
     def posterior(self) -> dict[str, float]:
@@ -110,7 +109,7 @@ class TerrainNoise:
 
     @property
     def _probabilities(self) -> Array:
-        return self.detector.probabilities if self._told is None else self._told
+        return self.detector.probabilities if self._label_probabilities is None else self._label_probabilities
 
     def external(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Fuse the class probabilities of another source.
@@ -130,20 +129,20 @@ class TerrainNoise:
         self._reweight(t_ns)
 
     def update(self, state: State, imu: ImuStream, wheels: WheelStream) -> None:
-        """Look at the last second, twice a second."""
+        """Evaluate the last second, twice a second."""
         if state.t_ns < self._next_ns:
             return
         self._next_ns = state.t_ns + UPDATE_NS
         self.detector.update(self._window(state, imu, wheels))
         self._source = "detector"
-        self._listen(state.t_ns)
+        self._apply_labels(state.t_ns)
         self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
         self._reweight(state.t_ns)
 
-    def _listen(self, t_ns: int) -> None:
-        """Take the ground from the labels, where some are told; the detector runs on, unheard."""
+    def _apply_labels(self, t_ns: int) -> None:
+        """Take the ground from the labels, where there are some; the detector runs on, unused."""
         if self._labels is not None:
-            self._told = self._labels.probabilities(t_ns, self.detector.classes)
+            self._label_probabilities = self._labels.probabilities(t_ns, self.detector.classes)
             self._source = "label"
 
     def _window(self, state: State, imu: ImuStream, wheels: WheelStream) -> Window:
@@ -167,7 +166,7 @@ class TerrainNoise:
             wheel_speed_rate_mps2=0.0 if np.isnan(rate) else rate,
             speed_mps=float(np.hypot(*state.velocity_mps[:2])),
             yaw_rate_wheels_radps=None
-            if rolled is None or not self._two_yaws
+            if rolled is None or not self._has_yaw_slip
             else (right - left) / rig.track_m / (WINDOW_NS * 1e-9),
             yaw_rate_gyro_radps=float(gyro[:, 2].mean() - state.gyro_bias_radps[2]) if len(gyro) else np.nan,
             slip=slip,
@@ -176,13 +175,14 @@ class TerrainNoise:
 
     @property
     def _shares(self) -> Array:
-        """What each ground counts, (k,): its probability.
+        """Weight of each class (k,): its probability.
 
-        For a robot that the model does not know, a ground counts as far as it is more likely than not: the
-        pooled row, which holds until then, was fitted to all grounds, and has the doubt between them in it.
+        For a robot that the terrain model does not know, a class counts as far as it is more likely than
+        not: until then the pooled noise holds, which was fitted to all grounds and includes the doubt
+        between them.
         """
         p = self._probabilities
-        if self._pooled and self._told is None:
+        if self._starts_pooled and self._label_probabilities is None:
             p = np.maximum(2.0 * p - 1.0, 0.0)
             unknown = self.detector.classes.index(UNKNOWN)
             p[unknown] = 0.0
@@ -194,9 +194,9 @@ class TerrainNoise:
             return
         p = self._probabilities
         self.noise = self.policy.blend(self._shares, self._grade)
-        if self._noted is None:  # not started yet: nothing to change from
+        if self._recorded is None:  # not started yet: nothing to change from
             return
-        before, now = dataclasses.asdict(self._noted), dataclasses.asdict(self.noise)
+        before, now = dataclasses.asdict(self._recorded), dataclasses.asdict(self.noise)
         best = int(p.argmax())
         why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
         for name, (sensor, unit) in _RECORDED.items():
@@ -204,4 +204,13 @@ class TerrainNoise:
             if abs(now[name] - before[name]) > NOTEWORTHY * scale:
                 reason = f"{name}: {why}"
                 self.changes.append(WeightChange(t_ns, sensor, before[name], now[name], unit, reason))
-                self._noted = dataclasses.replace(self._noted, **{name: now[name]})
+                self._recorded = dataclasses.replace(self._recorded, **{name: now[name]})
+
+
+def _weighting_for(config: EstimatorConfig, noise: NoiseInForce) -> Weighting:
+    """The weighting of the mode asked for; what it changes is recorded in `noise`."""
+    if config.mode == "robust":
+        return RobustWeighting(config, noise)
+    if config.mode == "innovation":
+        return InnovationWeighting(config, noise)
+    return Weighting()

@@ -1,20 +1,20 @@
-"""Mode "robust": the fixed row under a robust loss.
+"""Mode "robust": the fixed noise under a robust loss.
 
-Cauchy: rho(r) = c^2/2 log(1 + r^2/c^2) by iteratively reweighted least squares, weight
-1 / (1 + r^2/c^2) of the whitened residual r (Holland and Welsch 1977, Comm. Stat. A 6(9)). A
-measurement is weighed when it comes, against the prediction: with prediction variance P and noise R,
-the residual left by the update that the weight w allows is nu (R/w) / (P + R/w), so a surprise that
-the prediction's own doubt explains costs no weight.
+Cauchy: rho(r) = c^2/2 log(1 + r^2/c^2) by iteratively reweighted least squares, weight 1 / (1 + r^2/c^2)
+of the whitened residual r (Holland and Welsch 1977, Comm. Stat. A 6(9)). A measurement is weighted when it
+comes, against the prediction: with prediction variance P and noise R, the residual left by the update that
+the weight w allows is nu (R/w) / (P + R/w), so an innovation within the prediction's own uncertainty costs
+no weight.
 
 GNC: truncated least squares, rho(r) = min(r^2, c^2), by graduated non-convexity over all fixes of the
-window (Yang, Antonante, Tzoumas, Carlone 2020, IEEE RA-L 5(2), eq. 13-14), each time a fix comes that
-leaves the weights of the window unsettled. It starts from the present estimate, and its control
-parameter mu grows fourfold a step, not by the paper's 1.4: it has to keep up with the drive. Fixes that
-leave the window keep the last weight they had. Wheels have the Cauchy loss here too: one increment at
-a time has nothing to be compared with but the prediction.
+window (Yang, Antonante, Tzoumas, Carlone 2020, IEEE RA-L 5(2), eq. 13-14), each time a fix leaves the
+weights of the window unsettled. It starts from the present estimate, and its control parameter mu grows
+fourfold a step, not by the paper's 1.4, to keep up with the run. Fixes that leave the window keep their
+last weight. Wheels have the Cauchy loss here too: a single increment can only be compared with the
+prediction.
 
-Against an estimate that went astray no loss helps, so the gate's re-acquisition stays in force: fixes in
-a row that contradict the estimate and agree with each other are believed.
+No loss helps an estimate that went astray, so the gate's re-acquisition stays in force: consecutive fixes
+that contradict the estimate and agree with each other are believed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.graph import gnss_factor
@@ -35,23 +35,21 @@ from terrafusion.fusion.weighting.weighting import (
     InnovationTest,
     NoiseInForce,
     Weighting,
+    inflated,
     wheel_innovation_test,
-    widened,
 )
-
-Array = NDArray[np.float64]
 
 IRLS_STEPS = 10
 LEAST_WEIGHT = 1e-6
 """In place of zero: the factor stays, a thousand sigmas wide."""
 DOUBTED = 0.5
-"""A weight that crosses this is worth a record."""
+"""A weight that crosses this is recorded."""
 MU_GROWTH = 4.0
 GNC_STEPS = 20
 
 
 class RobustWeighting(Weighting):
-    """Weights of single measurements under the robust loss of the configuration."""
+    """Weights of single measurements under the configured robust loss."""
 
     def __init__(self, config: EstimatorConfig, noise: NoiseInForce) -> None:
         self.loss = config.robust_loss
@@ -64,29 +62,29 @@ class RobustWeighting(Weighting):
         self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
     ) -> WheelIncrement:
         """By the Cauchy loss."""
-        tested = wheel_innovation_test(t_ns, wheels, innovation_m, variance_m2, dt_s)
-        w = cauchy_weight(tested, self.tuning.wheel_c)
+        test = wheel_innovation_test(t_ns, wheels, innovation_m, variance_m2, dt_s)
+        w = cauchy_weight(test, self.tuning.wheel_c)
         if (w < DOUBTED) != self._wheels_doubted:
             self._wheels_doubted = not self._wheels_doubted
             before, after = (1.0, w) if self._wheels_doubted else (DOUBTED, w)
             what = "doubted" if self._wheels_doubted else "believed again"
-            why = f"cauchy loss: increments {what}, innovation {tested.innovation_m[0]:.3f} m"
-            self._noise.note(WeightChange(tested.t_ns, "wheels", before, after, "", why))
-        return widened(wheels, float(w**-0.5))
+            why = f"cauchy loss: increments {what}, innovation {test.innovation_m[0]:.3f} m"
+            self._noise.record(WeightChange(test.t_ns, "wheels", before, after, "", why))
+        return inflated(wheels, float(w**-0.5))
 
-    def gnss(self, tested: InnovationTest) -> tuple[float, float]:
+    def gnss(self, test: InnovationTest) -> tuple[float, float]:
         """By the Cauchy loss, or by the first step of GNC: all or nothing, against the prediction."""
         if self.loss == "cauchy":
-            w = cauchy_weight(tested, self.tuning.gnss_c)
+            w = cauchy_weight(test, self.tuning.gnss_c)
         else:
-            nis = float(np.sum(tested.innovation_m**2 / (tested.predicted_m2 + tested.noise_m2)))
+            nis = float(np.sum(test.innovation_m**2 / (test.predicted_m2 + test.noise_m2)))
             w = 1.0 if nis <= self.tuning.gnss_c**2 else LEAST_WEIGHT
         if w < DOUBTED:
-            self._record(tested.t_ns, 1.0, w, float(np.hypot(*tested.innovation_m)))
+            self._record(test.t_ns, 1.0, w, float(np.hypot(*test.innovation_m)))
         return float(w**-0.5), w
 
     def revisit(self, chain: Chain) -> None:
-        """GNC over the fixes of the window; nothing where their weights are settled."""
+        """GNC over the fixes of the window, unless their weights are settled."""
         if self.loss != "gnc":
             return
         chain.smooth(len(chain.nodes), iterations=1)
@@ -125,16 +123,16 @@ class RobustWeighting(Weighting):
     def _record(self, t_ns: int, before: float, after: float, off: float, unit: str = "m") -> None:
         what = "doubted" if after < DOUBTED else "believed again"
         why = f"{self.loss} loss: fix {what}, {off:.1f} {unit} off"
-        self._noise.note(WeightChange(t_ns, "gnss", before, after, "", why))
+        self._noise.record(WeightChange(t_ns, "gnss", before, after, "", why))
 
 
-def cauchy_weight(tested: InnovationTest, c: float) -> float:
+def cauchy_weight(test: InnovationTest, c: float) -> float:
     """Weight of one measurement whose update settles at the Cauchy loss's minimum, by reweighting."""
     w = 1.0
     for _ in range(IRLS_STEPS):
-        noise = tested.noise_m2 / w
-        left = tested.innovation_m * noise / (tested.predicted_m2 + noise)
-        w = max(1.0 / (1.0 + float(np.sum(left**2 / tested.noise_m2)) / c**2), LEAST_WEIGHT)
+        noise = test.noise_m2 / w
+        left = test.innovation_m * noise / (test.predicted_m2 + noise)
+        w = max(1.0 / (1.0 + float(np.sum(left**2 / test.noise_m2)) / c**2), LEAST_WEIGHT)
     return w
 
 

@@ -1,4 +1,4 @@
-"""What a mode makes of single measurements: the seam between the estimator and its baselines."""
+"""What a mode makes of single measurements: the interface between the estimator and its baselines."""
 
 from __future__ import annotations
 
@@ -7,17 +7,15 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import WeightChange
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 from terrafusion.fusion.noise.policy import SensorNoise
 
-Array = NDArray[np.float64]
-
 NOTEWORTHY = 0.1
-"""Relative change of a weight that is worth a record."""
+"""Relative change of a weight that is recorded."""
 
 
 class NoiseInForce(Protocol):
@@ -25,7 +23,7 @@ class NoiseInForce(Protocol):
 
     noise: SensorNoise
 
-    def note(self, change: WeightChange) -> None:
+    def record(self, change: WeightChange) -> None:
         """Record a change."""
 
 
@@ -39,8 +37,8 @@ class InnovationTest:
         predicted_m2: (d,) variance of the prediction, and of all errors that are not weighted.
         noise_m2: (d,) variance that the factor gives to the measurement itself.
         drift_m2: GNSS: variance of the part of its error that is a state.
-        unit_m: (d,) what the noise is a multiple of: the receiver's sigma, or the time step (s).
-        white_share: GNSS: share of the reported variance that is at least new at every fix.
+        unit_m: (d,) unit of the noise: the receiver's sigma, or the time step (s).
+        white_share: GNSS: least white share of the reported variance.
     """
 
     t_ns: int
@@ -53,7 +51,7 @@ class InnovationTest:
 
 
 class Weighting:
-    """The trivial answers, of modes "fixed" and "adaptive": a measurement keeps the sigma of the row.
+    """The trivial answers of modes "fixed" and "adaptive": a measurement keeps its sigma.
 
     Attributes:
         passed_nis: a fix that its gate rejects is used all the same up to this normalised square.
@@ -64,7 +62,7 @@ class Weighting:
     def wheels(
         self, t_ns: int, wheels: WheelIncrement, innovation_m: float, variance_m2: float, dt_s: float
     ) -> WheelIncrement:
-        """The increment with the sigma it is to have; `variance_m2` is that of the innovation."""
+        """The increment with the sigma to use; `variance_m2` is that of the innovation."""
         return wheels
 
     def gnss(self, tested: InnovationTest) -> tuple[float, float]:
@@ -72,7 +70,7 @@ class Weighting:
         return 1.0, 1.0
 
     def revisit(self, chain: Chain) -> None:
-        """Weigh the fixes still held in the window again, after new ones came."""
+        """Weight the fixes held in the window again, after new ones came."""
 
 
 def wheel_innovation_test(
@@ -84,6 +82,6 @@ def wheel_innovation_test(
     return InnovationTest(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
 
 
-def widened(wheels: WheelIncrement, scale: float) -> WheelIncrement:
+def inflated(wheels: WheelIncrement, scale: float) -> WheelIncrement:
     """The increment with `scale` times the sigma along body x."""
     return dataclasses.replace(wheels, sigma=wheels.sigma * np.array([scale, 1.0, 1.0, 1.0]))

@@ -28,7 +28,7 @@ from terrafusion.fusion.estimator.magnetometer import (
     yaw_jacobian,
     yaw_of,
 )
-from terrafusion.fusion.estimator.slow_bias import AHEAD_NS, SlowBias, split
+from terrafusion.fusion.estimator.slow_bias import MOST_AHEAD_NS, SlowBias, split_by_time
 
 ANGLES = st.floats(-3.1, 3.1)
 TILTS = st.floats(-0.5, 0.5)
@@ -173,7 +173,7 @@ def test_a_field_tells_the_heading_at_any_tilt_and_iron_is_linear(
     world[:2] = 19e-6 * math.sin(declination), 19e-6 * math.cos(declination)
     R = rotation(roll, pitch, yaw)
     aid = MagnetometerAiding(None, declination, lambda _: None)
-    told, H = aid._told(R, R.T @ world)
+    told, H = aid._heading_of_field(R, R.T @ world)
     assert wrapped(told - yaw) == pytest.approx(0.0, abs=1e-9)
     np.testing.assert_allclose(levelled(R) @ R.T @ world, rotation(0.0, 0.0, yaw).T @ world, atol=1e-18)
     for k, step in enumerate((1e-6, 1e-10, 1e-10)):
@@ -181,7 +181,7 @@ def test_a_field_tells_the_heading_at_any_tilt_and_iron_is_linear(
         for sign in (1.0, -1.0):
             aid.bias.mean = np.array([declination, 0.0, 0.0])
             aid.bias.mean[k] -= sign * step  # the true bias is `step` above the estimate
-            errors.append(wrapped(aid._told(R, R.T @ world)[0] - told))
+            errors.append(wrapped(aid._heading_of_field(R, R.T @ world)[0] - told))
         assert (errors[0] - errors[1]) / (2.0 * step) == pytest.approx(
             H[k], rel=1e-4, abs=1e-3 * abs(H[1:]).max()
         )
@@ -287,11 +287,13 @@ def test_a_magnetometer_that_does_not_turn_with_the_robot_is_left_out() -> None:
 
 
 def test_a_stamp_of_another_clock_stops_nothing() -> None:
-    due, waiting, impossible = split([(10, "a"), (10**18, "b"), (30, "c"), (20 + AHEAD_NS, "d")], 20, 20)
+    due, waiting, impossible = split_by_time(
+        [(10, "a"), (10**18, "b"), (30, "c"), (20 + MOST_AHEAD_NS, "d")], 20, 20
+    )
     assert [value for _, value in due] == ["a"]
     assert [value for _, value in waiting] == ["c", "d"]
     assert impossible == 1
-    assert split([(30 + AHEAD_NS, "late start")], 20, 30)[2] == 0
+    assert split_by_time([(30 + MOST_AHEAD_NS, "late start")], 20, 30)[2] == 0
 
 
 def test_a_climb_in_warm_air_is_within_the_sigma_told() -> None:

@@ -103,7 +103,7 @@ def test_a_slip_opened_later_keeps_what_else_began_at_that_keyframe() -> None:
     for k in range(4):
         chain.append(k * 10**8, point, markov=step(rolling(1.0)) if k else None)
     drift = slice(1, 3)
-    chain.revise(2, chain.nodes[2].markov.renewed(drift))  # another class of fix
+    chain.revise(2, chain.nodes[2].markov.restarted(drift))  # another class of fix
 
     def open_at_2(switch: float) -> np.ndarray:
         slow_states.inflate_slip_covariance(chain, 2 * 10**8, 0.1, SAND, 0.02, 100.0, switch)

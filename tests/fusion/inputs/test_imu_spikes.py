@@ -13,7 +13,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.graph.preintegration import HELD_INFLATION, Preintegrator
-from terrafusion.fusion.inputs.streams import RECENT, SHOCK_MPS2, SPIN_RADPS, ImuStream
+from terrafusion.fusion.inputs.streams import REPLACED_BY, SHOCK_MPS2, SPIN_RADPS, ImuStream
 from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -39,7 +39,7 @@ def test_the_samples_before_stand_for_spikes_and_nothing_else_changes() -> None:
     for i in range(1, 100):
         (a,), (b,) = (s.segments((i - 1) * STEP_NS, i * STEP_NS) for s in (plain, spiked))
         if i in (60, 61):
-            assert b.accel_mps2 == pytest.approx([1e-3 * (i - 0.5 - 0.5 * RECENT), *LEVEL[1:]], abs=1e-3)
+            assert b.accel_mps2 == pytest.approx([1e-3 * (i - 0.5 - 0.5 * REPLACED_BY), *LEVEL[1:]], abs=1e-3)
         else:
             assert b.accel_mps2.tolist() == a.accel_mps2.tolist()
         assert b.gyro_radps.tolist() == a.gyro_radps.tolist()
@@ -52,7 +52,9 @@ def test_a_rate_is_held_by_itself(gyro: float, beyond: bool) -> None:
     imu = stream({}, 50)
     imu.add(50 * STEP_NS, [0.0, 0.0, gyro], LEVEL + 1.0)
     assert imu.spikes == beyond
-    assert imu.gyro[-1] == pytest.approx([1e-3 * (49.5 - 0.5 * RECENT), 0, 0] if beyond else [0, 0, gyro])
+    assert imu.gyro[-1] == pytest.approx(
+        [1e-3 * (49.5 - 0.5 * REPLACED_BY), 0, 0] if beyond else [0, 0, gyro]
+    )
     assert imu.accel[-1].tolist() == (LEVEL + 1.0).tolist()
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 
 import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import Terrain
+from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.replay import replay
-from terrafusion.fusion.terrain.external import external_probabilities
 from terrafusion.twin.simulate import simulate
 
 KNOWN = ("asphalt", "mud", "unknown")
@@ -20,21 +21,32 @@ def camera(rows: list[list[float]], source: str = "camera") -> Terrain:
     return Terrain(t_ns, np.array(["mud"] * len(rows)), source, ("mud", "lava", "asphalt"), np.array(rows))
 
 
+def taken(terrain: Terrain) -> list[tuple[int, dict[str, float]]]:
+    """What an estimator whose policy has the classes `KNOWN` is given of the messages."""
+    rows: list[tuple[int, dict[str, float]]] = []
+    estimator = types.SimpleNamespace(
+        config=types.SimpleNamespace(policy=types.SimpleNamespace(names=lambda: KNOWN)),
+        add_terrain=lambda t_ns, probabilities: rows.append((t_ns, probabilities)),
+    )
+    for message in terrain.samples():
+        add_message(estimator, message)  # type: ignore[arg-type]
+    return rows
+
+
 def test_classes_the_policy_lacks_are_unknown_ground() -> None:
-    rows = external_probabilities(camera([[0.2, 0.5, 0.3], [1.0, 0.0, 0.0]]), KNOWN)
+    rows = taken(camera([[0.2, 0.5, 0.3], [1.0, 0.0, 0.0]]))
     assert rows[0] == (0, {"asphalt": 0.3, "mud": 0.2, "unknown": 0.5})
     assert rows[1] == (10**9, {"asphalt": 0.0, "mud": 1.0, "unknown": 0.0})
 
 
 def test_what_is_no_probability_is_left_out() -> None:
     odd = [[np.nan, 0.5, 0.5], [-1.0, 1.0, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    assert [t for t, _ in external_probabilities(camera(odd), KNOWN)] == [3 * 10**9]
+    assert [t for t, _ in taken(camera(odd))] == [3 * 10**9]
 
 
 @pytest.mark.parametrize("source", ["annotation", "simulation"])
 def test_the_truth_is_not_shown_to_the_estimator(source: str) -> None:
-    assert external_probabilities(camera([[1.0, 0.0, 0.0]], source), KNOWN) == []
-    assert external_probabilities(None, KNOWN) == []
+    assert taken(camera([[1.0, 0.0, 0.0]], source)) == []
 
 
 def test_a_camera_in_the_log_reaches_the_weights() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import pickle
 import time
 
 import numpy as np
@@ -109,20 +108,6 @@ def test_standing_keeps_the_class() -> None:
     for _ in range(1000):
         after = detector.update(window(wheel_speed_mps=0.0, speed_mps=0.01))
     assert np.array_equal(after, before)
-
-
-def test_restored_detectors_go_on_with_the_same_bits() -> None:
-    first = TerrainDetector(MODEL, CLASSES)
-    for seed in range(5):
-        first.update(window(seed))
-    second = TerrainDetector(MODEL, CLASSES)
-    second.restore(pickle.loads(pickle.dumps(first.state())))
-    for seed in range(5, 10):
-        a, b = first.update(window(seed)), second.update(window(seed))
-        assert a.tobytes() == b.tobytes()
-    other = TerrainDetector(MODEL, (*CLASSES[1:], CLASSES[0]))
-    with pytest.raises(DataError, match="classes"):
-        other.restore(first.state())
 
 
 def test_a_camera_is_evidence_but_not_proof() -> None:
