@@ -59,6 +59,10 @@ class RejectedError(ValueError):
         super().__init__(what)
         self.what, self.remedy = what, remedy
 
+    def inside(self, suffix: str) -> RejectedError:
+        """The same about a part of the value, `{key}` and `suffix`."""
+        return RejectedError(self.what.replace("{key}", f"{{key}}{suffix}"), self.remedy)
+
     def at(self, key: str, file: Path | str) -> ConfigError:
         """The error as a user sees it."""
         return ConfigError(self.what.replace("{key}", key), file=file, remedy=self.remedy)
@@ -175,7 +179,7 @@ class Sourced(Quantity):
         try:
             low, high = Quantity(self.unit, self.low, self.high, size=2).parse(valid)  # type: ignore[misc]
         except RejectedError as error:
-            raise RejectedError(error.what.replace("{key}", "{key}.valid"), error.remedy) from None
+            raise error.inside(".valid") from None
         if not all(low <= x <= high for x in (value if isinstance(value, tuple) else (value,))):
             what = f"'{{key}}' is {shown(value)}, outside its validity range"
             raise RejectedError(what, f"its source covers [{low:g}, {high:g}] {self.unit}".rstrip())
@@ -365,8 +369,9 @@ def _one_error(error: Any, kind: Any, file: Path | str, key: str) -> ConfigError
     if error["type"] == "empty":
         return ConfigError(f"'{key}' has no value", file=file, remedy="give one, or leave the key out")
     if error["type"] == "missing":
-        what = _marker(hint)
-        remedy = f"add it: {what.hint()}" if what is not None and what.hint() else "add it"
+        names = ", ".join(_hints(_bare(hint)))
+        example = f"keys from {names}" if names else getattr(_marker(hint), "hint", str)()
+        remedy = f"add it: {example}" if example else "add it"
         return ConfigError(f"'{key}' is missing", file=file, remedy=remedy)
     value = shown(error["input"])
     if error["type"] in ("dataclass_type", "dict_type"):

@@ -14,12 +14,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 
-from terrafusion.datasets.core.config import Quantity, checked_number, shown
+from terrafusion.datasets.core.config import (
+    Parsed,
+    Quantity,
+    RejectedError,
+    Switch,
+    Whole,
+    refuse,
+    shown,
+    structure,
+)
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.soil import SoilParams, load_soil
@@ -29,9 +40,106 @@ from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG, Scenario
 from terrafusion.twin.sweep.plan import AXES, Axis, Sweep, top_speed_mps
 
 MAX_LEVELS = 10_000
-_MAX_SEED = 2**31 - 1
-_KEYS = ("description", "scenario", "vehicle", "axes", "random", "random_seed", "sensors")
-_SPAN = ("from", "to", "count")
+_COUNT = Whole("", 2, MAX_LEVELS)
+_SEED = Whole("", 0, 2**31 - 1)
+
+
+@dataclass(frozen=True)
+class Span:
+    """`{from, to, count}` of an axis; without a count, what a random sweep draws from."""
+
+    low: float
+    high: float
+    count: int | None
+
+
+@dataclass(frozen=True)
+class Levels(Parsed):
+    """Annotation of an axis: a list of numbers, each once, or a span."""
+
+    quantity: Quantity
+
+    def parse(self, raw: Any) -> tuple[float, ...] | Span:
+        if isinstance(raw, dict):
+            return self._span(raw)
+        if not isinstance(raw, list) or not 0 < len(raw) <= MAX_LEVELS:
+            remedy = f"give a list of 1 to {MAX_LEVELS} values, or {{from, to, count}}"
+            raise RejectedError(f"'{{key}}' is '{shown(raw)}'", remedy)
+        levels = tuple(_part(f"[{i}]", self.quantity, value) for i, value in enumerate(raw))
+        if len(set(levels)) < len(levels):
+            twice = next(x for x in levels if levels.count(x) > 1)
+            raise RejectedError(f"'{{key}}' has {shown(twice)} twice", "name each level once")
+        return levels
+
+    def _span(self, raw: dict[Any, Any]) -> Span:
+        ends = {"from": self.quantity, "to": self.quantity, "count": _COUNT}
+        for name in raw:
+            if name not in ends:
+                raise RejectedError(f"unknown key '{{key}}.{shown(name)}'", "known here: from, to, count")
+        for name in ("from", "to"):
+            if name not in raw:
+                raise RejectedError(f"'{{key}}.{name}' is missing", "add it")
+        given = {name: _part(f".{name}", ends[name], value) for name, value in raw.items()}
+        low, high, count = given["from"], given["to"], given.get("count")
+        if low >= high:
+            raise RejectedError(
+                f"'{{key}}.from' is {low:g}, not below 'to' {high:g}", "swap them or give a list"
+            )
+        return Span(float(low), float(high), count)
+
+    def spread(self, span: Span) -> tuple[float, ...]:
+        """The levels of a span with a count.
+
+        Raises:
+            RejectedError: a level between the ends is not allowed.
+        """
+        # Twelve digits: 0.15, not 0.15000000000000002.
+        numbers = [round(x, 12) for x in np.linspace(span.low, span.high, span.count or 0).tolist()]
+        return tuple(self.quantity.parse(x) for x in numbers)  # type: ignore[misc]
+
+    def schema(self) -> dict[str, Any]:
+        number = self.quantity.schema()
+        ends = {"from": number, "to": number, "count": _COUNT.schema()}
+        span = {
+            "type": "object",
+            "properties": ends,
+            "required": ["from", "to"],
+            "additionalProperties": False,
+        }
+        listed = {
+            "type": "array",
+            "items": number,
+            "minItems": 1,
+            "maxItems": MAX_LEVELS,
+            "uniqueItems": True,
+        }
+        return {"anyOf": [listed, span]}
+
+
+@dataclass(frozen=True)
+class AxesFile:
+    """Axes of a sweep; the vehicle limits payload and speed further."""
+
+    terrain: tuple[str, ...] | None = None
+    friction: Annotated[Any, Levels(Quantity("", 0.01, 2.0))] = None
+    slope_deg: Annotated[Any, Levels(Quantity("deg", 0.0, MAX_SLOPE_DEG))] = None
+    payload_kg: Annotated[Any, Levels(Quantity("kg", 0.0, 5000.0))] = None
+    speed_scale: Annotated[Any, Levels(Quantity("", 0.01, 10.0))] = None
+    speed_mps: Annotated[Any, Levels(Quantity("m/s", 0.01, 50.0))] = None
+    seed: Annotated[Any, Levels(_SEED)] = None
+
+
+@dataclass(frozen=True)
+class SweepFile:
+    """Keys of a sweep file."""
+
+    scenario: str
+    axes: AxesFile
+    vehicle: str = "elevate"
+    description: str = ""
+    random: Annotated[int, Whole("", 1, 10**7)] | None = None
+    random_seed: Annotated[int, _SEED] = 0
+    sensors: Switch = False
 
 
 def sweep_names() -> tuple[str, ...]:
@@ -48,150 +156,71 @@ def load_sweep(name_or_path: str | Path) -> Sweep:
         ConfigError: unknown name or key, a wrong type, or a number out of range.
     """
     raw, file = read_named("sweeps", name_or_path, kind="sweep")
-    for name in raw:
-        if name not in _KEYS:
-            raise ConfigError(
-                f"unknown key '{shown(name)}'", file=file, remedy=f"known here: {', '.join(_KEYS)}"
-            )
+    found = structure(SweepFile, raw, file=file)
     folder = Path(file).parent
-    scenario = load_scenario(_near(_text(raw, "scenario", file), folder))
-    vehicle = load_vehicle(_near(_text(raw, "vehicle", file, "elevate"), folder))
-    random = _whole(raw, "random", 1, 10**7, file)
-    axes = _axes(raw, file, vehicle, random is not None)
-    if any(axis.name == "speed_mps" for axis in axes) and top_speed_mps(scenario) <= 0.0:
-        raise ConfigError(
-            f"'axes.speed_mps' needs a forward speed, and '{scenario.name}' has none",
-            file=file,
-            remedy="use 'speed_scale'",
-        )
+    scenario = load_scenario(_near(found.scenario, folder))
+    vehicle = load_vehicle(_near(found.vehicle, folder))
+    refuse(_problems(found, scenario), file)
+    axes = _axes(raw["axes"], vehicle, file)
     return Sweep(
         name=Path(file).stem,
-        description=_text(raw, "description", file, ""),
+        description=found.description,
         scenario=scenario,
         vehicle=vehicle,
         axes=axes,
-        random=random,
-        random_seed=_whole(raw, "random_seed", 0, _MAX_SEED, file) or 0,
-        sensors=_flag(raw, "sensors", file),
+        random=found.random,
+        random_seed=found.random_seed,
+        sensors=found.sensors,
         soils=_soils(scenario, axes, folder),
     )
 
 
-def _axes(raw: dict[str, Any], file: str, vehicle: VehicleParams, random: bool) -> tuple[Axis, ...]:
-    section = raw.get("axes")
-    if not isinstance(section, dict) or not section:
-        raise ConfigError(
-            f"'axes' is '{shown(section)}'", file=file, remedy=f"give axes from {', '.join(AXES)}"
-        )
-    for name in section:
-        if name not in AXES:
-            raise ConfigError(
-                f"unknown key 'axes.{shown(name)}'", file=file, remedy=f"known here: {', '.join(AXES)}"
-            )
-    if "speed_scale" in section and "speed_mps" in section:
-        raise ConfigError(
-            "'axes.speed_scale' and 'axes.speed_mps' exclude each other", file=file, remedy="keep one of them"
-        )
-    ranges = {
-        "friction": Quantity("", 0.01, 2.0),
-        "slope_deg": Quantity("deg", 0.0, MAX_SLOPE_DEG),
-        "payload_kg": Quantity("kg", 0.0, vehicle.body.payload_max_kg),
-        "speed_scale": Quantity("", 0.01, 10.0),
-        "speed_mps": Quantity("m/s", 0.01, vehicle.drive.max_speed_mps),
-        "seed": Quantity("", 0, _MAX_SEED),
-    }
-    axes = []
-    for name in (n for n in AXES if n in section):
-        if name == "terrain":
-            axes.append(Axis(name, _terrains(section[name], file)))
-        else:
-            axes.append(_axis(name, section[name], ranges[name], file, random))
+def _problems(found: SweepFile, scenario: Scenario) -> Iterator[tuple[str, str]]:
+    """What is wrong beyond single values, and the remedy."""
+    axes = found.axes
+    if axes == AxesFile():
+        yield "'axes' is empty", f"give axes from {', '.join(AXES)}"
+    terrain = axes.terrain or ()
+    if axes.terrain == ():
+        yield "'axes.terrain' is '[]'", "give a list of terrains"
+    if len(set(terrain)) < len(terrain):
+        twice = next(name for name in terrain if terrain.count(name) > 1)
+        yield f"'axes.terrain' has {shown(twice)} twice", "name each level once"
+    if axes.speed_scale and axes.speed_mps:
+        yield "'axes.speed_scale' and 'axes.speed_mps' exclude each other", "keep one of them"
+    if axes.speed_mps and top_speed_mps(scenario) <= 0.0:
+        yield f"'axes.speed_mps' needs a forward speed, and '{scenario.name}' has none", "use 'speed_scale'"
+    for name in AXES:
+        span = getattr(axes, name)
+        if isinstance(span, Span) and span.count is None and found.random is None:
+            yield f"'axes.{name}.count' is missing", "add it, or make the sweep 'random'"
+
+
+def _axes(raw: dict[str, Any], vehicle: VehicleParams, file: str) -> tuple[Axis, ...]:
+    """The axes in the order of `AXES`, within the limits of the vehicle."""
+    kinds = {name: get_args(hint)[1] for name, hint in get_type_hints(AxesFile, include_extras=True).items()}
+    kinds["payload_kg"] = Levels(Quantity("kg", 0.0, vehicle.body.payload_max_kg))
+    kinds["speed_mps"] = Levels(Quantity("m/s", 0.01, vehicle.drive.max_speed_mps))
+    axes, errors = [], []
+    for name in (n for n in AXES if n in raw):
+        try:
+            value = tuple(raw[name]) if name == "terrain" else kinds[name].parse(raw[name])
+            if isinstance(value, Span) and value.count is not None:
+                value = kinds[name].spread(value)
+            ends = (value.low, value.high) if isinstance(value, Span) else None
+            axes.append(Axis(name, () if ends else value, ends))
+        except RejectedError as error:
+            errors.append(error.at(f"axes.{name}", file))
+    if errors:
+        raise ConfigError.joined(errors)
     return tuple(axes)
 
 
-def _terrains(raw: Any, file: str) -> tuple[str, ...]:
-    if not isinstance(raw, list) or not raw or not all(isinstance(word, str) for word in raw):
-        raise ConfigError(f"'axes.terrain' is '{shown(raw)}'", file=file, remedy="give a list of terrains")
-    return _distinct("axes.terrain", tuple(raw), file)
-
-
-def _axis(name: str, raw: Any, allowed: Quantity, file: str, random: bool) -> Axis:
-    key = f"axes.{name}"
-    if isinstance(raw, dict):
-        return _span(name, raw, allowed, file, random)
-    if not isinstance(raw, list) or not 0 < len(raw) <= MAX_LEVELS:
-        raise ConfigError(
-            f"'{key}' is '{shown(raw)}'",
-            file=file,
-            remedy=f"give a list of 1 to {MAX_LEVELS} values, or {{from, to, count}}",
-        )
-    numbers = [_level(name, value, allowed, file, f"{key}[{i}]") for i, value in enumerate(raw)]
-    return Axis(name, _distinct(key, tuple(numbers), file))
-
-
-def _span(name: str, raw: dict[str, Any], allowed: Quantity, file: str, random: bool) -> Axis:
-    key = f"axes.{name}"
-    needed = ("from", "to") if random else _SPAN
-    for entry in raw:
-        if entry not in _SPAN:
-            raise ConfigError(
-                f"unknown key '{key}.{shown(entry)}'", file=file, remedy=f"known here: {', '.join(_SPAN)}"
-            )
-    for entry in needed:
-        if entry not in raw:
-            raise ConfigError(f"'{key}.{entry}' is missing", file=file, remedy="add it")
-    low, high = (_level(name, raw[end], allowed, file, f"{key}.{end}") for end in ("from", "to"))
-    if low >= high:
-        raise ConfigError(
-            f"'{key}.from' is {low:g}, not below 'to' {high:g}", file=file, remedy="swap them or give a list"
-        )
-    count = _whole(raw, "count", 2, MAX_LEVELS, file, f"{key}.")
-    if count is None:
-        return Axis(name, span=(float(low), float(high)))
-    # Twelve digits: 0.15, not 0.15000000000000002.
-    numbers = [round(x, 12) for x in np.linspace(low, high, count).tolist()]
-    return Axis(name, tuple(_level(name, x, allowed, file, key) for x in numbers))
-
-
-def _level(name: str, value: Any, allowed: Quantity, file: str, key: str) -> float | int:
-    number = checked_number(value, allowed, file=file, key=key)
-    assert isinstance(number, float)
-    if name != "seed":
-        return number
-    if not number.is_integer():
-        raise ConfigError(f"'{key}' is {number:g}", file=file, remedy="give whole numbers")
-    return int(number)
-
-
-def _distinct(key: str, levels: tuple[Any, ...], file: str) -> tuple[Any, ...]:
-    if len(set(levels)) < len(levels):
-        twice = next(x for x in levels if levels.count(x) > 1)
-        raise ConfigError(f"'{key}' has {shown(twice)} twice", file=file, remedy="name each level once")
-    return levels
-
-
-def _whole(raw: dict[str, Any], key: str, low: int, high: int, file: str, prefix: str = "") -> int | None:
-    if key not in raw:
-        return None
-    number = checked_number(raw[key], Quantity("", low, high), file=file, key=prefix + key)
-    if int(number) != number:  # type: ignore[arg-type]
-        raise ConfigError(f"'{prefix}{key}' is {number:g}", file=file, remedy="give a whole number")
-    return int(number)
-
-
-def _flag(raw: dict[str, Any], key: str, file: str) -> bool:
-    value = raw.get(key, False)
-    if not isinstance(value, bool):
-        raise ConfigError(f"'{key}' is '{shown(value)}'", file=file, remedy="give true or false")
-    return value
-
-
-def _text(raw: dict[str, Any], key: str, file: str, default: str | None = None) -> str:
-    value = raw.get(key, default)
-    if not isinstance(value, str):
-        what = f"'{key}' is '{shown(value)}'" if key in raw else f"'{key}' is missing"
-        raise ConfigError(what, file=file, remedy="give a text")
-    return value
+def _part(suffix: str, quantity: Quantity, raw: Any) -> Any:
+    try:
+        return quantity.parse(raw)
+    except RejectedError as error:
+        raise error.inside(suffix) from None
 
 
 def _near(name: str, folder: Path) -> str:
