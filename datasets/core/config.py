@@ -232,14 +232,21 @@ Switch = Annotated[bool, _Truth()]
 
 @dataclass(frozen=True)
 class Prepared:
-    """Annotation of a field whose raw value `prepare` brings into the form of its type."""
+    """Annotation of a field whose raw value `prepare` brings into the form of its type.
+
+    `short` is the JSON schema of the form that it takes, too.
+    """
 
     prepare: Callable[[Any], Any]
+    short: Mapping[str, Any]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: Any) -> Any:
         from pydantic_core import core_schema
 
         return core_schema.no_info_before_validator_function(self.prepare, handler(source))
+
+    def __get_pydantic_json_schema__(self, core: Any, handler: Any) -> dict[str, Any]:
+        return {"anyOf": [handler(core), dict(self.short)]}
 
 
 @dataclass(frozen=True)
@@ -314,9 +321,26 @@ def quantities(kind: type, prefix: str = "") -> dict[str, Quantity]:
     return found
 
 
-def schema(kind: Any, title: str = "") -> dict[str, Any]:
+def schema(kind: Any, title: str) -> dict[str, Any]:
     """JSON schema (2020-12) of the files that `structure` loads as `kind`."""
-    content: dict[str, Any] = _adapter(kind).json_schema()
+    from pydantic.json_schema import GenerateJsonSchema
+
+    class Generator(GenerateJsonSchema):
+        """Without titles that repeat keys, nulls (a key has a value) and defaults of sections."""
+
+        def field_title_should_be_set(self, schema: Any) -> bool:
+            return False
+
+        def nullable_schema(self, schema: Any) -> Any:
+            return self.generate_inner(schema["schema"])
+
+        def default_schema(self, schema: Any) -> Any:
+            inner = self.generate_inner(schema["schema"])
+            plain = inner.get("type") in ("number", "string", "integer", "boolean") or "enum" in inner
+            given = schema.get("default")
+            return inner | {"default": given} if plain and given is not None else inner
+
+    content: dict[str, Any] = _adapter(kind).json_schema(schema_generator=Generator)
     return {"$schema": "https://json-schema.org/draft/2020-12/schema"} | content | {"title": title}
 
 

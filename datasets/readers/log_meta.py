@@ -62,6 +62,10 @@ class ClockJumpFile:
     step_s: Annotated[float, Quantity("s", -1e10, 1e10)]
 
 
+def _listed(raw: Any) -> Any:
+    return raw if isinstance(raw, (list, tuple)) else [raw]
+
+
 @dataclass(frozen=True, kw_only=True)
 class MetaFile(DescriptionFile):
     """Keys of `meta.yaml`."""
@@ -71,9 +75,7 @@ class MetaFile(DescriptionFile):
         Whole("", 0, MAX_START_NS, meaning="the Unix time of t_s = 0 in whole nanoseconds (0 when unknown)"),
     ]
     notes: tuple[str, ...] = ()
-    clock_jumps: Annotated[
-        tuple[ClockJumpFile, ...], Prepared(lambda raw: raw if isinstance(raw, (list, tuple)) else [raw])
-    ] = ()
+    clock_jumps: Annotated[tuple[ClockJumpFile, ...], Prepared(_listed, {"type": "object"})] = ()
     keep_empty: Switch = False
 
 

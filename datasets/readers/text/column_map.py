@@ -65,6 +65,9 @@ def _section(raw: Any) -> Any:
     return raw
 
 
+_BY_NAME = Prepared(_section, {"type": ["string", "integer"]})
+
+
 @dataclass(frozen=True)
 class ColumnOf:
     """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way."""
@@ -90,8 +93,8 @@ class TimeOf:
 class ColumnMapFile(DescriptionFile):
     """Keys of a column map; see `ColumnMap`."""
 
-    time: Annotated[TimeOf, Prepared(_section)]
-    channels: dict[str, dict[str, Annotated[ColumnOf, Prepared(_section)]]]
+    time: Annotated[TimeOf, _BY_NAME]
+    channels: dict[str, dict[str, Annotated[ColumnOf, _BY_NAME]]]
     separator: str = ""
     header: Annotated[str, Word(("line", "none"))] = "line"
     imu_axes: tuple[str, ...] = BODY_AXES

@@ -91,15 +91,11 @@ def posterior_weights() -> PosteriorWeights:
     Raises:
         ConfigError: the file lacks one.
     """
-    from terrafusion.datasets.core.config import read_yaml
-    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.datasets.core.config import read_yaml, structure
 
     with resources.as_file(resources.files("terrafusion.twin.gap.infer") / "cause_posterior.yaml") as path:
-        read = read_yaml(path)
-        names = [field.name for field in dataclasses.fields(PosteriorWeights)]
-        if set(read.get("weights", {})) != set(names):
-            raise ConfigError("weights are missing or unknown", file=path, remedy="train them again")
-        return PosteriorWeights(**{name: float(read["weights"][name]) for name in names})
+        weights = read_yaml(path).get("weights")
+        return structure(PosteriorWeights, weights, file=path, key="weights")
 
 
 @dataclass(frozen=True, eq=False)
