@@ -97,8 +97,7 @@ def _measured(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     centre = t_s - 0.5 * min(sample_interval_s(t_s), 0.1)
     grid = DT_S * np.arange(round(float(t_s[-1]) / DT_S) + 1)
     sides = np.stack([np.interp(grid, centre, side) for side in measured.T], axis=1)
-    far = np.flatnonzero(np.diff(t_s) > LONGEST_GAP_S)
-    return TwinInput(start, sides, True, np.stack([t_s[far], t_s[far + 1]], axis=1), tuple(notes))
+    return TwinInput(start, sides, True, _gaps(t_s), tuple(notes))
 
 
 def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
@@ -119,7 +118,12 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     start = int(stamps[0])
     t_s: Array = (stamps - start).astype(float) * 1e-9
     ends = [int(channel.t_ns[-1]) for channel in recording.channels().values() if len(channel)]
-    _in_one_time(recording, max(ends) - int(stamps[-1]))
+    after_ns = max(ends) - int(stamps[-1])
+    if after_ns > 86_400 * 10**9:
+        raise DataError(
+            f"the log goes on for {after_ns * 1e-9:.0f} s after its last command: its clocks differ",
+            file=recording.name, channel="command", remedy="try --stamps receive",
+        )  # fmt: skip
     count = round((max(ends) - start) * 1e-9 / DT_S) + 1
     grid: Array = DT_S * np.arange(float(count))
     limits = np.array([vehicle.drive.max_accel_mps2, vehicle.drive.max_yaw_accel_radps2])
@@ -127,27 +131,17 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     first = np.zeros(2) if _rests(recording, vehicle) else wanted[0]
     free = Scenario(name=recording.name, duration_s=math.inf, max_accel_mps2=math.inf)
     sides = side_speeds(limit_slew(wanted, DT_S, vehicle, free, first), vehicle)
-    gaps = _holes(t_s)
+    # Rare commands hold until the next one.
+    gaps = _gaps(t_s) if sample_interval_s(t_s) <= 0.5 * LONGEST_GAP_S else np.zeros((0, 2))
     notes = [f"the commands have {len(gaps)} hole(s) of up to {np.diff(gaps).max():.1f} s: what falls into "
              "them is not compared, the last command is held"] if len(gaps) else []  # fmt: skip
     return TwinInput(start, sides, False, gaps, tuple(notes))
 
 
-def _holes(t_s: Array) -> Array:
-    """Stretches (G, 2) without commands, where these come at a steady rate; rare ones hold until the next."""
-    if sample_interval_s(t_s) > 0.5 * LONGEST_GAP_S:
-        return np.zeros((0, 2))
+def _gaps(t_s: Array) -> Array:
+    """Intervals (G, 2) without samples that are longer than `LONGEST_GAP_S`."""
     far = np.flatnonzero(np.diff(t_s) > LONGEST_GAP_S)
     return np.stack([t_s[far], t_s[far + 1]], axis=1)
-
-
-def _in_one_time(recording: Recording, after_ns: int) -> None:
-    """Refuse a log that goes on for a day after its last command: its clocks differ."""
-    if after_ns > 86_400 * 10**9:
-        raise DataError(
-            f"the log goes on for {after_ns * 1e-9:.0f} s after its last command: its clocks differ",
-            file=recording.name, channel="command", remedy="try --stamps receive",
-        )  # fmt: skip
 
 
 def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:

@@ -18,7 +18,7 @@ from terrafusion.twin.model.measurement import (
     measurement_jacobian,
 )
 from terrafusion.twin.model.motion import plane_rotation
-from terrafusion.twin.model.plant import Plant, RouteTable
+from terrafusion.twin.model.plant import Plant, RouteTable, smoothstep
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS, WHEELS
 
@@ -77,7 +77,7 @@ def along(route: RouteTable, table: Array, t_s: Array) -> Array:
     out = np.repeat(table[:1], len(t_s), axis=0)
     for k in range(len(route.at) - 1):
         s = np.clip((t_s - route.at[k]) / (route.at[k + 1] - route.at[k]), 0.0, 1.0)
-        share = s * s * (3.0 - 2.0 * s)
+        share = smoothstep(s)
         out += share.reshape(-1, *(1,) * (table.ndim - 1)) * (table[k + 1] - table[k])
     return out
 

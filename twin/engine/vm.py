@@ -1,4 +1,4 @@
-"""The twin in CasADi's virtual machine: for where no C compiler is found, and to test the C code by."""
+"""The twin in CasADi's virtual machine: where no C compiler is found, and to test the C code against."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.model.dynamics import rhs
-from terrafusion.twin.model.plant import Plant, SoilField
+from terrafusion.twin.model.plant import Plant, SoilField, smoothstep
 from terrafusion.twin.physics.layout import (
     ENDS,
     INDEX,
@@ -168,7 +168,7 @@ def _soil(knots: int) -> Any:
     soil = flat[:n]
     for k in range(knots - 1):
         s = ca.fmin(1.0, ca.fmax(0.0, (c - at[k]) / (at[k + 1] - at[k])))
-        soil += s * s * (3.0 - 2.0 * s) * (flat[(k + 1) * n : (k + 2) * n] - flat[k * n : (k + 1) * n])
+        soil += smoothstep(s) * (flat[(k + 1) * n : (k + 2) * n] - flat[k * n : (k + 1) * n])
     return ca.Function("tf_soil", [c, at, flat], [soil])
 
 

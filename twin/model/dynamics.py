@@ -113,7 +113,7 @@ def wheel_loads(p: dict[str, Any], gravity_x: Any, gravity_y: Any) -> list[Any]:
     `gravity_x`, `gravity_y` are gravity along body x and y, m/s2. A load is
     bounded above zero smoothly: the model does not tip over.
     """
-    from terrafusion.twin.physics.wheel import smooth_max
+    from terrafusion.twin.physics.smooth import smooth_max
 
     weight = p["mass_kg"] * p["gravity_normal_mps2"]
     lean_x = (p["cg_forward_m"] + p["cg_height_m"] * gravity_x / p["gravity_normal_mps2"]) / p["wheelbase_m"]
@@ -158,8 +158,8 @@ def _supply(q: dict[str, Any]) -> dict[str, Any]:
 
 def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, Any]:
     """All quantities of one wheel: its corner of the body, its ground, its motor, its forces."""
-    from terrafusion.twin.physics.terramechanics import following
-    from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, contact, slipping
+    from terrafusion.twin.physics.terramechanics import WheelShape, following
+    from terrafusion.twin.physics.wheel import WheelSoil, contact, slipping
 
     name, side, end = WHEELS[i], SIDES[i], ENDS[i]
     forward, left = wheel_positions(q)[i]

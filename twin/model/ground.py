@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.config import Quantity
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.model.plant import RouteTable, SoilField
+from terrafusion.twin.model.plant import RouteTable, SoilField, smoothstep
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 
 Array = NDArray[np.float64]
@@ -180,5 +180,5 @@ def _on_route(route: RouteTable, coordinate: Array) -> Array:
         return np.tile(route.soil[0], (len(coordinate), 1))
     i = np.clip(np.searchsorted(route.at, coordinate, side="right") - 1, 0, len(route.at) - 2)
     w = np.clip((coordinate - route.at[i]) / (route.at[i + 1] - route.at[i]), 0.0, 1.0)
-    w = (w * w * (3.0 - 2.0 * w))[:, None]
+    w = smoothstep(w)[:, None]
     return np.asarray(route.soil[i] + w * (route.soil[i + 1] - route.soil[i]))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,3 +81,8 @@ class Plant:
     def effect_values(self, also: Iterable[str] = ()) -> Array:
         """Values (E,) in the order of `effect_names(also)`."""
         return np.array([self.effects.get(name, 0.0) for name in self.effect_names(also)], dtype=float)
+
+
+def smoothstep(share: Any) -> Any:
+    """3 s^2 - 2 s^3 of a share from 0 to 1 (expressions, numbers or arrays): how two grounds join."""
+    return share * share * (3.0 - 2.0 * share)

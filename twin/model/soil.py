@@ -22,8 +22,8 @@ from terrafusion.twin.model.soil_table import is_published, published_soil
 class PressureSinkage:
     """Bekker: pressure p = (k_c / b + k_phi) z^n; rigid-wheel sinkage grows with slip by 1 + k_ss |s|.
 
-    `skid_sinkage` is the same for the skid of a braked or side-slipping wheel; `multipass` is the share of the
-    sinkage that is already in the rut of the wheel ahead.
+    `skid_sinkage` is the same for the skid of a braked or side-slipping wheel; `multipass` is the share of
+    the sinkage that the rut of the wheel ahead already has.
     """
 
     k_c_n_per_m_n1: Annotated[float, Sourced("N/m^(n+1)", 0.0, 1e7)]

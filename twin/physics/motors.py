@@ -28,7 +28,7 @@ def motor_torque(
     `voltage_share` is the supply's voltage over the nominal one: stall torque
     and no-load speed are proportional to it.
     """
-    from terrafusion.twin.physics.wheel import smooth_max, smooth_min
+    from terrafusion.twin.physics.smooth import smooth_max, smooth_min
 
     wanted = p["loop_p_nms"] * error_radps + p["loop_i_nm"] * integral_rad
     at_wheel = p["gear_ratio"] * p["gear_efficiency"]
@@ -78,7 +78,7 @@ def gear_loss(p: Any, current_a: Any, torque_nm: Any, speed_radps: Any) -> Any:
 
 def drawn_power(p: Any, torque_nm: Any, speed_radps: Any) -> Any:
     """Power a motor draws, W, never negative: a bridge without recovery burns what comes back."""
-    from terrafusion.twin.physics.wheel import smooth_max
+    from terrafusion.twin.physics.smooth import smooth_max
 
     current = motor_current(p, torque_nm, speed_radps)
     return smooth_max(motor_voltage(p, current, speed_radps) * current, 0.0, DRAW_WIDTH_W)
@@ -98,7 +98,7 @@ def battery(p: Any, power_w: Any, drawn_j: Any, current_a: Any) -> tuple[Any, An
         drawn_j: energy taken from the store since the start.
         current_a: smoothed current (state).
     """
-    from terrafusion.twin.physics.wheel import smooth_max
+    from terrafusion.twin.physics.smooth import smooth_max
 
     charge = smooth_max(p["battery_charge"] - drawn_j / p["battery_j"], 0.0, 1e-3)
     open_v = p["battery_empty_v"] + (p["battery_full_v"] - p["battery_empty_v"]) * charge

@@ -12,24 +12,8 @@ from typing import NamedTuple
 import casadi as ca
 
 from terrafusion.twin.physics import terramechanics as tm
-from terrafusion.twin.physics.smooth import Scalar, saturate, smooth_abs, smooth_max, smooth_min
+from terrafusion.twin.physics.smooth import Scalar, saturate, smooth_abs, smooth_max
 from terrafusion.twin.physics.terramechanics import SLIP_SPEED_MPS, WheelShape
-
-__all__ = [
-    "Contact",
-    "Footprint",
-    "WheelShape",
-    "WheelSoil",
-    "clog_rate",
-    "contact",
-    "footprint",
-    "saturate",
-    "slipping",
-    "smooth_abs",
-    "smooth_max",
-    "smooth_min",
-    "steady_contact",
-]  # fmt: skip
 
 REST_SPEED_MPS = 1e-4
 """Below this speed a wheel counts as resting: the leak of the held shear displacement is of this order."""

@@ -1,4 +1,4 @@
-"""The ground of a drive: soil parameters for the integrator, labels and shares for the sensors."""
+"""The ground of a run: soil parameters for the integrator, labels and shares for the sensors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.model.ground import SoilPatches, Variation, soil_field
-from terrafusion.twin.model.plant import RouteTable
+from terrafusion.twin.model.plant import RouteTable, smoothstep
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.scenario.scenario import Scenario
@@ -93,7 +93,7 @@ class Route:
         ramps = []
         for border in self.borders:
             w = np.clip((coordinate - border) / self.transition + 0.5, 0.0, 1.0)
-            ramps.append(w * w * (3.0 - 2.0 * w))
+            ramps.append(smoothstep(w))
         edges = [np.ones_like(coordinate), *ramps, np.zeros_like(coordinate)]
         parts = [(s, a - b) for s, a, b in zip(self.soils, edges[:-1], edges[1:], strict=True)]
         if self.patch_soil is not None and patch_share is not None:

@@ -1,7 +1,8 @@
 """Validity ranges of soils: what lies outside is refused, not extrapolated.
 
-Each number of a soil file has its own range `valid`, checked on loading (`datasets.core.config`). What depends on the run is checked here: ground pressure, wheel diameter and
-moisture before the drive, slip after it.
+Each number of a soil file has its own range `valid`, checked on loading (`datasets.core.config`). What
+depends on the run is checked here: ground pressure, wheel diameter and moisture before the drive, slip after
+it.
 """
 
 from __future__ import annotations

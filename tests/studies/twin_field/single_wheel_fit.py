@@ -131,7 +131,8 @@ def _model(count: int, fixed: tuple[tuple[str, float], ...]) -> Any:
     """(values (P,), motion (4, N)) -> outputs (3, N) and derivatives (3, N P), trial by trial."""
     import casadi as ca
 
-    from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, steady_contact
+    from terrafusion.twin.physics.terramechanics import WheelShape
+    from terrafusion.twin.physics.wheel import WheelSoil, steady_contact
 
     values, motion = ca.SX.sym("values", len(FREE)), ca.SX.sym("motion", 4)
     numbers: dict[str, Any] = dict.fromkeys(SOIL_PARAMETERS, 0.0)

@@ -14,7 +14,8 @@ from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import motor_current
-from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, footprint
+from terrafusion.twin.physics.terramechanics import WheelShape
+from terrafusion.twin.physics.wheel import WheelSoil, footprint
 
 ELEVATE = load_vehicle("elevate")
 RADIUS_M = ELEVATE.wheel.radius_m

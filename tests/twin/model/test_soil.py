@@ -20,7 +20,8 @@ from terrafusion.twin.model.soil_table import published_soils
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.model.vehicle import load_vehicle, vehicle_names
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, STATES, state_slice
-from terrafusion.twin.physics.wheel import WheelShape, WheelSoil, steady_contact
+from terrafusion.twin.physics.terramechanics import WheelShape
+from terrafusion.twin.physics.wheel import WheelSoil, steady_contact
 from terrafusion.twin.scenario.route import Route
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.scenario.validity import check_slip, check_wheel, ground_pressure_pa

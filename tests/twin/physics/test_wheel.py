@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from terrafusion.twin.model.soil import load_soil, soil_names
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS
-from terrafusion.twin.physics.wheel import Contact, WheelShape, WheelSoil, contact, footprint, steady_contact
+from terrafusion.twin.physics.terramechanics import WheelShape
+from terrafusion.twin.physics.wheel import Contact, WheelSoil, contact, footprint, steady_contact
 
 LOAD_N = 80.0
 SMOOTH = WheelShape(0.175, 0.145)
