@@ -50,7 +50,6 @@ def benchmark(
         write_benchmark,
         write_document,
     )
-    from terrafusion.fusion.reports.benchmark_tables import markdown
 
     plan = BenchmarkPlan(families_of(only or []), seeds, quick)
     words = [f"--{name}" for name, given in (("quick", quick),) if given]
@@ -67,5 +66,5 @@ def benchmark(
     if docs is not None:
         write_document(docs, made, result, origin)
     for table in made[:3]:
-        print("\n".join([*markdown(table), ""]))
+        print("\n".join([*table.markdown(), ""]))
     print(f"report: {out / 'report.html'}")

@@ -1,10 +1,10 @@
 """The files of a benchmark.
 
-benchmark.json   every row, every comparison and target, where it comes from
+benchmark.json   every row, comparison and target, with its provenance
 benchmark.md     the tables; with `--docs` also the document made of them
 ratios.png       the figure
 report.html      tables and figure in one page
-parts/           the rows of single jobs, from which a stopped run goes on
+parts/           the rows of single jobs, from which a stopped run continues
 """
 
 from __future__ import annotations
@@ -12,12 +12,10 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import to_json
 from terrafusion.fusion.benchmark.checkpoints import LIBRARIES, hash_sources, sources_sha256
 from terrafusion.fusion.benchmark.compare import LEAST_UNITS, contrasts, shares
@@ -29,43 +27,48 @@ from terrafusion.fusion.benchmark.twin_runs import FIELD
 from terrafusion.fusion.metrics.pooled_consistency import PooledConsistency
 from terrafusion.fusion.noise.modes import load_modes
 from terrafusion.fusion.noise.policy import load_policy
-from terrafusion.fusion.reports import page
-from terrafusion.fusion.reports.benchmark_tables import Table, markdown, tables
+from terrafusion.fusion.reports.benchmark_tables import Section, tables
+from terrafusion.fusion.reports.page import write_page, write_png, write_text
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 SCHEMA = "terrafusion.benchmark/1"
 MARK = "<!-- what follows is written by terrafusion benchmark --docs -->"
 CAPTION = (
-    "Position error in the outage over that of the fixed row tuned on the training drives. "
-    "The diamond is the adaptive weighting with the detected ground."
+    "Position error in the outage over that of the fixed noise tuned on the training drives. "
+    "The diamond is the adaptive weighting with the detected terrain."
 )
 
 
-def write_benchmark(out: Path, found: BenchmarkResult, origin: Mapping[str, str]) -> list[Table]:
+def write_benchmark(out: Path, found: BenchmarkResult, origin: Mapping[str, str]) -> list[Section]:
     """All files but the parts; returns the tables.
 
     Raises:
         TerrafusionError: a file cannot be written.
     """
-    made = tables(found.rows)
-    _text(out / "benchmark.json", to_json(_content(found, origin), indent=1) + "\n")
-    _text(out / "benchmark.md", "\n".join(document_lines(made, found, origin)) + "\n")
-    figure = plot_ratios(contrasts(found.rows))
-    write_atomically(out / "ratios.png", lambda part: figure.savefig(part, format="png", dpi=110))
-    _page(out / "report.html", made, found, origin)
-    return made
+    sections = tables(found.rows)
+    write_text(out / "benchmark.json", to_json(_content(found, origin), indent=1) + "\n")
+    write_text(out / "benchmark.md", "\n".join(document_lines(sections, found, origin)) + "\n")
+    ratios = plot_ratios(contrasts(found.rows))
+    write_png(out / "ratios.png", ratios, dpi=110)
+    write_page(
+        out / "report.html", "benchmark.html.j2", "Fixed against adaptive weighting",
+        provenance=origin, packages=LIBRARIES, tables=sections, ratios=ratios, caption=CAPTION,
+        refused=[one.line for one in found.refused],
+    )  # fmt: skip
+    return sections
 
 
 def write_document(
-    path: Path, made: Sequence[Table], found: BenchmarkResult, origin: Mapping[str, str]
+    path: Path, made: Sequence[Section], found: BenchmarkResult, origin: Mapping[str, str]
 ) -> None:
-    """Put the tables into a document: what follows its line `MARK` is replaced, the rest is kept.
+    """Replace what follows the line `MARK` of a document by the tables.
 
     Raises:
         ConfigError: the file is not there, or has no such line.
         TerrafusionError: it cannot be written.
     """
-    _text(path, document_head(path) + MARK + "\n\n" + "\n".join(document_lines(made, found, origin)) + "\n")
+    lines = document_lines(made, found, origin)
+    write_text(path, document_head(path) + MARK + "\n\n" + "\n".join(lines) + "\n")
 
 
 def document_head(path: Path) -> str:
@@ -86,7 +89,7 @@ def document_head(path: Path) -> str:
 
 
 def origin_of(plan: BenchmarkPlan, command: str) -> dict[str, str]:
-    """What the numbers are made by and of: to be asked before they are made."""
+    """Command, commit, sources and inputs of a benchmark, to be recorded before it runs."""
     seeds = [f"{family} {plan.seed_count(family)}" for family in plan.families if family != FIELD]
     return {
         "command": command,
@@ -99,7 +102,7 @@ def origin_of(plan: BenchmarkPlan, command: str) -> dict[str, str]:
 
 
 def at_the_end(origin: Mapping[str, str]) -> dict[str, str]:
-    """The origin, which says so where the sources are no longer those of the beginning."""
+    """The origin, with a note where the sources have changed since the start."""
     note = "" if hash_sources()[:16] == origin["sources"] else ", changed while it ran"
     return {**origin, "sources": origin["sources"] + note}
 
@@ -107,7 +110,7 @@ def at_the_end(origin: Mapping[str, str]) -> dict[str, str]:
 def commit() -> str:
     """Commit of the checkout that this library runs from, "-dirty" where files differ; "" without one.
 
-    An installed library lies in nobody's checkout, even where the folder above it is one.
+    An installed library is in no checkout, even where the folder above it is one.
     """
     file = Path(__file__)
     try:
@@ -122,11 +125,9 @@ def _git(folder: Path, *words: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
 
-def document_lines(made: Sequence[Table], found: BenchmarkResult, origin: Mapping[str, str]) -> list[str]:
+def document_lines(made: Sequence[Section], found: BenchmarkResult, origin: Mapping[str, str]) -> list[str]:
     """The tables as Markdown, and where they come from."""
-    lines: list[str] = []
-    for table in made:
-        lines += [*markdown(table), ""]
+    lines = [line for section in made for line in [*section.markdown(), ""]]
     if found.refused:
         lines += ["## Logs not run", "", *(f"- {one.line}" for one in found.refused), ""]
     return [*lines, "## Made by", "", *(f"- {name}: `{text}`" for name, text in origin.items())]
@@ -154,21 +155,3 @@ def _cell(cell: PooledConsistency) -> dict[str, Any]:
     few = cell.drives < LEAST_UNITS
     known = {"interval": None, "verdict": None} if few else {"verdict": cell.verdict()}
     return dataclasses.asdict(cell) | known
-
-
-def _page(path: Path, made: Sequence[Table], found: BenchmarkResult, origin: Mapping[str, str]) -> None:
-    body = ["<h1>Fixed against adaptive weighting</h1>"]
-    for k, table in enumerate(made):
-        cells = [[escape(cell) for cell in row] for row in table.rows]
-        body += [f"<h2>{escape(table.title)}</h2>", f"<p>{escape(table.about)}</p>"]
-        body.append(page.table(table.heads, cells, range(1, len(table.heads))))
-        if k == 0:
-            body.append(page.figure(plot_ratios(contrasts(found.rows)), CAPTION))
-    if found.refused:
-        body += ["<h2>Logs not run</h2>", page.bullets(escape(one.line) for one in found.refused)]
-    body.append(page.where_from(origin, LIBRARIES))
-    page.write_page(path, "Fixed against adaptive weighting", body)
-
-
-def _text(path: Path, text: str) -> None:
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.datasets.core.tables import number
+from terrafusion.datasets.core.tables import markdown_table, number
 from terrafusion.fusion.benchmark.compare import (
     LEAST_UNITS,
     Contrast,
@@ -28,16 +28,20 @@ Cells = list[str]
 
 
 @dataclass(frozen=True)
-class Table:
-    """A table with what it says in words; the first column is text, the others numbers or words."""
+class Section:
+    """A table with an explanation; its first column is text, the others are numbers or words."""
 
     title: str
     about: str
     heads: tuple[str, ...]
     rows: tuple[Cells, ...]
 
+    def markdown(self) -> list[str]:
+        """Lines of a section of a document."""
+        return [f"## {self.title}", self.about, "", *markdown_table(self.heads, self.rows)]
 
-def tables(rows: Sequence[RunScore]) -> list[Table]:
+
+def tables(rows: Sequence[RunScore]) -> list[Section]:
     """All tables, the main one first; those without rows are left out."""
     made = (
         _main(rows), _targets(targets(rows)), _reasons(reasons(rows)), _wins(contrasts(rows)), _shares(rows),
@@ -46,20 +50,13 @@ def tables(rows: Sequence[RunScore]) -> list[Table]:
     return [table for table in made if table.rows]
 
 
-def markdown(table: Table) -> list[str]:
-    """Lines of a section."""
-    lines = [f"## {table.title}", table.about, "", f"| {' | '.join(table.heads)} |"]
-    lines.append("| --- |" + " --- |" * (len(table.heads) - 1))
-    return [*lines, *(f"| {' | '.join(cells)} |" for cells in table.rows)]
-
-
 def group_name(family: str, plant: str) -> str:
     """ "mixed, twin"."""
     return f"{family}, {plant}"
 
 
-def _main(rows: Sequence[RunScore]) -> Table:
-    """Median error of the fixed row, and the ratios to it."""
+def _main(rows: Sequence[RunScore]) -> Section:
+    """Median error of the fixed noise, and the ratios to it."""
     found = contrasts(rows)
     arms = [arm.name for arm in METHODS if arm.name != BASELINE]
     lines = []
@@ -75,10 +72,10 @@ def _main(rows: Sequence[RunScore]) -> Table:
         "Below 1 is better. A replay that failed counts as infinitely wrong; in brackets the pairs where not "
         "every drive has labels."
     )
-    return Table("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *arms), tuple(lines))
+    return Section("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *arms), tuple(lines))
 
 
-def _targets(found: Iterable[Target]) -> Table:
+def _targets(found: Iterable[Target]) -> Section:
     lines = [
         [
             t.name, t.what, f"{'<=' if t.most else '>='} {t.limit:g}{f' {t.unit}' if t.unit else ''}",
@@ -88,31 +85,31 @@ def _targets(found: Iterable[Target]) -> Table:
         for t in found
     ]  # fmt: skip
     about = (
-        "Reached or missed: by the whole interval. Open: the interval holds the limit, or there is none "
-        f"(below {LEAST_UNITS} drives). G9 is missed by any replay of {ADAPTIVE} that fails or diverges, "
-        "and the estimator was made with its logs in view."
+        "Reached or missed: the whole interval is on one side of the limit. Open: it contains the limit, or "
+        f"there is none (below {LEAST_UNITS} drives). G9 is missed by any replay of {ADAPTIVE} that fails or "
+        "diverges; its logs were in view while the estimator was developed."
     )
-    return Table("Targets", about, ("target", "what", "limit", "found", "verdict"), tuple(lines))
+    return Section("Targets", about, ("target", "what", "limit", "measured", "verdict"), tuple(lines))
 
 
-def _reasons(found: Iterable[Reason]) -> Table:
+def _reasons(found: Iterable[Reason]) -> Section:
     lines = [
         [
-            group_name(r.family, r.plant), f"{r.winner}, {r.ratio:.2f}{'' if r.sure else ' (not sure)'}",
-            number(r.oracle), r.blame(), f"{r.ground}: {r.kind}" if r.ground else "the truth does not tell",
+            group_name(r.family, r.plant), f"{r.winner}, {r.ratio:.2f}{'' if r.sure else ' (not significant)'}",
+            number(r.oracle), r.blame(), f"{r.ground}: {r.kind}" if r.ground else "unknown",
             _percent(r.recognised[0]), _percent(r.recognised[1]),
         ]
         for r in found
     ]  # fmt: skip
     about = (
-        "Groups in which some baseline beats the detected ground by more than 3 %: adaptive over that "
-        "baseline, the oracle over it, and the ground and kind of velocity error in which most is lost to it."
+        "Groups in which some baseline beats adaptive by more than 3 %: error of adaptive over that "
+        "baseline, of the oracle over it, and the terrain and kind of velocity error with the largest loss."
     )
-    heads = ("drives", "beaten by", "oracle", "blame", "most lost", "recognised", "recognised there")
-    return Table("Where adaptive loses", about, heads, tuple(lines))
+    heads = ("drives", "beaten by", "oracle", "cause", "largest loss", "recognised", "recognised there")
+    return Section("Where adaptive loses", about, heads, tuple(lines))
 
 
-def _wins(found: Iterable[Contrast]) -> Table:
+def _wins(found: Iterable[Contrast]) -> Section:
     arms = [arm.name for arm in METHODS if arm.name != BASELINE]
     groups: dict[tuple[str, str], dict[str, Contrast]] = {}
     for c in found:
@@ -122,10 +119,10 @@ def _wins(found: Iterable[Contrast]) -> Table:
         for key, of in groups.items()
     ]
     about = f"Drives (logs in the field) won and lost against {BASELINE} by more than 3 %."
-    return Table("Wins and losses", about, ("drives", *arms), tuple(lines))
+    return Section("Wins and losses", about, ("drives", *arms), tuple(lines))
 
 
-def _shares(rows: Sequence[RunScore]) -> Table:
+def _shares(rows: Sequence[RunScore]) -> Section:
     groups = groups_of(rows)
     lines = []
     for s in shares(rows):
@@ -138,16 +135,16 @@ def _shares(rows: Sequence[RunScore]) -> Table:
             after = f"{np.median(delays):.1f} s" if delays else "-"
             lines.append([group_name(s.family, s.plant), share, _percent(known), after])
     about = (
-        f"Gain of the detected ground over {BASELINE} as a share of the gain with true labels, and how much of "
-        "the outages the detector names the ground, and how long after a change (median over drives). "
-        "No gain: the oracle is no better than 3 %."
+        f"Gain of adaptive over {BASELINE} as a share of the gain with true labels, the share of the outages in "
+        "which the detector is right, and its delay after a change (median over drives). "
+        "No gain: the oracle gains no more than 3 %."
     )
-    return Table(
-        "Share of the oracle's gain", about, ("drives", "share", "recognised", "after"), tuple(lines)
+    return Section(
+        "Share of the oracle's gain", about, ("drives", "share", "recognised", "delay"), tuple(lines)
     )
 
 
-def _nees(cells: Iterable[PooledConsistency]) -> Table:
+def _nees(cells: Iterable[PooledConsistency]) -> Section:
     groups: dict[tuple[str, str], dict[str, PooledConsistency]] = {}
     for cell in cells:
         groups.setdefault((cell.terrain, cell.mode), {})[cell.quantity] = cell
@@ -156,15 +153,15 @@ def _nees(cells: Iterable[PooledConsistency]) -> Table:
         texts = [_cell(of[q]) if q in of else "-" for q in (INSIDE, IN_OUTAGE)]
         lines.append([ground, mode, str(max(c.drives for c in of.values())), *texts])
     about = (
-        "Mean NEES of the position per dimension on each true ground [95 % interval over drives], inside "
+        "Mean NEES of the position per dimension on each true terrain [95 % interval over drives], inside "
         "(=), above (+, overconfident) or below (-, cautious) the band of a consistent estimator; with fewer "
         f"than {LEAST_UNITS} drives the mean alone."
     )
-    heads = ("ground", "plant, arm", "drives", INSIDE, IN_OUTAGE)
-    return Table("Consistency", about, heads, tuple(lines))
+    heads = ("terrain", "plant, arm", "drives", INSIDE, IN_OUTAGE)
+    return Section("Consistency", about, heads, tuple(lines))
 
 
-def _field(rows: Sequence[RunScore]) -> Table:
+def _field(rows: Sequence[RunScore]) -> Section:
     """Log by log: medians over its outages."""
     own = [row for row in rows if row.family == FIELD and row.error_m is not None]
     lines = []
@@ -174,22 +171,22 @@ def _field(rows: Sequence[RunScore]) -> Table:
             for arm in METHODS
         }
         lines.append([log, str(len(of[BASELINE])), *(_median(of[arm.name]) for arm in METHODS)])
-    about = "Median over the outages of a log, m; against truth, or fixes kept back with their noise."
-    return Table("Field logs", about, ("log", "drives", *(arm.name for arm in METHODS)), tuple(lines))
+    about = "Median over the outages of a log, m; against truth, or held-out fixes with their noise."
+    return Section("Field logs", about, ("log", "drives", *(arm.name for arm in METHODS)), tuple(lines))
 
 
-def _failures(rows: Sequence[RunScore]) -> Table:
+def _failures(rows: Sequence[RunScore]) -> Section:
     found = [(row, row.failed or f"diverged: {row.diverged}") for row in rows if row.failed or row.diverged]
     lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.arm, why] for row, why in found)
-    return Table("Replays that failed or diverged", "All of them.", ("drive", "arm", "why"), lines)
+    return Section("Replays that failed or diverged", "All of them.", ("drive", "arm", "why"), lines)
 
 
-def _arms() -> Table:
+def _arms() -> Section:
     lines = [[arm.name, arm.about] for arm in METHODS]
     lines += [[name, family.about] for name, family in FAMILIES.items()]
-    lines += [[FIELD, "field logs at hand, 30, 60 and 120 s without GNSS; by ground"]]
+    lines += [[FIELD, "field logs at hand, 30, 60 and 120 s without GNSS; by terrain"]]
     lines += [[name, about] for name, about in PLANTS.items()]
-    return Table("Names", "Arms, families of drives, and plants.", ("name", "is"), tuple(lines))
+    return Section("Names", "Arms, families of drives, and plants.", ("name", "is"), tuple(lines))
 
 
 def _ratio(c: Contrast | None, units: int) -> str:

@@ -1,4 +1,4 @@
-"""A diagnosis in plain words that say only what its numbers carry."""
+"""A diagnosis in sentences."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ MOST_LISTED = 4
 
 def sentences(d: GapDiagnosis) -> list[str]:
     """The answer in sentences."""
-    said = [_detection(d)]
+    lines = [_detection(d)]
     if d.detected:
-        said += [_cause(d), _place(d), _shrink(d)]
+        lines += [_cause(d), _place(d), _shrink(d)]
     if d.next_run is not None:
         what = d.next_run.scenario
-        said.append(f"Next, {what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}.")
+        lines.append(f"Next, {what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}.")
     if d.uncalibrated:
-        said.append(
-            "The threshold is uncalibrated: there are too few reference runs, and twin replicates stood in "
-            "for them."
+        lines.append(
+            "The threshold is uncalibrated: there are too few reference runs, so replicates of the twin "
+            "take their place."
         )
-    return [s for s in said if s]
+    return [line for line in lines if line]
 
 
 def _detection(d: GapDiagnosis) -> str:
@@ -33,8 +33,8 @@ def _detection(d: GapDiagnosis) -> str:
     against = f"{len(d.references)} reference run(s)" if d.references else "the twin's own replicates"
     if not d.detected:
         return (
-            f"No gap was found: {runs} differ from {against} no more than these among themselves "
-            f"(p = {p:.3g}, threshold {d.significance:g}). A small gap may still be there."
+            f"No gap was detected: {runs} differ from {against} no more than these among themselves "
+            f"(p = {p:.3g}, threshold {d.significance:g}). A small gap may remain undetected."
         )
     return f"There is a gap: {runs} differ from {against} (p = {p:.3g}, threshold {d.significance:g})."
 
@@ -44,19 +44,19 @@ def _cause(d: GapDiagnosis) -> str:
     share = "" if first.share is None else f", which explains {100.0 * first.share:.0f} % of it"
     if verdict.kind == "unknown":
         return (
-            f"No candidate explains it: the best, {first.effect}, leaves too much. "
-            "Something is at work that the catalogue does not have."
+            f"No candidate explains it: the best, {first.effect}, leaves too large a residual. "
+            "The cause is probably not in the catalogue of effects."
         )
     if verdict.kind == "parameters":
-        return f"The ground has changed its strength; nothing structural is missing ({numbers(d)})."
+        return f"The soil parameters differ; no structural effect is missing ({numbers(d)})."
     if len(verdict.named) > 1:
         several = [cause for name in verdict.named for cause in verdict.causes if cause.effect == name]
         listed = "; and ".join(f"{_class_of(cause)} ({numbers(d, cause)})" for cause in several)
-        sure = 100.0 * sum(cause.probability for cause in several)
-        return f"The most probable causes act together (probability {sure:.0f} %): {listed}."
+        total = 100.0 * sum(cause.probability for cause in several)
+        return f"The most probable causes act together (probability {total:.0f} %): {listed}."
     if verdict.kind == "ambiguous":
         listed = ", ".join(first.members)
-        return f"Its cause is one of {listed}: these runs cannot tell them apart{share} ({numbers(d)})."
+        return f"Its cause is one of {listed}, which these runs cannot distinguish{share} ({numbers(d)})."
     return (
         f"The most probable cause is {first.effect} "
         f"(probability {100.0 * first.probability:.0f} %){share} ({numbers(d)})."
@@ -66,7 +66,7 @@ def _cause(d: GapDiagnosis) -> str:
 def _class_of(cause: Cause) -> str:
     if len(cause.members) == 1:
         return cause.effect
-    return f"one of {', '.join(cause.members)}, which these runs cannot tell apart"
+    return f"one of {', '.join(cause.members)}, which these runs cannot distinguish"
 
 
 def numbers(d: GapDiagnosis, cause: Cause | None = None) -> str:
@@ -84,12 +84,14 @@ def numbers(d: GapDiagnosis, cause: Cause | None = None) -> str:
 
 def _place(d: GapDiagnosis) -> str:
     if len(d.references) < LEAST_REFERENCES:
-        return f"In which channel and regime it shows is not told: that takes {LEAST_REFERENCES} references."
-    sure = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
-    if not sure:
-        return "It shows in no single channel and regime clearly enough to name one."
-    listed = "; ".join(f"{c.channel} while {c.regime}, {c.band} ({100.0 * c.share:.0f} %)" for c in sure)
-    return f"It shows in: {listed}. A channel in which a gap shows is not its cause."
+        return f"The channel and regime are unknown: that takes {LEAST_REFERENCES} references."
+    significant = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
+    if not significant:
+        return "It is significant in no single channel and regime."
+    listed = "; ".join(
+        f"{c.channel} while {c.regime}, {c.band} ({100.0 * c.share:.0f} %)" for c in significant
+    )
+    return f"It is significant in: {listed}. A channel in which a gap is significant is not its cause."
 
 
 def _shrink(d: GapDiagnosis) -> str:
@@ -98,15 +100,15 @@ def _shrink(d: GapDiagnosis) -> str:
         return ""
     if s.share is None:
         return (
-            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap stands "
-            "too little above its floor to call that a share."
+            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap is too "
+            "little above its floor to state a share."
         )
     interval = (
         "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
     )
-    held = "on runs left out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
+    data = "on runs held out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
     return (
-        f"With the effect in the twin {100.0 * s.share:.0f} % of the gap above its floor goes away "
-        f"{held}{interval}: {s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the "
-        f"references; soil and sensor offsets set anew alone leave {s.recalibrated:.3g}."
+        f"With the effect in the twin, {100.0 * s.share:.0f} % of the gap above its floor disappears "
+        f"{data}{interval}: {s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the "
+        f"references; refitting soil and sensor offsets alone leaves {s.recalibrated:.3g}."
     )

@@ -1,6 +1,7 @@
-"""The frame of every `report.html`: one file, nothing in it points outside, there is no script.
+"""Reports as HTML: each is one file without scripts, and nothing in it points outside.
 
-Plots are SVG inside the file. Callers escape what comes from a log or from a user.
+`templates/` holds the text of the reports. Jinja escapes every value that a template shows; figures become
+SVG inside the file. The same values give the same bytes.
 """
 
 from __future__ import annotations
@@ -9,115 +10,98 @@ import base64
 import io
 import platform
 import re
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from html import escape
-from importlib import metadata, resources
+from collections.abc import Mapping, Sequence
+from functools import cache
+from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.tables import number
 
 if TYPE_CHECKING:
+    from jinja2 import Environment
     from matplotlib.figure import Figure
 
-
-def write_page(path: Path, title: str, body: Sequence[str]) -> Path:
-    """Write the sections of a report to `path`.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
-    """
-    page = _PAGE.format(title=escape(title), css=_stylesheet(), body="\n".join(body))
-    return write_atomically(path, lambda part: part.write_text(page, encoding="utf-8"))
-
-
-def versions(packages: Sequence[str]) -> dict[str, str]:
-    """Versions of Python, of this library and of the packages that the numbers depend on."""
-    found = {"Python": platform.python_version()}
-    for name in ("terrafusion", *packages):
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
-
-
-_PAGE = """<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title>
-<style>
-{css}
-</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
-
-
-def where_from(lines: Mapping[str, object], packages: Sequence[str] = ("gtsam", "numpy", "scipy")) -> str:
-    """The last section: what the numbers were made of, and the versions they depend on."""
-    told = dict(lines)
-    told["versions"] = ", ".join(f"{name} {version}" for name, version in versions(packages).items())
-    pairs = "".join(
-        f"<dt>{escape(str(label))}</dt><dd><code>{escape(str(text))}</code></dd>"
-        for label, text in told.items()
-    )
-    return f"<h2>Where this comes from</h2>\n<dl>{pairs}</dl>"
-
-
-def bullets(items: Iterable[str]) -> str:
-    """A list of items that are HTML already."""
-    return f"<ul>{''.join(f'<li>{item}</li>' for item in items)}</ul>"
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], numbers: Collection[int] = ()) -> str:
-    """A table with a head a row and a column.
-
-    Args:
-        heads: of the columns, plain text.
-        rows: cells that are HTML already; the first of a row is its head.
-        numbers: columns that are aligned as numbers.
-    """
-
-    def line(cells: Sequence[str], tag: str) -> str:
-        kinds = [' class="n"' if column in numbers else "" for column in range(len(cells))]
-        tags = ["th", *[tag] * (len(cells) - 1)]
-        told = (f"<{t}{kind}>{cell}</{t}>" for t, kind, cell in zip(tags, kinds, cells, strict=True))
-        return f"<tr>{''.join(told)}</tr>"
-
-    top = line([escape(head) for head in heads], "th")
-    body = "".join(line(row, "td") for row in rows)
-    return f'<div class="scroll"><table><thead>{top}</thead><tbody>{body}</tbody></table></div>'
-
-
-def figure(fig: Figure, caption: str) -> str:
-    """The figure inside the page; the caption serves as its description too."""
-    source = base64.b64encode(_svg(fig)).decode("ascii")
-    text = escape(caption)
-    return (
-        f'<figure><div class="scroll"><img alt="{text}" src="data:image/svg+xml;base64,{source}"></div>'
-        f"<figcaption>{text}</figcaption></figure>"
-    )
-
-
+LIBRARIES = ("gtsam", "numpy", "scipy")
+TWIN_LIBRARIES = ("casadi", "numpy", "scipy")
 _PATH_DATA = re.compile(rb' d="[^"]*"')
 _LONG_NUMBER = re.compile(rb"(\.\d\d)\d+")
 
 
-def _svg(fig: Figure) -> bytes:
-    """The figure as SVG, the same bytes each time, with paths to a hundredth of a point."""
+def write_page(
+    path: Path,
+    template: str,
+    title: str,
+    *,
+    provenance: Mapping[str, object] | None = None,
+    packages: Sequence[str] = LIBRARIES,
+    **values: Any,
+) -> Path:
+    """Write the report that `template` (a file of `templates/`) makes of `values` to `path`.
+
+    Args:
+        provenance: lines of the last section, which also lists the versions of `packages`.
+
+    Raises:
+        TerrafusionError: the file cannot be written.
+    """
+    versions = ", ".join(f"{name} {version}" for name, version in versions_of(packages).items())
+    made_by = dict(provenance or {}) | {"versions": versions}
+    page = _environment().get_template(template).render(title=title, provenance=made_by, **values)
+    return write_text(path, page)
+
+
+def write_text(path: Path, text: str) -> Path:
+    """Write a text file, which appears when it is whole.
+
+    Raises:
+        TerrafusionError: the file cannot be written.
+    """
+    return write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
+
+
+def write_png(path: Path, fig: Figure, dpi: int = 150) -> Path:
+    """Write a figure as PNG.
+
+    Raises:
+        TerrafusionError: the file cannot be written.
+    """
+    return write_atomically(path, lambda part: fig.savefig(part, format="png", dpi=dpi))
+
+
+def versions_of(packages: Sequence[str]) -> dict[str, str]:
+    """Versions of Python, of this library and of `packages`."""
+    versions = {"Python": platform.python_version()}
+    for name in ("terrafusion", *packages):
+        try:
+            versions[name] = metadata.version(name)
+        except metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return versions
+
+
+@cache
+def _environment() -> Environment:
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("terrafusion.fusion.reports"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {"svg": _svg, "number": number}
+    return environment
+
+
+def _svg(fig: Figure) -> str:
+    """The figure as a data URI: the same bytes each time, with paths to a hundredth of a point."""
     import matplotlib
 
     buffer = io.BytesIO()
     with matplotlib.rc_context({"svg.hashsalt": "terrafusion", "svg.fonttype": "path"}):
         fig.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
-    return _PATH_DATA.sub(lambda found: _LONG_NUMBER.sub(rb"\1", found[0]), buffer.getvalue())
-
-
-def _stylesheet() -> str:
-    return (resources.files("terrafusion.fusion.reports") / "report.css").read_text(encoding="utf-8")
+    image = _PATH_DATA.sub(lambda match: _LONG_NUMBER.sub(rb"\1", match[0]), buffer.getvalue())
+    return f"data:image/svg+xml;base64,{base64.b64encode(image).decode('ascii')}"

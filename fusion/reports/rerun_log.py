@@ -29,7 +29,7 @@ from terrafusion.fusion.graph.key_state import LINEAR
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.outputs.replay_files import is_local
 from terrafusion.fusion.reports.plots import style
-from terrafusion.fusion.reports.plots.replay_map import ellipse_rows, ellipses, refused_fixes
+from terrafusion.fusion.reports.plots.replay_map import ellipse_rows, ellipses, rejected_fixes
 
 if TYPE_CHECKING:
     from terrafusion.fusion.replay import ReplayResult
@@ -124,7 +124,7 @@ def _world(log: _Log, result: ReplayResult) -> None:
     if recording.truth is not None and len(recording.truth) and not is_local(estimate):
         points = np.nan_to_num(recording.truth.position_m)
         log.fixed("world/truth", rr.LineStrips3D([points], colors=_rgba(style.TRUTH), radii=0.04))
-    refused = np.isin(result.used.t_ns, refused_fixes(estimate)) if result.used is not None else None
+    refused = np.isin(result.used.t_ns, rejected_fixes(estimate)) if result.used is not None else None
     for name, gnss, rows, colour in (
         ("used", result.used, None if refused is None else ~refused, GNSS_COLOUR),
         ("rejected", result.used, refused, REFUSED_COLOUR),

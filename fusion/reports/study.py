@@ -1,7 +1,6 @@
 """The files of a reproduced study.
 
-plan.json        what was asked for, written before the runs, so that a folder that cannot be written is
-                 told at once
+plan.json        what was asked for, written before the runs: a folder that cannot be written fails at once
 agreement.csv    one row a statement of the study, with its verdict
 agreement.md     the same as the Markdown that docs/study.md holds
 metrics.json     everything measured, with intervals; the plan; the counts
@@ -15,15 +14,13 @@ import csv
 import dataclasses
 import io
 from collections.abc import Iterable, Mapping, Sequence
-from html import escape
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
-from terrafusion.fusion.reports.page import bullets, figure, table, where_from, write_page
+from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import study as plots
-from terrafusion.fusion.reports.plots import study_field as field
+from terrafusion.fusion.reports.plots import study_field as field_plots
 from terrafusion.twin.study.agreement import BASES, PREDICTED, Row, counts
 from terrafusion.twin.study.batch import CellResult
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE
@@ -40,7 +37,14 @@ from terrafusion.twin.study.text import (
     table_cells,
 )
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 SCHEMA = "terrafusion.study/1"
+BATCH_COLUMNS = (
+    "terrain", "friction", "slope_deg", "payload_kg", "shear_modulus_m", "mobile", "advance", "slip_percent",
+    "slip_ratio_percent", "energy_per_m_j", "immobilised_at_s",
+)  # fmt: skip
 
 
 def write_plan(out: Path, plan: StudyPlan) -> None:
@@ -51,7 +55,7 @@ def write_plan(out: Path, plan: StudyPlan) -> None:
         TerrafusionError: the folder cannot be written.
     """
     content = {"scenario": SCENARIO, "vehicle": VEHICLE, "seeds": plan.seed_count(), "quick": plan.quick}
-    _write_text(out / "plan.json", to_json(content, indent=2) + "\n")
+    write_text(out / "plan.json", to_json(content, indent=2) + "\n")
 
 
 def write_study(out: Path, study: Study, provenance: Mapping[str, object] | None = None) -> None:
@@ -60,17 +64,16 @@ def write_study(out: Path, study: Study, provenance: Mapping[str, object] | None
     Raises:
         TerrafusionError: the folder cannot be written.
     """
+    columns = [field.name for field in dataclasses.fields(Row)]
     texts = {
-        "agreement.csv": _csv(
-            [field.name for field in dataclasses.fields(Row)], map(dataclasses.asdict, study.rows)
-        ),
+        "agreement.csv": _csv(columns, map(dataclasses.asdict, study.rows)),
         "agreement.md": "\n".join(document_section(study)) + "\n",
         "metrics.json": to_json(metrics_of(study), indent=2) + "\n",
         "batch.csv": _csv(BATCH_COLUMNS, map(batch_row, (*study.batch, *study.over_slip))),
     }
     for name, text in texts.items():
-        _write_text(out / name, text)
-    write_study_page(out / "report.html", study, provenance)
+        write_text(out / name, text)
+    _write_page(out / "report.html", study, provenance)
 
 
 def write_bags(out: Path) -> None:
@@ -100,12 +103,6 @@ def metrics_of(study: Study) -> dict[str, Any]:
     }
 
 
-BATCH_COLUMNS = (
-    "terrain", "friction", "slope_deg", "payload_kg", "shear_modulus_m", "mobile", "advance", "slip_percent",
-    "slip_ratio_percent", "energy_per_m_j", "immobilised_at_s",
-)  # fmt: skip
-
-
 def batch_row(result: CellResult) -> dict[str, Any]:
     """One run of the batch, by `BATCH_COLUMNS`; `shear_modulus_m` is empty for the soil's own."""
     return dataclasses.asdict(result.cell) | {
@@ -118,10 +115,6 @@ def batch_row(result: CellResult) -> dict[str, Any]:
     }
 
 
-def _write_text(path: Path, text: str) -> None:
-    write_atomically(path, lambda part: part.write_text(text, encoding="utf-8"))
-
-
 def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
     """A table as text; unknown and not finite numbers are empty."""
     buffer = io.StringIO()
@@ -132,230 +125,70 @@ def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
     return buffer.getvalue()
 
 
-def write_study_page(path: Path, study: Study, provenance: Mapping[str, object] | None = None) -> Path:
-    """Write the report of a reproduced study to `path`.
-
-    Raises:
-        TerrafusionError: the file cannot be written.
-    """
-    body = [
-        _head(study),
-        _tab4(study),
-        _open(study.rows),
-        _mud(study),
-        _sand(study),
-        _gnss(study),
-        _batch(study),
-        _field(study),
-        _tables(study),
-        _agreement(study.rows),
-        _method(study),
-        where_from(provenance or {}, ("casadi", "numpy", "scipy")),
-    ]
-    return write_page(path, "The source study, reproduced", body)
-
-
-def _head(study: Study) -> str:
-    found = counts(study.rows)
-    predicted = counts(study.rows, PREDICTED)
-    told = ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS)
-    free = ", ".join(f"{predicted[verdict]} {verdict}" for verdict in VERDICTS)
-    return (
-        f'<h1>The source study, reproduced</h1>\n<p class="lead">{escape(TITLE)}, by the twin with '
-        f"{study.plan.seed_count()} seeds a case. Of {len(study.rows)} statements and numbers: {told}. "
-        f"Of the {sum(predicted.values())} that the twin was neither calibrated to nor given: {free}.</p>"
+def _write_page(path: Path, study: Study, provenance: Mapping[str, object] | None) -> None:
+    found, predicted = counts(study.rows), counts(study.rows, PREDICTED)
+    lead = (
+        f"{TITLE}, by the twin with {study.plan.seed_count()} seeds a case. Of {len(study.rows)} statements "
+        f"and numbers: {_counts_text(found)}. Of the {sum(predicted.values())} that the twin was neither "
+        f"calibrated to nor given: {_counts_text(predicted)}."
     )
+    disagreeing = [row for verdict in VERDICTS[:0:-1] for row in study.rows if row.verdict == verdict]
+    write_page(
+        path, "study.html.j2", "The source study, reproduced", lead=lead, provenance=provenance,
+        packages=TWIN_LIBRARIES, figures=_figures(study), noise=noise_sentence(study),
+        tab4_heads=TAB4_HEAD, tab4=[(case.label, *table_cells(study, case)) for case in CASES],
+        disagreement=[(*_statement(row), row.why) for row in disagreeing],
+        agreement=[(*_statement(row), row.criterion, row.why) for row in study.rows],
+        batch=len(study.batch), stuck=sum(not r.mobile for r in study.batch),
+        tab3=_friction_rows(study.batch), assumed_heads=ASSUMED_HEAD, assumed=assumed_rows(study),
+        robot=[(f.name, f"{f.study:g} {f.unit}", f"{f.twin:.5g} {f.unit}") for f in platform_figures()],
+    )  # fmt: skip
 
 
-def _tab4(study: Study) -> str:
-    gaussian = {
-        terrain: [run.error(study.study_like().common_m) for run in of] for terrain, of in study.noisy.items()
+def _figures(study: Study) -> dict[str, Figure]:
+    first, uneven = ({t: of[0] for t, of in runs.items()} for runs in (study.runs, study.uneven))
+    noisy = {t: of[0] for t, of in study.noisy.items()}
+    common_m, drive = study.study_like().common_m, study.field[0]
+    gaussian = {terrain: [run.error(common_m) for run in of] for terrain, of in study.noisy.items()}
+    return {
+        "tab4": plots.plot_tab4(study.runs, gaussian),
+        "mud": plots.plot_mud(first["mud"]),
+        "slip_proxy": plots.plot_slip_proxy(first["mud"], study.uneven["mud"]),
+        "yaw_mud": plots.plot_yaw_rates(uneven, ("mud",)),
+        "sand": plots.plot_sand_speeds(first),
+        "yaw_sand": plots.plot_yaw_rates(uneven, ("loose_sand", "medium_sand")),
+        "gnss": plots.plot_gnss_speeds(first, noisy, common_m),
+        "noise": plots.plot_noise(study.noise),
+        "mobility": plots.plot_mobility(study.batch),
+        "energy": plots.plot_energy(study.batch, study.over_slip),
+        "acceleration": field_plots.plot_acceleration(drive),
+        "trace": field_plots.plot_trace(drive),
+        "velocity": field_plots.plot_velocity(drive),
+        "ground_speed": field_plots.plot_ground_speed(drive),
+        "imu_speed": field_plots.plot_imu_speed(study.field),
     }
-    fig, _ = plots.plot_tab4(study.runs, gaussian)
-    rows = [[escape(cell) for cell in (case.label, *table_cells(study, case))] for case in CASES]
-    return "\n".join(
-        [
-            "<h2>Tab. 4: twin / study</h2>",
-            table(TAB4_HEAD, rows, range(1, 7)),
-            '<p class="dim">Mean percent over moving samples, with the 95 % interval of the mean over the '
-            "seeds. On even ground the motion knows no seed: slip and odometry do not scatter.</p>",
-            figure(fig, "Each point is one run of the twin; the diamonds are the study's single runs."),
-        ]
-    )
 
 
-def _open(rows: Sequence[Row]) -> str:
-    """What does not agree, or in part only."""
-    found = [row for verdict in VERDICTS[:0:-1] for row in rows if row.verdict == verdict]
-    lines = [
-        (_told(row), escape(row.study), escape(row.twin), _verdict(row), escape(row.why)) for row in found
-    ]
-    heads = ("statement and what is measured", "study", "twin", "verdict", "why")
-    return "<h2>What does not agree</h2>\n" + table(heads, lines, (1, 2))
+def _counts_text(found: Mapping[str, int]) -> str:
+    return ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS)
 
 
-def _agreement(rows: Sequence[Row]) -> str:
-    lines = [
-        (
-            _told(row),
-            escape(row.study),
-            escape(row.twin),
-            _verdict(row),
-            escape(row.criterion),
-            escape(row.why),
-        )
-        for row in rows
-    ]
-    heads = ("statement and what is measured", "study", "twin", "verdict", "criterion", "why")
-    return (
-        "<h2>All statements and numbers</h2>\n"
-        + table(heads, lines, (1, 2))
-        + '<p class="dim">The verdict is computed by the criterion. Calibrated: the twin was fitted to '
-        "this, or it follows from what it was fitted to; given: taken over. That proves little.</p>"
-    )
+def _statement(row: Row) -> tuple[tuple[str, str], str, str, str | tuple[str, str]]:
+    """Cells: the statement and what is measured, the study's and the twin's value, the verdict and its basis."""
+    verdict = row.verdict if row.basis == PREDICTED else (row.verdict, row.basis)
+    return (f"{row.source}: {row.statement}", row.quantity), row.study, row.twin, verdict
 
 
-def _told(row: Row) -> str:
-    return f'{escape(row.source)}: {escape(row.statement)}<span class="about">{escape(row.quantity)}</span>'
+def _friction_rows(batch: Sequence[CellResult]) -> list[list[str]]:
+    """Slip at the ends of each terrain's friction range, without payload, flat and on 5 deg."""
 
+    def ends(terrain: str, slope_deg: float) -> str:
+        place = (terrain, slope_deg, 0.0)
+        mine = [r for r in batch if (r.cell.terrain, r.cell.slope_deg, r.cell.payload_kg) == place]
+        mine.sort(key=lambda r: r.cell.friction)
+        return " to ".join(f"{r.slip:.1f} %" if r.mobile else "stuck" for r in (mine[0], mine[-1]))
 
-def _verdict(row: Row) -> str:
-    basis = "" if row.basis == PREDICTED else f'<span class="about">{escape(row.basis)}</span>'
-    return f"{escape(row.verdict)}{basis}"
-
-
-def _tables(study: Study) -> str:
-    tab3 = [
-        (
-            escape(terrain.replace("_", " ")),
-            f"{low:g} to {high:g}",
-            *(escape(_ends(study.batch, terrain, slope)) for slope in (0.0, 5.0)),
-        )
+    return [
+        [terrain.replace("_", " "), f"{low:g} to {high:g}", ends(terrain, 0.0), ends(terrain, 5.0)]
         for terrain, (low, high) in FRICTION.items()
     ]
-    robot = [(escape(f.name), f"{f.study:g} {f.unit}", f"{f.twin:.5g} {f.unit}") for f in platform_figures()]
-    return "\n".join(
-        [
-            "<h2>Tab. 3: effective friction</h2>",
-            table(("terrain", "friction", "mean |s| over it, flat", "mean |s| over it, 5 deg"), tab3),
-            "<h2>Tabs. 1 and 2: robot, sensors, profile</h2>",
-            table(("figure", "study", "twin"), robot, (1, 2)),
-        ]
-    )
-
-
-def _ends(batch: Sequence[CellResult], terrain: str, slope_deg: float) -> str:
-    """Slip at the ends of a terrain's friction range, without payload."""
-    found = sorted(
-        (
-            r
-            for r in batch
-            if (r.cell.terrain, r.cell.slope_deg, r.cell.payload_kg) == (terrain, slope_deg, 0.0)
-        ),
-        key=lambda r: r.cell.friction,
-    )
-    return " to ".join(f"{r.slip:.1f} %" if r.mobile else "stuck" for r in (found[0], found[-1]))
-
-
-def _mud(study: Study) -> str:
-    run, uneven = study.runs["mud"][0], {terrain: of[0] for terrain, of in study.uneven.items()}
-    parts = [
-        (plots.plot_mud(run)[0], "Fig. 4. Command, odometry and truth on mud."),
-        (
-            plots.plot_slip_proxy(run, study.uneven["mud"])[0],
-            "Fig. 6. The slip proxy on mud, while it moves; negative: the wheels run ahead.",
-        ),
-        (plots.plot_yaw_rates(uneven, ("mud",))[0], "Fig. 7. Yaw rate on mud whose strength varies."),
-    ]
-    return "<h2>Mud (Figs. 4, 6, 7)</h2>\n" + _figures(parts)
-
-
-def _sand(study: Study) -> str:
-    first, uneven = ({t: of[0] for t, of in runs.items()} for runs in (study.runs, study.uneven))
-    parts = [
-        (plots.plot_sand_speeds(first)[0], "Fig. 5. Speeds on loose and medium sand, 5 deg."),
-        (
-            plots.plot_yaw_rates(uneven, ("loose_sand", "medium_sand"))[0],
-            "Fig. 8. Yaw rate on loose and medium sand whose strength varies.",
-        ),
-    ]
-    return "<h2>Sand (Figs. 5, 8)</h2>\n" + _figures(parts)
-
-
-def _gnss(study: Study) -> str:
-    fit = study.study_like()
-    first, noisy = {t: of[0] for t, of in study.runs.items()}, {t: of[0] for t, of in study.noisy.items()}
-    parts = [
-        (
-            plots.plot_gnss_speeds(first, noisy, fit.common_m)[0],
-            "Fig. 9. GNSS speed by differenced positions: the data sheet's RTK, and the one Gaussian noise "
-            "that comes closest to the study's errors.",
-        ),
-        (
-            plots.plot_noise(study.noise)[0],
-            "White position noise that gives the study's GNSS error of each terrain. It falls with the rate: "
-            "the study's errors do not tell its noise without its rate.",
-        ),
-    ]
-    return f"<h2>GNSS (Fig. 9)</h2>\n<p>{escape(noise_sentence(study))}</p>\n" + _figures(parts)
-
-
-def _batch(study: Study) -> str:
-    stuck = sum(not r.mobile for r in study.batch)
-    parts = [
-        (
-            plots.plot_mobility(study.batch)[0],
-            "Net way uphill over the commanded way. Solid: no payload, dashed and dotted: with payload. "
-            "Below zero the robot slides back.",
-        ),
-        (
-            plots.plot_energy(study.batch, study.over_slip)[0],
-            "Energy a metre of the runs that make half of the way, averaged over friction. Right: one load "
-            "on one slope, with sand from stiff to soft in shear.",
-        ),
-    ]
-    return (
-        f"<h2>Batch: terrain x friction x slope x payload</h2>\n<p>{len(study.batch)} runs of 300 s; {stuck} "
-        "make less than half of the way. All of them are in batch.csv.</p>\n" + _figures(parts)
-    )
-
-
-def _field(study: Study) -> str:
-    drive = study.field[0]
-    parts = [
-        (field.plot_acceleration(drive)[0], "Fig. 11. Specific force as measured."),
-        (field.plot_trace(drive)[0], "Fig. 12. Latitude and longitude of the fixes, and altitude."),
-        (field.plot_velocity(drive)[0], "Fig. 13. Velocity east, north, up."),
-        (field.plot_ground_speed(drive)[0], "Fig. 14. Ground speed."),
-        (field.plot_imu_speed(study.field)[0], "Fig. 15. Speed integrated from the IMU."),
-    ]
-    return (
-        "<h2>Field test (Figs. 11 to 15)</h2>\n<p>A drive of the twin on loose and medium sand with a "
-        "stand-alone receiver under partial canopy. Course, ground and commands of the study's field test "
-        "are not published: these figures can agree in kind only.</p>\n" + _figures(parts)
-    )
-
-
-def _method(study: Study) -> str:
-    items = [
-        "Streams are matched in time within 50 ms; speeds and the yaw rate pass a second-order low-pass of "
-        "1 Hz without lag (cut-off assumed).",
-        "Errors and slip are averaged over samples with a true speed above 0.1 m/s (threshold assumed).",
-        "GNSS speed: differenced positions, then the low-pass. IMU speed: forward acceleration less its mean "
-        "over the first 2 s, 0.5 s moving average, trapezoid rule.",
-        "Stops of the profile: 5 s every 75 s, ramps of 0.5 m/s2 (assumed; the study says short stops).",
-        "Uneven ground: strength with a standard deviation of 20 % and a correlation length of 0.5 m "
-        "(assumed), another one for each seed.",
-    ]
-    return "\n".join(
-        [
-            "<h2>How it is processed</h2>",
-            bullets(escape(item) for item in items),
-            '<p class="dim">Tab. 4 under other cut-offs and thresholds of motion, mean percent:</p>',
-            table(ASSUMED_HEAD, assumed_rows(study), range(1, 10)),
-        ]
-    )
-
-
-def _figures(parts: Iterable[tuple[object, str]]) -> str:
-    return "\n".join(figure(fig, caption) for fig, caption in parts)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Maps of the drive, and several runs of one drive over each other."""
+"""Maps of a drive, and several runs of one drive compared."""
 
 from __future__ import annotations
 
@@ -22,11 +22,14 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TimesNs = NDArray[np.int64]
+Array = NDArray[np.float64]
 
 ELLIPSE_SIGMAS = 2.0
 """Half axes of the ellipses; two dimensions have 1 - exp(-2) = 86 % of their probability inside."""
 ELLIPSE_S, MOST_ELLIPSES = 10.0, 60
 """Seconds between ellipses; longer drives get at most so many, outside and inside outages."""
+_DASHES = (0, (4, 3))
+_ESTIMATE = "#0072b2"
 
 
 def plot_map(
@@ -39,43 +42,32 @@ def plot_map(
     ax: Axes | None = None,
 ) -> tuple[Figure, Axes]:
     """The path coloured by terrain with ellipses of two sigma, over truth and fixes; outages are edged."""
-    from matplotlib.collections import LineCollection
-    from matplotlib.lines import Line2D
-
     fig, ax = style.canvas(ax, _map_size([estimate]))
+    path = estimate.trajectory
     local = is_local(estimate)
     if local:
-        handles = _draw_moved(ax, estimate, errors)
+        handles = _draw_aligned_reference(ax, estimate, errors)
     else:
-        handles = draw_references(ax, recording, held_out, refused_fixes(estimate))
-    path = estimate.trajectory
-    keep = style.thin(len(path), 2 * style.MAX_POINTS)
-    xy = path.position_m[keep, :2]
-    handles += _edge_outages(ax, estimate, recording.start_ns, outages)
-    if len(xy) > 1 and estimate.classes:
-        label = estimate.dominant_terrain()[keep]
-        lines, colours = [], []
-        for first, last in style.runs_of(label):
-            lines.append(xy[first : last + 1])
-            colours.append(style.colour_of(str(label[first]), style.TERRAIN_COLOURS))
-        ax.add_collection(LineCollection(lines, colors=colours, linewidths=3.2, zorder=4))
-        for name in dict.fromkeys(label.tolist()):
-            colour = style.colour_of(str(name), style.TERRAIN_COLOURS)
-            handles.append(Line2D([], [], color=colour, linewidth=3, label=f"on {style.plain(name)}"))
-    elif len(xy):
-        handles += ax.plot(xy[:, 0], xy[:, 1], color="#0072b2", linewidth=2.0, label="estimate")
-    handles += _draw_ellipses(ax, ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages)))
-    if len(xy):
-        handles += ax.plot(
-            *xy[0], "^", color="#111111", markersize=8, zorder=6, label="start", linestyle="none"
-        )
-        handles += ax.plot(
-            *xy[-1], "s", color="#111111", markersize=6, zorder=6, label="end", linestyle="none"
-        )
-    _frame(ax)
-    if local:
-        style.dress(ax, x="x of the local frame, m", y="y of the local frame, m")
-    _side_legend(ax, handles)
+        handles = _draw_references(ax, recording, held_out, rejected_fixes(estimate))
+    for i, outage in enumerate(outages):
+        rows = np.flatnonzero(outage.covers(path.t_ns, recording.start_ns))
+        edge: dict[str, Any] = {"color": "#f4a582", "linewidth": 7.0, "alpha": 0.8, "zorder": 3.5}
+        drawn = _draw(ax, path.position_m[rows], "-", "no GNSS", solid_capstyle="round", **edge)
+        handles += drawn if i == 0 else []
+    handles += _draw_path(ax, estimate)
+    rings = ellipses(estimate, ellipse_rows(estimate, recording.start_ns, outages))
+    for i, ring in enumerate(rings):
+        label = f"{ELLIPSE_SIGMAS:g} sigma of position"
+        drawn = ax.plot(*ring.T, color=_ESTIMATE, linewidth=0.7, alpha=0.8, zorder=5, label=label)
+        handles += drawn if i == 0 else []
+    if len(path):
+        ends: dict[str, Any] = {"color": "#111111", "zorder": 6, "linestyle": "none"}
+        keep = style.thin(len(path), 2 * style.MAX_POINTS)
+        xy = path.position_m[keep, :2]
+        handles += ax.plot(*xy[0], "^", markersize=8, label="start", **ends)
+        handles += ax.plot(*xy[-1], "s", markersize=6, label="end", **ends)
+    frame = "of the local frame, m"
+    _finish(ax, handles, *((f"x {frame}", f"y {frame}") if local else ()))
     return fig, ax
 
 
@@ -86,31 +78,27 @@ def plot_map_runs(
     colours: Mapping[str, str] | None = None,
     held_out: Gnss | None = None,
     outages: Sequence[Outage] = (),
-    ax: Axes | None = None,
-) -> tuple[Figure, Axes]:
+) -> Figure:
     """The paths of several runs, by name, over truth and GNSS fixes; thick where a run has no GNSS."""
-    fig, ax = style.canvas(ax, _map_size(list(estimates.values())))
-    handles = draw_references(ax, recording, held_out)
+    from matplotlib.lines import Line2D
+
+    fig, ax = style.canvas(None, _map_size(list(estimates.values())))
+    handles = _draw_references(ax, recording, held_out)
     for name, estimate in estimates.items():
         colour = (colours or {}).get(name) or style.colour_of(name, style.MODE_COLOURS)
         path = estimate.trajectory
-        xy = path.position_m[style.thin(len(path), 2 * style.MAX_POINTS), :2]
-        handles += ax.plot(xy[:, 0], xy[:, 1], color=colour, linewidth=1.4, zorder=5, label=style.plain(name))
+        label = style.label_text(name)
+        most = 2 * style.MAX_POINTS
+        handles += _draw(ax, path.position_m, "-", label, most, color=colour, linewidth=1.4, zorder=5)
         for outage in outages:
-            rows = np.flatnonzero(outage.covers(path.t_ns, recording.start_ns))
-            inside = path.position_m[rows[style.thin(len(rows))], :2]
-            ax.plot(inside[:, 0], inside[:, 1], color=colour, linewidth=4.0, alpha=0.45, zorder=4)
-            if len(inside):
-                ax.plot(*inside[-1], "o", color=colour, markersize=6, markeredgecolor="white", zorder=6)
+            inside = path.position_m[outage.covers(path.t_ns, recording.start_ns)]
+            _draw(ax, inside, "-", color=colour, linewidth=4.0, alpha=0.45, zorder=4)
+            _draw(ax, inside[-1:], "o", color=colour, markersize=6, markeredgecolor="white", zorder=6)
     if outages:
-        from matplotlib.lines import Line2D
-
-        handles.append(
-            Line2D([], [], color="#777777", linewidth=4, alpha=0.5, label="no GNSS (dot: its end)")
-        )
-    _frame(ax)
-    _side_legend(ax, handles)
-    return fig, ax
+        label = "no GNSS (dot: its end)"
+        handles.append(Line2D([], [], color="#777777", linewidth=4, alpha=0.5, label=label))
+    _finish(ax, handles)
+    return fig
 
 
 def plot_error_runs(
@@ -119,55 +107,34 @@ def plot_error_runs(
     *,
     colours: Mapping[str, str] | None = None,
     outages: Sequence[Outage] = (),
-    ax: Axes | None = None,
-) -> tuple[Figure, Axes]:
-    """Size of the horizontal position error of several runs, by name, over time."""
-    fig, ax = style.canvas(ax, (9.0, 3.0))
+) -> Figure:
+    """Horizontal position error of several runs, by name, over time."""
+    fig, ax = style.canvas(None, (9.0, 3.0))
     shade_outages(ax, outages)
     for name, series in errors.items():
         colour = (colours or {}).get(name) or style.colour_of(name, style.MODE_COLOURS)
         distance = series.distance_m()
         peak = [int(np.nanargmax(distance))] if np.isfinite(distance).any() else []
-        keep = style.thin(len(distance), keep=peak)
-        t = style.seconds(series.t_ns, start_ns)[keep]
-        ax.plot(t, distance[keep], color=colour, linewidth=1.2, label=style.plain(name))
+        rows = style.thin(len(distance), keep=peak)
+        t = style.seconds(series.t_ns, start_ns)[rows]
+        ax.plot(t, distance[rows], color=colour, linewidth=1.2, label=style.label_text(name))
     ax.set_ylim(bottom=0.0)
-    style.dress(ax, x=TIME, y="position error, m")
+    style.format_axes(ax, x=TIME, y="position error, m")
     style.legend_above(ax)
-    return fig, ax
+    return fig
 
 
-def _draw_moved(ax: Axes, estimate: Estimate, errors: Errors | None) -> list[Any]:
-    """The reference in the local frame: scoring moved the path onto it, and this moves it back."""
-    if errors is None:
-        return []
-    here = estimate.trajectory.positions_at(errors.t_ns)[:, :2]
-    rows = np.isfinite(here + errors.estimate_m + errors.reference_m).all(axis=1)
-    if rows.sum() < 2:
-        return []
-    here, there = here[rows] @ [1.0, 1j], errors.estimate_m[rows] @ [1.0, 1j]
-    turn = np.vdot(there - there.mean(), here - here.mean())
-    turn = turn / abs(turn) if abs(turn) > 0.0 else 1.0
-    moved = (errors.reference_m[rows] @ [1.0, 1j] - there.mean()) * turn + here.mean()
-    moved = moved[style.thin(len(moved), 2 * style.MAX_POINTS)]
-    dashes, label = (0, (4, 3)), "reference, moved to the start"
-    return ax.plot(
-        moved.real, moved.imag, color=style.TRUTH, linewidth=0.8, linestyle=dashes, zorder=7, label=label
-    )
-
-
-def refused_fixes(estimate: Estimate) -> TimesNs:
-    """Times (N,) of the fixes whose position a gate turned away."""
-    return np.array(
-        [i.t_ns for i in estimate.innovations if i.sensor == "gnss" and not i.accepted], dtype=np.int64
-    )
+def rejected_fixes(estimate: Estimate) -> TimesNs:
+    """Times (N,) of the fixes whose position was rejected by a gate."""
+    rejected = [i.t_ns for i in estimate.innovations if i.sensor == "gnss" and not i.accepted]
+    return np.array(rejected, dtype=np.int64)
 
 
 def ellipse_rows(estimate: Estimate, start_ns: int, outages: Sequence[Outage]) -> NDArray[np.int64]:
-    """Keyframes that get an ellipse: one in ten seconds, one in two seconds where there is no GNSS.
+    """Keyframes that get an ellipse: one in ten seconds, and one in two seconds in an outage.
 
-    Without GNSS is what the caller left out and what the estimate's status says. The last of each
-    such stretch is among them: there the position is the least sure.
+    An outage is one of `outages`, or where the estimate's status says so. The last keyframe of each is
+    among them: there the position is the least certain.
     """
     t_ns = estimate.trajectory.t_ns
     alone = np.asarray(estimate.status == "outage")
@@ -183,108 +150,92 @@ def ellipse_rows(estimate: Estimate, start_ns: int, outages: Sequence[Outage]) -
     return np.unique(np.array([*rows, *ends.tolist()], dtype=np.int64))
 
 
-def draw_references(
-    ax: Axes, recording: Recording, held_out: Gnss | None, refused_ns: TimesNs | None = None
-) -> list[Any]:
-    """Truth, the fixes used, turned away and kept back; returns the legend's handles."""
-    handles: list[Any] = []
-    truth, gnss = recording.truth, recording.gnss
-    if truth is not None and len(truth) and ("position" in (recording.truth_channels or ("position",))):
-        xy = truth.position_m[style.thin(len(truth), 2 * style.MAX_POINTS), :2]
-        handles += ax.plot(
-            xy[:, 0],
-            xy[:, 1],
-            color=style.TRUTH,
-            linewidth=0.8,
-            linestyle=(0, (4, 3)),
-            zorder=7,
-            label="truth",
-        )
-    kept_ns = held_out.t_ns if held_out is not None else np.zeros(0, dtype=np.int64)
-    if gnss is not None and len(gnss):
-        given = gnss.select((gnss.fix != Fix.NONE) & ~np.isin(gnss.t_ns, kept_ns))
-        refused = np.isin(given.t_ns, refused_ns if refused_ns is not None else [])
-        used, away = given.select(~refused), given.select(refused).enu_m
-        if len(away):
-            handles += ax.plot(
-                away[:, 0],
-                away[:, 1],
-                "x",
-                color="#111111",
-                markersize=5,
-                zorder=6,
-                label="GNSS rejected",
-                linestyle="none",
-            )
-        xy = used.enu_m[style.thin(len(used), 800), :2]
-        handles += ax.plot(
-            xy[:, 0],
-            xy[:, 1],
-            ".",
-            color="#9a9a9a",
-            markersize=4,
-            zorder=2,
-            label="GNSS used",
-            linestyle="none",
-        )
-    if held_out is not None and len(held_out):
-        xy = held_out.enu_m[style.thin(len(held_out), 400), :2]
-        handles += ax.plot(
-            xy[:, 0],
-            xy[:, 1],
-            "o",
-            markerfacecolor="none",
-            color=style.HELD_OUT,
-            markersize=4,
-            markeredgewidth=0.8,
-            zorder=3,
-            label="GNSS kept back",
-            linestyle="none",
-        )
-    return handles
-
-
-def _edge_outages(ax: Axes, estimate: Estimate, start_ns: int, outages: Sequence[Outage]) -> list[Any]:
-    handles: list[Any] = []
-    path = estimate.trajectory
-    for outage in outages:
-        rows = np.flatnonzero(outage.covers(path.t_ns, start_ns))
-        xy = path.position_m[rows[style.thin(len(rows))], :2]
-        line = ax.plot(
-            xy[:, 0],
-            xy[:, 1],
-            color="#f4a582",
-            linewidth=7.0,
-            alpha=0.8,
-            zorder=3.5,
-            label="no GNSS",
-            solid_capstyle="round",
-        )
-        handles = handles or list(line)
-    return handles
-
-
-def ellipses(estimate: Estimate, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+def ellipses(estimate: Estimate, rows: NDArray[np.int64]) -> Array:
     """Ellipses (K, 41, 2) of the position, m, at those of the keyframes `rows` whose covariance is known."""
     path = estimate.trajectory
     if path.covariance is None:
         return np.zeros((0, 41, 2))
     P = path.covariance[rows, :2, :2]
-    sound = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(path.position_m[rows, :2]).all(axis=1)
-    size, axes = np.linalg.eigh(P[sound])
+    known = np.isfinite(P).all(axis=(1, 2)) & np.isfinite(path.position_m[rows, :2]).all(axis=1)
+    size, axes = np.linalg.eigh(P[known])
     angle = np.linspace(0.0, 2.0 * np.pi, 41)
     ring = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     points = ring * ELLIPSE_SIGMAS * np.sqrt(np.maximum(size, 0.0))[:, None, :]
-    return np.asarray(np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[sound], None, :2])
+    return np.asarray(np.einsum("kij,knj->kni", axes, points) + path.position_m[rows[known], None, :2])
 
 
-def _draw_ellipses(ax: Axes, rings: NDArray[np.float64]) -> list[Any]:
-    label = f"{ELLIPSE_SIGMAS:g} sigma of position"
-    lines = [
-        ax.plot(*ring.T, color="#0072b2", linewidth=0.7, alpha=0.8, zorder=5, label=label)[0]
-        for ring in rings
+def _draw(
+    ax: Axes, xyz: Array, form: str, label: str | None = None, most: int = style.MAX_POINTS, **options: Any
+) -> list[Any]:
+    xy = xyz[style.thin(len(xyz), most), :2]
+    return ax.plot(xy[:, 0], xy[:, 1], *filter(None, [form]), label=label, **options)
+
+
+def _draw_path(ax: Axes, estimate: Estimate) -> list[Any]:
+    """The path, coloured by the most probable terrain where there are classes; returns the handles."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.lines import Line2D
+
+    keep = style.thin(len(estimate.trajectory), 2 * style.MAX_POINTS)
+    xy = estimate.trajectory.position_m[keep, :2]
+    if not len(xy):
+        return []
+    if len(xy) < 2 or not estimate.classes:
+        return ax.plot(xy[:, 0], xy[:, 1], color=_ESTIMATE, linewidth=2.0, label="estimate")
+    label = estimate.dominant_terrain()[keep]
+    runs = style.runs_of(label)
+    colours = [style.terrain_colour(label[first]) for first, _ in runs]
+    lines = [xy[first : last + 1] for first, last in runs]
+    ax.add_collection(LineCollection(lines, colors=colours, linewidths=3.2, zorder=4))
+    names = dict.fromkeys(label.tolist())
+    return [
+        Line2D([], [], color=style.terrain_colour(name), linewidth=3, label=f"on {style.label_text(name)}")
+        for name in names
     ]
-    return lines[:1]
+
+
+def _draw_aligned_reference(ax: Axes, estimate: Estimate, errors: Errors | None) -> list[Any]:
+    """The reference moved into the local frame, by the inverse of the alignment of the scores."""
+    if errors is None:
+        return []
+    here = estimate.trajectory.positions_at(errors.t_ns)[:, :2]
+    rows = np.isfinite(here + errors.estimate_m + errors.reference_m).all(axis=1)
+    if rows.sum() < 2:
+        return []
+    here, there = here[rows] @ [1.0, 1j], errors.estimate_m[rows] @ [1.0, 1j]
+    turn = np.vdot(there - there.mean(), here - here.mean())
+    turn = turn / abs(turn) if abs(turn) > 0.0 else 1.0
+    moved = (errors.reference_m[rows] @ [1.0, 1j] - there.mean()) * turn + here.mean()
+    xy = np.column_stack([moved.real, moved.imag])
+    look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": _DASHES, "zorder": 7}
+    return _draw(ax, xy, "", "reference, moved to the start", 2 * style.MAX_POINTS, **look)
+
+
+def _draw_references(
+    ax: Axes, recording: Recording, held_out: Gnss | None, rejected_ns: TimesNs | None = None
+) -> list[Any]:
+    """Truth, and the fixes used, rejected and held out; returns the legend's handles."""
+    handles: list[Any] = []
+    truth, gnss = recording.truth, recording.gnss
+    if truth is not None and len(truth) and "position" in (recording.truth_channels or ("position",)):
+        look: dict[str, Any] = {"color": style.TRUTH, "linewidth": 0.8, "linestyle": _DASHES, "zorder": 7}
+        handles += _draw(ax, truth.position_m, "", "truth", 2 * style.MAX_POINTS, **look)
+    held_ns = held_out.t_ns if held_out is not None else np.zeros(0, dtype=np.int64)
+    if gnss is not None and len(gnss):
+        given = gnss.select((gnss.fix != Fix.NONE) & ~np.isin(gnss.t_ns, held_ns))
+        rejected = np.isin(given.t_ns, rejected_ns if rejected_ns is not None else [])
+        if rejected.any():
+            away = given.enu_m[rejected]
+            handles += _draw(
+                ax, away, "x", "GNSS rejected", len(away), color="#111111", markersize=5, zorder=6
+            )
+        used = given.enu_m[~rejected]
+        handles += _draw(ax, used, ".", "GNSS used", 800, color="#9a9a9a", markersize=4, zorder=2)
+    if held_out is not None and len(held_out):
+        ring: dict[str, Any] = {"markerfacecolor": "none", "markeredgewidth": 0.8, "markersize": 4}
+        colour = style.HELD_OUT
+        handles += _draw(ax, held_out.enu_m, "o", "GNSS held out", 400, color=colour, zorder=3, **ring)
+    return handles
 
 
 def _map_size(estimates: Sequence[Estimate]) -> tuple[float, float]:
@@ -295,15 +246,11 @@ def _map_size(estimates: Sequence[Estimate]) -> tuple[float, float]:
     return 9.0, float(np.clip(7.0 * height / max(width, 1e-3), 2.2, 6.0)) + 0.7
 
 
-def _frame(ax: Axes) -> None:
+def _finish(ax: Axes, handles: list[Any], x: str = "east, m", y: str = "north, m") -> None:
     ax.set_aspect("equal", adjustable="datalim")
     ax.margins(0.05)
     ax.autoscale_view()
-    style.dress(ax, x="east, m", y="north, m")
-
-
-def _side_legend(ax: Axes, handles: Sequence[Any]) -> None:
+    style.format_axes(ax, x=x, y=y)
     if handles:
-        ax.legend(
-            handles=list(handles), loc="upper left", bbox_to_anchor=(1.0, 1.0), frameon=False, fontsize=8
-        )
+        corner = (1.0, 1.0)
+        ax.legend(handles=handles, loc="upper left", bbox_to_anchor=corner, frameon=False, fontsize=8)

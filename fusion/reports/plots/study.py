@@ -1,14 +1,13 @@
-"""Plots of the reproduced source study: its Figs. 4 to 9 and 11 to 15, the batch, and energy a metre.
+"""Plots of the reproduced source study: its Figs. 4 to 9, Tab. 4, the batch and the energy per metre.
 
-Every function draws into the axes it is given, or into new ones, and returns
-the figure and the axes. Times are seconds from the start of the run.
+Times are seconds from the start of the run. Figs. 11 to 15 are in `study_field`.
 """
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,9 +24,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-Axs = NDArray[Any]
-TIME = "time, s"
-SPEED = "speed, m/s"
+TIME, SPEED, ENERGY = "time, s", "speed, m/s", "energy, J/m"
 WHEELS, GNSS = style.SENSOR_COLOURS["wheels"], style.SENSOR_COLOURS["gnss"]
 GYRO, RAW = style.SENSOR_COLOURS["gyro"], "#b9d9cf"
 COMMAND = "#9a9a9a"
@@ -35,266 +32,189 @@ LABELS = {case.terrain: case.label for case in CASES}
 MARKERS = "os^Dv"
 
 
-def plot_mud(run: CaseRun, *, ax: Axes | None = None) -> tuple[Figure, Axes]:
-    """Fig. 4: command, odometry and truth on mud, and when it stops for good."""
-    fig, ax = style.canvas(ax)
-    p = run.profiles
-    _line(ax, p.t_s, p.command, "command", COMMAND, linewidth=1.0)
-    _line(ax, p.t_s, p.odometry, "odometry", WHEELS)
-    _line(ax, p.t_s, p.truth, "truth", style.TRUTH)
+def plot_mud(run: CaseRun) -> Figure:
+    """Fig. 4: command, odometry and truth on mud, and when it is immobilised."""
+    fig, ax = style.canvas()
+    _speeds(ax, run)
     at = run.summary.immobilised_at_s
     if at is not None:
         ax.axvline(at, color=style.HELD_OUT, linewidth=0.9, linestyle="--", label=f"stops at {at:.0f} s")
-    style.dress(ax, x=TIME, y=SPEED, title=LABELS["mud"])
+    style.format_axes(ax, x=TIME, y=SPEED, title=LABELS["mud"])
     style.legend_above(ax)
-    return fig, ax
+    return fig
 
 
-def plot_sand_speeds(
-    runs: Mapping[str, CaseRun], *, axes: Sequence[Axes] | None = None
-) -> tuple[Figure, Axs]:
+def plot_sand_speeds(runs: Mapping[str, CaseRun]) -> Figure:
     """Fig. 5: command, odometry and truth on loose and on medium sand."""
-    fig, panels = style.canvases(axes, 2, (9.0, 5.0))
-    for ax, terrain in zip(panels, ("loose_sand", "medium_sand"), strict=True):
-        p = runs[terrain].profiles
-        _line(ax, p.t_s, p.command, "command", COMMAND, linewidth=1.0)
-        _line(ax, p.t_s, p.odometry, "odometry", WHEELS)
-        _line(ax, p.t_s, p.truth, "truth", style.TRUTH)
-        style.dress(ax, y=SPEED, title=LABELS[terrain])
-    style.legend_above(panels[0])
-    panels[-1].set_xlabel(TIME, fontsize=9)
-    return fig, panels
+    fig, axes = style.canvases(2, (9.0, 5.0))
+    for ax, terrain in zip(axes, ("loose_sand", "medium_sand"), strict=True):
+        _speeds(ax, runs[terrain])
+        style.format_axes(ax, y=SPEED, title=LABELS[terrain])
+    return _over_time(fig, axes)
 
 
-def plot_slip_proxy(
-    even: CaseRun, uneven: Sequence[CaseRun], *, ax: Axes | None = None
-) -> tuple[Figure, Axes]:
+def plot_slip_proxy(even: CaseRun, uneven: Sequence[CaseRun]) -> Figure:
     """Fig. 6: the slip proxy of eq. 2 on mud, where it moves; even ground over runs on uneven ground."""
-    fig, ax = style.canvas(ax)
-    for number, run in enumerate(uneven):
-        label = "uneven ground, each seed" if number == 0 else None
+    fig, ax = style.canvas()
+    for k, run in enumerate(uneven):
+        label = "uneven ground, each seed" if k == 0 else None
         ax.plot(run.profiles.t_s, 100.0 * run.profiles.slip(), color="#c9b3dd", linewidth=0.8, label=label)
-    ax.plot(
-        even.profiles.t_s,
-        100.0 * even.profiles.slip(),
-        color=style.TERRAIN_COLOURS["mud"],
-        linewidth=1.3,
-        label="even ground",
-    )
+    colour, label = style.TERRAIN_COLOURS["mud"], "even ground"
+    ax.plot(even.profiles.t_s, 100.0 * even.profiles.slip(), color=colour, linewidth=1.3, label=label)
     last = max(float(run.profiles.t_s[run.profiles.moving()][-1]) for run in (even, *uneven))
     ax.set_xlim(0.0, 1.1 * last)
-    style.dress(ax, x=TIME, y="s = 1 - v_odom / v_truth, %", title=LABELS["mud"])
+    style.format_axes(ax, x=TIME, y="s = 1 - v_odom / v_truth, %", title=LABELS["mud"])
     style.legend_above(ax)
-    return fig, ax
+    return fig
 
 
-def plot_yaw_rates(
-    runs: Mapping[str, CaseRun], terrains: Sequence[str], *, axes: Sequence[Axes] | None = None
-) -> tuple[Figure, Axs]:
+def plot_yaw_rates(runs: Mapping[str, CaseRun], terrains: Sequence[str]) -> Figure:
     """Figs. 7 and 8: yaw rate of the gyro as measured and low-passed, and of the body."""
-    fig, panels = style.canvases(axes, len(terrains), (9.0, 2.3 * len(terrains) + 0.5))
+    fig, axes = style.canvases(len(terrains), (9.0, 2.3 * len(terrains) + 0.5))
     top = max(np.nanpercentile(np.abs(runs[terrain].profiles.gyro), 99.5) for terrain in terrains)
-    for ax, terrain in zip(panels, terrains, strict=True):
+    for ax, terrain in zip(axes, terrains, strict=True):
         p = runs[terrain].profiles
-        keep = style.thin(len(p.t_s), 4000)
-        ax.plot(p.t_s[keep], p.gyro[keep], color=RAW, linewidth=0.4, label="gyro as measured")
-        _line(ax, p.t_s, p.yaw_rate, "gyro, low-passed", GYRO, linewidth=1.0)
-        _line(ax, p.t_s, p.true_yaw_rate, "body", style.TRUTH, linewidth=0.7)
+        rows = style.thin(len(p.t_s), 4000)
+        ax.plot(p.t_s[rows], p.gyro[rows], color=RAW, linewidth=0.4, label="gyro as measured")
+        style.line(ax, p.t_s, p.yaw_rate, GYRO, "gyro, low-passed", linewidth=1.0)
+        style.line(ax, p.t_s, p.true_yaw_rate, style.TRUTH, "body", linewidth=0.7)
         ax.set_ylim(-top, top)
-        style.dress(ax, y="yaw rate, rad/s", title=f"{LABELS[terrain]}, uneven ground")
-    style.legend_above(panels[0])
-    panels[-1].set_xlabel(TIME, fontsize=9)
-    return fig, panels
+        style.format_axes(ax, y="yaw rate, rad/s", title=f"{LABELS[terrain]}, uneven ground")
+    return _over_time(fig, axes)
 
 
-def plot_gnss_speeds(
-    runs: Mapping[str, CaseRun],
-    noisy: Mapping[str, NoisyRun],
-    sigma_m: float,
-    *,
-    axes: Sequence[Axes] | None = None,
-) -> tuple[Figure, Axs]:
-    """Fig. 9: GNSS speed on the three grounds, with the data sheet's RTK and with Gaussian noise."""
-    fig, panels = style.canvases(axes, len(CASES), (9.0, 6.6))
-    for ax, case in zip(panels, CASES, strict=True):
+def plot_gnss_speeds(runs: Mapping[str, CaseRun], noisy: Mapping[str, NoisyRun], sigma_m: float) -> Figure:
+    """Fig. 9: GNSS speed on the three terrains, with the data sheet's RTK and with Gaussian noise."""
+    fig, axes = style.canvases(len(CASES), (9.0, 6.6))
+    gaussian = f"GNSS, Gaussian noise of {100 * sigma_m:.1f} cm"
+    for ax, case in zip(axes, CASES, strict=True):
         p, q = runs[case.terrain].profiles, noisy[case.terrain].noisy(sigma_m)
-        seen = np.isfinite(q.gnss)
-        ax.plot(
-            q.t_s[seen],
-            q.gnss[seen],
-            color="#d9a6c8",
-            linewidth=0.9,
-            label=f"GNSS, Gaussian noise of {100 * sigma_m:.1f} cm",
-        )
-        seen = np.isfinite(p.gnss)
-        ax.plot(p.t_s[seen], p.gnss[seen], color=GNSS, linewidth=1.0, label="GNSS, RTK of the data sheet")
-        _line(ax, p.t_s, p.truth, "truth", style.TRUTH, linewidth=0.8)
-        style.dress(ax, y=SPEED, title=LABELS[case.terrain])
-    style.legend_above(panels[0])
-    panels[-1].set_xlabel(TIME, fontsize=9)
-    return fig, panels
+        for of, colour, width, label in (
+            (q, "#d9a6c8", 0.9, gaussian),
+            (p, GNSS, 1.0, "GNSS, RTK of the data sheet"),
+        ):
+            known = np.isfinite(of.gnss)
+            ax.plot(of.t_s[known], of.gnss[known], color=colour, linewidth=width, label=label)
+        style.line(ax, p.t_s, p.truth, style.TRUTH, "truth", linewidth=0.8)
+        style.format_axes(ax, y=SPEED, title=LABELS[case.terrain])
+    return _over_time(fig, axes)
 
 
-def plot_noise(fits: Sequence[NoiseFit], *, ax: Axes | None = None) -> tuple[Figure, Axes]:
+def plot_noise(fits: Sequence[NoiseFit]) -> Figure:
     """Size of white position noise that gives the study's GNSS errors, over the rate of the positions."""
-    fig, ax = style.canvas(ax, (9.0, 3.2))
+    fig, ax = style.canvas(None, (9.0, 3.2))
     rates = [fit.rate_hz for fit in fits]
     for case, marker in zip(CASES, MARKERS, strict=False):
-        ax.loglog(
-            rates,
-            [100.0 * fit.alone_m[case.terrain] for fit in fits],
-            marker=marker,
-            color=style.TERRAIN_COLOURS[case.terrain],
-            label=f"{case.label} ({case.gnss:g} %)",
-        )
-    ax.loglog(
-        rates, [100.0 * fit.common_m for fit in fits], color=style.TRUTH, linestyle="--", label="one for all"
-    )
+        sigmas = [100.0 * fit.alone_m[case.terrain] for fit in fits]
+        colour, label = style.TERRAIN_COLOURS[case.terrain], f"{case.label} ({case.gnss:g} %)"
+        ax.loglog(rates, sigmas, marker=marker, color=colour, label=label)
+    common = [100.0 * fit.common_m for fit in fits]
+    ax.loglog(rates, common, color=style.TRUTH, linestyle="--", label="one for all")
     ax.axhline(2.0, color=GNSS, linewidth=0.8, linestyle=":", label="RTK (2 cm)")
-    style.dress(ax, x="rate of the positions, Hz", y="sigma of each axis, cm")
+    style.format_axes(ax, x="rate of the positions, Hz", y="sigma of each axis, cm")
     style.legend_above(ax)
-    return fig, ax
+    return fig
 
 
-def plot_mobility(batch: Sequence[CellResult], *, axes: Sequence[Axes] | None = None) -> tuple[Figure, Axs]:
-    """Way made good over slope, for each terrain, friction (colour) and payload (line)."""
-    fig, panels = _side_by_side(axes, len(CASES))
-    for ax, case in zip(panels, CASES, strict=True):
+def plot_mobility(batch: Sequence[CellResult]) -> Figure:
+    """Net uphill distance over slope, for each terrain, friction (colour) and payload (line)."""
+    fig, axes = style.canvases(1, (9.0, 3.2), len(CASES), sharex=False)
+    for ax, case in zip(axes, CASES, strict=True):
         mine = [r for r in batch if r.cell.terrain == case.terrain]
         frictions = sorted({r.cell.friction for r in mine})
         for friction, payload in itertools.product(frictions, sorted({r.cell.payload_kg for r in mine})):
-            line = [r for r in mine if (r.cell.friction, r.cell.payload_kg) == (friction, payload)]
-            if len(line) < 2:
-                continue
-            ax.plot(
-                [r.cell.slope_deg for r in line],
-                [100.0 * r.advance for r in line],
-                color=("#0072b2", "#009e73", "#d55e00")[frictions.index(friction) % 3],
-                linestyle={0.0: "-", 30.0: "--"}.get(payload, ":"),
-                marker="o",
-                markersize=3,
-                label=f"mu {friction:g}" if payload == 0.0 else None,
-            )
+            cells = [r for r in mine if (r.cell.friction, r.cell.payload_kg) == (friction, payload)]
+            if len(cells) > 1:
+                slopes, advance = [r.cell.slope_deg for r in cells], [100.0 * r.advance for r in cells]
+                colour = style.AXIS_COLOURS[frictions.index(friction) % 3]
+                dash = {0.0: "-", 30.0: "--"}.get(payload, ":")
+                label = f"mu {friction:g}" if payload == 0.0 else None
+                ax.plot(slopes, advance, color=colour, linestyle=dash, marker="o", markersize=3, label=label)
         ax.axhline(0.0, color=COMMAND, linewidth=0.8)
-        style.dress(ax, x="slope, deg", y="way made good, %", title=case.terrain.replace("_", " "))
+        style.format_axes(ax, x="slope, deg", y="net distance, %", title=case.terrain.replace("_", " "))
         ax.legend(fontsize=7, frameon=False)
         ax.margins(x=0.05)
-    return fig, panels
+    return fig
 
 
-def plot_energy(
-    batch: Sequence[CellResult], over_slip: Sequence[CellResult], *, axes: Sequence[Axes] | None = None
-) -> tuple[Figure, Axs]:
-    """Energy a metre of the mobile runs: over slope, over payload, and over slip at one load and slope."""
-    fig, panels = _side_by_side(axes, 3)
+def plot_energy(batch: Sequence[CellResult], over_slip: Sequence[CellResult]) -> Figure:
+    """Energy per metre of the mobile runs: over slope, over payload, and over slip at one load and slope."""
+    fig, axes = style.canvases(1, (9.0, 3.2), 3, sharex=False)
     mobile = [r for r in batch if r.mobile]
-    for ax, (name, other, label) in zip(
-        panels,
-        (("slope_deg", "payload_kg", "slope, deg"), ("payload_kg", "slope_deg", "payload, kg")),
-        strict=False,
-    ):
-        for terrain, held in itertools.product(LABELS, (0.0, 5.0, 60.0)):
-            line = [r for r in mobile if r.cell.terrain == terrain and getattr(r.cell, other) == held]
-            xs = sorted({getattr(r.cell, name) for r in line})
-            if len(xs) < 2:
-                continue
-            means = [np.mean([r.energy_per_m_j for r in line if getattr(r.cell, name) == x]) for x in xs]
-            unit = "kg" if other == "payload_kg" else "deg"
-            ax.plot(
-                xs,
-                means,
-                color=style.TERRAIN_COLOURS[terrain],
-                marker="o",
-                markersize=3,
-                linestyle="-" if held == 0.0 else ":",
-                label=f"{terrain.replace('_', ' ')}, {held:g} {unit}",
-            )
-        style.dress(ax, x=label, y="energy, J/m")
-        ax.set_ylim(0.0, 1.35 * ax.get_ylim()[1])
-        ax.legend(fontsize=7, frameon=False, loc="upper left")
+    _mean_energy(axes[0], mobile, "slope_deg", "payload_kg", "slope, deg", "kg")
+    _mean_energy(axes[1], mobile, "payload_kg", "slope_deg", "payload, kg", "deg")
     known = [r for r in over_slip if r.mobile]
+    energy = [r.energy_per_m_j for r in known]
     for key, label, marker in (("slip_ratio", "usual slip ratio", "o"), ("slip", "the study's proxy", "s")):
-        panels[2].plot(
-            [getattr(r, key) for r in known],
-            [r.energy_per_m_j for r in known],
-            marker=marker,
-            markersize=3,
-            label=label,
-        )
-    style.dress(panels[2], x="mean slip, %", y="energy, J/m", title="loose sand, 5 deg")
-    panels[2].legend(fontsize=7, frameon=False)
-    return fig, panels
+        axes[2].plot([getattr(r, key) for r in known], energy, marker=marker, markersize=3, label=label)
+    style.format_axes(axes[2], x="mean slip, %", y=ENERGY, title="loose sand, 5 deg")
+    axes[2].legend(fontsize=7, frameon=False)
+    return fig
 
 
-def plot_tab4(
-    runs: Mapping[str, Sequence[CaseRun]], gaussian: Mapping[str, Sequence[float]], *, ax: Axes | None = None
-) -> tuple[Figure, Axes]:
+def plot_tab4(runs: Mapping[str, Sequence[CaseRun]], gaussian: Mapping[str, Sequence[float]]) -> Figure:
     """Tab. 4: each single run, the mean with its interval, and the study's number; logarithmic."""
-    fig, ax = style.canvas(ax, (9.0, 3.6))
+    fig, ax = style.canvas(None, (9.0, 3.6))
     place, ticks = 0.0, list[tuple[float, str]]()
     for case in CASES:
+        errors = [run.errors for run in runs[case.terrain]]
         columns = {
-            "|s|": ([run.errors.slip for run in runs[case.terrain]], case.slip),
-            "odometry": ([run.errors.odometry for run in runs[case.terrain]], case.odometry),
-            "IMU": ([run.errors.imu for run in runs[case.terrain]], case.imu),
-            "GNSS\nRTK": ([run.errors.gnss for run in runs[case.terrain]], case.gnss),
+            "|s|": ([e.slip for e in errors], case.slip),
+            "odometry": ([e.odometry for e in errors], case.odometry),
+            "IMU": ([e.imu for e in errors], case.imu),
+            "GNSS\nRTK": ([e.gnss for e in errors], case.gnss),
             "GNSS\nGaussian": (list(gaussian[case.terrain]), case.gnss),
         }
-        first = place
+        first, colour = place, style.TERRAIN_COLOURS[case.terrain]
         for name, (values, published) in columns.items():
-            colour, first_of_all = style.TERRAIN_COLOURS[case.terrain], not ticks
+            twin, study = ("twin: mean and 95 % interval", "study") if not ticks else (None, None)
+            mean = spread(values)
+            half = 0.0 if np.isnan(mean.half_width) else min(mean.half_width, 0.99 * mean.mean)
             ax.plot([place] * len(values), values, ".", color=colour, markersize=5, alpha=0.5)
-            found = spread(values)
             ax.errorbar(
-                place + 0.15,
-                found.mean,
-                yerr=0.0 if np.isnan(found.half_width) else min(found.half_width, 0.99 * found.mean),
-                fmt="o",
-                color=style.TRUTH,
-                markersize=4,
-                capsize=3,
-                linewidth=1.0,
-                label="twin: mean and 95 % interval" if first_of_all else None,
-            )
-            ax.plot(
-                place - 0.2,
-                published,
-                "D",
-                color=style.HELD_OUT,
-                markersize=5,
-                label="study" if first_of_all else None,
-            )
+                place + 0.15, mean.mean, yerr=half, fmt="o", color=style.TRUTH, markersize=4, capsize=3,
+                linewidth=1.0, label=twin,
+            )  # fmt: skip
+            ax.plot(place - 0.2, published, "D", color=style.HELD_OUT, markersize=5, label=study)
             ticks.append((place, name))
             place += 1.0
-        ax.text(
-            0.5 * (first + place - 1.0),
-            1.03,
-            case.label,
-            transform=ax.get_xaxis_transform(),
-            ha="center",
-            fontsize=9,
-        )
+        top, middle = ax.get_xaxis_transform(), 0.5 * (first + place - 1.0)
+        ax.text(middle, 1.03, case.label, transform=top, ha="center", fontsize=9)
         place += 0.8
     ax.set_yscale("log")
     ax.set_xticks([x for x, _ in ticks], [name for _, name in ticks])
-    style.dress(ax, y="mean error, %")
+    style.format_axes(ax, y="mean error, %")
     ax.tick_params(axis="x", labelsize=7)
     ax.margins(x=0.03)
     ax.legend(fontsize=8, frameon=False, loc="lower left")
-    return fig, ax
+    return fig
 
 
-def _side_by_side(axes: Sequence[Axes] | None, columns: int) -> tuple[Figure, Axs]:
-    """Like `style.canvases`, beside each other."""
-    if axes is None:
-        from matplotlib.figure import Figure
-
-        axes = list(Figure(figsize=(9.0, 3.2), layout="constrained").subplots(1, columns))
-    found = np.empty(columns, dtype=object)
-    found[:] = list(axes)
-    return found[0].get_figure(root=True), found
+def _speeds(ax: Axes, run: CaseRun) -> None:
+    p = run.profiles
+    style.line(ax, p.t_s, p.command, COMMAND, "command", linewidth=1.0)
+    style.line(ax, p.t_s, p.odometry, WHEELS, "odometry")
+    style.line(ax, p.t_s, p.truth, style.TRUTH, "truth")
 
 
-def _line(ax: Axes, t_s: Array, values: Array, label: str, colour: str, **options: Any) -> None:
-    keep = style.thin(len(t_s))
-    ax.plot(t_s[keep], values[keep], color=colour, label=label, **({"linewidth": 1.2} | options))
+def _mean_energy(
+    ax: Axes, mobile: Sequence[CellResult], name: str, other: str, label: str, unit: str
+) -> None:
+    """Energy per metre over the axis `name`, averaged over friction; a line each value of `other`."""
+    for terrain, held in itertools.product(LABELS, (0.0, 5.0, 60.0)):
+        runs = [r for r in mobile if r.cell.terrain == terrain and getattr(r.cell, other) == held]
+        xs = sorted({getattr(r.cell, name) for r in runs})
+        if len(xs) > 1:
+            means = [np.mean([r.energy_per_m_j for r in runs if getattr(r.cell, name) == x]) for x in xs]
+            colour, dash = style.TERRAIN_COLOURS[terrain], "-" if held == 0.0 else ":"
+            text = f"{terrain.replace('_', ' ')}, {held:g} {unit}"
+            ax.plot(xs, means, color=colour, marker="o", markersize=3, linestyle=dash, label=text)
+    style.format_axes(ax, x=label, y=ENERGY)
+    ax.set_ylim(0.0, 1.35 * ax.get_ylim()[1])
+    ax.legend(fontsize=7, frameon=False, loc="upper left")
+
+
+def _over_time(fig: Figure, axes: Sequence[Axes]) -> Figure:
+    style.legend_above(axes[0])
+    axes[-1].set_xlabel(TIME, fontsize=9)
+    return fig

@@ -1,8 +1,7 @@
-"""Colours and habits that all plots share. matplotlib is imported only when something is drawn.
+"""Colours and helpers that all plots share. matplotlib is imported only when something is drawn.
 
-The colours start from Okabe and Ito (2008, "Color Universal Design"), which
-readers with the common kinds of colour blindness can tell apart; grounds that
-look alike in colour differ in lightness.
+The colours start from Okabe and Ito (2008, "Color Universal Design"), which readers with the common kinds of
+colour blindness can tell apart; terrains that are alike in hue differ in lightness.
 """
 
 from __future__ import annotations
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
@@ -48,9 +48,11 @@ MODE_COLOURS = {
     "robust": "#cc79a7",
     "oracle": "#7f7f7f",
 }
-TRUTH = "#1a1a1a"
-HELD_OUT = "#cc3311"
-OUTAGE = "#ffe0b3"
+AXIS_COLOURS = ("#0072b2", "#d55e00", "#009e73")
+"""Of x, y and z."""
+TRUTH, HELD_OUT, NEUTRAL = "#1a1a1a", "#cc3311", "#7f7f7f"
+BEFORE, AFTER = "#d55e00", "#0072b2"
+OUTAGE, EXPECTED = "#ffe0b3", "#dddddd"
 SPARE_COLOURS = ("#332288", "#88ccee", "#44aa99", "#999933", "#aa4499", "#661100", "#6699cc")
 
 MAX_POINTS = 1200
@@ -58,39 +60,57 @@ MAX_POINTS = 1200
 
 
 def colour_of(name: str, table: dict[str, str]) -> str:
-    """The fixed colour of a name; names outside the table get one of the spare colours, always the same."""
+    """The colour of a name; one that is not in the table always gets the same spare colour."""
     return table.get(name) or SPARE_COLOURS[zlib.crc32(name.encode()) % len(SPARE_COLOURS)]
 
 
-def canvas(ax: Axes | None, size: tuple[float, float] = (9.0, 3.0)) -> tuple[Figure, Axes]:
-    """`ax` and its figure, or new ones; no global figure is made."""
-    if ax is None:
-        from matplotlib.figure import Figure
+def terrain_colour(name: object) -> str:
+    """The colour of a terrain class."""
+    return colour_of(str(name), TERRAIN_COLOURS)
 
-        ax = Figure(figsize=size, layout="constrained").subplots()
-    return ax.get_figure(root=True), ax  # type: ignore[return-value]
+
+def canvas(ax: Axes | None = None, size: tuple[float, float] = (9.0, 3.0)) -> tuple[Figure, Axes]:
+    """`ax` and its figure, or new ones; pyplot's list of figures is not touched."""
+    if ax is not None:
+        return ax.get_figure(root=True), ax  # type: ignore[return-value]
+    fig, axes = canvases(1, size)
+    return fig, axes[0]
 
 
 def canvases(
-    axes: Sequence[Axes] | None, rows: int, size: tuple[float, float]
-) -> tuple[Figure, NDArray[Any]]:
-    """Like `canvas`, for `rows` plots above each other on one time axis."""
-    if axes is None:
-        from matplotlib.figure import Figure
+    rows: int, size: tuple[float, float], columns: int = 1, *, sharex: bool = True
+) -> tuple[Figure, list[Axes]]:
+    """A new figure of `size`, inches, and its axes row by row."""
+    from matplotlib.figure import Figure
 
-        grid = Figure(figsize=size, layout="constrained").subplots(rows, 1, sharex=True, squeeze=False)
-        axes = list(grid[:, 0])
-    found = np.empty(rows, dtype=object)
-    found[:] = list(axes)
-    return found[0].get_figure(root=True), found
+    fig = Figure(figsize=size, layout="constrained")
+    return fig, list(fig.subplots(rows, columns, sharex=sharex, squeeze=False).flat)
 
 
-def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
+def channel_grid(count: int, height: float, extra: float) -> tuple[Figure, list[Axes]]:
+    """Axes for `count` channels over time in two columns, `height` inches a row."""
+    rows = (count + 1) // 2
+    fig, axes = canvases(rows, (10.0, extra + height * rows), 2)
+    for ax in axes[count:]:
+        ax.set_axis_off()
+    return fig, axes[:count]
+
+
+def finish_grid(fig: Figure, axes: Sequence[Axes]) -> None:
+    """Time below the last row of a `channel_grid`, and one legend above it."""
+    for ax in axes[-2:]:
+        ax.set_xlabel("time, s", fontsize=9)
+        ax.tick_params(labelbottom=True)
+    handles, labels = axes[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside upper right", ncols=len(labels), fontsize=8, frameon=False)
+
+
+def format_axes(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
     """Axis labels, a light grid and no box."""
     ax.set_xlabel(x, fontsize=9)
     ax.set_ylabel(y, fontsize=9)
     if title:
-        ax.set_title(plain(title), fontsize=10, loc="left")
+        ax.set_title(label_text(title), fontsize=10, loc="left")
     ax.tick_params(labelsize=8)
     ax.grid(True, color="#e0e0e0", linewidth=0.6)
     ax.set_axisbelow(True)
@@ -99,31 +119,43 @@ def dress(ax: Axes, *, x: str = "", y: str = "", title: str = "") -> None:
         ax.spines[side].set_visible(False)
 
 
-def legend_above(ax: Axes, *, columns: int = 8, **options: Any) -> None:
+def legend_above(ax: Axes, *, columns: int = 8, handles: Sequence[Any] | None = None) -> None:
     """The legend in rows above the plot, where it hides no data."""
-    handles = options.pop("handles", None)
-    if handles is None:
-        handles, _ = ax.get_legend_handles_labels()
+    handles = ax.get_legend_handles_labels()[0] if handles is None else handles
     if handles:
         ax.legend(
-            handles=handles,
-            loc="lower right",
-            bbox_to_anchor=(1.0, 1.0),
-            ncols=min(columns, len(handles)),
-            frameon=False,
-            fontsize=8,
-            handlelength=1.4,
-            columnspacing=1.2,
-            borderaxespad=0.1,
-            **options,
-        )
+            handles=handles, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=min(columns, len(handles)),
+            frameon=False, fontsize=8, handlelength=1.4, columnspacing=1.2, borderaxespad=0.1,
+        )  # fmt: skip
 
 
-def plain(text: object, limit: int = 60) -> str:
+def line(ax: Axes, t_s: Array, values: Array, colour: str, label: str | None = None, **options: Any) -> None:
+    """A line, thinned to `MAX_POINTS`."""
+    rows = thin(len(t_s))
+    ax.plot(t_s[rows], values[rows], color=colour, label=label, **({"linewidth": 1.2} | options))
+
+
+def band(ax: Axes, t_s: Array, values: Array, sigma: Array, colour: str, **options: Any) -> None:
+    """`values` within two `sigma`, thinned like `line`."""
+    rows = thin(len(t_s))
+    low, high = (values + k * sigma for k in (-2.0, 2.0))
+    ax.fill_between(t_s[rows], low[rows], high[rows], color=colour, linewidth=0, **options)
+
+
+def plain_log_ticks(axis: Axis, subs: Sequence[float] = (1.0, 2.0, 5.0)) -> None:
+    """Ticks of a logarithmic axis as 200 instead of 2 x 10^2."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    axis.set_major_locator(LogLocator(subs=subs))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def label_text(text: object, limit: int = 60) -> str:
     """Text from a log for a label: one short line, no mathematics, and not hidden from the legend."""
-    line = " ".join(str(text).split()).lstrip("_") or "unnamed"
-    line = line if len(line) <= limit else line[: limit - 1] + "…"
-    return line.replace("$", r"\$")
+    words = " ".join(str(text).split()).lstrip("_") or "unnamed"
+    words = words if len(words) <= limit else words[: limit - 1] + "…"
+    return words.replace("$", r"\$")
 
 
 def thin(n: int, most: int = MAX_POINTS, keep: Iterable[int] = ()) -> NDArray[np.int64]:
@@ -139,7 +171,7 @@ def seconds(t_ns: NDArray[np.int64], start_ns: int) -> Array:
 
 
 def robust_limits(values: Array, *, include: Sequence[float] = (), pad: float = 0.08) -> tuple[float, float]:
-    """Limits that show all but the wildest 0.5 % at each end."""
+    """Limits that show all but the most extreme 0.5 % at each end."""
     finite = values[np.isfinite(values)]
     if not len(finite):
         return -1.0, 1.0
@@ -150,7 +182,7 @@ def robust_limits(values: Array, *, include: Sequence[float] = (), pad: float = 
 
 
 def runs_of(labels: NDArray[Any]) -> list[tuple[int, int]]:
-    """First and one-past-last row of each stretch of equal labels."""
+    """First and one-past-last row of each run of equal labels."""
     if not len(labels):
         return []
     cuts = np.flatnonzero(labels[1:] != labels[:-1]) + 1

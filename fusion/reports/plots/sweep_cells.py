@@ -1,4 +1,4 @@
-"""What the plots of a sweep show, as numbers: its runs gathered in cells of two axes."""
+"""The runs of a sweep gathered in cells of one or two axes."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
@@ -36,9 +37,9 @@ def select(columns: Columns, rows: NDArray[np.bool_]) -> dict[str, NDArray[Any]]
 
 
 def varied(columns: Columns) -> list[str]:
-    """Numeric axes with more than one value on some ground: grounds differ in friction by themselves."""
-    grounds = [columns["terrain"] == terrain for terrain in dict.fromkeys(columns["terrain"])]
-    return [name for name in NUMERIC_AXES if any(len(levels(columns[name][rows])) > 1 for rows in grounds)]
+    """Numeric axes with more than one value on some terrain: terrains differ in friction by themselves."""
+    terrains = [columns["terrain"] == terrain for terrain in dict.fromkeys(columns["terrain"])]
+    return [name for name in NUMERIC_AXES if any(len(levels(columns[name][rows])) > 1 for rows in terrains)]
 
 
 def plane_of(columns: Columns) -> tuple[str, str] | None:
@@ -81,31 +82,36 @@ class CellAxis:
         return np.where(np.isfinite(values), found, -1)
 
 
-def in_cells(columns: Columns, name: str, x: CellAxis, y: CellAxis, plane: tuple[str, str]) -> Array:
-    """Median (rows of y, columns of x) of a column's finite values in each cell; NaN where there is none."""
-    column, row = x.cells(columns[plane[0]]), y.cells(columns[plane[1]])
-    values = columns[name]
-    out = np.full((len(y.centres), len(x.centres)), np.nan)
-    good = np.isfinite(values) & (column >= 0) & (row >= 0)
-    cell = row * len(x.centres) + column
-    for number in np.unique(cell[good]):
-        out.flat[number] = np.median(values[good & (cell == number)])
+def per_cell(cell: NDArray[np.int64], values: Array, count: int, statistic: str) -> Array:
+    """Statistic (count,) of the finite values (N,) in each cell ("median" or "mean"); NaN where there is none."""
+    good = np.isfinite(values) & (cell >= 0)
+    found = pd.Series(values[good]).groupby(cell[good]).agg(statistic)
+    out = np.full(count, np.nan)
+    out[found.index] = found
     return out
 
 
+def in_cells(
+    columns: Columns,
+    values: Array,
+    x: CellAxis,
+    y: CellAxis,
+    plane: tuple[str, str],
+    statistic: str = "median",
+) -> Array:
+    """Statistic (rows of y, columns of x) of values (N,) in each cell of the plane."""
+    column, row = x.cells(columns[plane[0]]), y.cells(columns[plane[1]])
+    cell = np.where((column >= 0) & (row >= 0), row * len(x.centres) + column, -1)
+    shape = (len(y.centres), len(x.centres))
+    return per_cell(cell, values, shape[0] * shape[1], statistic).reshape(shape)
+
+
 def mobile(columns: Columns) -> Array:
-    """1 for a run (N,) that got on, 0 for one that did not, NaN for one that failed."""
+    """1 for a run (N,) that drove to the end, 0 for one that did not, NaN for one that failed."""
     status = columns["status"]
     return np.where(status == "failed", np.nan, np.where(status == "done", 1.0, 0.0))
 
 
 def share_mobile(columns: Columns, x: CellAxis, y: CellAxis, plane: tuple[str, str]) -> Array:
-    """Share (rows of y, columns of x) of the runs in each cell that got on; NaN where there is none."""
-    column, row = x.cells(columns[plane[0]]), y.cells(columns[plane[1]])
-    got_on = mobile(columns)
-    good = np.isfinite(got_on) & (column >= 0) & (row >= 0)
-    shape = (len(y.centres), len(x.centres))
-    total, of_those = np.zeros(shape), np.zeros(shape)
-    np.add.at(total, (row[good], column[good]), 1.0)
-    np.add.at(of_those, (row[good], column[good]), got_on[good])
-    return np.divide(of_those, total, out=np.full(shape, np.nan), where=total > 0.0)
+    """Share (rows of y, columns of x) of mobile runs in each cell; NaN where there is none."""
+    return in_cells(columns, mobile(columns), x, y, plane, "mean")

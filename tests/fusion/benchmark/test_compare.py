@@ -13,7 +13,7 @@ from terrafusion.fusion.benchmark.compare import contrasts, median_interval, sha
 from terrafusion.fusion.benchmark.reasons import reasons
 from terrafusion.fusion.benchmark.run_score import GroundScore, RunScore, switch_delay_s
 from terrafusion.fusion.benchmark.targets import MISSED, OPEN, REACHED, Target, pooled_nees, targets
-from terrafusion.fusion.reports.benchmark_tables import markdown, tables
+from terrafusion.fusion.reports.benchmark_tables import tables
 from terrafusion.fusion.reports.plots.benchmark import plot_ratios
 
 
@@ -89,7 +89,7 @@ def test_a_failed_replay_loses_and_where_the_base_failed_nothing_is_compared() -
     assert (found.units, found.wins, found.losses, found.ratio) == (10, 2, 8, np.inf)
     assert found.interval == (0.5, np.inf)
     assert {t.verdict() for t in targets(base + own)} == {OPEN}
-    text = "\n".join(line for table in tables(base + own) for line in markdown(table))
+    text = "\n".join(line for table in tables(base + own) for line in table.markdown())
     assert "inf [0.50, inf]" in text
     plot_ratios(contrasts(base + own)).canvas.draw()
     assert shares(base + own + rows("oracle", np.full(12, 0.4)))[0].share == -np.inf
@@ -243,5 +243,5 @@ def test_tables_are_rectangular_and_tell_failures() -> None:
     made = tables(rows("fixed", base) + rows("adaptive", base) + failed)
     for table in made:
         assert {len(cells) for cells in table.rows} == {len(table.heads)}
-        assert len({line.count("|") for line in markdown(table)[3:]}) == 1
-    assert "the start was not found" in "\n".join(line for table in made for line in markdown(table))
+        assert len({line.count("|") for line in table.markdown()[3:]}) == 1
+    assert "the start was not found" in "\n".join(line for table in made for line in table.markdown())

@@ -25,9 +25,9 @@ from terrafusion.fusion.outputs.replay_files import (
 from terrafusion.fusion.reports.plots import replay as plots
 from terrafusion.fusion.reports.plots import replay_filter as plots_filter
 from terrafusion.fusion.reports.plots import replay_map as plots_map
-from terrafusion.fusion.reports.plots.style import colour_of, plain, thin
+from terrafusion.fusion.reports.plots.style import colour_of, label_text, thin
 from terrafusion.fusion.reports.replay import ReportRun, write_report
-from terrafusion.fusion.reports.replay_text import Row, head_of_many, pick_pair, table_rows
+from terrafusion.fusion.reports.replay_text import ScoreRow, pick_pair, score_rows, summary_of_many
 
 HOSTILE = '<script>alert("x")</script>&_$\\frac{'
 OUTAGES = (Outage(40.0, 30.0),)
@@ -110,11 +110,11 @@ def test_a_comparison_has_all_sections_and_nothing_outside(drive, tmp_path):
         "Numbers",
         "Map",
         "Errors",
-        "Ground and slip",
-        "Weights and their reasons",
+        "Terrain and slip",
+        "Sensor weights",
         "Sensors",
-        "Notes of the run",
-        "Where this comes from",
+        "Notes",
+        "Provenance",
     ]
     assert len(page.images) == 10
     assert all(link.startswith("data:image/svg+xml;base64,") for link in page.links)
@@ -183,22 +183,22 @@ def test_losses_are_told_like_wins(drive):
     metrics = [good.metrics, bad.metrics]
     ours, theirs = pick_pair(metrics)
     assert (ours, theirs) == (1, 0)
-    row = table_rows(metrics)[0]
+    row = score_rows(metrics)[0]
     assert row.verdict(1, 0) == ("6.0 times", "worse")
     assert row.verdict(0, 1) == ("83 % lower", "better")
     assert row.best() == 0
-    sentences = " ".join(head_of_many(["fixed", "adaptive"], metrics, ours, theirs))
+    sentences = " ".join(summary_of_many(["fixed", "adaptive"], metrics, ours, theirs))
     assert "6.0 times with adaptive" in sentences
     assert re.search(r"adaptive is better than fixed in 0 and worse in \d+", sentences)
 
 
 def test_rows_judge_by_their_goal():
-    nees = Row("NEES", (0.5, 1.2), goal="one")
+    nees = ScoreRow("NEES", (0.5, 1.2), goal="one")
     assert nees.best() == 1
     assert nees.verdict(0, 1) == ("farther from 1", "worse")
-    assert Row("draw", (1.0001, 1.0002), goal="low").best() is None
-    assert Row("half", (1.0, None), goal="low").best() is None
-    assert Row("count", (1, 2)).verdict(0, 1) == ("", "")
+    assert ScoreRow("draw", (1.0001, 1.0002), goal="low").best() is None
+    assert ScoreRow("half", (1.0, None), goal="low").best() is None
+    assert ScoreRow("count", (1, 2)).verdict(0, 1) == ("", "")
 
 
 @pytest.mark.parametrize(
@@ -254,12 +254,12 @@ def test_plots_bear_gaps_nan_and_single_keyframes(drive):
         for fig in (
             plots.plot_slip(estimate, start, outages=OUTAGES)[0],
             plots.plot_terrain(estimate, start)[0],
-            plots.plot_weights(estimate, start)[0],
-            plots_filter.plot_biases(estimate, start)[0],
-            plots_filter.plot_innovations(estimate, start)[0],
+            plots.plot_weights(estimate, start),
+            plots_filter.plot_biases(estimate, start),
+            plots_filter.plot_innovations(estimate, start),
             plots.plot_speeds(estimate, recording)[0],
             plots_map.plot_map(estimate, recording, held_out=none, outages=OUTAGES)[0],
-            plots_map.plot_map_runs({"a": estimate}, recording, outages=OUTAGES)[0],
+            plots_map.plot_map_runs({"a": estimate}, recording, outages=OUTAGES),
         ):
             fig.draw_without_rendering()
             assert fig.axes
@@ -285,7 +285,7 @@ def test_important_changes_are_the_largest_apart_and_in_order():
 def test_style_helpers():
     assert colour_of("mud", {"mud": "#123456"}) == "#123456"
     assert colour_of("ice", {}) == colour_of("ice", {})
-    assert plain("_a\n$b") == r"a \$b"
+    assert label_text("_a\n$b") == r"a \$b"
     rows = thin(100_000, 100, keep=[77])
     assert rows[0] == 0
     assert rows[-1] == 99_999
@@ -294,12 +294,12 @@ def test_style_helpers():
 
 
 def test_a_report_on_a_long_drive_is_quick(drive, tmp_path):
-    """About one second; the bound leaves room for a busy machine."""
+    """About one second of computing; the bound leaves room for a busy machine."""
     d = drive(seconds=400.0, truth_hz=100, noise_m=0.05)
     runs = [make_run(d, "adaptive"), make_run(d, "fixed")]
-    begun = time.perf_counter()
+    begun = time.process_time()
     path = write_report(tmp_path / "r.html", "Long", runs, d.recording, held_out=d.fixes, outages=OUTAGES)
-    assert time.perf_counter() - begun < 10.0
+    assert time.process_time() - begun < 10.0
     assert path.stat().st_size < 3_000_000
 
 

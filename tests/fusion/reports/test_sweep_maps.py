@@ -38,7 +38,7 @@ def test_medians_and_shares_of_cells() -> None:
     plane = ("friction", "slope_deg")
     x, y = (CellAxis.of(columns[name]) for name in plane)
     nan = np.nan
-    np.testing.assert_array_equal(in_cells(columns, "energy", x, y, plane), [[2.0, nan], [nan, 7.0]])
+    np.testing.assert_array_equal(in_cells(columns, columns["energy"], x, y, plane), [[2.0, nan], [nan, 7.0]])
     np.testing.assert_allclose(share_mobile(columns, x, y, plane), [[2.0 / 3.0, nan], [nan, 0.0]])
 
 

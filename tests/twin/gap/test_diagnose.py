@@ -220,7 +220,7 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
 
 def test_a_plot_names_references_where_there_are_any(wide: GapDiagnosis, unreferred: GapDiagnosis) -> None:
     for found, labels in ((wide, ["before", "after", "references"]), (unreferred, ["before", "after"])):
-        legend = plot_shrink(found)[1].get_legend()
+        legend = plot_shrink(found).axes[0].get_legend()
         assert legend is not None
         assert {text.get_text() for text in legend.get_texts()} == {*labels}
 
