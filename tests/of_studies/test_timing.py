@@ -36,4 +36,4 @@ def test_more_references_leave_the_trials_as_they_are() -> None:
     few, many = specs(3, 2), specs(3, 5)
     assert len(many) == len(few) + 3
     for a, b in zip(few, many, strict=False):
-        assert (a.seed, a.heading_rad, a.knobs) == (b.seed, b.heading_rad, b.knobs)
+        assert (a.seed, a.heading_rad, a.changes) == (b.seed, b.heading_rad, b.changes)

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.twin.gap.blind.drives import KINDS, drive
-from terrafusion.twin.gap.blind.plan import SEVERITIES, SOILS, VEHICLE, _size
+from terrafusion.twin.gap.blind.plan import SEVERITIES, SOILS, VEHICLE, shape_size
 from terrafusion.twin.gap.blind.plant.spec import RunSpec
 from terrafusion.twin.gap.blind.shapes import (
     IN_CATALOGUE,
@@ -118,16 +118,16 @@ def specs(number: int, references: int = REFERENCES) -> list[RunSpec]:
     rng = np.random.default_rng([FIRST_SEED, number, 2])
     vehicle, ground, robot = load_vehicle(VEHICLE), load_soil(soil), int(rng.integers(2**31))
 
-    def one(place: int, seed: int, knobs: Mapping[str, float]) -> RunSpec:
+    def one(place: int, seed: int, changes: Mapping[str, float]) -> RunSpec:
         own = np.random.default_rng([FIRST_SEED, number, 3, place])
         heading = float(own.uniform(-np.pi, np.pi))
         run_seed = int(np.random.default_rng([FIRST_SEED, number, 4, seed]).integers(2**31))
-        return RunSpec(vehicle, ground, drive(kind, own), heading, run_seed, robot, dict(knobs))
+        return RunSpec(vehicle, ground, drive(kind, own), heading, run_seed, robot, dict(changes))
 
     out = []
     for t, (shape, severity) in enumerate(trials):
-        knobs = {} if shape is None else shape.turned(_size(shape, kind, severity), rng)
-        out += [one(i, RUNS * t + i, knobs) for i in range(RUNS)]
+        changes = {} if shape is None else shape.turned(shape_size(shape, kind, severity), rng)
+        out += [one(i, RUNS * t + i, changes) for i in range(RUNS)]
     return out + [one(RUNS + i, RUNS * len(trials) + i, {}) for i in range(references)]
 
 
@@ -257,7 +257,8 @@ def scores(trials: Sequence[Trial]) -> dict[str, Any]:
 
 def deviations(trials: Iterable[Trial]) -> list[float]:
     """By how many of its sigmas each size that is told differs from the true one: of effects by the
-    catalogue's own law that come first, where one parameter tells them (no sign: a knob turns either way)."""
+    catalogue's own law that come first, where one parameter tells them (no sign: a change turns either
+    way)."""
     out = []
     for trial in trials:
         first = trial.answer["causes"][0]
@@ -265,7 +266,7 @@ def deviations(trials: Iterable[Trial]) -> list[float]:
             continue
         told = list(first["parameters"].values())
         if len(told) == 1 and told[0]["sigma"] is not None:
-            true = _size(shapes()[trial.shape], trial.drive, trial.severity)
+            true = shape_size(shapes()[trial.shape], trial.drive, trial.severity)
             out.append((abs(told[0]["value"]) - true) / told[0]["sigma"])
     return out
 

@@ -68,8 +68,8 @@ def measure(kind: str, count: int, seed: int) -> tuple[float, list[tuple[str, fl
     vehicle, soil, rng = load_vehicle(VEHICLE), load_soil(SOIL), np.random.default_rng([seed, 7])
     chosen = [IN_CATALOGUE[i] for i in rng.permutation(len(IN_CATALOGUE))[:count]]
     trials = [(s, m) for s in chosen for m in MULTIPLES if m * observed(s.key, kind) <= s.most]
-    knobs = [s.turned(m * observed(s.key, kind), rng) for s, m in trials]
-    runs = [own for own in knobs for _ in range(RUNS)] + [{}] * REFERENCES
+    changes = [s.turned(m * observed(s.key, kind), rng) for s, m in trials]
+    runs = [own for own in changes for _ in range(RUNS)] + [{}] * REFERENCES
 
     def spec(own: dict[str, float]) -> RunSpec:
         heading = rng.uniform(-np.pi, np.pi)

@@ -1,5 +1,4 @@
-"""Trials put to a diagnosis, and what it answers: one line of JSON a trial, written as soon as it is
-there."""
+"""Trials given to a diagnosis, and its answers: one line of JSON a trial, written at once."""
 
 from __future__ import annotations
 
@@ -7,7 +6,7 @@ import functools
 import json
 import os
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -21,11 +20,11 @@ from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
 ORACLE = "oracle.jsonl"
 LANES = 160
-"""Runs of the plant computed side by side (memory: about 5 MB each)."""
+"""Runs of the plant in one batch (about 5 MB each)."""
 
 
 class Answer(Protocol):
-    """What a diagnosis gives back."""
+    """Result of a diagnosis."""
 
     def to_json(self) -> dict[str, Any]:
         """Keeps to `diagnosis.schema.json`."""
@@ -36,8 +35,8 @@ Diagnose = Callable[..., Answer]
 
 
 @dataclass(frozen=True, eq=False)
-class Case:
-    """What a diagnosis is given of a trial: nothing of the truth."""
+class BlindCase:
+    """A trial as a diagnosis gets it: nothing of the truth."""
 
     trial: str
     runs: tuple[Recording, ...]
@@ -45,22 +44,21 @@ class Case:
     vehicle: VehicleParams
 
 
-def cases(trials: Sequence[Trial]) -> Iterator[Case]:
-    """The trials' recordings, made as they are asked for."""
+def cases(trials: Sequence[Trial]) -> Iterator[BlindCase]:
+    """The trials' recordings, simulated lazily."""
     from terrafusion.twin.gap.blind.plant.run import record
 
     vehicle = load_vehicle(VEHICLE)
     for block in _blocks(trials):
-        many = [specs(trial) for trial in block]
-        names = [f"{kind}-{i + 1}" for trial in block for kind, i in _names(trial)]
-        recordings = iter(record([spec for own in many for spec in own], names=names))
+        many, names = [spec for trial in block for spec in specs(trial)], list[str]()
+        for trial in block:
+            names += [f"run-{i + 1}" for i in range(trial.runs)]
+            names += [f"reference-{i + 1}" for i in range(trial.references)]
+        recordings = iter(record(many, names=names))
         for trial in block:
             runs = tuple(next(recordings) for _ in range(trial.runs))
-            yield Case(trial.trial, runs, tuple(next(recordings) for _ in range(trial.references)), vehicle)
-
-
-def _names(trial: Trial) -> list[tuple[str, int]]:
-    return [*(("run", i) for i in range(trial.runs)), *(("reference", i) for i in range(trial.references))]
+            references = tuple(next(recordings) for _ in range(trial.references))
+            yield BlindCase(trial.trial, runs, references, vehicle)
 
 
 def _blocks(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
@@ -76,7 +74,7 @@ def _blocks(trials: Sequence[Trial]) -> Iterator[list[Trial]]:
 
 
 def answered(folder: Path, name: str = seal.ANSWERS) -> dict[str, dict[str, Any]]:
-    """Answers that are there, by trial; a line that was cut off does not count."""
+    """Stored answers by trial; a truncated line does not count."""
     path = folder / name
     found = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
@@ -95,7 +93,7 @@ def answer_all(
     jobs: int,
     progress: Callable[[float], None] | None = None,
 ) -> None:
-    """Puts the trials that have no answer yet to the diagnosis; closes the answers when all are there."""
+    """Diagnoses the trials that have no answer yet; closes the answers when all are stored."""
     done = answered(folder)
     _rewrite(folder, done)  # without a line that was cut off
     missing = [trial for trial in trials if trial.trial not in done]
@@ -116,8 +114,8 @@ def answer_all(
     seal.close(folder)
 
 
-def answer(case: Case, diagnose: Diagnose, sealed: Path | None) -> dict[str, Any]:
-    """One answer. What the diagnosis raises is noted as the answer: it counts as wrong.
+def answer(case: BlindCase, diagnose: Diagnose, sealed: Path | None) -> dict[str, Any]:
+    """One answer. An exception of the diagnosis is recorded: it counts as wrong.
 
     The process cannot open the labels in the folder `sealed`.
     """
@@ -135,18 +133,14 @@ def answer(case: Case, diagnose: Diagnose, sealed: Path | None) -> dict[str, Any
 
 
 def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, jobs: int) -> dict[str, float]:
-    """Share of the gap that goes away where the diagnosis is told the true effects, by trial.
+    """Share of the gap that disappears where the diagnosis is given the true effects, by trial.
 
-    Asked for trials whose answer tells a share itself, once the labels are open; `oracle.jsonl` keeps what
-    is done. The oracle is called as the diagnosis, with `effects`, the names of the candidates.
+    For trials whose answer has a share, once the labels are open; `oracle.jsonl` stores the results. The
+    oracle is called as the diagnosis, with `effects`, the names of the candidates.
     """
-    told = {
-        t
-        for t, entry in answered(folder).items()
-        if ((entry["answer"] or {}).get("shrink") or {}).get("share")
-    }
+    with_share = {t for t, entry in answered(folder).items() if _share(entry)}
     done = answered(folder, ORACLE)
-    asked = [t for t in trials if t.trial in told and t.family in ("same", "shifted")]
+    asked = [t for t in trials if t.trial in with_share and t.family in ("same", "shifted")]
     effects = {t.trial: t.effects() for t in asked}
     missing = [t for t in asked if t.trial not in done]
     with open_workers("loky", jobs) as pool, (folder / ORACLE).open("a", encoding="utf-8") as file:
@@ -155,14 +149,14 @@ def ask_oracle(folder: Path, trials: Sequence[Trial], oracle: Diagnose, jobs: in
             done[entry["trial"]] = entry
             file.write(json.dumps(entry) + "\n")
             file.flush()
-    shares = {t: ((entry["answer"] or {}).get("shrink") or {}).get("share") for t, entry in done.items()}
+    shares = {t: _share(entry) for t, entry in done.items()}
     return {t: float(share) for t, share in shares.items() if share is not None}
 
 
+def _share(entry: dict[str, Any]) -> float | None:
+    return ((entry["answer"] or {}).get("shrink") or {}).get("share")
+
+
 def _rewrite(folder: Path, entries: dict[str, dict[str, Any]]) -> None:
-    lines = _lines(entries[name] for name in sorted(entries))
+    lines = "".join(json.dumps(entries[name]) + "\n" for name in sorted(entries))
     write_atomically(folder / seal.ANSWERS, lambda part: part.write_text(lines, encoding="utf-8"))
-
-
-def _lines(entries: Iterable[dict[str, Any]]) -> str:
-    return "".join(json.dumps(entry) + "\n" for entry in entries)

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.answers import Diagnose, answer_all, answered, ask_oracle
-from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, Trial, from_text, plan, to_text
+from terrafusion.twin.gap.blind.plan import FULL, QUICK, CheckSize, Trial, from_text, plan, to_text
 from terrafusion.twin.gap.blind.score import score
 
 RESULT = "blind.json"
@@ -27,7 +27,7 @@ def run_blind_check(
     diagnose: Diagnose,
     *,
     quick: bool = False,
-    scale: Scale | None = None,
+    scale: CheckSize | None = None,
     seed: int = 0,
     jobs: int = 1,
     progress: Callable[[float], None] | None = None,
@@ -36,10 +36,10 @@ def run_blind_check(
     """Scores of a diagnosis on sealed trials; `blind.json` in the folder `out` holds them too.
 
     Args:
-        diagnose: what is judged, see `answers.Diagnose`.
+        diagnose: the diagnosis to check, see `answers.Diagnose`.
         quick: a small subset of all families.
         scale: in place of the full or quick one.
-        oracle: the diagnosis once more, which then is told the true `effects`: how far the gap could shrink.
+        oracle: the diagnosis once more, given the true `effects`: how far the gap could shrink.
 
     Raises:
         ConfigError: the folder holds a check of another seed or scale.
@@ -48,7 +48,7 @@ def run_blind_check(
     """
     folder, scale = Path(out), scale or (QUICK if quick else FULL)
     trials = plan(seed, scale)
-    public = {"seed": seed, "scale": _told(scale), "trials": len(trials)}
+    public = {"seed": seed, "scale": _scale_json(scale), "trials": len(trials)}
     _sealed(folder, trials, public)
     if not (folder / seal.CLOSED).is_file():
         answer_all(folder, trials, diagnose, jobs, progress)
@@ -83,5 +83,5 @@ def _sealed(folder: Path, trials: list[Trial], public: Mapping[str, Any]) -> Non
         )
 
 
-def _told(scale: Scale) -> dict[str, Any]:
+def _scale_json(scale: CheckSize) -> dict[str, Any]:
     return {**dataclasses.asdict(scale), "severities": list(scale.severities)}

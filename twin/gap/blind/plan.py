@@ -26,7 +26,7 @@ PAIR_SEVERITY = 4.0
 
 
 @dataclass(frozen=True)
-class Scale:
+class CheckSize:
     """How many trials, and how much data each has.
 
     Attributes:
@@ -45,15 +45,15 @@ class Scale:
     references: int
     severities: tuple[float, ...] = SEVERITIES
 
-    def part(self, share: float) -> Scale:
+    def part(self, share: float) -> CheckSize:
         """The same data a trial, but only `share` (0 to 1] of the trials of every family, rounded up."""
         counts = {name: math.ceil(share * getattr(self, name)) for name in COUNTS}
         return dataclasses.replace(self, **counts)
 
 
 COUNTS = ("nulls", "effects", "outside", "pairs")
-FULL = Scale(nulls=200, effects=37, outside=24, pairs=40, runs=3, references=20)
-QUICK = Scale(nulls=4, effects=2, outside=1, pairs=1, runs=3, references=12, severities=(4.0,))
+FULL = CheckSize(nulls=200, effects=37, outside=24, pairs=40, runs=3, references=20)
+QUICK = CheckSize(nulls=4, effects=2, outside=1, pairs=1, runs=3, references=12, severities=(4.0,))
 
 
 @dataclass(frozen=True)
@@ -61,8 +61,8 @@ class Trial:
     """One trial and its truth.
 
     Attributes:
-        trial: opaque name; the order of names tells nothing.
-        family, drive, severity, soil: what it is for; severity is 0 for null.
+        trial: opaque name, in random order.
+        family, drive, severity, soil: its cell of the plan; severity is 0 for null.
         shapes: keys of `shapes.shapes` that are present.
         values: their sizes.
         seed: of everything that is drawn.
@@ -94,35 +94,26 @@ class Trial:
         return cls(**{**own, **lists})
 
 
-def plan(seed: int, scale: Scale) -> list[Trial]:
-    """All trials, in an order that tells nothing of what they hold."""
+def plan(seed: int, scale: CheckSize) -> list[Trial]:
+    """All trials, in random order."""
     cells = list(_cells(scale, np.random.default_rng([seed, 1])))
     rng = np.random.default_rng([seed, 2])
     trials = []
     for place, index in enumerate(rng.permutation(len(cells))):
         family, kind, severity, chosen = cells[index]
         own = int(rng.integers(2**62))
-        values = tuple(_size(shape, kind, severity) for shape in chosen)
-        soil = SOILS[int(rng.integers(len(SOILS)))]
-        name = f"trial-{place + 1:04d}"
+        values = tuple(shape_size(shape, kind, severity) for shape in chosen)
+        soil, name = SOILS[int(rng.integers(len(SOILS)))], f"trial-{place + 1:04d}"
         trials.append(
             Trial(
-                name,
-                family,
-                kind,
-                severity,
-                soil,
-                tuple(s.key for s in chosen),
-                values,
-                own,
-                scale.runs,
+                name, family, kind, severity, soil, tuple(s.key for s in chosen), values, own, scale.runs,
                 scale.references,
             )
-        )
+        )  # fmt: skip
     return trials
 
 
-def _cells(scale: Scale, rng: np.random.Generator) -> Iterator[tuple[str, str, float, tuple[Shape, ...]]]:
+def _cells(scale: CheckSize, rng: np.random.Generator) -> Iterator[tuple[str, str, float, tuple[Shape, ...]]]:
     for i in range(scale.nulls):
         yield "null", KINDS[i % len(KINDS)], 0.0, ()
     for kind in KINDS:
@@ -144,25 +135,25 @@ def _in_turn(pool: Sequence[Shape], count: int, rng: np.random.Generator) -> lis
     return [pool[i] for _ in range(rounds) for i in rng.permutation(len(pool))][:count]
 
 
-def _size(shape: Shape, kind: str, severity: float) -> float:
-    """`severity` times the half-power point, within what the plant is asked for."""
+def shape_size(shape: Shape, kind: str, severity: float) -> float:
+    """`severity` times the half-power point, within the plant's range."""
     return min(severity * half_power(shape.key, kind), shape.most)
 
 
 def specs(trial: Trial) -> list[RunSpec]:
-    """What the plant is to run: the trial's runs, then its references; one robot, one soil."""
+    """Runs of the plant: the trial's runs, then its references; one robot, one soil."""
     rng = np.random.default_rng([trial.seed, 3])
     chosen = [shapes()[key] for key in trial.shapes]
-    knobs: dict[str, float] = {}
+    changes: dict[str, float] = {}
     for shape, value in zip(chosen, trial.values, strict=True):
-        for knob, turned in shape.turned(value, rng).items():
-            knobs[knob] = knobs.get(knob, 0.0) + turned
+        for change, turned in shape.turned(value, rng).items():
+            changes[change] = changes.get(change, 0.0) + turned
     vehicle, soil, robot = load_vehicle(VEHICLE), load_soil(trial.soil), int(rng.integers(2**31))
     out = []
     for i in range(trial.runs + trial.references):
         own = np.random.default_rng([trial.seed, 4, i])
         heading, run_seed = own.uniform(-np.pi, np.pi), int(own.integers(2**31))
-        with_effect = knobs if i < trial.runs else {}
+        with_effect = changes if i < trial.runs else {}
         out.append(
             RunSpec(vehicle, soil, drive(trial.drive, own), heading, run_seed, robot, dict(with_effect))
         )

@@ -15,7 +15,7 @@ from terrafusion.twin.gap.blind.verdicts import Judged, judge
 SCHEMA = "terrafusion.gap-blind/1"
 SINGLE = ("same", "shifted")
 MATTERS = 1.5
-"""Severity from which an effect counts as one that ought to be told."""
+"""Severity from which an effect should be identified."""
 
 
 def score(
@@ -28,8 +28,7 @@ def score(
     Args:
         trials: with their truth.
         answers: by trial; missing ones count as crashes.
-        oracle: share of the gap that goes away when the true effect is given, by trial, where it was
-        computed.
+        oracle: share of the gap that goes away when the true effect is given, by trial, known.
     """
     judged = [judge(trial, answers.get(trial.trial)) for trial in trials]
     scores: dict[str, Any] = {
@@ -74,17 +73,11 @@ def _cells(judged: Sequence[Judged], outcome: Callable[[Judged], bool]) -> list[
         {(j.trial.family, j.trial.drive, j.trial.severity) for j in judged if j.trial.family != "null"},
         key=lambda key: (FAMILIES.index(key[0]), key[1], key[2]),
     )
-    return [
-        {"family": family, "drive": drive, "severity": severity}
-        | rate(
-            [
-                outcome(j)
-                for j in judged
-                if (j.trial.family, j.trial.drive, j.trial.severity) == (family, drive, severity)
-            ]
-        ).to_json()
-        for family, drive, severity in keys
-    ]
+    out = []
+    for key in keys:
+        mine = [outcome(j) for j in judged if (j.trial.family, j.trial.drive, j.trial.severity) == key]
+        out.append(dict(zip(("family", "drive", "severity"), key, strict=True)) | rate(mine).to_json())
+    return out
 
 
 def _by_family(judged: Sequence[Judged], outcome: Callable[[Judged], bool]) -> dict[str, Any]:
@@ -95,23 +88,23 @@ def _by_family(judged: Sequence[Judged], outcome: Callable[[Judged], bool]) -> d
 
 
 def _class_size(judged: Sequence[Judged]) -> dict[str, float | None]:
-    """Mean size of the class ranked first: one that holds everything is always right, and says nothing."""
+    """Mean size of the class ranked first: a class of all effects is always right and worthless."""
     sizes = {f: [len(j.first_class) for j in _of(judged, f, detected=True) if j.first] for f in SINGLE}
     return {family: statistics.fmean(many) if many else None for family, many in sizes.items()}
 
 
 def _confusion(judged: Sequence[Judged]) -> dict[str, dict[str, int]]:
-    """True effect against what was said: the effect ranked first, or no_gap, unknown, crash."""
+    """True effect against the effect ranked first, or no_gap, unknown, crash."""
     table: dict[str, Counter[str]] = {}
     for j in _of(judged, *SINGLE, "outside"):
-        table.setdefault(j.trial.effects()[0], Counter())[_said(j)] += 1
+        table.setdefault(j.trial.effects()[0], Counter())[_answer(j)] += 1
     for j in _of(judged, "null"):
-        table.setdefault("no_gap", Counter())[_said(j)] += 1
+        table.setdefault("no_gap", Counter())[_answer(j)] += 1
     order = [*dict.fromkeys(shape.effect for shape in shapes().values()), "no_gap"]
     return {truth: dict(table[truth].most_common()) for truth in order if truth in table}
 
 
-def _said(j: Judged) -> str:
+def _answer(j: Judged) -> str:
     if j.crashed:
         return "crash"
     if not j.detected:
@@ -148,26 +141,25 @@ def _unknown(judged: Sequence[Judged]) -> dict[str, Any]:
 
 def _pairs(judged: Sequence[Judged]) -> dict[str, Any]:
     pairs = _of(judged, "pair")
+    single = _of(judged, *SINGLE, detected=True)
     return {
         "both": rate([j.found == 2 for j in pairs]).to_json(),
         "at_least_one": rate([j.found >= 1 for j in pairs]).to_json(),
         "false_extras_a_case": statistics.fmean([j.extras for j in pairs]) if pairs else None,
-        "false_extras_single": statistics.fmean([j.extras for j in _of(judged, *SINGLE, detected=True)])
-        if _of(judged, *SINGLE, detected=True)
-        else None,
+        "false_extras_single": statistics.fmean([j.extras for j in single]) if single else None,
     }
 
 
 def _shrink(judged: Sequence[Judged], oracle: Mapping[str, float]) -> dict[str, Any]:
-    """Mean share of the gap that goes away, and the oracle's on the same trials."""
+    """Mean share of the gap that disappears, and the oracle's on the same trials."""
     out: dict[str, Any] = {}
     for family in SINGLE:
-        told = {j.trial.trial: j.shrink for j in _of(judged, family, detected=True) if j.shrink is not None}
-        both = [(share, oracle[trial]) for trial, share in told.items() if trial in oracle]
+        shares = {j.trial.trial: j.shrink for j in _of(judged, family, detected=True) if j.shrink is not None}
+        both = [(share, oracle[trial]) for trial, share in shares.items() if trial in oracle]
         chosen = statistics.fmean(s for s, _ in both) if both else None
         best = statistics.fmean(o for _, o in both) if both else None
         out[family] = {
-            "mean": statistics.fmean(told.values()) if told else None, "count": len(told),
+            "mean": statistics.fmean(shares.values()) if shares else None, "count": len(shares),
             "beside_oracle": chosen, "oracle": best, "count_oracle": len(both),
             "over_oracle": chosen / best if chosen is not None and best else None,
         }  # fmt: skip
@@ -175,17 +167,17 @@ def _shrink(judged: Sequence[Judged], oracle: Mapping[str, float]) -> dict[str, 
 
 
 def _effects(judged: Sequence[Judged]) -> list[dict[str, Any]]:
-    """Each effect: how often it was seen, and told apart, from severity `MATTERS` on."""
+    """Each effect: how often it was detected, and identified, from severity `MATTERS` on."""
     strong = [j for j in _of(judged, *SINGLE, "outside") if j.trial.severity >= MATTERS]
     names = list(dict.fromkeys(j.trial.effects()[0] for j in strong))
     rows = []
     for name in sorted(names):
         own = [j for j in strong if j.trial.effects()[0] == name]
-        seen = [j for j in own if j.detected]
+        detected = [j for j in own if j.detected]
         rows.append({
             "effect": name, "power": rate([j.detected for j in own]).to_json(),
-            "top1": rate([j.top(1) for j in seen]).to_json(),
-            "unknown": rate([j.verdict == "unknown" for j in seen]).to_json(),
+            "top1": rate([j.top(1) for j in detected]).to_json(),
+            "unknown": rate([j.verdict == "unknown" for j in detected]).to_json(),
         })  # fmt: skip
     return rows
 

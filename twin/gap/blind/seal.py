@@ -1,19 +1,18 @@
-"""Labels under seal: committed to before the answers, opened after them, by a chain of hashes.
+"""Sealed labels: a hash commitment before the answers, opened after them.
 
-1. `seal` encrypts the labels and writes `commitment.json` with their salted hash. The key stays in
-`labels.key`. 2. `close` notes the hash of the finished answers and of the commitment they were given under.
-3. `unseal` opens the labels only if the answers are the ones that were closed, under this commitment, and
-if the
-   labels were not opened before for other answers; then it checks them against the salted hash.
+1. `seal` writes the labels, hidden by a secret, and publishes the SHA-256 of secret and labels in
+`commitment.json`. 2. `close` records the hashes of the finished answers and of the commitment they were given
+under. 3. `unseal` returns the labels if the answers are the closed ones, under this commitment, if the labels
+were not opened
+   before for other answers, and if they are those committed to.
 
-This guards against a diagnosis (or its author) that peeks, by accident or habit. It is no protection against
-whoever draws the plan once more from a seed that is known.
+This guards against a diagnosis (or its author) that reads the labels by accident or habit, not against one
+who draws the plan again from a known seed.
 """
 
 from __future__ import annotations
 
 import hashlib
-import hmac
 import json
 import os
 import secrets
@@ -27,72 +26,61 @@ from terrafusion.datasets.core.files import write_atomically
 
 LABELS, KEY, COMMITMENT = "labels.sealed", "labels.key", "commitment.json"
 ANSWERS, CLOSED, OPENED = "answers.jsonl", "answers.closed.json", "labels.opened.json"
-_BYTES = 32
 _guarded: set[str] = set()
 _hooks: list[str] = []
 
 
 def seal(folder: Path, labels: bytes, public: Mapping[str, Any]) -> None:
-    """Encrypts the labels into the folder and commits to them; `public` is told beside the hash.
-
-    Encryption is by the key stream of SHAKE-256 over key and nonce, authenticated by HMAC-SHA256
-    (encrypt, then authenticate).
-    """
-    key, salt, nonce = (secrets.token_bytes(_BYTES) for _ in range(3))
-    hidden = _xor(labels, key, nonce)
-    tag = hmac.digest(key, nonce + hidden, "sha256")
-    _write(folder / LABELS, nonce + tag + hidden)
-    _write(folder / KEY, json.dumps({"key": key.hex(), "salt": salt.hex()}).encode())
-    told = {**public, "labels_salted_sha256": hashlib.sha256(salt + labels).hexdigest()}
-    _write(folder / COMMITMENT, json.dumps(told, indent=1).encode())
+    """Hides the labels in the folder and commits to them; `public` is published beside the hash."""
+    secret = secrets.token_bytes(32)
+    _write(folder / LABELS, _hidden(labels, secret))
+    _write(folder / KEY, secret.hex().encode())
+    _write_json(folder / COMMITMENT, {**public, "labels_salted_sha256": _commitment(secret, labels)})
 
 
 def commitment(folder: Path) -> dict[str, Any] | None:
-    """What was committed to, or None where nothing was."""
+    """What was committed to, or None."""
     path = folder / COMMITMENT
     return dict(json.loads(path.read_text())) if path.is_file() else None
 
 
 def close(folder: Path) -> None:
-    """Declares the answers finished: what is scored are these bytes, given under this commitment."""
-    told = {"answers_sha256": _hash(folder / ANSWERS), "commitment_sha256": _hash(folder / COMMITMENT)}
-    _write(folder / CLOSED, json.dumps(told, indent=1).encode())
+    """Declares the answers finished: these bytes, given under this commitment, are scored."""
+    hashes = {"answers_sha256": _sha256(folder / ANSWERS), "commitment_sha256": _sha256(folder / COMMITMENT)}
+    _write_json(folder / CLOSED, hashes)
 
 
 def unseal(folder: Path) -> bytes:
     """The labels.
 
     Raises:
-        DataError: the answers are not closed, are other ones than those closed, were given under another
-            commitment, come after the labels were opened; or the labels are not those committed to.
+        DataError: the answers are not closed, are not the closed ones, were given under another commitment,
+            or come after the labels were opened; or the labels are not those committed to.
     """
-    _check_answers(folder)
-    sealed, key = (folder / LABELS).read_bytes(), json.loads((folder / KEY).read_text())
-    nonce, tag, hidden = sealed[:_BYTES], sealed[_BYTES : 2 * _BYTES], sealed[2 * _BYTES :]
-    secret, salt = bytes.fromhex(key["key"]), bytes.fromhex(key["salt"])
-    labels = _xor(hidden, secret, nonce)
-    told = (commitment(folder) or {}).get("labels_salted_sha256")
-    if not hmac.compare_digest(tag, hmac.digest(secret, nonce + hidden, "sha256")):
-        raise DataError("the sealed labels or their key were changed", file=folder / LABELS)
-    if hashlib.sha256(salt + labels).hexdigest() != told:
-        raise DataError("the labels are not those committed to", file=folder / COMMITMENT)
-    opened = json.dumps({"answers_sha256": _hash(folder / ANSWERS)}).encode()
-    _write(folder / OPENED, opened)
+    answers = _check_answers(folder)
+    secret = bytes.fromhex((folder / KEY).read_text())
+    labels = _hidden((folder / LABELS).read_bytes(), secret)
+    if _commitment(secret, labels) != (commitment(folder) or {}).get("labels_salted_sha256"):
+        raise DataError(
+            "the labels or their key were changed: they are not those committed to", file=folder / LABELS
+        )
+    _write_json(folder / OPENED, {"answers_sha256": answers})
     return labels
 
 
-def _check_answers(folder: Path) -> None:
+def _check_answers(folder: Path) -> str:
+    """Hash of the answers, once they may be scored."""
     if not (folder / CLOSED).is_file():
         raise DataError("the answers are not finished", file=folder, remedy="the same command continues")
-    closed, answers = json.loads((folder / CLOSED).read_text()), _hash(folder / ANSWERS)
+    closed, answers = json.loads((folder / CLOSED).read_text()), _sha256(folder / ANSWERS)
     if closed["answers_sha256"] != answers:
         raise DataError("the answers changed after they were closed", file=folder / ANSWERS)
-    if closed["commitment_sha256"] != _hash(folder / COMMITMENT):
+    if closed["commitment_sha256"] != _sha256(folder / COMMITMENT):
         raise DataError("the answers were given under another commitment", file=folder / ANSWERS)
-    if (folder / OPENED).is_file():
-        before = json.loads((folder / OPENED).read_text())["answers_sha256"]
-        if before != answers:
-            raise DataError("the labels were opened before these answers were given", file=folder / ANSWERS)
+    opened = folder / OPENED
+    if opened.is_file() and json.loads(opened.read_text())["answers_sha256"] != answers:
+        raise DataError("the labels were opened before these answers were given", file=folder / ANSWERS)
+    return answers
 
 
 def forbid(folder: Path) -> None:
@@ -118,14 +106,23 @@ def _refuse(event: str, arguments: tuple[Any, ...]) -> None:
             raise PermissionError(f"{path} stays closed until the answers are given")
 
 
-def _xor(text: bytes, key: bytes, nonce: bytes) -> bytes:
-    stream = hashlib.shake_256(key + nonce).digest(len(text))
+def _commitment(secret: bytes, labels: bytes) -> str:
+    return hashlib.sha256(secret + labels).hexdigest()
+
+
+def _hidden(text: bytes, secret: bytes) -> bytes:
+    """The text XOR a key stream of the secret (SHAKE-256); the same call reveals it."""
+    stream = hashlib.shake_256(secret).digest(len(text))
     return (int.from_bytes(text, "big") ^ int.from_bytes(stream, "big")).to_bytes(len(text), "big")
 
 
-def _hash(path: Path) -> str:
+def _sha256(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _write(path: Path, content: bytes) -> None:
     write_atomically(path, lambda part: part.write_bytes(content))
+
+
+def _write_json(path: Path, content: Mapping[str, Any]) -> None:
+    _write(path, json.dumps(content, indent=1).encode())

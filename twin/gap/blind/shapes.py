@@ -1,6 +1,6 @@
 """How each effect of the catalogue enters the plant: one shape as the twin's catalogue has it, one shifted.
 
-A shape turns knobs of the plant in proportion to one value e. Laws of the shifted shapes are in no form of
+A shape turns changes of the plant in proportion to one value e. Laws of the shifted shapes are in no form of
 the catalogue; neither are the effects `OUTSIDE`, which a diagnosis can at best call unknown.
 """
 
@@ -20,17 +20,17 @@ class Shape:
     """One way in which an effect shows.
 
     Attributes:
-        knobs: names and gains; knobs that end in a pair of axes share a direction that is drawn, see
+        changes: names and gains; changes that end in a pair of axes share a direction that is drawn, see
         `vector`.
         typical: a usual size of e, from which the search for the half-power point starts (assumed).
         most: the largest e the plant is asked for.
         signed: whether e may be negative.
-        vector: the two knobs are components; e is the length.
+        vector: the two changes are components; e is the length.
     """
 
     effect: str
     kind: str
-    knobs: tuple[tuple[str, float], ...]
+    changes: tuple[tuple[str, float], ...]
     typical: float
     most: float
     signed: bool = False
@@ -42,23 +42,29 @@ class Shape:
         return f"{self.effect}/{self.kind}"
 
     def turned(self, value: float, rng: np.random.Generator) -> dict[str, float]:
-        """Knobs at the size `value`; sign and direction are drawn, always with the same count of draws."""
+        """Changes at the size `value`; sign and direction are drawn, always with the same count of draws."""
         sign, angle = (1.0 if rng.uniform() < 0.5 else -1.0), rng.uniform(0.0, 2.0 * math.pi)
         if self.vector:
-            (first, gain), (second, gain_2) = self.knobs
+            (first, gain), (second, gain_2) = self.changes
             return {first: gain * value * math.cos(angle), second: gain_2 * value * math.sin(angle)}
-        return {knob: gain * value * (sign if self.signed else 1.0) for knob, gain in self.knobs}
+        return {change: gain * value * (sign if self.signed else 1.0) for change, gain in self.changes}
 
 
 def _both(
     effect: str, same: str, shifted: str, typical: float, most: float, *, signed: bool = False
 ) -> tuple[Shape, ...]:
-    """Two shapes of one knob each; `a,b` are the components of a vector."""
+    """Two shapes of one change each; `a,b` are the components of a vector."""
     return tuple(
         Shape(
-            effect, kind, tuple((knob, 1.0) for knob in knobs.split(",")), typical, most, signed, "," in knobs
+            effect,
+            kind,
+            tuple((change, 1.0) for change in changes.split(",")),
+            typical,
+            most,
+            signed,
+            "," in changes,
         )
-        for kind, knobs in ((SAME, same), (SHIFTED, shifted))
+        for kind, changes in ((SAME, same), (SHIFTED, shifted))
     )
 
 
@@ -106,8 +112,8 @@ IN_CATALOGUE: tuple[Shape, ...] = (
 """Two shapes of every effect of the catalogue, in its order."""
 
 
-def _outside(effect: str, knob: str, typical: float, most: float, *, signed: bool = False) -> Shape:
-    return Shape(effect, OUTSIDE, ((knob, 1.0),), typical, most, signed)
+def _outside(effect: str, change: str, typical: float, most: float, *, signed: bool = False) -> Shape:
+    return Shape(effect, OUTSIDE, ((change, 1.0),), typical, most, signed)
 
 
 OUT_OF_CATALOGUE: tuple[Shape, ...] = (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from terrafusion.twin.effects.catalogue import effect_names
-from terrafusion.twin.gap.blind.answers import Case
+from terrafusion.twin.gap.blind.answers import BlindCase
 from terrafusion.twin.gap.blind.plan import Trial
 from terrafusion.twin.gap.blind.plant.run import record
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment
@@ -79,10 +79,10 @@ def breaking(runs: Any, references: Any, vehicle: Any, *, seed: int = 0) -> Fixe
     raise np.linalg.LinAlgError("singular")
 
 
-def short_cases(trials: Sequence[Trial]) -> Iterator[Case]:
+def short_cases(trials: Sequence[Trial]) -> Iterator[BlindCase]:
     """In place of `answers.cases`: recordings of a second each, all of one robot."""
     vehicle, soil = load_vehicle("elevate"), load_soil("gravel")
     runs = (
         record([RunSpec(vehicle, soil, (Segment(1.0),), seed=t.seed % 997) for t in trials]) if trials else []
     )
-    return (Case(t.trial, (run,), (), vehicle) for t, run in zip(trials, runs, strict=True))
+    return (BlindCase(t.trial, (run,), (), vehicle) for t, run in zip(trials, runs, strict=True))

@@ -20,18 +20,19 @@ from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.answers import answered, cases
 from terrafusion.twin.gap.blind.check import run_blind_check
 from terrafusion.twin.gap.blind.drives import DURATION_S, KINDS, drive
-from terrafusion.twin.gap.blind.plan import FULL, QUICK, Scale, from_text, plan, specs, to_text
-from terrafusion.twin.gap.blind.plant.parameters import KNOBS
+from terrafusion.twin.gap.blind.plan import FULL, QUICK, CheckSize, from_text, plan, specs, to_text
+from terrafusion.twin.gap.blind.plant.parameters import CHANGES
 from terrafusion.twin.gap.blind.rates import Rate, reliability
 from terrafusion.twin.gap.blind.score import score
-from terrafusion.twin.gap.blind.severity import Observer, half_power, size_for
+from terrafusion.twin.gap.blind.severity import half_power
 from terrafusion.twin.gap.blind.shapes import IN_CATALOGUE, OUT_OF_CATALOGUE, SAME, SHIFTED, shapes
 from terrafusion.twin.gap.blind.verdicts import judge
 from tests.studies.blind.power import half_power_multiple
+from tests.studies.blind.severity import Observer, size_for
 from tests.twin.gap.blind import blind_answers as fake
 
 BUILT_IN = tuple(dict.fromkeys(form.effect for form in built_in().values()))
-TINY = Scale(nulls=2, effects=1, outside=1, pairs=1, runs=1, references=1, severities=(4.0,))
+TINY = CheckSize(nulls=2, effects=1, outside=1, pairs=1, runs=1, references=1, severities=(4.0,))
 
 
 def as_answers(trials: Any, answer: Any) -> dict[str, Any]:
@@ -54,7 +55,7 @@ def test_the_full_check_is_as_large_as_it_has_to_be() -> None:
 
 
 def test_every_effect_has_two_shapes_of_its_own() -> None:
-    """37 effects, each in two shapes that turn different knobs; eight more that the catalogue does not
+    """37 effects, each in two shapes that turn different changes; eight more that the catalogue does not
     hold."""
     names = BUILT_IN
     assert len(names) == 37
@@ -62,10 +63,10 @@ def test_every_effect_has_two_shapes_of_its_own() -> None:
         assert [s.effect for s in IN_CATALOGUE if s.kind == kind] == list(names)
     assert not {s.effect for s in OUT_OF_CATALOGUE} & set(names)
     assert len(OUT_OF_CATALOGUE) >= 5
-    turned = [knob for shape in shapes().values() for knob, _ in shape.knobs]
-    assert set(turned) <= set(KNOBS)
+    turned = [change for shape in shapes().values() for change, _ in shape.changes]
+    assert set(turned) <= set(CHANGES)
     for effect in names:
-        same, shifted = (dict(shapes()[f"{effect}/{kind}"].knobs) for kind in (SAME, SHIFTED))
+        same, shifted = (dict(shapes()[f"{effect}/{kind}"].changes) for kind in (SAME, SHIFTED))
         assert same != shifted
 
 
@@ -106,8 +107,8 @@ def test_only_the_runs_have_the_effect() -> None:
     trial = next(t for t in plan(0, QUICK) if t.family == "pair")
     made = specs(trial)
     assert len(made) == trial.runs + trial.references
-    assert all(len(s.knobs) >= 2 for s in made[: trial.runs])
-    assert all(not s.knobs for s in made[trial.runs :])
+    assert all(len(s.changes) >= 2 for s in made[: trial.runs])
+    assert all(not s.changes for s in made[trial.runs :])
     assert {s.robot_seed for s in made} == {made[0].robot_seed}
     assert len({s.seed for s in made}) == len(made) == len({s.heading_rad for s in made})
     assert all(s.duration_s() == pytest.approx(DURATION_S) for s in made)
@@ -127,7 +128,7 @@ def test_a_case_tells_nothing_of_the_truth() -> None:
     """What a diagnosis is given: recordings with neutral names and no truth."""
     first = next(iter(cases(plan(0, TINY)[:1])))
     told = f"{first.trial} {first.runs[0].name} {first.runs[0].description} {first.runs[0].notes}"
-    assert not any(name in told for name in (*BUILT_IN, *KNOBS, "null", "pair"))
+    assert not any(name in told for name in (*BUILT_IN, *CHANGES, "null", "pair"))
     assert first.runs[0].truth is None
 
 
@@ -209,8 +210,8 @@ def hook(event, arguments):
 sys.addaudithook(hook)
 import blind_answers as fake
 from terrafusion.twin.gap.blind.check import run_blind_check
-from terrafusion.twin.gap.blind.plan import Scale
-run_blind_check({out!r}, fake.guess, scale=Scale(2, 1, 1, 0, 1, 1, (4.0,)), seed=5)
+from terrafusion.twin.gap.blind.plan import CheckSize
+run_blind_check({out!r}, fake.guess, scale=CheckSize(2, 1, 1, 0, 1, 1, (4.0,)), seed=5)
 sealed = ("labels.sealed", "labels.key")
 reads = [i for i, (name, writes) in enumerate(order) if name in sealed and not writes]
 closed = max(i for i, (name, _) in enumerate(order) if name.startswith("answers.closed.json"))

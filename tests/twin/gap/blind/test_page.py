@@ -11,7 +11,7 @@ import pytest
 
 from terrafusion.fusion.reports.blind import summary, write_blind
 from terrafusion.fusion.reports.plots import blind as plots
-from terrafusion.twin.gap.blind.plan import FULL, Scale, plan
+from terrafusion.twin.gap.blind.plan import FULL, CheckSize, plan
 from terrafusion.twin.gap.blind.score import score
 from tests.twin.gap.blind import blind_answers as fake
 
@@ -36,7 +36,7 @@ def test_the_page_tells_every_score(tmp_path: Path) -> None:
 
 def test_the_page_of_a_check_without_answers(tmp_path: Path) -> None:
     """Nothing detected, nothing to rank: every panel stands, no number is made up."""
-    tiny = Scale(nulls=0, effects=1, outside=0, pairs=0, runs=1, references=1, severities=(4.0,))
+    tiny = CheckSize(nulls=0, effects=1, outside=0, pairs=0, runs=1, references=1, severities=(4.0,))
     scores = score(plan(0, tiny), {})
     write_blind(tmp_path, scores)
     assert "not measured" in (tmp_path / "report.html").read_text()
@@ -46,7 +46,7 @@ def test_the_page_of_a_check_without_answers(tmp_path: Path) -> None:
 def test_the_command_writes_and_continues(
     terrafusion: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tiny = Scale(nulls=1, effects=0, outside=0, pairs=0, runs=1, references=1)
+    tiny = CheckSize(nulls=1, effects=0, outside=0, pairs=0, runs=1, references=1)
     monkeypatch.setattr("terrafusion.twin.gap.blind.check.QUICK", tiny)
     monkeypatch.setattr("terrafusion.twin.gap.diagnose", fake.guess)
     monkeypatch.setattr("terrafusion.twin.gap.blind.answers.cases", fake.short_cases)

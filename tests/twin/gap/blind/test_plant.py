@@ -16,11 +16,11 @@ from hypothesis.strategies import floats, sampled_from
 from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.gap.blind.plant import contact
-from terrafusion.twin.gap.blind.plant.field import Patches
+from terrafusion.twin.gap.blind.plant.field import SoilField
 from terrafusion.twin.gap.blind.plant.machine import Machine, motor_current
-from terrafusion.twin.gap.blind.plant.parameters import KNOBS
+from terrafusion.twin.gap.blind.plant.parameters import CHANGES
 from terrafusion.twin.gap.blind.plant.run import record, simulate
-from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment, side_by_side
+from terrafusion.twin.gap.blind.plant.spec import RunSpec, Segment, stacked_numbers
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.blind.plant_against_twin import steady_differences
@@ -37,7 +37,7 @@ def spec(soil: str = "medium_sand", drive: tuple[Segment, ...] = DRIVE, **more: 
 def machine(soil: str, **state: float) -> Machine:
     """One robot with the motors' demand at zero unless it is told, in a given state."""
     one = [spec(soil)]
-    found = Machine(side_by_side(one), Patches(one))
+    found = Machine(stacked_numbers(one), SoilField(one))
     for name, value in state.items():
         found.s[name] = np.full_like(found.s[name], value)
     return found
@@ -112,7 +112,7 @@ def test_left_and_right_are_alike() -> None:
 def test_rest_is_rest() -> None:
     """Nothing commanded: no motion on level ground; on a slope it holds within 1 mm in 10 s."""
     level, tilted = simulate(
-        [spec(drive=(Segment(10.0),)), spec(drive=(Segment(10.0),), knobs={"slope": 0.05})]
+        [spec(drive=(Segment(10.0),)), spec(drive=(Segment(10.0),), changes={"slope": 0.05})]
     )
     assert np.abs(level["u"]).max() == 0.0
     assert np.hypot(tilted["x"][-1], tilted["y"][-1]) < 1e-3
@@ -122,7 +122,7 @@ def test_slip_needs_force() -> None:
     """Without resistance a wheel rolls at the hub's speed; the slip grows with the drag to overcome."""
     slips = []
     for rolling in (-load_soil("asphalt").resistance.rolling, 0.0, 0.05):
-        h = simulate([spec("asphalt", (Segment(8.0, 1.0),), knobs={"rolling": rolling})])[0]
+        h = simulate([spec("asphalt", (Segment(8.0, 1.0),), changes={"rolling": rolling})])[0]
         slips.append(1.0 - h["u"][-1] / (h["speed"][-1].mean() * 0.175))
     assert slips[0] < slips[1] < slips[2]
     free = machine("asphalt", u=1.0, speed=1.0 / 0.175)
@@ -152,17 +152,17 @@ def test_half_the_step_changes_little_and_half_of_that_less() -> None:
 
 
 def test_every_knob_turns_something_and_zero_is_absent() -> None:
-    """A knob of zero leaves every bit; any other value changes the log."""
+    """A change of zero leaves every bit; any other value changes the log."""
     base = record([spec(noiseless=False)], names=["a"])[0]
     sizes = {"suction_pa": 2000.0, "tack_pa": 2000.0, "cda_m2": 2.0, "cda_gust_m2": 2.0, "gust_n": 20.0}
     sizes |= {"limit": 0.9, "limit_foldback": 0.9, "sag_ohm": 2.0, "sag_root": 5.0}
     made = record(
-        [spec(noiseless=False, knobs={knob: sizes.get(knob, 0.1)}) for knob in KNOBS],
-        names=["a"] * len(KNOBS),
+        [spec(noiseless=False, changes={change: sizes.get(change, 0.1)}) for change in CHANGES],
+        names=["a"] * len(CHANGES),
     )
-    without = record([spec(noiseless=False, knobs=dict.fromkeys(KNOBS, 0.0))], names=["a"])[0]
+    without = record([spec(noiseless=False, changes=dict.fromkeys(CHANGES, 0.0))], names=["a"])[0]
     assert differences(base, without) == []
-    idle = [knob for knob, log in zip(KNOBS, made, strict=True) if not differences(base, log)]
+    idle = [change for change, log in zip(CHANGES, made, strict=True) if not differences(base, log)]
     assert idle == []
 
 
@@ -178,7 +178,7 @@ def test_runs_side_by_side_are_those_alone() -> None:
 def test_the_ground_varies_as_it_is_told() -> None:
     """Within a run by a field of the place, between runs by one draw each."""
     specs = [spec(noiseless=False, seed=i) for i in range(300)]
-    patches = Patches(specs)
+    patches = SoilField(specs)
     x = np.linspace(0.0, 200.0, 80)
     logs = np.stack([patches.at(np.full((4, 300), at), np.zeros((4, 300)))[0, 0] for at in x])
     assert logs.mean(axis=0).std() == pytest.approx(0.08, rel=0.2)
@@ -188,8 +188,8 @@ def test_the_ground_varies_as_it_is_told() -> None:
 
 
 def test_unknown_knobs_and_clogging_mud_are_refused() -> None:
-    with pytest.raises(ConfigError, match="unknown knob"):
-        spec(knobs={"warp": 1.0})
+    with pytest.raises(ConfigError, match="unknown change"):
+        spec(changes={"warp": 1.0})
     with pytest.raises(ConfigError, match="mud"):
         spec("mud")
     with pytest.raises(ConfigError, match="equally long"):
@@ -211,7 +211,7 @@ def test_twin_and_plant_agree_on_firm_ground() -> None:
 def test_a_loop_at_its_limit_comes_back() -> None:
     """A spin on strong ground takes all torque there is; what comes after is driven as told."""
     drive = (Segment(1.0), Segment(5.0, 0.0, 2.5), Segment(6.0, 1.6))
-    h = simulate([spec("gravel", drive, knobs={"strength": 1.2})])[0]
+    h = simulate([spec("gravel", drive, changes={"strength": 1.2})])[0]
     assert h["speed"][-1].mean() == pytest.approx(1.6 / 0.175, rel=0.01)
     assert np.ptp(h["speed"][-1]) < 0.1  # and no wheel holds a speed of its own
 

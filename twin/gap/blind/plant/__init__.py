@@ -1,4 +1,4 @@
-"""A simulator of robot and ground of its own, many runs at once, which shares no equation with the twin.
+"""An independent simulator of robot and ground, batched over runs, which shares no equation with the twin.
 
 It takes from the twin only records of parameters (vehicle, soil). What differs: the contact is that of Wong
 and Reece (1967) with Lyasko's (2010) slip sinkage and a shear law with a hump (Wong and Preston-Thomas

@@ -52,7 +52,7 @@ def lyasko(driven_slip: Array) -> Array:
 
 
 def skidded(skid: Array, gain: Array) -> Array:
-    """Growth of the sinkage of a wheel that slides over its way by the share `skid` (own form)."""
+    """Growth of the sinkage of a wheel that skids by the share `skid` (own form)."""
     return np.asarray(1.0 + gain * skid * skid / (skid + 0.3))
 
 

@@ -1,4 +1,4 @@
-"""Patchy ground: random fields of the place, one set a run, and one draw a run on top."""
+"""Soil that varies: random fields over the plane, one set a run, and one draw a run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ SHARED = 0.7
 """Correlation of the quantities: dense ground is strong, stiff and shears early (assumed)."""
 
 
-class Patches:
+class SoilField:
     """Logarithms of the gains of `QUANTITIES` at the wheels of all runs.
 
     A sum of plane waves with Gaussian wave vectors has a squared-exponential correlation (random Fourier

@@ -1,8 +1,8 @@
-"""What may be changed in the plant: numbers that are zero in the nominal robot. Effects turn them."""
+"""Changes of the plant by which effects act: numbers that are zero in the nominal robot."""
 
 from __future__ import annotations
 
-KNOBS: dict[str, str] = {
+CHANGES: dict[str, str] = {
     # ground
     "strength": "log of the gain of cohesion, friction and cap",
     "bearing": "log of the gain of the pressure-sinkage stiffness",
@@ -45,8 +45,8 @@ KNOBS: dict[str, str] = {
     "coulomb_nm": "torque against rotation, each wheel",
     "stribeck_nm": "torque e (0.6 + 0.8 exp(-(w / 2 rad/s)^2)) against rotation",
     "play_rad": "encoder angle + e/2 p, p follows the sign of the torque within 30 ms",
-    "gap_rad": "the same at 1 rad/s past a dead band of 0.3 N m, half of the torque lost on the way",
-    "late_s": "command told later",
+    "gap_rad": "the same at 1 rad/s past a dead band of 0.3 N m, half of the torque lost meanwhile",
+    "late_s": "command delayed",
     "hold_s": "command held over 2 e (mean delay e)",
     "lag_s": "lag of the torque",
     "lag_second_s": "command through two lags of e/2 each",
@@ -90,7 +90,7 @@ KNOBS: dict[str, str] = {
     "cross": "the plane rises to the north by e",
     "cross_wave": "the same times 1 + 0.6 sin(y / 6 m)",
     "cda_m2": "drag area in still air",
-    "cda_gust_m2": "drag area in a wind of 3 m/s that swings by 1.5 m/s over 12 s",
+    "cda_gust_m2": "drag area in a wind of 3 m/s that varies by 1.5 m/s over 12 s",
     # outside the catalogue
     "wobble": "front left radius times 1 + e sin(wheel angle)",
     "ring": "specific force + e times a 6 Hz resonance (damping 0.05) that the force excites",

@@ -1,4 +1,4 @@
-"""Runs of the plant, many side by side: specs in, `Recording`s out."""
+"""Batched runs of the plant: specs in, `Recording`s out."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from terrafusion.datasets.core.channels import Command, Terrain
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.gap.blind.plant import sensors
-from terrafusion.twin.gap.blind.plant.commands import side_commands, wanted_twist
-from terrafusion.twin.gap.blind.plant.field import Patches
+from terrafusion.twin.gap.blind.plant.commands import commanded_twist, side_commands
+from terrafusion.twin.gap.blind.plant.field import SoilField
 from terrafusion.twin.gap.blind.plant.machine import Machine
-from terrafusion.twin.gap.blind.plant.spec import RunSpec, side_by_side
+from terrafusion.twin.gap.blind.plant.spec import RunSpec, stacked_numbers
 
 Array = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def record(
 
 
 def simulate(specs: Sequence[RunSpec], *, substeps: int = SUBSTEPS) -> list[sensors.History]:
-    """What happened in each run, at frames of 10 ms: arrays (N,) or (N, 4) by name, SI units.
+    """The motion of each run, at frames of 10 ms: arrays (N,) or (N, 4) by name, SI units.
 
     Raises:
         ConfigError: durations differ.
@@ -55,22 +55,24 @@ def simulate(specs: Sequence[RunSpec], *, substeps: int = SUBSTEPS) -> list[sens
     duration = specs[0].duration_s()
     if any(abs(spec.duration_s() - duration) > 1e-9 for spec in specs):
         raise ConfigError("runs that are computed together must last equally long")
-    n = side_by_side(specs)
+    n = stacked_numbers(specs)
     t_s: Array = np.asarray(FRAME_S * np.arange(round(duration / FRAME_S) + 1), dtype=np.float64)
-    machine = Machine(n, Patches(specs), _gusts(specs, len(t_s)))
+    machine = Machine(n, SoilField(specs), _gusts(specs, len(t_s)))
     sides = side_commands(specs, n, t_s)
-    kept: dict[str, list[Array]] = {name: [] for name in (*_BODY, *_WHEEL, *_FRAME, "soil")}
+    history: dict[str, list[Array]] = {name: [] for name in (*_BODY, *_WHEEL, *_FRAME, "soil")}
     _settle(machine, sides[0])
-    _keep(machine, kept)
+    _store(machine, history)
     for i in range(len(t_s) - 1):
         machine.step(sides[i : i + 2], FRAME_S, substeps)
-        _keep(machine, kept)
-    whole = {name: np.stack(kept.pop(name)) for name in list(kept)}  # one after the other: half the memory
+        _store(machine, history)
+    whole = {
+        name: np.stack(history.pop(name)) for name in list(history)
+    }  # one after the other: half the memory
     return [_one(whole, n, t_s, b) for b in range(len(specs))]
 
 
 def _settle(machine: Machine, command: Array, seconds: float = 6.0) -> None:
-    """Loads, shear and speed loops settle where the robot stands; what it moved in doing so is taken back."""
+    """Loads, shear and speed loops settle at standstill; the motion meanwhile is undone."""
     start = {
         name: machine.s[name].copy()
         for name in ("x", "y", "z", "yaw", "travel", "angle", "motor_work", "heat")
@@ -81,13 +83,13 @@ def _settle(machine: Machine, command: Array, seconds: float = 6.0) -> None:
     machine.t_s = 0.0
 
 
-def _keep(machine: Machine, kept: dict[str, list[Array]]) -> None:
+def _store(machine: Machine, history: dict[str, list[Array]]) -> None:
     for name in (*_BODY, *_WHEEL):
-        kept[name].append(machine.s[name])
+        history[name].append(machine.s[name])
     shape = machine.s["u"].shape
     for name in _FRAME:
-        kept[name].append(np.broadcast_to(machine.frame[name], shape))
-    kept["soil"].append(machine.frame["soil"][0].mean(axis=0))
+        history[name].append(np.broadcast_to(machine.frame[name], shape))
+    history["soil"].append(machine.frame["soil"][0].mean(axis=0))
 
 
 def _one(whole: dict[str, Array], n: dict[str, Any], t_s: Array, b: int) -> sensors.History:
@@ -98,7 +100,7 @@ def _one(whole: dict[str, Array], n: dict[str, Any], t_s: Array, b: int) -> sens
 
 def _gusts(specs: Sequence[RunSpec], count: int) -> Array | None:
     """Side force (N, B) of gusts: first-order Gauss-Markov, N."""
-    sizes = [spec.knobs.get("gust_n", 0.0) for spec in specs]
+    sizes = [spec.changes.get("gust_n", 0.0) for spec in specs]
     if not any(sizes):
         return None
     from scipy.signal import lfilter
@@ -109,19 +111,19 @@ def _gusts(specs: Sequence[RunSpec], count: int) -> Array | None:
 
 
 def _recording(spec: RunSpec, h: sensors.History, name: str) -> Recording:
-    told = sensors.every(COMMAND_HZ, 1.0 / FRAME_S, len(h["t"]))
-    twist = wanted_twist(spec, h["t"][told])
-    seen = sensors.stamps(np.array([0.0]))
+    rows = sensors.every(COMMAND_HZ, 1.0 / FRAME_S, len(h["t"]))
+    twist = commanded_twist(spec, h["t"][rows])
+    first = sensors.stamps(np.array([0.0]))
     return Recording(
         name=name,
         start_ns=sensors.START_NS,
         vehicle=spec.vehicle.name,
-        command=Command(sensors.stamps(h["t"][told]), twist[:, 0], twist[:, 1]),
+        command=Command(sensors.stamps(h["t"][rows]), twist[:, 0], twist[:, 1]),
         wheels=sensors.wheels(spec, h),
         imu=sensors.imu(spec, h),
         gnss=sensors.gnss(spec, h),
         motor=sensors.motor(spec, h),
-        terrain=Terrain(seen, np.array([spec.soil.name], dtype=object)),
+        terrain=Terrain(first, np.array([spec.soil.name], dtype=object)),
         terrain_name=spec.soil.name,
         description="simulated by the plant of the blind check",
     )

@@ -1,4 +1,4 @@
-"""Encoders, IMU, GNSS and current sensors of the plant: what they make of the frames of a motion.
+"""Encoders, IMU, GNSS and current sensors of the plant.
 
 Each takes the history of one run (arrays (N,) or (N, 4) by name) and draws from streams of its own. With
 `noiseless` the readings are exact.
@@ -41,7 +41,7 @@ def every(spec_hz: float, frame_hz: float, count: int) -> NDArray[np.int64]:
 
 def wheels(spec: RunSpec, h: History) -> Wheels:
     """Counts of four encoders over the interval before the stamp."""
-    k = spec.knobs.get
+    k = spec.changes.get
     sensor, real = spec.vehicle.sensors.wheels, spec.vehicle.realism.encoder
     rows = every(sensor.rate_hz, 1.0 / float(h["t"][1]), len(h["t"]))
     t, angle = h["t"][rows], h["angle"][rows]
@@ -69,7 +69,7 @@ def wheels(spec: RunSpec, h: History) -> Wheels:
 
 def imu(spec: RunSpec, h: History) -> Imu:
     """Mean rates and specific forces over each frame, at the frame rate."""
-    k, t = spec.knobs.get, h["t"]
+    k, t = spec.changes.get, h["t"]
     dt = np.diff(t)
     rate = np.diff(h["yaw"]) / dt
     force = _specific_force(spec, h, rate)
@@ -98,7 +98,7 @@ def imu(spec: RunSpec, h: History) -> Imu:
 
 def _specific_force(spec: RunSpec, h: History, rate: Array) -> Array:
     """Mean specific force (N - 1, 3) at the IMU: change of its velocity less gravity, old body axes."""
-    k = spec.knobs.get
+    k = spec.changes.get
     at = spec.vehicle.sensors.imu.position_m
     sway = 1.0 + np.abs(np.concatenate([[0.0], rate]))
     x = at[0] + k("imu_x_m", 0.0) + k("imu_flex_x_m", 0.0) * sway - h["cg_forward"]
@@ -113,7 +113,7 @@ def _specific_force(spec: RunSpec, h: History, rate: Array) -> Array:
 
 def _on_its_mount(spec: RunSpec, force: Array, dt: float) -> Array:
     """A resonance of the IMU's mount, which the horizontal force itself excites."""
-    gain = spec.knobs.get("ring", 0.0)
+    gain = spec.changes.get("ring", 0.0)
     if gain == 0.0:
         return force
     from scipy.signal import lfilter
@@ -157,7 +157,7 @@ def _resonant(white: Array, hz: float, rate_hz: float) -> Array:
 
 def gnss(spec: RunSpec, h: History) -> Gnss:
     """Antenna position and velocity at the receiver's rate."""
-    k, sensor = spec.knobs.get, spec.vehicle.sensors.gnss
+    k, sensor = spec.changes.get, spec.vehicle.sensors.gnss
     rng = spec.stream("gnss")
     rows = every(sensor.rate_hz, 1.0 / float(h["t"][1]), len(h["t"]))
     position, velocity = _antenna(spec, h)
@@ -185,7 +185,7 @@ def gnss(spec: RunSpec, h: History) -> Gnss:
 
 def _antenna(spec: RunSpec, h: History) -> tuple[Array, Array]:
     """Position and velocity (N, 3) of the antenna, world."""
-    k, at = spec.knobs.get, spec.vehicle.sensors.gnss.antenna_m
+    k, at = spec.changes.get, spec.vehicle.sensors.gnss.antenna_m
     flex_x, flex_y = k("ant_flex_x_m", 0.0), k("ant_flex_y_m", 0.0)
     leans = 0.3 * bool(flex_x or flex_y) / GRAVITY_MPS2
     x = at[0] + k("ant_x_m", 0.0) + flex_x - leans * h["lean_x"]

@@ -1,4 +1,4 @@
-"""What a run of the plant is made from, and the numbers of many runs side by side."""
+"""Inputs of a run of the plant, and the numbers of many runs stacked."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.gap.blind.plant.parameters import KNOBS
+from terrafusion.twin.gap.blind.plant.parameters import CHANGES
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vehicle import VehicleParams
 
@@ -21,18 +21,18 @@ SPREAD_RADIUS, SPREAD_DRAG = 0.002, 0.1
 
 @dataclass(frozen=True)
 class Segment:
-    """Commanded twist: v + v_swing sin(2 pi hz t), likewise the yaw rate; t from the segment's start."""
+    """Commanded twist: v + v_amplitude sin(2 pi hz t), likewise the yaw rate; t from the segment's start."""
 
     duration_s: float
     v_mps: float = 0.0
     yaw_rate_radps: float = 0.0
-    v_swing_mps: float = 0.0
-    yaw_rate_swing_radps: float = 0.0
+    v_amplitude_mps: float = 0.0
+    yaw_rate_amplitude_radps: float = 0.0
     hz: float = 0.0
 
 
 @dataclass(frozen=True)
-class Ground:
+class GroundSpread:
     """How the ground of a run differs from its soil's numbers (standard deviations of logarithms, assumed).
 
     `between` is drawn once a run; `within` is a field of the place, correlated over `length_m`.
@@ -52,7 +52,7 @@ class RunSpec:
         heading_rad: at the start, from east to the left.
         seed: of ground, sensors and everything else that differs from run to run.
         robot_seed: of what differs from robot to robot of one type.
-        knobs: what is changed, see `knobs.KNOBS`.
+        changes: by name of `parameters.CHANGES`.
         noiseless: exact sensors, even ground, a robot as its data sheet has it.
     """
 
@@ -62,14 +62,14 @@ class RunSpec:
     heading_rad: float = 0.0
     seed: int = 0
     robot_seed: int = 0
-    knobs: Mapping[str, float] = field(default_factory=dict)
-    ground: Ground = Ground()
+    changes: Mapping[str, float] = field(default_factory=dict)
+    ground: GroundSpread = GroundSpread()
     noiseless: bool = False
 
     def __post_init__(self) -> None:
-        unknown = set(self.knobs) - set(KNOBS)
+        unknown = set(self.changes) - set(CHANGES)
         if unknown:
-            raise ConfigError(f"unknown knob '{min(unknown)}'", remedy="see plant/knobs.py")
+            raise ConfigError(f"unknown parameter '{min(unknown)}'", remedy="see plant/parameters.py")
         if self.soil.mud.pickup_per_m > 0.0:
             raise ConfigError("mud that clogs the wheels is not in this plant", channel=self.soil.name)
 
@@ -81,12 +81,12 @@ class RunSpec:
         return np.random.default_rng([self.seed, *name.encode()])
 
 
-def side_by_side(specs: Sequence[RunSpec]) -> dict[str, Array]:
-    """Numbers (B,) of all runs by name, radii and drag of each wheel (4, B), knobs as `knob_<name>`."""
+def stacked_numbers(specs: Sequence[RunSpec]) -> dict[str, Array]:
+    """Numbers (B,) of all runs by name, radii and drag of each wheel (4, B), changes as `change_<name>`."""
     numbers = [_numbers(spec) for spec in specs]
     table = {name: np.array([row[name] for row in numbers]) for name in numbers[0]}
-    for knob in KNOBS:
-        table[f"knob_{knob}"] = np.array([spec.knobs.get(knob, 0.0) for spec in specs])
+    for change in CHANGES:
+        table[f"change_{change}"] = np.array([spec.changes.get(change, 0.0) for spec in specs])
     spread = np.stack([_spread(spec) for spec in specs], axis=-1)
     table["radius_m"] = table["radius_m"] * (1.0 + SPREAD_RADIUS * spread[0])
     table["drag_gain"] = np.exp(SPREAD_DRAG * spread[1])
