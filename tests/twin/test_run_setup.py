@@ -1,4 +1,4 @@
-"""Cross-slope, payload, canopy and zones: what a scenario may ask for, and how wrong requests are told."""
+"""Cross-slope, payload, canopy and zones: what a scenario may ask for, and how wrong requests are refused."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def test_shares_of_the_weight_are_the_models_loads(yaw, slope, aspect) -> None:
     np.testing.assert_allclose(loads / (p["mass_kg"] * p["gravity_normal_mps2"]), shares, atol=0.01)
 
 
-def test_a_robot_that_would_tip_over_is_told() -> None:
+def test_a_robot_that_would_tip_over_is_reported() -> None:
     with pytest.raises(ConfigError, match=r"tips over where it starts: its centre of gravity at 0\.7"):
         simulate("straight", payload_kg=60.0, payload_at_m=(0.0, 0.0, 1.0), cross_slope_deg=20.0)
     turning = dataclasses.replace(load_scenario("circle"), payload_kg=60.0, payload_at_m=(-0.1, 0.0, 0.6))
@@ -141,7 +141,7 @@ def test_a_robot_that_would_tip_over_is_told() -> None:
     assert any("would tip over: a wheel carries no load" in note for note in notes)
 
 
-def test_patches_and_varying_strength_are_told(tmp_path) -> None:
+def test_patches_and_varying_strength_are_reported(tmp_path) -> None:
     own = tmp_path / "own.yaml"
     own.write_text(
         "drive: [{duration_s: 2}]\nvariation: {strength_sigma: 0.2, length_m: 2}\n"
@@ -230,7 +230,7 @@ def test_the_example_of_the_documents_drives(tmp_path) -> None:
         ("gnss_outages: [5]", r"'gnss_outages\[0\]' is '5', not a section; give keys from"),
     ],
 )
-def test_a_wrong_option_in_a_file_is_told_by_key(tmp_path, text, message) -> None:
+def test_a_wrong_option_in_a_file_is_reported_by_key(tmp_path, text, message) -> None:
     own = tmp_path / "own.yaml"
     own.write_text(f"drive: [{{duration_s: 5}}]\n{text}\n")
     with pytest.raises(ConfigError, match=message):
@@ -254,13 +254,13 @@ def test_stops_of_a_robot_that_follows_waypoints_are_refused(tmp_path) -> None:
         ({"payload_kg": float("nan")}, "payload nan kg is out of range"),
     ],
 )
-def test_wrong_options_of_a_run_are_told_in_one_line(options, message) -> None:
+def test_wrong_options_of_a_run_are_reported_in_one_line(options, message) -> None:
     with pytest.raises(ConfigError, match=message):
         simulate("straight", **options)
 
 
 @pytest.mark.parametrize("fix", [Fix.FIXED, Fix.NONE])
-def test_a_class_of_fix_the_receiver_does_not_reach_is_told(fix) -> None:
+def test_a_class_of_fix_the_receiver_does_not_reach_is_reported(fix) -> None:
     asked = dataclasses.replace(load_scenario("straight"), gnss_fix=fix)
     with pytest.raises(
         ConfigError, match=r"'gnss_fix' is .*, not a class .* 'husky' .*; give single to single"

@@ -148,7 +148,7 @@ def test_an_offset_centre_of_gravity_turns_the_robot_and_keeps_truth_at_the_orig
         ({"seed": -1}, "seed -1 is negative"),
     ],
 )
-def test_wrong_requests_are_told_in_one_line(kwargs, message) -> None:
+def test_wrong_requests_are_reported_in_one_line(kwargs, message) -> None:
     with pytest.raises(ConfigError, match=message):
         simulate(**({"scenario": "straight"} | kwargs))
 

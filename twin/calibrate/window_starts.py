@@ -85,7 +85,7 @@ def _dead_reckoned(rows: Mapping[str, Observed], model: Model, grid: Array) -> t
 
 
 def _turn(reckoned: Array, fixes: Array, sigma: float) -> float | None:
-    """Angle that rotates the first path (n, 2) onto the second, least squares; None where they are too short."""
+    """Angle that rotates the first path (n, 2) onto the second (least squares); None for short paths."""
     if len(fixes) < 4:
         return None
     a, b = reckoned - reckoned.mean(axis=0), fixes - fixes.mean(axis=0)

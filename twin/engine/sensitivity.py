@@ -93,7 +93,7 @@ def integrate_with_sensitivity(
 
 
 def _active(tangents: tuple[Array, ...], fixed_ground: bool) -> frozenset[tuple[str, int]]:
-    """The parameters that change along some direction; all of the soil where the ground changes during a run."""
+    """The parameters that change along some direction; all of the soil on ground that changes."""
     _, vehicle, effects, table = (a.any(axis=1) for a in tangents)
     soil = table.reshape(-1, len(SOIL_PARAMETERS)).any(axis=0) | (not fixed_ground)
     named = {"vehicle": vehicle, "effects": effects, "soil": soil}

@@ -123,7 +123,7 @@ def test_four_logs_halve_sigma() -> None:
     assert 0.4 < np.exp(np.mean(np.log(ratio))) < 0.62
 
 
-def test_what_is_not_told_keeps_its_value() -> None:
+def test_what_is_not_identified_keeps_its_value() -> None:
     height = "vehicle.body.cg_height_m"
     found = calibrate(drive(), "elevate", SOIL, (*NAMES, height))
     assert found[height].status == "not told"
@@ -142,7 +142,7 @@ def test_a_slope_is_suggested_for_the_height_of_the_centre_of_gravity() -> None:
     assert "slope of 10 deg" in best[0].sentence()
 
 
-def test_two_that_act_as_one_are_told_in_combination() -> None:
+def test_two_that_act_as_one_are_reported_in_combination() -> None:
     """Bekker's moduli enter as k_c + b k_phi only."""
     names = (f"{SOIL}.pressure.k_c_n_per_m_n1", f"{SOIL}.pressure.k_phi_n_per_m_n2")
     priors = {names[0]: Prior(1e5, 5e4)}
@@ -186,11 +186,11 @@ def test_outliers_are_weighed_down() -> None:
     assert gnss is not None
     enu = gnss.enu_m.copy()
     enu[::9] += 3.0
-    spoilt = dataclasses.replace(clean, gnss=dataclasses.replace(gnss, enu_m=enu))
+    corrupt = dataclasses.replace(clean, gnss=dataclasses.replace(gnss, enu_m=enu))
     name = "vehicle.wheel.radius_m"
     channels = ("wheel", "gnss", "yaw")
-    plain = calibrate(spoilt, "elevate", SOIL, NAMES[:4], channels=channels)
-    robust = calibrate(spoilt, "elevate", SOIL, NAMES[:4], channels=channels, robust=True)
+    plain = calibrate(corrupt, "elevate", SOIL, NAMES[:4], channels=channels)
+    robust = calibrate(corrupt, "elevate", SOIL, NAMES[:4], channels=channels, robust=True)
     assert robust[name].sigma < plain[name].sigma
     assert abs(robust[name].value - TRUTH[name]) < 4.0 * robust[name].sigma
 

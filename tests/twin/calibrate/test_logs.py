@@ -81,9 +81,9 @@ def test_an_effect_is_a_parameter(tmp_path) -> None:
 def test_holes_in_the_reference_are_left_out(field: str) -> None:
     reference = drive().truth
     assert reference is not None
-    spoilt = getattr(reference, field).copy()
-    spoilt[500:600] = np.nan
-    log = dataclasses.replace(drive(), truth=dataclasses.replace(reference, **{field: spoilt}))
+    corrupt = getattr(reference, field).copy()
+    corrupt[500:600] = np.nan
+    log = dataclasses.replace(drive(), truth=dataclasses.replace(reference, **{field: corrupt}))
     found = calibrate(log, "elevate", SOIL, NAMES, truth=True)
     assert found[SHEAR].value == pytest.approx(TRUTH[SHEAR], rel=1e-4)
 
@@ -102,7 +102,7 @@ def test_unknown_commands_are_a_hole_and_not_a_stop() -> None:
         calibrate(log, "elevate", SOIL, NAMES)
 
 
-def test_other_clocks_are_told_or_refused() -> None:
+def test_other_clocks_are_reported_or_refused() -> None:
     gnss = drive().gnss
     assert gnss is not None
     late, early = (
@@ -114,7 +114,7 @@ def test_other_clocks_are_told_or_refused() -> None:
     assert any("gnss_east_m" in note for note in calibrate(early, "elevate", SOIL, NAMES).notes)
 
 
-def test_a_wrong_vehicle_is_told_of() -> None:
+def test_a_wrong_vehicle_is_noted() -> None:
     right, wrong = (calibrate(drive(), name, SOIL, NAMES) for name in ("elevate", "husky"))
     assert not any("times its noise" in note for note in right.notes)
     assert any("current_left_a is off by" in note for note in wrong.notes)

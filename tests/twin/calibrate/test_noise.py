@@ -135,7 +135,7 @@ def test_binomial_interval() -> None:
 def test_truth_lies_where_sigma_says(number: int) -> None:
     """A small fixed part of the coverage study (docs/calibration.md has the whole)."""
     case = dataclasses.replace(Case.drawn(number, seed=77), drive="figure_eight")
-    told = [o for o in outcomes(case) if o.status == IDENTIFIED]
-    assert len(told) >= 4
-    assert np.mean([abs(o.score) <= 2.0 for o in told]) >= 0.6
-    assert max(abs(o.score) for o in told) < 4.0
+    identified = [o for o in outcomes(case) if o.status == IDENTIFIED]
+    assert len(identified) >= 4
+    assert np.mean([abs(o.score) <= 2.0 for o in identified]) >= 0.6
+    assert max(abs(o.score) for o in identified) < 4.0

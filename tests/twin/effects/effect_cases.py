@@ -79,7 +79,7 @@ def exciting() -> np.ndarray:
 def drive(
     values: dict[str, float], sides: np.ndarray, terrain: str = "loose_sand", start: np.ndarray | None = None
 ) -> tuple[np.ndarray, ...]:
-    """States, inputs and outputs of a drive, from rest unless told, in the graph of all effects."""
+    """States, inputs and outputs of a drive, from rest by default, in the graph of all effects."""
     effects = dict.fromkeys(KEYS, NAMED) | values
     own = plant(terrain, effects)
     inputs = delayed_inputs(sides, DT_S, values.get("dead_time/transport", 0.0))

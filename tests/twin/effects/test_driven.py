@@ -1,4 +1,4 @@
-"""Effects on a drive: signs and sizes, no energy from nowhere, and forms that can be told apart."""
+"""Effects on a drive: signs and sizes, no energy from nowhere, and forms that can be distinguished."""
 
 from __future__ import annotations
 
@@ -338,7 +338,7 @@ def kinetic_j(x: np.ndarray) -> np.ndarray:
 def signature(values: dict[str, float], sides: np.ndarray) -> np.ndarray:
     """What an effect changes in the readings of a drive, in units of noise.
 
-    Positions less the integral of the velocities: the rest of a motion's change is told by these.
+    Positions less the integral of the velocities: the rest of a motion's change is in these.
     """
     rows = slice(None, None, 5)
     change = (drive(values, sides)[2] - drive({}, sides)[2])[rows]

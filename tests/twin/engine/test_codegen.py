@@ -110,7 +110,7 @@ def test_functions_of_32_bits_at_the_edges(kernel_32) -> None:
         assert np.isnan(kernel_32(name, edges)[2])
 
 
-def test_a_number_that_32_bits_do_not_hold_is_told() -> None:
+def test_a_number_that_32_bits_do_not_hold_is_reported() -> None:
     graph, outputs = read(ca.Function("f", [x := ca.SX.sym("x")], [x + 1e-60], ["x"], ["dx"]), lambda n, i: i)
     for short in (False, True):
         emitter = Emitter(graph, outputs, {"x"}, (), lambda name, i: None, in_vectors=False, short=short)
@@ -145,7 +145,7 @@ def test_roots_by_multiplication_have_the_bits_of_roots(kernel) -> None:
         np.testing.assert_array_equal(kernel("root", values), np.sqrt(values))
 
 
-def test_an_unknown_operation_is_told() -> None:
+def test_an_unknown_operation_is_reported() -> None:
     x = ca.SX.sym("x", 2)
     f = ca.Function("f", [x], [ca.if_else(x[0] > 0, x[1], 1.0)], ["x"], ["dx"])
     with pytest.raises(UnsupportedOperationError, match="OP_"):

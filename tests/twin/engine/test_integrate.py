@@ -111,7 +111,7 @@ def test_a_library_is_not_remembered_by_names_that_do_not_tell_its_laws() -> Non
 
 
 @needs_compiler
-def test_a_compiler_that_fails_is_told_and_replaced(monkeypatch, tmp_path, caplog) -> None:
+def test_a_compiler_that_fails_is_reported_and_replaced(monkeypatch, tmp_path, caplog) -> None:
     monkeypatch.setenv("TERRAFUSION_CACHE", str(tmp_path / "cache"))
     monkeypatch.setattr(compiler, "FLAGS", ("-no-such-flag",))
     native.forget()

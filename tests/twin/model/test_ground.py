@@ -123,7 +123,7 @@ def test_even_ground_is_no_field() -> None:
     assert follows == {"k_c", "k_phi", "cohesion_pa", "tan_friction", "friction_cap"}
 
 
-def test_lengths_too_far_apart_are_told() -> None:
+def test_lengths_too_far_apart_are_reported() -> None:
     with pytest.raises(ConfigError, match=r"0.1 and 50 m do not fit one grid; keep them within"):
         soil_field(Variation(0.2, 0.1), SoilPatches("mud", 0.3, 50.0), None, 0)
 
@@ -172,7 +172,7 @@ def test_labels_follow_the_patches_under_the_body() -> None:
         ("patches: {terrain: mud, share: 0.5, length_m: 1, size: 2}", r"unknown key 'patches.size'"),
     ],
 )
-def test_a_wrong_field_is_told_by_key(tmp_path, text, message) -> None:
+def test_a_wrong_field_is_reported_by_key(tmp_path, text, message) -> None:
     path = tmp_path / "s.yaml"
     path.write_text(f"drive: [{{duration_s: 5}}]\n{text}\n", encoding="utf-8")
     with pytest.raises(ConfigError, match=message):

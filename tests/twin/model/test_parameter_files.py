@@ -41,7 +41,7 @@ def test_a_users_vehicle_and_soil_load_from_paths(tmp_path) -> None:
         ("name: elevate", "nme: elevate", "unknown key 'nme'"),
     ],
 )
-def test_a_wrong_vehicle_file_is_told_by_key(tmp_path, old, new, message) -> None:
+def test_a_wrong_vehicle_file_is_reported_by_key(tmp_path, old, new, message) -> None:
     text = (PARAMS / "vehicles" / "elevate.yaml").read_text(encoding="utf-8")
     with pytest.raises(ConfigError, match=message):
         load_vehicle(write(tmp_path / "v.yaml", text.replace(old, new, 1)))
@@ -77,7 +77,7 @@ def test_effects_of_a_vehicles_file_are_in_its_runs_unless_others_are_given(tmp_
         ("slope/uniform: 0.1", "without a source"),
     ],
 )
-def test_a_wrong_effect_of_a_vehicles_file_is_told(tmp_path, effect, message) -> None:
+def test_a_wrong_effect_of_a_vehicles_file_is_reported(tmp_path, effect, message) -> None:
     with pytest.raises(ConfigError, match=message):
         load_vehicle(with_effect(tmp_path / "v.yaml", effect))
 
@@ -102,7 +102,7 @@ def test_a_log_does_not_replace_what_was_measured() -> None:
     assert with_overrides(known, Overrides(0.2, 0.9)).wheel == robot.wheel
 
 
-def test_what_a_log_tells_of_the_geometry_is_said() -> None:
+def test_the_geometry_that_a_log_reports_is_noted() -> None:
     robot = load_vehicle("husky")
     assert geometry_notes(robot, Overrides()) == ()
     note = "the log's own geometry is used: wheel_radius_m = 0.2, track_m = 0.9"
@@ -181,12 +181,12 @@ def test_a_route_over_time_switches_at_its_time(tmp_path) -> None:
         ("drive: [{duration_s: 5}]\ngnss_fix: great", "give one of best, fixed, float, single"),
     ],
 )
-def test_a_wrong_scenario_file_is_told_by_key(tmp_path, text, message) -> None:
+def test_a_wrong_scenario_file_is_reported_by_key(tmp_path, text, message) -> None:
     with pytest.raises(ConfigError, match=message):
         simulate_run(write(tmp_path / "s.yaml", text))
 
 
-def test_a_missing_file_is_told() -> None:
+def test_a_missing_file_is_reported() -> None:
     with pytest.raises(ConfigError, match="no such file"):
         load_scenario("nowhere/own.yaml")
 

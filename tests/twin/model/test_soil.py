@@ -91,12 +91,12 @@ def test_every_vehicle_may_drive_on_every_ground_with_all_its_payload(name, vehi
         ("value: [0.2, 1.5]", "value: [1.5, 0.2]", r"validity.wheel_diameter_m must be \[low, high\]"),
     ],
 )  # fmt: skip
-def test_a_number_outside_its_range_is_told_when_the_file_is_loaded(tmp_path, old, new, message) -> None:
+def test_a_number_outside_its_range_is_reported_when_the_file_is_loaded(tmp_path, old, new, message) -> None:
     with pytest.raises(ConfigError, match=message):
         load_soil(own(tmp_path, "loose_sand", old, new))
 
 
-def test_a_wheel_too_small_or_a_load_too_heavy_for_the_soil_is_told() -> None:
+def test_a_wheel_too_small_or_a_load_too_heavy_for_the_soil_is_reported() -> None:
     sand = load_soil("loose_sand")
     with pytest.raises(ConfigError, match=r"wheel diameter is 0.1 m, outside .*'loose_sand'; .*0.2 to 1.5 m"):
         check_wheel(sand, 0.05, 0.05, 20.0)
@@ -120,7 +120,7 @@ def test_ground_pressure_is_load_over_contact() -> None:
         ("asphalt", 5.0, r"'asphalt' tells no range of moisture"),
     ],
 )  # fmt: skip
-def test_a_moisture_the_soil_was_not_measured_at_is_told(terrain, moisture, message) -> None:
+def test_a_moisture_the_soil_was_not_measured_at_is_reported(terrain, moisture, message) -> None:
     wet = dataclasses.replace(SHORT, route=(RouteLeg(terrain, None, moisture),))
     with pytest.raises(ConfigError, match=message):
         simulate_run(wet)
@@ -131,7 +131,7 @@ def test_a_moisture_inside_the_range_changes_nothing() -> None:
     assert simulate_run(damp).summary == simulate_run(SHORT).summary
 
 
-def test_slip_beyond_what_was_measured_is_told() -> None:
+def test_slip_beyond_what_was_measured_is_reported() -> None:
     sand = load_soil("loose_sand")
     narrow = dataclasses.replace(sand, validity=Validity(slip=(-0.02, 0.02)))
     with pytest.raises(ConfigError, match=r"slip reached .* on 'loose_sand', .* from -0.02 to 0.02"):
@@ -180,7 +180,7 @@ def test_library_soils_are_the_published_ones_they_name() -> None:
             assert a.shear.friction_angle_rad == pytest.approx(b.shear.friction_angle_rad, abs=1e-4)
 
 
-def test_an_unknown_published_soil_is_told_with_the_known_ones() -> None:
+def test_an_unknown_published_soil_is_reported_with_the_known_ones() -> None:
     with pytest.raises(ConfigError, match=r"unknown published soil 'wong:custard'; .*wong:lete_sand"):
         load_soil("wong:custard")
     with pytest.raises(ConfigError, match="unknown terrain 'wang:lete_sand'"):

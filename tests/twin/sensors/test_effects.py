@@ -155,7 +155,7 @@ def test_ground_under_the_wheels_is_that_of_the_integrator() -> None:
         ({"gyro_bias/constant": float("nan")}, "give -0.2 to 0.2 rad/s"),
     ],
 )
-def test_wrong_effects_are_told(effects, said) -> None:
+def test_wrong_effects_are_reported(effects, said) -> None:
     with pytest.raises(ConfigError, match=re.escape(said)):
         simulate(SHORT, effects=effects)
 

@@ -108,26 +108,26 @@ def test_an_interrupted_sweep_moves_to_the_cluster(cluster: str, tmp_path: Path)
 
     with pytest.raises(KeyboardInterrupt):
         run_sweep(sweep, tmp_path / "out", progress=interrupt)
-    told: list[float] = []
-    table = run_sweep(sweep, tmp_path / "out", backend="dask", address=cluster, progress=told.append)
+    shares: list[float] = []
+    table = run_sweep(sweep, tmp_path / "out", backend="dask", address=cluster, progress=shares.append)
     assert table.equals(whole)
-    assert told[0] > 0.4
+    assert shares[0] > 0.4
 
 
-def test_a_refused_address_is_told_within_ten_seconds(tmp_path: Path) -> None:
+def test_a_refused_address_is_reported_within_ten_seconds(tmp_path: Path) -> None:
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     _fails_fast(tmp_path, f"tcp://127.0.0.1:{port}", "no Dask scheduler answers .*refused.*dask scheduler")
 
 
-def test_a_silent_address_is_told_within_ten_seconds(tmp_path: Path) -> None:
+def test_a_silent_address_is_reported_within_ten_seconds(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as silent:
         port = silent.getsockname()[1]
         _fails_fast(tmp_path, f"tcp://127.0.0.1:{port}", "no Dask scheduler answers .*timed out")
 
 
-def test_another_kind_of_server_is_told_as_such(tmp_path: Path) -> None:
+def test_another_kind_of_server_is_reported_as_such(tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
 
         def answer() -> None:
@@ -148,20 +148,20 @@ def test_what_is_no_address_is_refused(tmp_path: Path, address: str) -> None:
         run_sweep(sweep_of(tmp_path), tmp_path / "out", backend="dask", address=address)
 
 
-def test_a_scheduler_without_workers_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_scheduler_without_workers_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executors, "CONNECT_S", 2.0)
     with scheduler(tmp_path) as address:
         _fails_fast(tmp_path, address, "the Dask scheduler has no worker; start some: `dask worker tcp://")
 
 
-def test_other_versions_are_told(cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_versions_are_reported(cluster: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(executors, "version", lambda: "9.9")
     _fails_fast(
         tmp_path, cluster, r"the worker tcp://\S+ has terrafusion \S+, here it is 9.9; install the same"
     )
 
 
-def test_dead_workers_are_told_and_nothing_finished_is_lost(
+def test_dead_workers_are_reported_and_nothing_finished_is_lost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(executors, "WORKERLESS_S", 2.0)
@@ -197,7 +197,7 @@ def test_the_work_of_a_dead_worker_is_done_by_others(tmp_path: Path) -> None:
     assert table.equals(whole)
 
 
-def test_a_lost_scheduler_is_told(tmp_path: Path) -> None:
+def test_a_lost_scheduler_is_reported(tmp_path: Path) -> None:
     sweep = sweep_of(tmp_path, duration_s=20)
     with contextlib.ExitStack() as running:
         file = tmp_path / "scheduler.json"

@@ -122,15 +122,15 @@ def test_a_run_that_fails_is_a_row_that_says_why(tmp_path: Path, monkeypatch: py
     def no_setup_at_6_deg(*args: Any, **kw: Any) -> Any:
         if kw["slope_deg"] == 6.0:
             raise ZeroDivisionError("float division by zero")
-        return honest_setup(*args, **kw)
+        return original_setup(*args, **kw)
 
     def second_diverges(*args: Any, **kw: Any) -> Any:
-        motions = honest(*args, **kw)
+        motions = original(*args, **kw)
         if kw.get("t0_s", 0.0) == 0.0:
             motions[1][100:] = np.nan
         return motions
 
-    honest_setup, honest = rows_module.set_up, batch.integrate_many
+    original_setup, original = rows_module.set_up, batch.integrate_many
     monkeypatch.setattr(rows_module, "set_up", no_setup_at_6_deg)
     monkeypatch.setattr(batch, "integrate_many", second_diverges)
     found = all_rows(sweep_of(tmp_path, "{terrain: [asphalt], slope_deg: [0, 6, 5, 4]}"))

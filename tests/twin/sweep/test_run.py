@@ -51,11 +51,11 @@ def file(tmp_path: Path) -> Path:
 def computed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Numbers of the runs that are computed in this process."""
     runs: list[int] = []
-    honest = module.run_chunk
+    original = module.run_chunk
 
     def counting(sweep: Sweep, cases: Sequence[SweepPoint]) -> Any:
         runs.extend(case.run for case in cases)
-        return honest(sweep, cases)
+        return original(sweep, cases)
 
     monkeypatch.setattr(module, "run_chunk", counting)
     return runs
@@ -94,11 +94,11 @@ def test_a_killed_sweep_continues_without_loss(file: Path, tmp_path: Path, compu
     assert not json.loads((killed / "sweep.json").read_text())["complete"]
     finished = {run for part in before for run in chunks[int(part[5:11])]}
 
-    told: list[float] = []
-    run_sweep(sweep, killed, progress=told.append)
+    shares: list[float] = []
+    run_sweep(sweep, killed, progress=shares.append)
     assert sorted(computed) == [run for run in range(sweep.runs) if run not in finished]
-    assert told[0] > len(finished) / sweep.runs
-    assert told[-1] == 1.0
+    assert shares[0] > len(finished) / sweep.runs
+    assert shares[-1] == 1.0
     for name in ("runs.parquet", "sweep.json"):
         assert (killed / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
     assert not parts.exists()
@@ -120,7 +120,7 @@ def test_an_interrupted_sweep_ends_at_once_and_quietly(file: Path, tmp_path: Pat
     assert said == "stopped\n"
 
 
-def test_a_worker_that_dies_is_told() -> None:
+def test_a_worker_that_dies_is_reported() -> None:
     words = "a worker process died .* fewer --jobs; finished runs are kept"
     with pytest.raises(TerrafusionError, match=words), open_workers("loky", 2) as workers:
         list(workers.results(os._exit, [(1,)]))
@@ -230,12 +230,12 @@ def test_columns_tell_what_they_hold(file: Path, tmp_path: Path) -> None:
 def test_without_pyarrow_one_line_says_what_to_install(
     file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    honest = builtins.__import__
+    original = builtins.__import__
 
     def without(name: str, *args: Any, **kw: Any) -> Any:
         if name.startswith("pyarrow"):
             raise ImportError(name)
-        return honest(name, *args, **kw)
+        return original(name, *args, **kw)
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(
