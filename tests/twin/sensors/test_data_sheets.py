@@ -16,7 +16,7 @@ from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 from terrafusion.twin.physics.layout import state_slice
 from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario, Stretch
 from terrafusion.twin.sensors.encoders import counted
-from terrafusion.twin.sensors.gnss import LADDERS, Sky, fix_classes
+from terrafusion.twin.sensors.gnss import FIX_LEVELS, Sky, fix_classes
 from terrafusion.twin.sensors.imu import triad
 from terrafusion.twin.sensors.noise import NoiseStreams, gauss_markov
 from terrafusion.twin.simulate import simulate, simulate_run
@@ -148,7 +148,7 @@ def fixed_share(density: float, real: GnssRealism, seconds: float = 40_000.0) ->
     count = round(seconds / 0.2)
     sky = Sky(np.full(count, density), np.ones(count, dtype=bool))
     fixes = fix_classes(sky, Fix.FIXED, 0.2, real, np.random.default_rng(0))
-    return np.array([np.mean(fixes == step) for step in LADDERS[Fix.FIXED]])
+    return np.array([np.mean(fixes == step) for step in FIX_LEVELS[Fix.FIXED]])
 
 
 @pytest.mark.parametrize("density", [0.2, 0.5, 0.8])
