@@ -230,7 +230,7 @@ Switch = Annotated[bool, _Truth()]
 """`true` or `false`, and nothing that could stand for them."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Prepared:
     """Annotation of a field whose raw value `prepare` brings into the form of its type.
 
@@ -392,23 +392,19 @@ def _one_error(error: Any, kind: Any, file: Path | str, key: str) -> ConfigError
     hint = _at(kind, error["loc"])
     if error["type"] == "empty":
         return ConfigError(f"'{key}' has no value", file=file, remedy="give one, or leave the key out")
+    names = ", ".join(_hints(_bare(hint)))
     if error["type"] == "missing":
-        names = ", ".join(_hints(_bare(hint)))
         example = f"keys from {names}" if names else getattr(_marker(hint), "hint", str)()
-        remedy = f"add it: {example}" if example else "add it"
-        return ConfigError(f"'{key}' is missing", file=file, remedy=remedy)
+        return ConfigError(
+            f"'{key}' is missing", file=file, remedy=f"add it: {example}" if example else "add it"
+        )
     value = shown(error["input"])
     if error["type"] in ("dataclass_type", "dict_type"):
-        names = _hints(_bare(hint))
-        remedy = f"give keys from {', '.join(names)}" if names else "give a mapping"
+        remedy = f"give keys from {names}" if names else "give a mapping"
         return ConfigError(f"'{key}' is '{value}', not a section", file=file, remedy=remedy)
-    remedies = {
-        "string_type": "give a text, in quotes",
-        "tuple_type": "give a list",
-    }
-    return ConfigError(
-        f"'{key}' is '{value}'", file=file, remedy=remedies.get(error["type"], error["msg"].lower())
-    )
+    remedies = {"string_type": "give a text, in quotes", "tuple_type": "give a list"}
+    remedy = remedies.get(error["type"], error["msg"].lower())
+    return ConfigError(f"'{key}' is '{value}'", file=file, remedy=remedy)
 
 
 def _unknown_key(name: str, known: Mapping[str, Any]) -> tuple[RejectedError, str]:

@@ -9,12 +9,12 @@ midway between the four contact points.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Sourced, structure
+from terrafusion.datasets.core.config import Sourced, refuse, structure
 from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
@@ -174,21 +174,24 @@ def load_vehicle(name_or_path: str | Path) -> VehicleParams:
     """
     raw, file = read_named("vehicles", name_or_path, kind="vehicle")
     found = structure(VehicleParams, raw, file=file)
+    refuse(_problems(found), file)
+    return found
+
+
+def _problems(found: VehicleParams) -> Iterator[tuple[str, str]]:
+    """What is wrong beyond single values, and the remedy."""
     for name in found.measured:
         section, _, last = name.partition(".")
         if not last or not isinstance(getattr(getattr(found, section, None), last, None), float):
-            raise ConfigError(
-                f"there is no number '{name}'", file=file, channel="measured",
-                remedy="give dotted names such as body.track_m",
-            )  # fmt: skip
+            yield f"measured: there is no number '{name}'", "give dotted names such as body.track_m"
     if found.effects:
         from terrafusion.twin.effects.catalogue import checked
 
-        try:
-            checked(found.effects)
-        except ConfigError as error:
-            raise ConfigError(error.what, file=file, channel="effects", remedy=error.remedy) from None
-    return found
+        for key, value in found.effects.items():
+            try:
+                checked({key: value})
+            except ConfigError as error:
+                yield f"effects: {error.what}", error.remedy or ""
 
 
 def as_vehicle(vehicle: str | Path | VehicleParams) -> VehicleParams:
