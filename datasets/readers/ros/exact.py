@@ -64,7 +64,7 @@ REMEDY = "write the bag again, or choose its topics with --topic"
 
 
 @dataclass(frozen=True)
-class Saved:
+class SavedChannels:
     """The content of `/terrafusion/meta`: the columns of each table, texts by column, lateness of stamps."""
 
     meta: Meta
@@ -106,7 +106,7 @@ def restore(
     return recording_of(channels, saved.meta, file.stem, tables.notes)
 
 
-def _parse(stream: Stream, file: Path) -> Saved:
+def _parse(stream: Stream, file: Path) -> SavedChannels:
     try:
         content = json.loads(stream.column("data")[0])
         tables, words, shift_ns = (content.pop(key) for key in ("tables", "words", "shift_ns"))
@@ -119,7 +119,7 @@ def _parse(stream: Stream, file: Path) -> Saved:
         raise DataError(
             "is not what this library writes", file=file, channel=META[0], remedy=REMEDY
         ) from None
-    return Saved(
+    return SavedChannels(
         dataclasses.replace(parse_meta(content, file), keep_empty=True), tables, words, int(shift_ns)
     )
 
@@ -139,7 +139,7 @@ def _standard(builder: ChannelBuilder, name: str, stream: Stream | None, shift_n
 class _BagTables:
     """The tables of a bag."""
 
-    def __init__(self, saved: Saved, file: Path, streams: Mapping[str, Stream]) -> None:
+    def __init__(self, saved: SavedChannels, file: Path, streams: Mapping[str, Stream]) -> None:
         self.saved = saved
         self.file = file
         self.streams = streams

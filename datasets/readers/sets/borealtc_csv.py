@@ -17,7 +17,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.delimited import head_lines, split
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.text.number_rows import Rows, put_in_time, read_rows
+from terrafusion.datasets.readers.text.number_rows import NumberRows, put_in_time, read_rows
 
 COLUMNS = {
     "imu": ("time", "wx", "wy", "wz", "ax", "ay", "az"),
@@ -105,7 +105,7 @@ def _terrain(folder: str) -> tuple[str, str]:
     return label, f"terrain: '{label}' from the folder {folder}{known}"
 
 
-def _pairing(rows: dict[str, Rows]) -> list[str]:
+def _pairing(rows: dict[str, NumberRows]) -> list[str]:
     """How the two files were put together, and what their times are worth."""
     notes = ["times count from the start of the run; the set has no absolute ones"]
     if len(rows) == 1:

@@ -33,7 +33,7 @@ class StandIn:
         return 0
 
 
-class Dtype(StandIn):
+class PickledDtype(StandIn):
     """`numpy.dtype` of booleans, integers, floats and objects."""
 
     def __init__(self, text: str, *_: Any) -> None:
@@ -62,7 +62,7 @@ class Dtype(StandIn):
         return np.frombuffer(data, kind).reshape(shape, order="F" if order == "F" else "C")
 
 
-class Array(StandIn):
+class PickledArray(StandIn):
     """`numpy.ndarray`, filled by its state."""
 
     values: NDArray[Any] = np.zeros(0)
@@ -75,39 +75,39 @@ class Array(StandIn):
         return self.values.size
 
 
-def reconstruct(*_: Any) -> Array:
+def reconstruct(*_: Any) -> PickledArray:
     """`numpy._core.multiarray._reconstruct`."""
-    return Array()
+    return PickledArray()
 
 
-def from_buffer(data: Any, kind: Dtype, shape: tuple[int, ...], order: str) -> Array:
+def from_buffer(data: Any, kind: PickledDtype, shape: tuple[int, ...], order: str) -> PickledArray:
     """`numpy._core.numeric._frombuffer`."""
-    array = Array()
+    array = PickledArray()
     array.values = kind.numbers(data, shape, order)
     return array
 
 
-def scalar(kind: Dtype, data: bytes) -> Any:
+def scalar(kind: PickledDtype, data: bytes) -> Any:
     """`numpy._core.multiarray.scalar`."""
     return kind.numbers(data, (1,), "C")[0].item()
 
 
-class Strings(StandIn):
+class PickledStrings(StandIn):
     """`pandas.arrays.StringArray` and `ArrowStringArray`: (N,) texts."""
 
     values: NDArray[Any] = np.zeros(0, dtype=object)
 
     def set_state(self, state: Any) -> None:
         parts = state.values() if isinstance(state, dict) else state
-        found = [part.values for part in parts if isinstance(part, Array)]
+        found = [part.values for part in parts if isinstance(part, PickledArray)]
         if len(found) != 1:
             raise ValueError("a string array without its strings")
         self.values = found[0]
 
 
-def strings_of_numpy(*_: Any) -> Strings:
+def strings_of_numpy(*_: Any) -> PickledStrings:
     """`pandas._libs.arrays.__pyx_unpickle_NDArrayBacked`."""
-    return Strings()
+    return PickledStrings()
 
 
 def named(*names: Any) -> tuple[Any, ...]:
@@ -122,7 +122,7 @@ def buffer(data: Any) -> bytes:
     return bytes(data)
 
 
-def arrow_array(data: tuple[Any, ...]) -> Array:
+def arrow_array(data: tuple[Any, ...]) -> PickledArray:
     """`pyarrow.lib._restore_array` of strings without missing values."""
     kind, length, _, start, (_, offsets, letters) = data[:5]
     width = {"large_string": np.int64, "string": np.int32}[kind[0]]
@@ -130,22 +130,22 @@ def arrow_array(data: tuple[Any, ...]) -> Array:
     if len(ends) != length + 1 or length > MAX_CELLS or (np.diff(ends) < 0).any() or ends[0] < 0:
         raise ValueError("an arrow array whose offsets do not fill it")
     cuts = ends.tolist()
-    array = Array()
+    array = PickledArray()
     texts = (letters[a:b].decode() for a, b in pairwise(cuts))
     array.values = np.fromiter(texts, dtype=object, count=length)
     return array
 
 
-def chunked(chunks: list[Array], *_: Any) -> Array:
+def chunked(chunks: list[PickledArray], *_: Any) -> PickledArray:
     """`pyarrow.lib.chunked_array`."""
-    array = Array()
+    array = PickledArray()
     if sum(chunk.cells() for chunk in chunks) > MAX_CELLS:
         raise ValueError(f"more than {MAX_CELLS} cells")
     array.values = np.concatenate([chunk.values for chunk in chunks])
     return array
 
 
-class Labels(StandIn):
+class PickledIndex(StandIn):
     """An index: its labels, or None where it counts rows."""
 
     def __init__(self, _: Any, state: dict[str, Any]) -> None:
@@ -156,37 +156,37 @@ class Labels(StandIn):
         return len(self.values or ())
 
 
-class Block:
+class PickledBlock:
     """Columns of one kind: values (items, rows), or (rows,) for one column, at the places `items`."""
 
-    def __init__(self, values: Array | Strings, placement: Any, ndim: int = 2) -> None:
+    def __init__(self, values: PickledArray | PickledStrings, placement: Any, ndim: int = 2) -> None:
         self.rows = np.atleast_2d(values.values)
         self.placement = placement
 
     def items(self, count: int) -> list[int]:
         """Places of its rows among `count` columns."""
-        place = self.placement.values if isinstance(self.placement, Array) else self.placement
+        place = self.placement.values if isinstance(self.placement, PickledArray) else self.placement
         places = range(count)[place] if isinstance(place, slice) else np.atleast_1d(place).tolist()
         if len(places) != len(self.rows):
             raise ValueError("a block whose columns have no place")
         return list(places)
 
 
-class Partial(StandIn):
+class PickledPartial(StandIn):
     """`functools.partial` of `new_block`, the one function a frame is pickled with."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        if function is not Block:
+        if function is not PickledBlock:
             raise ValueError("a partial function other than new_block")
 
     def set_state(self, state: Any) -> None:
         """Keeps nothing: how many dimensions a block has is seen from its values."""
 
-    def __call__(self, values: Array | Strings, placement: Any) -> Block:
-        return Block(values, placement)
+    def __call__(self, values: PickledArray | PickledStrings, placement: Any) -> PickledBlock:
+        return PickledBlock(values, placement)
 
 
-class Manager(StandIn):
+class PickledManager(StandIn):
     """`BlockManager`: by its arguments, before pandas 1.3 by its state."""
 
     def __init__(self, blocks: Any = (), axes: Any = ()) -> None:
@@ -195,7 +195,7 @@ class Manager(StandIn):
     def set_state(self, state: Any) -> None:
         inner = state[3]["0.14.1"]
         self.axes = inner["axes"]
-        self.blocks = [Block(block["values"], block["mgr_locs"]) for block in inner["blocks"]]
+        self.blocks = [PickledBlock(block["values"], block["mgr_locs"]) for block in inner["blocks"]]
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Columns (N,) by name."""
@@ -213,10 +213,10 @@ class Manager(StandIn):
         return {name: found[name] for name in names}
 
 
-class Frame(StandIn):
+class PickledFrame(StandIn):
     """`pandas.DataFrame`."""
 
-    manager: Manager | None = None
+    manager: PickledManager | None = None
 
     def set_state(self, state: Any) -> None:
         self.manager = state.get("_mgr", state.get("_data"))
@@ -227,24 +227,24 @@ def _modules(*modules: str, **names: Any) -> dict[tuple[str, str], Any]:
 
 
 ALLOWED: dict[tuple[str, str], Any] = {
-    **_modules("pandas", "pandas.core.frame", DataFrame=Frame),
-    **_modules("pandas.core.internals.managers", "pandas.core.internals", BlockManager=Manager),
-    **_modules("pandas.core.internals.blocks", new_block=Block),
-    **_modules("pandas._libs.internals", _unpickle_block=Block),
-    **_modules("pandas.core.indexes.base", _new_Index=Labels),
+    **_modules("pandas", "pandas.core.frame", DataFrame=PickledFrame),
+    **_modules("pandas.core.internals.managers", "pandas.core.internals", BlockManager=PickledManager),
+    **_modules("pandas.core.internals.blocks", new_block=PickledBlock),
+    **_modules("pandas._libs.internals", _unpickle_block=PickledBlock),
+    **_modules("pandas.core.indexes.base", _new_Index=PickledIndex),
     **_modules("pandas", "pandas.core.indexes.base", Index=named),
     **_modules("pandas", "pandas.core.indexes.range", RangeIndex=named),
     **_modules("pandas.core.indexes.numeric", Int64Index=named),
-    **_modules("pandas.arrays", "pandas.core.arrays.string_", StringArray=Strings),
-    **_modules("pandas.arrays", "pandas.core.arrays.string_arrow", ArrowStringArray=Strings),
+    **_modules("pandas.arrays", "pandas.core.arrays.string_", StringArray=PickledStrings),
+    **_modules("pandas.arrays", "pandas.core.arrays.string_arrow", ArrowStringArray=PickledStrings),
     **_modules("pandas._libs.arrays", __pyx_unpickle_NDArrayBacked=strings_of_numpy),
     **_modules("pandas", "pandas.core.arrays.string_", StringDtype=named),
     **_modules("pyarrow.lib", _restore_array=arrow_array, py_buffer=buffer),
     **_modules("pyarrow.lib", type_for_alias=named, chunked_array=chunked),
-    **_modules("numpy", dtype=Dtype, ndarray=named),
+    **_modules("numpy", dtype=PickledDtype, ndarray=named),
     **_modules("numpy.core.numeric", "numpy._core.numeric", _frombuffer=from_buffer),
     **_modules("numpy.core.multiarray", "numpy._core.multiarray", _reconstruct=reconstruct, scalar=scalar),
-    ("functools", "partial"): Partial,
+    ("functools", "partial"): PickledPartial,
     ("builtins", "bytearray"): buffer,
     ("builtins", "slice"): slice,
 }

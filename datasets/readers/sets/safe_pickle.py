@@ -19,7 +19,13 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.readers.sets.pickled_frame import ALLOWED, MAX_CELLS, Frame, Partial, StandIn
+from terrafusion.datasets.readers.sets.pickled_frame import (
+    ALLOWED,
+    MAX_CELLS,
+    PickledFrame,
+    PickledPartial,
+    StandIn,
+)
 
 LARGEST = 1e30
 """No number of a log is larger; squares of these are still numbers."""
@@ -78,7 +84,9 @@ class _Machine(pickle._Unpickler):
         return ALLOWED[module, name]
 
     def _call(self, function: Any, arguments: Any) -> Any:
-        known = isinstance(function, Partial) or any(function is stand_in for stand_in in ALLOWED.values())
+        known = isinstance(function, PickledPartial) or any(
+            function is stand_in for stand_in in ALLOWED.values()
+        )
         if not known or not isinstance(arguments, tuple):
             raise _RefusedError(f"to call {type(function).__name__}")
         return self._counted(function(*arguments))
@@ -128,7 +136,7 @@ def read_table(path: Path) -> dict[str, NDArray[Any]]:
         raise DataError(what, file=path, remedy=f"give a table of up to {MAX_BYTES // 2**20} MiB")
     try:
         frame = _Machine(io.BytesIO(data)).load()
-        if not isinstance(frame, Frame) or frame.manager is None:
+        if not isinstance(frame, PickledFrame) or frame.manager is None:
             raise DataError("the pickle holds no DataFrame", file=path, remedy="pickle a pandas DataFrame")
         return frame.manager.columns()
     except _RefusedError as refused:

@@ -22,7 +22,7 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
-from terrafusion.datasets.readers.text.number_rows import Rows, are_numbers, put_in_time, read_rows
+from terrafusion.datasets.readers.text.number_rows import NumberRows, are_numbers, put_in_time, read_rows
 
 POSE = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 COLUMNS = {
@@ -50,7 +50,7 @@ LOST_FRAME = 1.5
 
 
 @dataclass(frozen=True)
-class Part:
+class RecordingFile:
     """One file of a recording: what it holds, and the name that it shares with the others."""
 
     path: Path
@@ -101,11 +101,11 @@ def read(request: Request) -> list[Recording]:
     return [recording]
 
 
-def _part(path: Path) -> Part | None:
+def _part(path: Path) -> RecordingFile | None:
     for kind, pattern in NAMES.items():
         found = pattern.fullmatch(path.name)
         if found:
-            return Part(path, kind, found["stem"] or "")
+            return RecordingFile(path, kind, found["stem"] or "")
     return None
 
 
@@ -114,7 +114,7 @@ def _robot_name(stem: str) -> str:
     return f"trial{numbered[1]}" if numbered else stem
 
 
-def _family(given: Part) -> tuple[str, list[Part]]:
+def _family(given: RecordingFile) -> tuple[str, list[RecordingFile]]:
     """Name of the recording and its files, one of a kind.
 
     Motion capture files have the shape of the path behind the name it shares with IMU and wheels.
@@ -133,13 +133,13 @@ def _belongs(stem: str, robot: str) -> bool:
     return stem == robot or stem.startswith(f"{robot}_")
 
 
-def _owner(part: Part, robots: Iterable[str]) -> str:
+def _owner(part: RecordingFile, robots: Iterable[str]) -> str:
     if part.kind in ("imu", "wheels"):
         return _robot_name(part.stem)
     return max((r for r in robots if _belongs(part.stem, r)), key=len, default=part.stem)
 
 
-def _choice(given: Part, kind: str, candidates: list[Part]) -> Part:
+def _choice(given: RecordingFile, kind: str, candidates: list[RecordingFile]) -> RecordingFile:
     if kind == given.kind:
         return given
     same = [part for part in candidates if part.stem == given.stem] or candidates
@@ -152,7 +152,7 @@ def _choice(given: Part, kind: str, candidates: list[Part]) -> Part:
     return same[0]
 
 
-def _contemporaries(rows: dict[str, Rows], given: str) -> tuple[dict[str, Rows], list[str]]:
+def _contemporaries(rows: dict[str, NumberRows], given: str) -> tuple[dict[str, NumberRows], list[str]]:
     """The files that share time with the given one, and a note for each other."""
     first, last = rows[given].t_ns[0], rows[given].t_ns[-1]
     shared = {kind: r for kind, r in rows.items() if r.t_ns[0] <= last and r.t_ns[-1] >= first}
@@ -163,16 +163,16 @@ def _contemporaries(rows: dict[str, Rows], given: str) -> tuple[dict[str, Rows],
     ]
 
 
-def _joined(given: Part, rows: dict[str, Rows]) -> str:
+def _joined(given: RecordingFile, rows: dict[str, NumberRows]) -> str:
     others = ", ".join(r.path.name for r in rows.values() if r.path != given.path)
     return f"joined with {given.path.name}: {others}" if others else f"{given.path.name} stands alone"
 
 
-def _imu(rows: Rows) -> Imu:
+def _imu(rows: NumberRows) -> Imu:
     return Imu(rows.t_ns, rows.values[:, :3], rows.values[:, 3:])
 
 
-def _wheels(rows: Rows | None, asked_for: bool) -> tuple[Wheels | None, list[str]]:
+def _wheels(rows: NumberRows | None, asked_for: bool) -> tuple[Wheels | None, list[str]]:
     """The speed of the wheels; what moves sideways is the velocity of another source."""
     if rows is None:
         return None, []
@@ -190,7 +190,7 @@ def _wheels(rows: Rows | None, asked_for: bool) -> tuple[Wheels | None, list[str
     )
 
 
-def _truth(rows: dict[str, Rows]) -> tuple[Trajectory | None, list[str]]:
+def _truth(rows: dict[str, NumberRows]) -> tuple[Trajectory | None, list[str]]:
     """The centre's path; the front body's where there is no other."""
     paths = {kind: _trajectory(rows[kind]) for kind in ("center", "front") if kind in rows}
     if not paths:
@@ -204,14 +204,14 @@ def _truth(rows: dict[str, Rows]) -> tuple[Trajectory | None, list[str]]:
     return truth, notes
 
 
-def _truth_channels(rows: dict[str, Rows], truth: Trajectory | None) -> tuple[str, ...]:
+def _truth_channels(rows: dict[str, NumberRows], truth: Trajectory | None) -> tuple[str, ...]:
     if truth is None:
         return ()
     held = truth_contents(truth)
     return held if "center" in rows else tuple(name for name in held if name != "position")
 
 
-def _trajectory(rows: Rows) -> tuple[Trajectory, list[str]]:
+def _trajectory(rows: NumberRows) -> tuple[Trajectory, list[str]]:
     norm = np.linalg.norm(rows.values[:, 3:], axis=1)
     bad = np.flatnonzero(np.abs(norm - 1.0) > NORM_TOLERANCE)
     if bad.size:
@@ -241,7 +241,7 @@ def _gaps(t_ns: NDArray[np.int64]) -> list[str]:
     return [f"{lost} frames lost ({share:.1%}) in {gaps.size} gaps, the longest {gaps.max():.2f} s"]
 
 
-def _truth_of(rows: dict[str, Rows]) -> str:
+def _truth_of(rows: dict[str, NumberRows]) -> str:
     return "center" if "center" in rows else "front"
 
 

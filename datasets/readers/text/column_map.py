@@ -69,7 +69,7 @@ _BY_NAME = Prepared(_section, {"type": ["string", "integer"]})
 
 
 @dataclass(frozen=True)
-class ColumnOf:
+class MappedColumn:
     """Where a field stands: `unit` "" for that of the field's name, `sign` "-" where it is the other way."""
 
     column: str
@@ -78,7 +78,7 @@ class ColumnOf:
 
 
 @dataclass(frozen=True)
-class TimeOf:
+class TimeColumn:
     """The time column: decimal numbers in `unit` since `epoch`, or ISO 8601.
 
     `epoch` is unix, gps (leap seconds are taken off), none (no calendar), or an instant in ISO 8601.
@@ -93,8 +93,8 @@ class TimeOf:
 class ColumnMapFile(DescriptionFile):
     """Keys of a column map; see `ColumnMap`."""
 
-    time: Annotated[TimeOf, _BY_NAME]
-    channels: dict[str, dict[str, Annotated[ColumnOf, _BY_NAME]]]
+    time: Annotated[TimeColumn, _BY_NAME]
+    channels: dict[str, dict[str, Annotated[MappedColumn, _BY_NAME]]]
     separator: str = ""
     header: Annotated[str, Word(("line", "none"))] = "line"
     imu_axes: tuple[str, ...] = BODY_AXES
@@ -118,8 +118,8 @@ class ColumnMap:
         meta: what a log folder's meta.yaml may say.
     """
 
-    time: TimeOf
-    channels: dict[str, dict[str, ColumnOf]]
+    time: TimeColumn
+    channels: dict[str, dict[str, MappedColumn]]
     separator: str = ""
     header: str = "line"
     imu_axes: tuple[str, ...] = BODY_AXES
@@ -153,17 +153,17 @@ def read_column_map(path: Path) -> ColumnMap:
 def contract_map(names: list[str]) -> ColumnMap | None:
     """The map of a table whose columns are those of the log folder, None where they are not."""
     rest = [name for name in names if name != "t_s"]
-    channels: dict[str, dict[str, ColumnOf]] = {}
+    channels: dict[str, dict[str, MappedColumn]] = {}
     for name in rest:
         owners = [c for c in FIELDS if name in FIELDS[c] or (c == "terrain" and name.startswith("p_"))]
         if len(owners) > 1:  # v_mps: of the truth's twist beside x_m, else commanded
             owners = ["truth" if "x_m" in names else "command"]
         if not owners:
             return None
-        channels.setdefault(owners[0], {})[name] = ColumnOf(name)
+        channels.setdefault(owners[0], {})[name] = MappedColumn(name)
     if "t_s" not in names or not channels:
         return None
-    return ColumnMap(TimeOf("t_s", "s", "none"), channels)
+    return ColumnMap(TimeColumn("t_s", "s", "none"), channels)
 
 
 def starter_map(names: list[str]) -> str:
@@ -240,7 +240,7 @@ def _problems(found: ColumnMapFile) -> Iterator[tuple[str, str]]:
             )
 
 
-def _field_problems(channel: str, name: str, of: ColumnOf) -> Iterator[tuple[str, str]]:
+def _field_problems(channel: str, name: str, of: MappedColumn) -> Iterator[tuple[str, str]]:
     here = f"channels.{channel}.{name}"
     if name not in FIELDS[channel] and not (channel == "terrain" and name.startswith("p_")):
         close = difflib.get_close_matches(name, FIELDS[channel], n=1)

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.datasets.readers.delimited import MAX_BYTES
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
-from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, Epochs, collect
+from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, NmeaEpochs, collect
 from terrafusion.datasets.readers.text.row_times import row_times
 
 Array = NDArray[np.float64]
@@ -57,7 +57,7 @@ def read(request: Request) -> list[Recording]:
     return [recording]
 
 
-def _dated(path: Path, epochs: Epochs) -> tuple[NDArray[np.int64], list[str]]:
+def _dated(path: Path, epochs: NmeaEpochs) -> tuple[NDArray[np.int64], list[str]]:
     """Unix nanoseconds of the epochs: and notes on the source of their date."""
     day = epochs.day
     if np.isfinite(epochs.date).any():
@@ -89,7 +89,7 @@ def _date_notes(first_days: Array) -> list[str]:
     return [f"gnss: the date jumps {changes} times beyond midnights"] if changes else []
 
 
-def _receipt_days(epochs: Epochs) -> float:
+def _receipt_days(epochs: NmeaEpochs) -> float:
     """Date of the log's first day by the time stamps in front of the sentences, days since 1970."""
     stamped = np.flatnonzero(np.isfinite(epochs.receipt_s))
     if not stamped.size:
@@ -98,7 +98,7 @@ def _receipt_days(epochs: Epochs) -> float:
     return float(np.rint((epochs.receipt_s[i] - epochs.of_day_ns[i] * 1e-9) / 86400.0) - epochs.day[i])
 
 
-def _fixes(request: Request, epochs: Epochs, t_ns: NDArray[np.int64]) -> tuple[Fixes, list[str]]:
+def _fixes(request: Request, epochs: NmeaEpochs, t_ns: NDArray[np.int64]) -> tuple[Fixes, list[str]]:
     """The fixes, with HDOP for the sigmas that no GST gives."""
     notes = []
     fix, sigma = epochs.fix, epochs.sigma_enu_m.copy()

@@ -70,7 +70,7 @@ class _Epoch:
 
 
 @dataclass(frozen=True, eq=False)
-class Epochs:
+class NmeaEpochs:
     """The epochs with a position, as arrays (N,) or (N, 3); NaN where unknown.
 
     `day` counts midnights since the log's first epoch, `date` is days since 1970 where a sentence
@@ -110,7 +110,7 @@ class _Log:
         return self.epochs[-1]
 
 
-def collect(path: Path, text: str) -> tuple[Epochs, list[str]]:
+def collect(path: Path, text: str) -> tuple[NmeaEpochs, list[str]]:
     """All epochs of a log with a position, and what was wrong with its sentences.
 
     Raises:
@@ -151,14 +151,14 @@ def collect(path: Path, text: str) -> tuple[Epochs, list[str]]:
     return _arrays(path, log), notes
 
 
-def _arrays(path: Path, log: _Log) -> Epochs:
+def _arrays(path: Path, log: _Log) -> NmeaEpochs:
     epochs = [epoch for epoch in log.epochs if epoch.position is not None]
     if not epochs:
         raise DataError("no GGA or RMC sentence has a position", file=path, remedy="record GGA or RMC")
     if any(epoch.from_gga for epoch in epochs):  # RMC repeats the position with fewer digits
         epochs = [epoch for epoch in epochs if epoch.from_gga]
     velocity = np.array([(*epoch.velocity, np.nan) for epoch in epochs])
-    return Epochs(
+    return NmeaEpochs(
         np.array([epoch.of_day_ns for epoch in epochs], dtype=np.int64),
         np.array([epoch.day for epoch in epochs], dtype=float),
         np.array([epoch.date for epoch in epochs]),

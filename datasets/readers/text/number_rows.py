@@ -31,7 +31,7 @@ MAX_T_NS = 4 * 10**18
 
 
 @dataclass(frozen=True, eq=False)
-class Rows:
+class NumberRows:
     """What a file holds.
 
     Attributes:
@@ -51,9 +51,9 @@ class Rows:
     def __len__(self) -> int:
         return len(self.t_ns)
 
-    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Rows:
+    def select(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> NumberRows:
         """The rows of a mask or of indices."""
-        return Rows(self.path, self.t_ns[rows], self.values[rows], self.lines[rows], self.notes)
+        return NumberRows(self.path, self.t_ns[rows], self.values[rows], self.lines[rows], self.notes)
 
     def error(self, row: int, what: str, remedy: str) -> DataError:
         """An error at a row, with its line and the seconds since the first row."""
@@ -61,7 +61,9 @@ class Rows:
         return DataError(f"line {self.lines[row]}: {what}", file=self.path, time_s=time_s, remedy=remedy)
 
 
-def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, header: bool = False) -> Rows:
+def read_rows(
+    path: Path, columns: Sequence[str], *, separator: str = BLANKS, header: bool = False
+) -> NumberRows:
     """Read a file whose first column is time in seconds.
 
     Args:
@@ -90,13 +92,13 @@ def read_rows(path: Path, columns: Sequence[str], *, separator: str = BLANKS, he
     missing = np.argwhere(np.isnan(values))
     if missing.size:
         raise table.bad_cell(columns[int(missing[0, 1]) + 1], int(missing[0, 0]), "give a finite number")
-    return Rows(path, t_ns, values, np.arange(len(t_ns)) + layout.first_line, table.notes)
+    return NumberRows(path, t_ns, values, np.arange(len(t_ns)) + layout.first_line, table.notes)
 
 
 def put_in_time(
-    parts: Mapping[str, Rows], *, repair_clock: bool
-) -> tuple[dict[str, Rows], tuple[ClockJump, ...], tuple[str, ...]]:
-    """Rows of channels that may share a clock, brought into order of time.
+    parts: Mapping[str, NumberRows], *, repair_clock: bool
+) -> tuple[dict[str, NumberRows], tuple[ClockJump, ...], tuple[str, ...]]:
+    """NumberRows of channels that may share a clock, brought into order of time.
 
     Returns:
         The rows by channel, the steps of the clock that were taken out, and notes.
@@ -116,7 +118,7 @@ def put_in_time(
     times, jumps = repair_together({name: rows.t_ns for name, rows in parts.items()})
     notes, out = [], {}
     for name, rows in parts.items():
-        out[name] = Rows(rows.path, times[name], rows.values, rows.lines, rows.notes)
+        out[name] = NumberRows(rows.path, times[name], rows.values, rows.lines, rows.notes)
         order = in_order(times[name])
         if order is not None:
             moved = int((order != np.arange(len(order))).sum())

@@ -48,7 +48,7 @@ FIX_OF_Q = {0: Fix.NONE, 1: Fix.FIXED, 2: Fix.FLOAT, 3: Fix.DGPS, 4: Fix.DGPS, 5
 
 
 @dataclass(frozen=True)
-class Header:
+class PosHeader:
     """The `%` lines: names of the columns, their line, and the base station."""
 
     line: int
@@ -97,9 +97,9 @@ def _is_row(head: bytes) -> bool:
     return len(words) >= 7 and (words[0].count(b"/") == 2 or words[0].isdigit())
 
 
-def _header(path: Path, data: bytes) -> Header:
+def _header(path: Path, data: bytes) -> PosHeader:
     base: tuple[float, ...] | None = None
-    found: Header | None = None
+    found: PosHeader | None = None
     for number, line in head_lines(data):
         if not line.startswith("%"):
             if line.strip():
@@ -113,7 +113,7 @@ def _header(path: Path, data: bytes) -> Header:
         mark = line[line.index(kind) + len(kind) :][:1]
         separator = mark if mark and not mark.isspace() else ("\t" if mark == "\t" else BLANKS)
         time_system, *names = split(line[1:].strip(), separator)
-        found = Header(number, tuple(names), kind, separator, time_system, base)
+        found = PosHeader(number, tuple(names), kind, separator, time_system, base)
     if found is None:
         raise DataError(
             "no `%` line names the columns, so neither time system nor position is known",
@@ -136,7 +136,7 @@ def _numbers(text: str) -> tuple[float, ...] | None:
         return None
 
 
-def _columns(path: Path, data: bytes, header: Header) -> TextTable:
+def _columns(path: Path, data: bytes, header: PosHeader) -> TextTable:
     """All columns; dates take one cell or two, angles in degrees, minutes and seconds three each."""
     names: list[str] = []
     for name in header.names:
@@ -152,7 +152,7 @@ def _columns(path: Path, data: bytes, header: Header) -> TextTable:
     return read_columns(path, data, layout, names, time)
 
 
-def _times(path: Path, columns: TextTable, header: Header) -> tuple[TimesNs, list[str]]:
+def _times(path: Path, columns: TextTable, header: PosHeader) -> tuple[TimesNs, list[str]]:
     """Unix nanoseconds of the rows in the order of the file, and notes on UTC."""
     gps_epoch_ns = np.datetime64("1980-01-06", "ns").astype(np.int64)
     if "week" in columns.texts:
@@ -190,7 +190,7 @@ def _calendar_ns(columns: TextTable) -> TimesNs:
 class _Solution:
     """The rows of a file, in the order of their times."""
 
-    def __init__(self, request: Request, columns: TextTable, header: Header, times: RowTimes) -> None:
+    def __init__(self, request: Request, columns: TextTable, header: PosHeader, times: RowTimes) -> None:
         self.request, self.columns, self.header, self.times = request, columns, header, times
         self.notes: list[str] = []
         self.fix = self._fix()

@@ -27,7 +27,7 @@ from terrafusion.datasets.readers.text.column_map import (
     GEODETIC,
     TEXT_FIELDS,
     ColumnMap,
-    ColumnOf,
+    MappedColumn,
     contract_map,
     read_column_map,
     starter_map,
@@ -52,7 +52,7 @@ MAX_NS = 8 * 10**18
 """Leaves room for any epoch in int64."""
 
 
-class AnyColumns(Protocol):
+class TableColumns(Protocol):
     """A file's columns, text or Parquet."""
 
     path: Path
@@ -87,7 +87,7 @@ def read(request: Request) -> list[Recording]:
     path = request.path
     given = request.columns or path.with_name(path.name + MAP_SUFFIX)
     column_map = read_column_map(given) if request.columns or given.is_file() else None
-    columns: AnyColumns
+    columns: TableColumns
     with path.open("rb") as file:
         parquet = file.read(len(PARQUET_MAGIC)) == PARQUET_MAGIC
     columns = ParquetColumns(path) if parquet else TextColumns(path, column_map)
@@ -115,7 +115,7 @@ def _mapless(path: Path, names: list[str]) -> DataError:
     )
 
 
-def _recording(request: Request, columns: AnyColumns, column_map: ColumnMap, notes: list[str]) -> Recording:
+def _recording(request: Request, columns: TableColumns, column_map: ColumnMap, notes: list[str]) -> Recording:
     t_ns, time_notes = _times(columns, column_map)
     times = row_times(request, "table", t_ns)
     if not len(t_ns):
@@ -134,7 +134,7 @@ def _recording(request: Request, columns: AnyColumns, column_map: ColumnMap, not
     return apply(recording, column_map.conventions())
 
 
-def _times(columns: AnyColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
+def _times(columns: TableColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64], list[str]]:
     """Nanoseconds of the rows, since 1970 where the map gives the epoch."""
     time = column_map.time
     t_ns = columns.times_ns(time.column, time.unit) if time.unit != "iso8601" else None
@@ -157,7 +157,7 @@ def _times(columns: AnyColumns, column_map: ColumnMap) -> tuple[NDArray[np.int64
     return t_ns, []
 
 
-def _iso_ns(columns: AnyColumns, name: str) -> tuple[NDArray[np.int64], list[str]]:
+def _iso_ns(columns: TableColumns, name: str) -> tuple[NDArray[np.int64], list[str]]:
     texts = columns.texts(name).tolist()
     try:
         t_ns = dates_to_ns(texts)
@@ -175,7 +175,7 @@ class _Source:
     """The mapped columns of a file as tables of channels, in SI units."""
 
     def __init__(
-        self, path: Path, columns: AnyColumns, column_map: ColumnMap, times: RowTimes, start_ns: int
+        self, path: Path, columns: TableColumns, column_map: ColumnMap, times: RowTimes, start_ns: int
     ) -> None:
         self.path, self.columns, self.found, self.times = path, columns, column_map, times
         self.t_ns = times.t_ns - start_ns
@@ -199,12 +199,12 @@ class _Source:
             )
         return ChannelTable(self.t_ns, numbers, words)
 
-    def _numbers(self, name: str, of: ColumnOf) -> Array:
+    def _numbers(self, name: str, of: MappedColumn) -> Array:
         values = self.columns.numbers(of.column)[self.times.order]
         factor = units_of(name).get(of.unit, 1.0) * (-1.0 if of.sign == "-" else 1.0)
         return values if factor == 1.0 else values * factor
 
-    def _texts(self, name: str, of: ColumnOf) -> NDArray[Any]:
+    def _texts(self, name: str, of: MappedColumn) -> NDArray[Any]:
         texts = self.columns.texts(of.column)[self.times.order]
         if name != "fix" or not of.unit:
             return texts

@@ -28,7 +28,7 @@ SLOWEST_HZ = 1.0
 
 
 @dataclass(frozen=True, eq=False)
-class Clock:
+class DeviceClock:
     """Times (M,) of the rows (N,) bool that have one, and notes."""
 
     t_ns: TimesNs
@@ -36,7 +36,7 @@ class Clock:
     notes: tuple[str, ...]
 
 
-def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Clock:
+def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> DeviceClock:
     """The best clock the export has.
 
     UTC on every row is taken as it is. Else the ticks count from one to the next row, and the
@@ -49,7 +49,7 @@ def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Clock:
     ticks = columns.numbers.get("SampleTimeFine")
     counter = next((columns.numbers[n] for n in ("PacketCounter", "Counter") if n in columns.numbers), None)
     if valid.all() or (valid.any() and not _known(ticks) and not _known(counter)):
-        return Clock(utc[valid], valid, _left_out(valid))
+        return DeviceClock(utc[valid], valid, _left_out(valid))
     if _known(ticks):
         assert ticks is not None
         rows = np.isfinite(ticks)
@@ -67,7 +67,7 @@ def clock_of(path: Path, columns: TextTable, settings: dict[str, str]) -> Clock:
             "no row has a time", file=path, remedy="export SampleTimeFine, UTC time or PacketCounter"
         )
     t_ns, date_note = _dated(t_ns, utc[rows], valid[rows])
-    return Clock(t_ns, rows, (*notes, date_note, *_left_out(rows)))
+    return DeviceClock(t_ns, rows, (*notes, date_note, *_left_out(rows)))
 
 
 def _known(values: Array | None) -> bool:
