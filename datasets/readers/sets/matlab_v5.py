@@ -1,8 +1,9 @@
 """MATLAB v5 files: arrays of structures whose fields are numbers, within bounds.
 
 The format is MathWorks' "MAT-File Level 5"; only what such structures need is read. A few bytes can
-claim any number of values or inflate to gigabytes: here every count is held against the bytes that are
-there, and inflating ends at `MAX_BYTES`, which a general reader does not promise.
+claim any number of values or inflate to gigabytes: every count is compared with the bytes that are there,
+and inflating ends at `MAX_BYTES`. scipy.io is not safe here: it recurses into nested cells without a limit,
+so that a file of 1 MB crashes the interpreter.
 """
 
 from __future__ import annotations

@@ -211,6 +211,15 @@ def bomb() -> bytes:
     return struct.pack("<II", 15, len(data)) + data
 
 
+def nested_cells(depth: int) -> bytes:
+    """A cell in a cell in a cell ...: readers that recurse run out of stack."""
+    data = element(14, element(6, struct.pack("<II", 6, 0)) + element(5, bytes(8)) + element(1, b"") * 2)
+    for _ in range(depth):
+        head = element(6, struct.pack("<II", 1, 0)) + element(5, struct.pack("<ii", 1, 1)) + element(1, b"a")
+        data = struct.pack("<II", 14, len(head) + len(data)) + head + data
+    return data
+
+
 HOSTILE = {
     "huge dimensions": structure((2**31 - 1, 2**31 - 1)),
     "negative dimensions": structure((-5, 1)),
@@ -219,6 +228,8 @@ HOSTILE = {
     "zlib bomb": bomb(),
     "no zlib": struct.pack("<II", 15, 64) + bytes(64),
     "many variables": element(14, element(6, struct.pack("<II", 6, 0))) * 5000,
+    "nested cells": nested_cells(5_000),
+    "nested cells among the values": structure((1, 1), values=nested_cells(5_000)),
     "deep": structure((1, 1), values=structure((1, 1), values=structure((1, 1)))),
 }
 
@@ -227,13 +238,13 @@ HOSTILE = {
 def test_hostile_files_are_refused(tmp_path: Path, name: str) -> None:
     path = tmp_path / "any.mat"
     path.write_bytes(HEADER + HOSTILE[name])
-    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.monotonic()
+    before, began = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time()
     for read in (read_wheel_trials, open_recordings):
         with pytest.raises(DataError) as refusal:
             read(path)
         assert "\n" not in str(refusal.value)
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 300_000
-    assert time.monotonic() - began < 5.0
+    assert time.process_time() - began < 5.0
 
 
 def test_truncated_and_flipped_files(tmp_path: Path) -> None:
