@@ -21,10 +21,9 @@ from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import study as plots
 from terrafusion.fusion.reports.plots import study_field as field_plots
-from terrafusion.twin.study.agreement import BASES, PREDICTED, Row, counts
-from terrafusion.twin.study.batch import CellResult
+from terrafusion.twin.study.batch import BatchResult
 from terrafusion.twin.study.cases import SCENARIO, VEHICLE
-from terrafusion.twin.study.criteria import VERDICTS
+from terrafusion.twin.study.claims import BASES, PREDICTED, VERDICTS, ClaimResult, counts
 from terrafusion.twin.study.published import CASES, FRICTION, TITLE
 from terrafusion.twin.study.robot import platform_figures
 from terrafusion.twin.study.study import Study, StudyPlan
@@ -64,7 +63,7 @@ def write_study(out: Path, study: Study, provenance: Mapping[str, object] | None
     Raises:
         TerrafusionError: the folder cannot be written.
     """
-    columns = [field.name for field in dataclasses.fields(Row)]
+    columns = [field.name for field in dataclasses.fields(ClaimResult)]
     texts = {
         "agreement.csv": _csv(columns, map(dataclasses.asdict, study.rows)),
         "agreement.md": "\n".join(document_section(study)) + "\n",
@@ -103,7 +102,7 @@ def metrics_of(study: Study) -> dict[str, Any]:
     }
 
 
-def batch_row(result: CellResult) -> dict[str, Any]:
+def batch_row(result: BatchResult) -> dict[str, Any]:
     """One run of the batch, by `BATCH_COLUMNS`; `shear_modulus_m` is empty for the soil's own."""
     return dataclasses.asdict(result.cell) | {
         "mobile": result.mobile,
@@ -173,13 +172,13 @@ def _counts_text(found: Mapping[str, int]) -> str:
     return ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS)
 
 
-def _statement(row: Row) -> tuple[tuple[str, str], str, str, str | tuple[str, str]]:
+def _statement(row: ClaimResult) -> tuple[tuple[str, str], str, str, str | tuple[str, str]]:
     """Cells: the statement and what is measured, the study's and the twin's value, the verdict and its basis."""
     verdict = row.verdict if row.basis == PREDICTED else (row.verdict, row.basis)
     return (f"{row.source}: {row.statement}", row.quantity), row.study, row.twin, verdict
 
 
-def _friction_rows(batch: Sequence[CellResult]) -> list[list[str]]:
+def _friction_rows(batch: Sequence[BatchResult]) -> list[list[str]]:
     """Slip at the ends of each terrain's friction range, without payload, flat and on 5 deg."""
 
     def ends(terrain: str, slope_deg: float) -> str:

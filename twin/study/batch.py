@@ -21,7 +21,7 @@ SLOPES_DEG = (0.0, 5.0, 10.0, 15.0)
 PAYLOADS_KG = (0.0, 30.0, 60.0)
 QUICK_SLOPES_DEG = (0.0, 5.0)
 MOBILE_SHARE = 0.5
-"""A run that makes less than this of the commanded way is not counted as mobile, nor its energy a metre."""
+"""A run that makes less than this of the commanded distance is not counted as mobile, nor its energy a metre."""
 SHEAR_MODULI_M = (0.002, 0.005, 0.010, 0.015, 0.020, 0.025)
 """Stiff to soft sand (Wong: 10 to 25 mm for sand): how slip is varied at equal load and slope."""
 QUICK_MODULI_M = (0.002, 0.015, 0.025)
@@ -29,7 +29,7 @@ SLIP_TERRAIN, SLIP_SLOPE_DEG = "loose_sand", 5.0
 
 
 @dataclass(frozen=True)
-class Cell:
+class BatchCell:
     """Conditions of one run; `shear_modulus_m` None leaves the soil's own."""
 
     terrain: str
@@ -48,18 +48,18 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class CellResult:
+class BatchResult:
     """What came of a cell.
 
     Attributes:
-        advance: net way uphill over the commanded way; negative for a robot that slides back.
+        advance: net distance uphill over the commanded one; negative for a robot that slides back.
         slip: mean of the study's proxy |1 - v_odom / v_gt|, percent; NaN for a run that never moves.
         slip_ratio: mean of the usual |w R - u| / max(|w R|, |u|), percent.
-        energy_per_m_j: drawn from the battery over the way driven, NaN for a run that is not mobile.
+        energy_per_m_j: drawn from the battery over the distance driven, NaN for a run that is not mobile.
         immobilised_at_s: when it came to rest for good, None when it did not.
     """
 
-    cell: Cell
+    cell: BatchCell
     advance: float
     slip: float
     slip_ratio: float
@@ -68,11 +68,11 @@ class CellResult:
 
     @property
     def mobile(self) -> bool:
-        """Whether the robot made at least half of the commanded way."""
+        """Whether the robot made at least half of the commanded distance."""
         return self.advance >= MOBILE_SHARE
 
 
-def grid(quick: bool = False) -> tuple[Cell, ...]:
+def grid(quick: bool = False) -> tuple[BatchCell, ...]:
     """The batch: both ends of each range of Tab. 3 and its middle, all slopes and payloads.
 
     The quick one leaves out the middle and the steep slopes, and has payload on
@@ -81,22 +81,22 @@ def grid(quick: bool = False) -> tuple[Cell, ...]:
     cells = []
     for terrain, (low, high) in FRICTION.items():
         if quick:
-            cells += [Cell(terrain, mu, slope) for mu in (low, high) for slope in QUICK_SLOPES_DEG]
-            cells.append(Cell(terrain, high, 0.0, max(PAYLOADS_KG)))
+            cells += [BatchCell(terrain, mu, slope) for mu in (low, high) for slope in QUICK_SLOPES_DEG]
+            cells.append(BatchCell(terrain, high, 0.0, max(PAYLOADS_KG)))
         else:
             conditions = itertools.product((low, 0.5 * (low + high), high), SLOPES_DEG, PAYLOADS_KG)
-            cells += [Cell(terrain, *values) for values in conditions]
+            cells += [BatchCell(terrain, *values) for values in conditions]
     return tuple(cells)
 
 
-def slip_cells(quick: bool = False) -> tuple[Cell, ...]:
+def slip_cells(quick: bool = False) -> tuple[BatchCell, ...]:
     """One load on one slope, from little slip to much: sand from stiff to soft in shear."""
     friction = load_soil(SLIP_TERRAIN).shear.friction_cap
     moduli = QUICK_MODULI_M if quick else SHEAR_MODULI_M
-    return tuple(Cell(SLIP_TERRAIN, friction, SLIP_SLOPE_DEG, 0.0, modulus) for modulus in moduli)
+    return tuple(BatchCell(SLIP_TERRAIN, friction, SLIP_SLOPE_DEG, 0.0, modulus) for modulus in moduli)
 
 
-def run_cell(cell: Cell) -> CellResult:
+def run_cell(cell: BatchCell) -> BatchResult:
     """Drive the study's profile under the cell's conditions."""
     scenario = load_scenario(SCENARIO)
     run = simulate_run(
@@ -111,7 +111,7 @@ def run_cell(cell: Cell) -> CellResult:
     moved = truth.position_m[-1] - truth.position_m[0]
     level_m = moved[0] * math.cos(ahead) + moved[1] * math.sin(ahead)
     advance = float(level_m) / math.cos(math.radians(cell.slope_deg)) / wanted_m
-    return CellResult(
+    return BatchResult(
         cell=cell,
         advance=advance,
         slip=100.0 * run.summary.mean_abs_slip,
@@ -121,7 +121,7 @@ def run_cell(cell: Cell) -> CellResult:
     )
 
 
-def least_growth(results: Sequence[CellResult], name: str) -> float:
+def least_growth(results: Sequence[BatchResult], name: str) -> float:
     """Least factor of energy a metre from one value of a field to the next, all else equal; NaN if none."""
     return min(
         (b.energy_per_m_j / a.energy_per_m_j for a, b in neighbours(results, name) if a.mobile and b.mobile),
@@ -130,16 +130,16 @@ def least_growth(results: Sequence[CellResult], name: str) -> float:
 
 
 def share_of_pairs(
-    results: Sequence[CellResult], name: str, holds: Callable[[CellResult, CellResult], bool]
+    results: Sequence[BatchResult], name: str, holds: Callable[[BatchResult, BatchResult], bool]
 ) -> float:
     """Percent of the neighbouring pairs for which `holds(lower, higher)`; NaN without any pair."""
-    told = [holds(a, b) for a, b in neighbours(results, name)]
-    return 100.0 * sum(told) / len(told) if told else math.nan
+    outcomes = [holds(a, b) for a, b in neighbours(results, name)]
+    return 100.0 * sum(outcomes) / len(outcomes) if outcomes else math.nan
 
 
-def neighbours(results: Sequence[CellResult], name: str) -> list[tuple[CellResult, CellResult]]:
+def neighbours(results: Sequence[BatchResult], name: str) -> list[tuple[BatchResult, BatchResult]]:
     """Pairs of results that differ in one field of their cells only, by one step of the grid, lower first."""
-    groups: dict[tuple[object, ...], list[CellResult]] = {}
+    groups: dict[tuple[object, ...], list[BatchResult]] = {}
     for result in results:
         others = tuple(value for key, value in vars(result.cell).items() if key != name)
         groups.setdefault(others, []).append(result)
@@ -150,7 +150,7 @@ def neighbours(results: Sequence[CellResult], name: str) -> list[tuple[CellResul
     return pairs
 
 
-def steepening(results: Sequence[CellResult], slip: str) -> float:
+def steepening(results: Sequence[BatchResult], slip: str) -> float:
     """How much steeper energy a metre rises with slip in the upper half of the slips than in the lower.
 
     `slip` names the measure, "slip" or "slip_ratio". One means proportion; above one is out of proportion.
@@ -166,7 +166,7 @@ def steepening(results: Sequence[CellResult], slip: str) -> float:
     return upper / lower
 
 
-def slip_cost(results: Sequence[CellResult]) -> float:
+def slip_cost(results: Sequence[BatchResult]) -> float:
     """Energy a metre of the mobile run that slips most over that of the one that slips least; NaN if none."""
     mobile = sorted((r for r in results if r.mobile), key=lambda r: r.slip)
     return mobile[-1].energy_per_m_j / mobile[0].energy_per_m_j if mobile else math.nan

@@ -14,7 +14,7 @@ from terrafusion.twin.model.ground import Variation
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-from terrafusion.twin.study.published import Case
+from terrafusion.twin.study.published import StudyCase
 
 Array = NDArray[np.float64]
 
@@ -41,7 +41,7 @@ class CaseRun:
         gnss_enu_m: (K, 2) m, positions as the receiver reports them.
     """
 
-    case: Case
+    case: StudyCase
     seed: int
     profiles: Profiles
     errors: SpeedErrors
@@ -52,7 +52,7 @@ class CaseRun:
     gnss_enu_m: Array
 
 
-def run_case(case: Case, seed: int, variation: Variation | None = None) -> CaseRun:
+def run_case(case: StudyCase, seed: int, variation: Variation | None = None) -> CaseRun:
     """Drive the study's profile with the nominal robot on the case's ground, even or varying."""
     vehicle = load_vehicle(VEHICLE)
     scenario = dataclasses.replace(load_scenario(SCENARIO), variation=variation)

@@ -1,15 +1,166 @@
-"""The claims of the study, from the files `claims_*.yaml`."""
+"""Claims of the study held against the twin: what it says, what decides, and the table of agreement."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
 from terrafusion.datasets.core.config import read_yaml
-from terrafusion.twin.study.agreement import Claim
-from terrafusion.twin.study.criteria import AtLeast, AtMost, Criterion, Near, Published
+from terrafusion.twin.study.spread import Spread
 
+AGREE, PARTLY, DISAGREE = "agree", "partly", "disagree"
+VERDICTS = (AGREE, PARTLY, DISAGREE)
+PREDICTED, CALIBRATED, GIVEN = "predicted", "calibrated", "given"
+BASES = (PREDICTED, CALIBRATED, GIVEN)
+NOT_EXAMINED = "not looked into: it agreed when this was written"
+POINTS, SHARE, FACTOR = 1.0, 0.1, 2.0
+"""A published mean is met within one point or a tenth of it, and partly within a factor of two."""
 FILES = ("claims_tables.yaml", "claims_figures.yaml", "claims_rest.yaml")
+
+
+class Criterion:
+    """A rule for one measured quantity."""
+
+    def _holds(self, found: Spread) -> tuple[bool, bool]:
+        """Whether the quantity agrees, and whether it does in part."""
+        raise NotImplementedError
+
+    def verdict(self, found: Spread) -> str:
+        """One of `VERDICTS`; what could not be measured disagrees."""
+        agrees, partly = self._holds(found)
+        return AGREE if agrees else PARTLY if partly else DISAGREE
+
+    def words(self, unit: str) -> str:
+        """The rule in words."""
+        raise NotImplementedError
+
+    def wanted(self, unit: str) -> str:
+        """What the study says, short."""
+        return ""
+
+
+@dataclass(frozen=True)
+class Near(Criterion):
+    """The mean lies within `agree` of `target`; within `partly` it agrees in part."""
+
+    target: float
+    agree: float
+    partly: float
+
+    def _holds(self, found: Spread) -> tuple[bool, bool]:
+        return abs(found.mean - self.target) <= self.agree, abs(found.mean - self.target) <= self.partly
+
+    def words(self, unit: str) -> str:
+        return f"within {_limits(self.agree, self.partly, unit)}"
+
+    def wanted(self, unit: str) -> str:
+        return _number(self.target, unit)
+
+
+@dataclass(frozen=True)
+class AtLeast(Criterion):
+    """The mean is at least `agree`; at least `partly` agrees in part."""
+
+    agree: float
+    partly: float
+
+    def _holds(self, found: Spread) -> tuple[bool, bool]:
+        return found.mean >= self.agree, found.mean >= self.partly
+
+    def words(self, unit: str) -> str:
+        return f"at least {_limits(self.agree, self.partly, unit)}"
+
+
+@dataclass(frozen=True)
+class AtMost(Criterion):
+    """The mean is at most `agree`; at most `partly` agrees in part."""
+
+    agree: float
+    partly: float
+
+    def _holds(self, found: Spread) -> tuple[bool, bool]:
+        return found.mean <= self.agree, found.mean <= self.partly
+
+    def words(self, unit: str) -> str:
+        return f"at most {_limits(self.agree, self.partly, unit)}"
+
+
+@dataclass(frozen=True)
+class Published(Criterion):
+    """A mean of the study's Tab. 4, which is one run of each: near the twin's mean, or among its single runs.
+
+    A target inside the range of single runs counts only where chance moves them by more than a point.
+    """
+
+    target: float
+
+    def _holds(self, found: Spread) -> tuple[bool, bool]:
+        near = abs(found.mean - self.target) <= max(POINTS, SHARE * self.target)
+        scattered = found.runs > 1 and found.high - found.low > POINTS
+        among = scattered and found.low <= self.target <= found.high
+        return near or among, 1.0 / FACTOR <= found.mean / self.target <= FACTOR
+
+    def words(self, unit: str) -> str:
+        return f"±{POINTS:g} point or ±{100 * SHARE:g} %, or among single runs (partly: factor {FACTOR:g})"
+
+    def wanted(self, unit: str) -> str:
+        return _number(self.target, unit)
+
+
+def _limits(agree: float, partly: float, unit: str) -> str:
+    return _number(agree, unit) + (f" (partly: {_number(partly, unit)})" if partly != agree else "")
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:g} {unit}".rstrip()
+
+
+@dataclass(frozen=True)
+class Claim:
+    """One statement or number of the study.
+
+    Attributes:
+        source: table, figure or section of the study.
+        statement: what it says, in our words.
+        quantity: what is measured of the twin.
+        measure: its key among the measured quantities.
+        criterion: what decides.
+        unit, digits: of its value.
+        basis: `PREDICTED`, or why agreement proves little: it follows from what the twin was `CALIBRATED`
+            to, or was `GIVEN` to it.
+        why: what in the twin makes it agree.
+        why_not: what prevents agreement; empty where it was never examined.
+    """
+
+    source: str
+    statement: str
+    quantity: str
+    measure: str
+    criterion: Criterion
+    unit: str = ""
+    digits: int = 1
+    basis: str = PREDICTED
+    why: str = ""
+    why_not: str = ""
+
+
+@dataclass(frozen=True)
+class ClaimResult:
+    """A claim with its verdict: one line of `agreement.csv`."""
+
+    source: str
+    statement: str
+    quantity: str
+    study: str
+    twin: str
+    verdict: str
+    criterion: str
+    basis: str
+    why: str
+
+
 _RULES: dict[str, type] = {"near": Near, "at_least": AtLeast, "at_most": AtMost, "published": Published}
 
 
@@ -34,3 +185,28 @@ def _claim(row: dict[str, Any]) -> Claim:
     numbers = row.pop(rules[0])
     criterion: Criterion = _RULES[rules[0]](*(numbers if isinstance(numbers, list) else [numbers]))
     return Claim(criterion=criterion, **row)
+
+
+def judge(claims: Sequence[Claim], measured: Mapping[str, Spread]) -> tuple[ClaimResult, ...]:
+    """Every claim with its verdict.
+
+    Raises:
+        KeyError: a claim names a quantity that was not measured.
+    """
+    return tuple(_result(claim, measured[claim.measure]) for claim in claims)
+
+
+def counts(results: Sequence[ClaimResult], basis: str | None = None) -> dict[str, int]:
+    """How many results have each verdict; of one basis where it is given."""
+    verdicts = [result.verdict for result in results if basis in (None, result.basis)]
+    return {verdict: verdicts.count(verdict) for verdict in VERDICTS}
+
+
+def _result(claim: Claim, found: Spread) -> ClaimResult:
+    verdict = claim.criterion.verdict(found)
+    twin = f"{found.text(claim.digits)} {claim.unit}".rstrip() if found.runs else found.text()
+    return ClaimResult(
+        claim.source, claim.statement, claim.quantity, claim.criterion.wanted(claim.unit), twin, verdict,
+        claim.criterion.words(claim.unit), claim.basis,
+        claim.why if verdict == AGREE else claim.why_not or NOT_EXAMINED,
+    )  # fmt: skip

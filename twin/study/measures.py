@@ -18,7 +18,7 @@ RAMP_S = 4.0
 SINKING_S = 10.0
 """Before it stops for good on mud, the robot follows the command until this long before."""
 ONSET, HALF = 0.10, 0.50
-"""Slip proxy at which sinkage is called set in, and at which half of the wheels' way is lost."""
+"""Slip proxy at which sinkage is called set in, and at which half of the wheels' distance is lost."""
 SLOW_MPS, FAST_MPS = 0.75, 1.25
 """The lower and the upper quarter of the profile's speeds."""
 STALLED_MPS = 0.05
@@ -196,8 +196,8 @@ def imu_sees_stop(run: CaseRun) -> float:
     return float((p.imu[after] - p.imu[before]) / (p.truth[after] - p.truth[before]))
 
 
-def way_errors_percent(run: CaseRun) -> dict[str, float]:
-    """Error at the end of the run, percent of the true way: of GNSS positions, and of the way by odometry."""
+def path_errors_percent(run: CaseRun) -> dict[str, float]:
+    """Error at the end of the run, percent of the true distance: of GNSS positions, and of odometry."""
     p = run.profiles
     dt_s = float(p.t_s[1] - p.t_s[0])
     true_m, odometry_m = float(np.abs(p.truth).sum()) * dt_s, float(np.abs(p.odometry).sum()) * dt_s

@@ -12,7 +12,7 @@ TITLE = "Evaluation of Wheeled Robot Mobility Limits on Unstructured Terrain"
 
 
 @dataclass(frozen=True)
-class Case:
+class StudyCase:
     """One of the study's three runs with its row of Tab. 4, mean percent."""
 
     terrain: str
@@ -30,9 +30,9 @@ class Case:
 
 
 CASES = (
-    Case("mud", 0.0, slip=2.0, odometry=2.6, imu=4.9, gnss=45.7),
-    Case("loose_sand", 5.0, slip=27.0, odometry=27.0, imu=9.3, gnss=17.9),
-    Case("medium_sand", 5.0, slip=1.0, odometry=1.4, imu=7.3, gnss=57.1),
+    StudyCase("mud", 0.0, slip=2.0, odometry=2.6, imu=4.9, gnss=45.7),
+    StudyCase("loose_sand", 5.0, slip=27.0, odometry=27.0, imu=9.3, gnss=17.9),
+    StudyCase("medium_sand", 5.0, slip=1.0, odometry=1.4, imu=7.3, gnss=57.1),
 )
 """The scenarios of Tab. 4 and of Figs. 4 to 9."""
 

@@ -13,22 +13,21 @@ from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.executors import open_workers
-from terrafusion.twin.study.agreement import Row, judge
-from terrafusion.twin.study.batch import CellResult, grid, run_cell, slip_cells
+from terrafusion.twin.study.batch import BatchResult, grid, run_cell, slip_cells
 from terrafusion.twin.study.cases import UNEVEN, CaseRun, run_case
-from terrafusion.twin.study.claims import load_claims
-from terrafusion.twin.study.evidence import (
-    Evidence,
-    batch_evidence,
-    case_evidence,
-    field_evidence,
-    noise_evidence,
-    platform_evidence,
-    uneven_evidence,
-)
+from terrafusion.twin.study.claims import ClaimResult, judge, load_claims
 from terrafusion.twin.study.field_drive import FieldDrive, drive_field
 from terrafusion.twin.study.gnss_noise import RATES_HZ, NoiseFit, NoisyRun, fit_noise
-from terrafusion.twin.study.published import CASES, Case
+from terrafusion.twin.study.published import CASES, StudyCase
+from terrafusion.twin.study.quantities import (
+    Quantities,
+    batch_quantities,
+    case_quantities,
+    field_quantities,
+    noise_quantities,
+    platform_quantities,
+    uneven_quantities,
+)
 
 SEEDS, QUICK_SEEDS, MOST_SEEDS = 10, 2, 1000
 STUDY_LIKE_HZ = 5.0
@@ -82,11 +81,11 @@ class Study:
     uneven: Mapping[str, tuple[CaseRun, ...]]
     noisy: Mapping[str, tuple[NoisyRun, ...]]
     noise: tuple[NoiseFit, ...]
-    batch: tuple[CellResult, ...]
-    over_slip: tuple[CellResult, ...]
+    batch: tuple[BatchResult, ...]
+    over_slip: tuple[BatchResult, ...]
     field: tuple[FieldDrive, ...]
-    measured: Evidence
-    rows: tuple[Row, ...]
+    measured: Quantities
+    rows: tuple[ClaimResult, ...]
 
     def study_like(self) -> NoiseFit:
         """The fit that the figures and the table show."""
@@ -100,7 +99,7 @@ def run_study(plan: StudyPlan, progress: Progress | None = None) -> Study:
         ConfigError: seeds or jobs out of range.
         TerrafusionError: a worker process died.
     """
-    seeds, level = range(plan.seed_count()), Case(FLAT_TERRAIN, 0.0, *[float("nan")] * 4)
+    seeds, level = range(plan.seed_count()), StudyCase(FLAT_TERRAIN, 0.0, *[float("nan")] * 4)
     cells, steps = grid(plan.quick), slip_cells(plan.quick)
     work: list[tuple[Callable[..., Any], tuple[Any, ...]]] = [
         *((run_case, (case, seed)) for case in (*CASES, level) for seed in seeds),
@@ -118,12 +117,12 @@ def run_study(plan: StudyPlan, progress: Progress | None = None) -> Study:
     noise = tuple(_noise_at(rate_hz, runs) for rate_hz in RATES_HZ)
     noisy = _noisy(STUDY_LIKE_HZ, runs)
     measured = (
-        platform_evidence()
-        | case_evidence(runs, flat)
-        | uneven_evidence(uneven)
-        | noise_evidence(noise, noisy, STUDY_LIKE_HZ)
-        | batch_evidence(batch, over_slip)
-        | field_evidence(field)
+        platform_quantities()
+        | case_quantities(runs, flat)
+        | uneven_quantities(uneven)
+        | noise_quantities(noise, noisy, STUDY_LIKE_HZ)
+        | batch_quantities(batch, over_slip)
+        | field_quantities(field)
     )
     rows = judge(load_claims(), measured)
     return Study(plan, runs, uneven, noisy, noise, batch, over_slip, field, measured, rows)

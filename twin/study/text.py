@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Sequence
 
 from terrafusion.twin.analysis.speeds import OTHERS, USUAL
-from terrafusion.twin.study.agreement import PREDICTED, Row, counts
 from terrafusion.twin.study.cases import CaseRun
+from terrafusion.twin.study.claims import PREDICTED, ClaimResult, counts
 from terrafusion.twin.study.gnss_noise import DATA_SHEET_M, rate_for
-from terrafusion.twin.study.published import CASES, Case
+from terrafusion.twin.study.published import CASES, StudyCase
 from terrafusion.twin.study.spread import spread
 from terrafusion.twin.study.study import Study
 
@@ -24,7 +24,7 @@ ASSUMED_HEAD = (
     ),
 )
 COLUMNS = ("source", "statement", "quantity", "study", "twin", "verdict", "criterion", "basis", "why")
-"""Columns of the table of agreement, fields of `Row`."""
+"""Columns of the table of agreement, fields of `ClaimResult`."""
 
 
 def study_lines(study: Study) -> list[str]:
@@ -37,7 +37,7 @@ def study_lines(study: Study) -> list[str]:
     return [*lines, "", noise_sentence(study), *count_lines(study.rows)]
 
 
-def table_cells(study: Study, case: Case) -> list[str]:
+def table_cells(study: Study, case: StudyCase) -> list[str]:
     """One row of Tab. 4, each cell `twin / study`, and when the robot stopped for good."""
     found, terrain = study.measured, case.terrain
     pairs = [
@@ -88,19 +88,19 @@ def noise_sentence(study: Study) -> str:
     )
 
 
-def count_lines(rows: Sequence[Row]) -> list[str]:
+def count_lines(rows: Sequence[ClaimResult]) -> list[str]:
     """How many claims agree, of all and of those the twin was not calibrated to."""
     lines = []
     for name, found in (
         ("of all claims", counts(rows)),
         ("of those neither calibrated to nor given", counts(rows, PREDICTED)),
     ):
-        told = ", ".join(f"{count} {verdict}" for verdict, count in found.items())
-        lines.append(f"{name} ({sum(found.values())}): {told}")
+        shares = ", ".join(f"{count} {verdict}" for verdict, count in found.items())
+        lines.append(f"{name} ({sum(found.values())}): {shares}")
     return lines
 
 
-def markdown_rows(rows: Sequence[Row], columns: Sequence[str] = COLUMNS) -> list[str]:
+def markdown_rows(rows: Sequence[ClaimResult], columns: Sequence[str] = COLUMNS) -> list[str]:
     """The table of agreement in Markdown."""
     return _markdown(columns, [[str(getattr(row, column)) for column in columns] for row in rows])
 
@@ -126,5 +126,5 @@ def document_section(study: Study) -> list[str]:
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
     """A table in Markdown; bars inside cells are escaped."""
     lines = [head, *rows]
-    told = [f"| {' | '.join(cell.replace('|', BAR) for cell in line)} |" for line in lines]
-    return [told[0], f"|{' --- |' * len(head)}", *told[1:]]
+    text = [f"| {' | '.join(cell.replace('|', BAR) for cell in line)} |" for line in lines]
+    return [text[0], f"|{' --- |' * len(head)}", *text[1:]]

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.reports.plots import style
-from terrafusion.twin.study.batch import CellResult
+from terrafusion.twin.study.batch import BatchResult
 from terrafusion.twin.study.cases import CaseRun
 from terrafusion.twin.study.gnss_noise import NoiseFit, NoisyRun
 from terrafusion.twin.study.published import CASES
@@ -116,7 +116,7 @@ def plot_noise(fits: Sequence[NoiseFit]) -> Figure:
     return fig
 
 
-def plot_mobility(batch: Sequence[CellResult]) -> Figure:
+def plot_mobility(batch: Sequence[BatchResult]) -> Figure:
     """Net uphill distance over slope, for each terrain, friction (colour) and payload (line)."""
     fig, axes = style.canvases(1, (9.0, 3.2), len(CASES), sharex=False)
     for ax, case in zip(axes, CASES, strict=True):
@@ -137,7 +137,7 @@ def plot_mobility(batch: Sequence[CellResult]) -> Figure:
     return fig
 
 
-def plot_energy(batch: Sequence[CellResult], over_slip: Sequence[CellResult]) -> Figure:
+def plot_energy(batch: Sequence[BatchResult], over_slip: Sequence[BatchResult]) -> Figure:
     """Energy per metre of the mobile runs: over slope, over payload, and over slip at one load and slope."""
     fig, axes = style.canvases(1, (9.0, 3.2), 3, sharex=False)
     mobile = [r for r in batch if r.mobile]
@@ -198,7 +198,7 @@ def _speeds(ax: Axes, run: CaseRun) -> None:
 
 
 def _mean_energy(
-    ax: Axes, mobile: Sequence[CellResult], name: str, other: str, label: str, unit: str
+    ax: Axes, mobile: Sequence[BatchResult], name: str, other: str, label: str, unit: str
 ) -> None:
     """Energy per metre over the axis `name`, averaged over friction; a line each value of `other`."""
     for terrain, held in itertools.product(LABELS, (0.0, 5.0, 60.0)):

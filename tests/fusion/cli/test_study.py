@@ -13,10 +13,8 @@ from pathlib import Path
 import pytest
 
 from terrafusion.twin.study import study as study_module
-from terrafusion.twin.study.agreement import NOT_EXAMINED
-from terrafusion.twin.study.batch import Cell, slip_cells
-from terrafusion.twin.study.claims import load_claims
-from terrafusion.twin.study.criteria import AGREE, VERDICTS
+from terrafusion.twin.study.batch import BatchCell, slip_cells
+from terrafusion.twin.study.claims import AGREE, NOT_EXAMINED, VERDICTS, load_claims
 from terrafusion.twin.study.published import CASES, FRICTION
 from terrafusion.twin.study.text import COLUMNS
 
@@ -33,11 +31,11 @@ def reproduced(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Path,
     from terrafusion.fusion.cli.main import app
 
     cells = [
-        Cell(terrain, mu, slope)
+        BatchCell(terrain, mu, slope)
         for terrain, ends in FRICTION.items()
         for mu, slope in ((ends[0], 5.0), (ends[1], 0.0), (ends[1], 5.0))
     ]
-    heavy = Cell("medium_sand", 1.0, 0.0, 60.0)
+    heavy = BatchCell("medium_sand", 1.0, 0.0, 60.0)
     folder = tmp_path_factory.mktemp("study") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(study_module, "grid", lambda quick: (*cells, heavy))

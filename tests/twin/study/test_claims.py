@@ -10,17 +10,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.study.agreement import BASES, NOT_EXAMINED, PREDICTED, Claim, counts, judge
-from terrafusion.twin.study.claims import load_claims
-from terrafusion.twin.study.criteria import (
+from terrafusion.twin.study.claims import (
     AGREE,
+    BASES,
     DISAGREE,
+    NOT_EXAMINED,
     PARTLY,
+    PREDICTED,
     AtLeast,
     AtMost,
+    Claim,
     Criterion,
     Near,
     Published,
+    counts,
+    judge,
+    load_claims,
 )
 from terrafusion.twin.study.published import CASES
 from terrafusion.twin.study.spread import Spread, spread

@@ -7,8 +7,8 @@ import math
 import pytest
 
 from terrafusion.twin.study.batch import (
-    Cell,
-    CellResult,
+    BatchCell,
+    BatchResult,
     grid,
     least_growth,
     neighbours,
@@ -20,8 +20,10 @@ from terrafusion.twin.study.batch import (
 from terrafusion.twin.study.published import FRICTION
 
 
-def result(energy: float, slip: float = 1.0, advance: float = 1.0, **cell: float) -> CellResult:
-    return CellResult(Cell("loose_sand", **{"friction": 0.5, **cell}), advance, slip, slip, energy, None)
+def result(energy: float, slip: float = 1.0, advance: float = 1.0, **cell: float) -> BatchResult:
+    return BatchResult(
+        BatchCell("loose_sand", **{"friction": 0.5, **cell}), advance, slip, slip, energy, None
+    )
 
 
 def test_the_grid_covers_the_ranges_of_friction() -> None:
@@ -62,12 +64,12 @@ def test_steepening_is_one_in_proportion_and_more_beyond() -> None:
 
 
 def test_cells_drive_what_they_say() -> None:
-    easy, heavy = run_cell(Cell("medium_sand", 0.9)), run_cell(Cell("medium_sand", 0.9, 5.0, 60.0))
+    easy, heavy = run_cell(BatchCell("medium_sand", 0.9)), run_cell(BatchCell("medium_sand", 0.9, 5.0, 60.0))
     assert easy.mobile
     assert heavy.mobile
     assert heavy.energy_per_m_j > 2.0 * easy.energy_per_m_j > 0.0
-    slippery, gripping = run_cell(Cell("loose_sand", 0.2)), run_cell(Cell("loose_sand", 0.6))
+    slippery, gripping = run_cell(BatchCell("loose_sand", 0.2)), run_cell(BatchCell("loose_sand", 0.6))
     assert slippery.slip > gripping.slip
-    stuck = run_cell(Cell("mud", 0.1, 10.0))
+    stuck = run_cell(BatchCell("mud", 0.1, 10.0))
     assert not stuck.mobile
     assert math.isnan(stuck.energy_per_m_j)

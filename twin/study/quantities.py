@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from terrafusion.twin.study import measures
 from terrafusion.twin.study.batch import (
     SLIP_SLOPE_DEG,
-    CellResult,
+    BatchResult,
     least_growth,
     share_of_pairs,
     slip_cost,
@@ -22,17 +22,17 @@ from terrafusion.twin.study.robot import platform_figures
 from terrafusion.twin.study.spread import Spread, spread
 
 Runs = Mapping[str, Sequence[CaseRun]]
-Evidence = dict[str, Spread]
+Quantities = dict[str, Spread]
 
 
-def case_evidence(runs: Runs, flat: Runs) -> Evidence:
+def case_quantities(runs: Runs, flat: Runs) -> Quantities:
     """Tab. 4 and Figs. 4 to 9; keys such as `mud.odometry`."""
-    found: Evidence = {}
+    found: Quantities = {}
     for terrain, of in runs.items():
         for name in ("slip", "odometry", "imu", "gnss"):
             found[f"{terrain}.{name}"] = spread(getattr(run.errors, name) for run in of)
         found |= _many(f"{terrain}.imu_drift", map(measures.imu_drift_mps, of))
-        found |= _many(f"{terrain}.way", map(measures.way_errors_percent, of))
+        found |= _many(f"{terrain}.way", map(measures.path_errors_percent, of))
     mud, loose, medium = (runs[case.terrain] for case in CASES)
     found["mud.stopped_after"] = spread(map(measures.stopped_after_s, mud))
     found |= _many("mud.until_stop", map(measures.follows_until_stop, mud))
@@ -49,10 +49,10 @@ def case_evidence(runs: Runs, flat: Runs) -> Evidence:
     return found | _ratios(runs, added)
 
 
-def uneven_evidence(uneven: Runs) -> Evidence:
+def uneven_quantities(uneven: Runs) -> Quantities:
     """The three runs on uneven ground: slip, the stop, stalls, and yaw rates (Figs. 6 to 8)."""
     mud, loose, medium = (uneven[case.terrain] for case in CASES)
-    found: Evidence = {
+    found: Quantities = {
         "mud.uneven.stopped_after": spread(map(measures.stopped_after_s, mud)),
         "mud.uneven.slip_swings": spread(map(measures.slip_swings, mud)),
         "loose_sand.uneven.short_stalls": spread(map(measures.short_stalls, loose)),
@@ -70,7 +70,7 @@ def uneven_evidence(uneven: Runs) -> Evidence:
     return found
 
 
-def _ratios(runs: Runs, added: Sequence[Mapping[str, float]]) -> Evidence:
+def _ratios(runs: Runs, added: Sequence[Mapping[str, float]]) -> Quantities:
     """Quotients of two quantities, taken seed by seed."""
     _, loose, medium = (runs[case.terrain] for case in CASES)
     drifts = [measures.imu_drift_mps(run) for run in (*loose, *medium)]
@@ -99,13 +99,13 @@ def _ratios(runs: Runs, added: Sequence[Mapping[str, float]]) -> Evidence:
     }
 
 
-def noise_evidence(
+def noise_quantities(
     fits: Sequence[NoiseFit], noisy: Mapping[str, Sequence[NoisyRun]], rate_hz: float
-) -> Evidence:
+) -> Quantities:
     """GNSS with the one Gaussian noise that comes closest to the study's errors, at one rate."""
     fit = next(fit for fit in fits if fit.rate_hz == rate_hz)
     wanted = {case.terrain: case.gnss for case in CASES}
-    found: Evidence = {"gnss.noise.worst_factor": spread([min(f.worst_factor(wanted) for f in fits)])}
+    found: Quantities = {"gnss.noise.worst_factor": spread([min(f.worst_factor(wanted) for f in fits)])}
     ratio = least_ratio(noisy["loose_sand"], noisy["medium_sand"], fit.common_m)
     found["gnss.noise.loose_over_medium"] = spread([ratio])
     for terrain, of in noisy.items():
@@ -114,7 +114,7 @@ def noise_evidence(
     return found | _many("medium_sand.gnss_gaussian", medium)
 
 
-def batch_evidence(batch: Sequence[CellResult], over_slip: Sequence[CellResult]) -> Evidence:
+def batch_quantities(batch: Sequence[BatchResult], over_slip: Sequence[BatchResult]) -> Quantities:
     """Tab. 3 and energy a metre."""
     mud = [r for r in batch if r.cell.terrain == "mud"]
     on = {(r.cell.terrain, r.cell.friction): r for r in batch if _nominal(r)}
@@ -133,34 +133,34 @@ def batch_evidence(batch: Sequence[CellResult], over_slip: Sequence[CellResult])
     return {name: spread([value]) for name, value in numbers.items()}
 
 
-def field_evidence(drives: Sequence[FieldDrive]) -> Evidence:
+def field_quantities(drives: Sequence[FieldDrive]) -> Quantities:
     """Figs. 11 to 15."""
     return _many("field", map(field_measures, drives))
 
 
-def platform_evidence() -> Evidence:
+def platform_quantities() -> Quantities:
     """Tab. 1 and 2 and the profile: how many figures differ."""
     return {"platform.differences": spread([float(sum(not figure.same for figure in platform_figures()))])}
 
 
-def _friction_factor(on: Mapping[tuple[str, float], CellResult], terrain: str) -> float:
+def _friction_factor(on: Mapping[tuple[str, float], BatchResult], terrain: str) -> float:
     """Slip at the low end of a terrain's friction range over that at the high end."""
     low, high = FRICTION[terrain]
     return on[terrain, low].slip / on[terrain, high].slip
 
 
-def _nominal(result: CellResult) -> bool:
+def _nominal(result: BatchResult) -> bool:
     return result.cell.slope_deg == SLIP_SLOPE_DEG and result.cell.payload_kg == 0.0
 
 
-def _less_friction_slips_more(lower: CellResult, higher: CellResult) -> bool:
+def _less_friction_slips_more(lower: BatchResult, higher: BatchResult) -> bool:
     """Whether the run with the lower friction slips more, or does not get on at all."""
     if lower.mobile != higher.mobile:
         return higher.mobile
     return not lower.mobile or lower.slip > higher.slip
 
 
-def _many(prefix: str, found: Iterable[Mapping[str, float]]) -> Evidence:
+def _many(prefix: str, found: Iterable[Mapping[str, float]]) -> Quantities:
     """Spreads of quantities that a function measures together."""
     each = list(found)
     return {f"{prefix}.{name}": spread(one[name] for one in each) for name in each[0]}
