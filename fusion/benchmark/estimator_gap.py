@@ -1,8 +1,8 @@
-"""The gap as somebody else sees it who has to work with such logs, an estimator for one.
+"""The gap as the estimator sees it: how it performs on real logs and on the twin's logs of the same drives.
 
-The twin drives what each log was told, with the same channels, noise of its own data sheets and ground set
-to the references: once as it is, and once with the named effect. What a judge makes of these logs is held
-against what it makes of the real ones. The judge is a function that is passed in: this package knows none.
+The twin drives the commands of each log, with the same channels, noise of its own data sheets and soil set to
+the references: once as it is, and once with the named effect. Any function that scores a log can take the
+estimator's place.
 """
 
 from __future__ import annotations
@@ -12,13 +12,14 @@ import itertools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.replay import replay
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
 from terrafusion.twin.calibrate.model import Model
@@ -27,20 +28,17 @@ from terrafusion.twin.gap.infer.refit import effects_at
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
 
-Array = NDArray[np.float64]
+STEP_S = 0.1  # step of the commands of the twin's drive
+ERROR = "distance from fixes held out, m (median)"
+NIS = "squared innovation of {}, a degree of freedom"
 
-STEP_S = 0.1
-"""Commands of the twin's drive are held this long."""
-
-Marks = Mapping[str, float]
-"""What a judge says of one log, by name of the mark, such as "NIS of wheels"; marks it cannot give are left
-out."""
-Judge = Callable[[Recording], Marks]
+LogScores = Mapping[str, float]  # scores of one log by name; those that it does not allow are left out
+Scorer = Callable[[Recording], LogScores]
 
 
 @dataclass(frozen=True)
 class Compared:
-    """One mark: mean over the logs of each kind, None where no log has it.
+    """One score: mean over the logs of each kind, None where no log has it.
 
     Attributes:
         references, runs: real logs.
@@ -55,43 +53,67 @@ class Compared:
     corrected: float | None
 
 
-def judged(
+def estimator_scorer(vehicle: str) -> Scorer:
+    """A function that replays a log and scores it; the reference pose of the log is not used.
+
+    Args:
+        vehicle: name or YAML file, as `terrafusion replay` takes it.
+
+    The error is that against every fifth fix, which the estimator is not given; a log without GNSS has none.
+    A squared innovation (NIS) of one a degree of freedom is what its own covariance says.
+    """
+
+    def score(recording: Recording) -> dict[str, float]:
+        result = replay(dataclasses.replace(recording, truth=None, truth_channels=()), vehicle=vehicle)
+        scores = {}
+        if result.scores.held_out is not None:
+            scores[ERROR] = result.scores.held_out.median_m
+        by_sensor: dict[str, list[float]] = {}
+        for one in result.estimate.innovations:
+            if one.dof > 0 and math.isfinite(one.nis):
+                by_sensor.setdefault(one.sensor, []).append(one.nis / one.dof)
+        return scores | {NIS.format(sensor): fmean(values) for sensor, values in by_sensor.items()}
+
+    return score
+
+
+def estimator_gap(
     found: GapDiagnosis,
     runs: Sequence[Recording],
     references: Sequence[Recording],
-    judge: Judge,
+    scorer: Scorer,
     seed: int = 0,
 ) -> tuple[list[Compared], list[str]]:
-    """Marks of real logs, and of the twin's logs of the judged runs' drives; and why some have none.
+    """Scores of real logs, and of the twin's logs of the judged runs' drives; and why some have none.
 
     Args:
         found: the diagnosis of these runs against these references.
-        judge: gives marks; a `TerrafusionError` of it is told and that log left out.
+        scorer: a `TerrafusionError` of it is returned and that log left out.
     """
     failed: list[str] = []
 
-    def marks(logs: Sequence[Recording]) -> list[Marks]:
+    def scores(logs: Sequence[Recording]) -> list[LogScores]:
         out = []
         for log in logs:
             try:
-                out.append(judge(log))
+                out.append(scorer(log))
             except TerrafusionError as error:
                 failed.append(str(error))
         return out
 
     def twins(effects: Mapping[str, float]) -> list[Recording]:
-        drives = zip(runs, found.evidence.runs, itertools.count(seed), strict=False)
-        return [twin_of(run, evidence.log, found.evidence.model, effects, k) for run, evidence, k in drives]
+        pairs = zip(runs, found.evidence.runs, itertools.count(seed), strict=False)
+        return [twin_of(run, white.log, found.evidence.model, effects, k) for run, white, k in pairs]
 
-    groups = [marks(references), marks(runs), marks(twins({})), []]
+    groups = [scores(references), scores(runs), scores(twins({})), []]
     fit = found.verdict.fit
     if fit is not None:
-        groups[-1] = marks(twins(effects_at(found.evidence, fit.columns, fit.value)))
+        groups[-1] = scores(twins(effects_at(found.evidence, fit.columns, fit.value)))
     names = dict.fromkeys(name for group in groups for one in group for name in one)
     return [Compared(name, *(_mean(group, name) for group in groups)) for name in names], failed
 
 
-def _mean(group: Sequence[Marks], name: str) -> float | None:
+def _mean(group: Sequence[LogScores], name: str) -> float | None:
     values = [one[name] for one in group if name in one and math.isfinite(one[name])]
     return float(np.mean(values)) if values else None
 
@@ -102,7 +124,7 @@ def twin_of(
     """The twin's log of a drive: the channels the recording has, no truth, noise by the vehicle's file.
 
     Args:
-        log: the recording made ready: what the twin was told, and the ground.
+        log: the prepared recording: inputs and soil.
         effects: on top of the model's own.
     """
     run = simulate_run(
@@ -120,7 +142,7 @@ def twin_of(
 
 
 def scenario_of(log: PreparedLog, model: Model) -> Scenario:
-    """The drive of a log as commands: the speeds its sides were told, at the vehicle's radius and track."""
+    """The drive of a log as commands: the speeds of its sides, at the vehicle's radius and track."""
     every = round(STEP_S / DT_S)
     rim = model.vehicle.wheel.radius_m * log.sides[: len(log.sides) // every * every]
     sides = rim.reshape(-1, every, 2).mean(axis=1)

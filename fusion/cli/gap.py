@@ -64,7 +64,7 @@ def gap(
         ),
     ] = None,
     judge: Annotated[
-        bool, typer.Option("--judge", help="Also tell what the estimator makes of these logs and the twin's.")
+        bool, typer.Option("--judge", help="Also compare the estimator on these logs and on the twin's.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
     topic: TopicOption = None,
@@ -72,7 +72,7 @@ def gap(
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
 ) -> None:
-    """Tell where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
+    """Diagnose where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
 
     Writes diagnosis.json and report.html. No truth channel is read.
 
@@ -95,8 +95,8 @@ def gap(
             effects=None if effects is None else split(effects), significance=significance, source=source,
             seed=seed, progress=progress,
         )  # fmt: skip
-    marks = _judged(found, judged, normal, vehicle, seed) if judge else None
-    write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])}, marks)
+    scores = _estimator_gap(found, judged, normal, vehicle, seed) if judge else None
+    write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])}, scores)
     for line in sentences(found):
         print(line)
     if write_vehicle is not None:
@@ -107,17 +107,17 @@ def gap(
     print(f"written to {out} ({found.elapsed_s:.1f} s)")
 
 
-def _judged(
+def _estimator_gap(
     found: GapDiagnosis, runs: list[Recording], references: list[Recording], vehicle: str, seed: int
 ) -> tuple[list[Compared], list[str]]:
-    from terrafusion.fusion.benchmark.estimator_gap import judged
-    from terrafusion.fusion.benchmark.judge import estimator_judge
+    from terrafusion.fusion.benchmark.estimator_gap import estimator_gap, estimator_scorer
 
-    marks, failed = judged(found, runs, references, estimator_judge(vehicle), seed)
-    for mark in marks:
-        told = [(word, value) for word, value in (
-            ("references", mark.references), ("runs", mark.runs), ("their twin", mark.twin),
-            ("twin with the effect", mark.corrected),
-        ) if value is not None]  # fmt: skip
-        print(f"{mark.mark}: " + ", ".join(f"{word} {value:.3g}" for word, value in told))
-    return marks, failed
+    scores, failed = estimator_gap(found, runs, references, estimator_scorer(vehicle), seed)
+    for score in scores:
+        values = {
+            "references": score.references, "runs": score.runs, "their twin": score.twin,
+            "twin with the effect": score.corrected,
+        }  # fmt: skip
+        listed = [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
+        print(f"{score.mark}: {', '.join(listed)}")
+    return scores, failed

@@ -21,7 +21,7 @@ SLOPES_DEG = (0.0, 5.0, 10.0, 15.0)
 PAYLOADS_KG = (0.0, 30.0, 60.0)
 QUICK_SLOPES_DEG = (0.0, 5.0)
 MOBILE_SHARE = 0.5
-"""A run that makes less than this of the commanded distance is not counted as mobile, nor its energy a metre."""
+"""Least share of the commanded distance of a mobile run, for which energy a metre is counted."""
 SHEAR_MODULI_M = (0.002, 0.005, 0.010, 0.015, 0.020, 0.025)
 """Stiff to soft sand (Wong: 10 to 25 mm for sand): how slip is varied at equal load and slope."""
 QUICK_MODULI_M = (0.002, 0.015, 0.025)

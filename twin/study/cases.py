@@ -18,8 +18,7 @@ from terrafusion.twin.study.published import StudyCase
 
 Array = NDArray[np.float64]
 
-SCENARIO = "paper_profile"
-"""v(t) = 1.0 + 0.5 sin(2 pi t / 60) m/s for 300 s with short stops."""
+SCENARIO = "paper_profile"  # v(t) = 1.0 + 0.5 sin(2 pi t / 60) m/s for 300 s with short stops
 VEHICLE = "elevate"
 UNEVEN = Variation(strength_sigma=0.2, length_m=0.5)
 """Ground on which left and right wheels differ. Assumed: the study's ground was even, its contacts were not.

@@ -54,8 +54,7 @@ FIELD_DRIVE = Scenario(
         Canopy(Interval(165.0, 45.0), 0.3),
     ),
 )  # fmt: skip
-HIGH_HZ = 2.0
-"""Above this the robot's own speed profile holds nothing: what is faster is vibration and shock."""
+HIGH_HZ = 2.0  # above this the robot's own speed profile holds nothing: what is faster is vibration and shock
 
 
 @dataclass(frozen=True, eq=False)

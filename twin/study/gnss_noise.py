@@ -29,12 +29,9 @@ from terrafusion.twin.study.cases import CaseRun
 
 Array = NDArray[np.float64]
 
-RATES_HZ = (1.0, 5.0, 10.0, 100.0)
-"""Rates at which positions may have been differenced; the study names none."""
-SIGMAS_M = (1e-4, 10.0)
-"""Sizes of noise that are searched."""
-DATA_SHEET_M = 0.02
-"""Tab. 2 of the study: RTK below this."""
+RATES_HZ = (1.0, 5.0, 10.0, 100.0)  # rates at which positions may have been differenced; the study names none
+SIGMAS_M = (1e-4, 10.0)  # sizes of noise that are searched
+DATA_SHEET_M = 0.02  # tab. 2 of the study: RTK below this
 
 
 @dataclass(frozen=True)

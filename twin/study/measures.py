@@ -13,14 +13,11 @@ from terrafusion.twin.study.cases import CaseRun, between, set_off_s, stopped_s
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-RAMP_S = 4.0
-"""After a stop the robot needs this long to reach the command within its limit of acceleration."""
-SINKING_S = 10.0
-"""Before it stops for good on mud, the robot follows the command until this long before."""
+RAMP_S = 4.0  # after a stop the robot needs this long to reach the command within its limit of acceleration
+SINKING_S = 10.0  # before it stops for good on mud, the robot follows the command until this long before
 ONSET, HALF = 0.10, 0.50
 """Slip proxy at which sinkage is called set in, and at which half of the wheels' distance is lost."""
-SLOW_MPS, FAST_MPS = 0.75, 1.25
-"""The lower and the upper quarter of the profile's speeds."""
+SLOW_MPS, FAST_MPS = 0.75, 1.25  # the lower and the upper quarter of the profile's speeds
 STALLED_MPS = 0.05
 
 

@@ -30,10 +30,8 @@ from terrafusion.twin.study.quantities import (
 )
 
 SEEDS, QUICK_SEEDS, MOST_SEEDS = 10, 2, 1000
-STUDY_LIKE_HZ = 5.0
-"""Rate at which the study-like Gaussian noise is shown: that of the twin's receiver."""
-FLAT_TERRAIN = "loose_sand"
-"""The terrain that is driven on level ground, too, to see what the slope adds."""
+STUDY_LIKE_HZ = 5.0  # rate at which the study-like Gaussian noise is shown: that of the twin's receiver
+FLAT_TERRAIN = "loose_sand"  # the terrain that is driven on level ground, too, to see what the slope adds
 
 Progress = Callable[[float], None]
 

@@ -10,8 +10,14 @@ import pytest
 
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.benchmark.estimator_gap import judged, scenario_of, twin_of
-from terrafusion.fusion.benchmark.judge import ERROR, NIS, estimator_judge
+from terrafusion.fusion.benchmark.estimator_gap import (
+    ERROR,
+    NIS,
+    estimator_gap,
+    estimator_scorer,
+    scenario_of,
+    twin_of,
+)
 from terrafusion.twin.calibrate.log import PreparedLog, prepare
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.gap.infer.refit import Refit
@@ -58,11 +64,11 @@ def test_the_twin_of_a_run_turns_its_wheels_alike_and_lacks_what_the_log_lacks(
 
 
 def fake(found_fit: Refit | None, driven: tuple[Recording, PreparedLog]) -> SimpleNamespace:
-    bench = SimpleNamespace(model=MODEL, runs=[SimpleNamespace(log=driven[1])])
-    return SimpleNamespace(bench=bench, verdict=SimpleNamespace(fit=found_fit))
+    evidence = SimpleNamespace(model=MODEL, runs=[SimpleNamespace(log=driven[1])])
+    return SimpleNamespace(evidence=evidence, verdict=SimpleNamespace(fit=found_fit))
 
 
-def test_marks_are_means_and_a_log_that_cannot_be_judged_is_told(
+def test_scores_are_means_and_a_log_that_cannot_be_scored_is_listed(
     driven: tuple[Recording, PreparedLog],
 ) -> None:
     def judge(log: Recording) -> dict[str, float]:
@@ -72,14 +78,14 @@ def test_marks_are_means_and_a_log_that_cannot_be_judged_is_told(
 
     recording = driven[0]
     references = [recording, dataclasses.replace(recording, name="bad")]
-    (mark,), failed = judged(fake(None, driven), [recording], references, judge)
+    (mark,), failed = estimator_gap(fake(None, driven), [recording], references, judge)
     assert (mark.references, mark.runs, mark.twin, mark.corrected) == (1.0, 1.0, 3.0, None)
     assert len(failed) == 1
     assert "no wheels" in failed[0]
 
 
 def test_the_estimator_gives_its_error_and_its_innovations(driven: tuple[Recording, PreparedLog]) -> None:
-    judge = estimator_judge("elevate")
+    judge = estimator_scorer("elevate")
     marks = judge(driven[0])
     assert 0.0 < marks[ERROR] < 5.0
     assert marks[NIS.format("gnss")] > 0.0

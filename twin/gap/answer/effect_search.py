@@ -26,8 +26,7 @@ MOST_EFFECTS = 3
 FURTHER_TRIED = 2
 """Further effects that are refitted: the greatest by Bayes factor, and as many by what they leave to first
 order."""
-FURTHER_ODDS = 4.0
-"""Log odds that each further effect costs."""
+FURTHER_ODDS = 4.0  # log odds that each further effect costs
 FURTHER_SHARE, FURTHER_LEFT = 0.15, 0.5
 """Least reduction by a further effect of what remains, as a share and in its units. These three are set on
 development trials (docs/gap-blind.md)."""

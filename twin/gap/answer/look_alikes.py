@@ -17,10 +17,8 @@ from terrafusion.twin.gap.infer.posterior import PooledScores
 
 Array = NDArray[np.float64]
 
-SAME_CLASS = 0.985
-"""Correlation from which two effects are one class whatever the size of the gap (assumed)."""
-SEPARABLE_SIGMAS = 3.0
-"""Sigmas by which the better effect must explain more to be distinguished from another."""
+SAME_CLASS = 0.985  # correlation from which two effects are one class whatever the size of the gap (assumed)
+SEPARABLE_SIGMAS = 3.0  # sigmas by which the better effect must explain more to be distinguished from another
 
 
 def similarity(pooled: PooledScores, signal: Array, square: float, other: Sequence[int]) -> float:

@@ -30,8 +30,7 @@ from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
 Array = NDArray[np.float64]
 
 BY_HAND = "measurement by hand"
-MOST_REPEATS = 10
-"""If the best drive would have to be repeated more often, none is suggested."""
+MOST_REPEATS = 10  # if the best drive would have to be repeated more often, none is suggested
 LIFTED = "wheels lifted"
 HALF_TURN_S, QUARTER_TURN_S = math.pi / 0.6, 0.5 * math.pi / 0.6
 

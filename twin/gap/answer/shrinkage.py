@@ -24,10 +24,8 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 Array = NDArray[np.float64]
 
 METRIC = "mean squared whitened error with soil, offsets and pose adapted, on runs left out of the fit"
-ABOVE_FLOOR = 3.0
-"""A share is given where the gap is so many standard deviations of the floor above it."""
-FREE = 10.0
-"""Factor on theta's 1 sigma where it alone is recalibrated."""
+ABOVE_FLOOR = 3.0  # a share is given where the gap is so many standard deviations of the floor above it
+FREE = 10.0  # factor on theta's 1 sigma where it alone is recalibrated
 
 
 @dataclass(frozen=True, eq=False)

@@ -35,8 +35,7 @@ UNKNOWN = OUTSIDE_SHARE
 LAW_SIGMA_MOTION, LAW_SIGMA_SENSOR = 0.2, 0.03
 """1 sigma, as a share of its value, by which the size of an effect on the motion, and of one of the sensors
 alone, is wrong because the robot's law is not the twin's. Set on development trials (docs/gap-blind.md)."""
-CLASSED = 5
-"""Most probable causes whose look-alikes are sought."""
+CLASSED = 5  # most probable causes whose look-alikes are sought
 
 
 @dataclass(frozen=True, eq=False)

@@ -33,13 +33,10 @@ REGIMES = (
 """Name and condition on commanded speed (m/s), turn rate (rad/s) and acceleration (m/s2); the first that
 holds."""
 BANDS = ("below 0.5 Hz", "above 0.5 Hz")
-SLOW_S = 2.0
-"""Means over this interval are the slow band."""
-ACCELERATION_SAMPLES = 51
-"""Grid samples over which the acceleration is averaged: half a second."""
+SLOW_S = 2.0  # means over this interval are the slow band
+ACCELERATION_SAMPLES = 51  # grid samples over which the acceleration is averaged: half a second
 LEAST_SAMPLES = 5
-LEAST_REFERENCES = 2
-"""Fewer have no scatter from run to run."""
+LEAST_REFERENCES = 2  # fewer have no scatter from run to run
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,7 @@ from terrafusion.twin.gap.blind.plan import VEHICLE, Trial, specs
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
 
 ORACLE = "oracle.jsonl"
-LANES = 160
-"""Runs of the plant in one batch (about 5 MB each)."""
+LANES = 160  # runs of the plant in one batch (about 5 MB each)
 
 
 class Answer(Protocol):
@@ -30,8 +29,7 @@ class Answer(Protocol):
         """Keeps to `diagnosis.schema.json`."""
 
 
-Diagnose = Callable[..., Answer]
-"""diagnose(runs, references, vehicle, *, seed) -> Answer"""
+Diagnose = Callable[..., Answer]  # diagnose(runs, references, vehicle, *, seed) -> Answer
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,8 +14,7 @@ from terrafusion.twin.gap.blind.verdicts import Judged, judge
 
 SCHEMA = "terrafusion.gap-blind/1"
 SINGLE = ("same", "shifted")
-MATTERS = 1.5
-"""Severity from which an effect should be identified."""
+MATTERS = 1.5  # severity from which an effect should be identified
 
 
 def score(

@@ -8,8 +8,7 @@ from typing import Any
 
 from terrafusion.twin.gap.blind.plan import Trial
 
-PARAMETER = "soil_strength"
-"""The effect whose verdict is *parameters*."""
+PARAMETER = "soil_strength"  # the effect whose verdict is *parameters*
 
 
 @dataclass(frozen=True)

@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 
 SOIL_STRENGTH = "soil_strength"
 """The effect that is a known parameter of the soil, not missing physics: verdict `parameters`."""
-RANGE_SHARE = 0.98
-"""Share of its range within which a parameter is sought."""
+RANGE_SHARE = 0.98  # share of its range within which a parameter is sought
 
 
 @dataclass(frozen=True)

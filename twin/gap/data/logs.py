@@ -16,8 +16,7 @@ from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, report
 
 Soils = str | Path | SoilParams | Mapping[str, str | Path | SoilParams] | None
 
-WINDOW_S = 10.0
-"""Length of a window, at whose start the pose is reset."""
+WINDOW_S = 10.0  # length of a window, at whose start the pose is reset
 GENERIC_SOIL = "medium_sand"
 """Stands in where a log names no known soil; the references then set its strength."""
 

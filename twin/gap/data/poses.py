@@ -18,8 +18,7 @@ Array = NDArray[np.float64]
 
 EAST_NORTH = (("gnss_east_m", "gnss_north_m"), ("gnss_v_e_mps", "gnss_v_n_mps"))
 """Channels of positions (rotated and shifted) and of velocities (rotated only)."""
-HEADING_SIGMA_RAD = 0.5
-"""1 sigma of the initial heading (assumed): keeps it in a window without motion."""
+HEADING_SIGMA_RAD = 0.5  # 1 sigma of the initial heading (assumed): keeps it in a window without motion
 
 
 def alignment_angles(log: PreparedLog, values: Sequence[Array]) -> Array:

@@ -17,8 +17,7 @@ from terrafusion.twin.calibrate.predict import averaging
 Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-COARSE_STEP = 5
-"""Derivatives are stored at every n-th sample of the run: they enter as weights only."""
+COARSE_STEP = 5  # derivatives are stored at every n-th sample of the run: they enter as weights only
 
 
 @dataclass(frozen=True, eq=False)

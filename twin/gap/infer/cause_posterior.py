@@ -29,12 +29,9 @@ from terrafusion.twin.gap.infer.posterior import PooledScores
 
 Array = NDArray[np.float64]
 
-LEAST_GAP = 0.5
-"""Least size of a gap (in the units of `CauseResidual`)."""
-OUTSIDE_SHARE = 0.2
-"""Prior share of gaps with a cause outside the catalogue, as in a blind check."""
-LAPSE = 0.02
-"""Probability that the odds do not hold (assumed), spread evenly over all causes."""
+LEAST_GAP = 0.5  # least size of a gap (in the units of `CauseResidual`)
+OUTSIDE_SHARE = 0.2  # prior share of gaps with a cause outside the catalogue, as in a blind check
+LAPSE = 0.02  # probability that the odds do not hold (assumed), spread evenly over all causes
 
 
 @dataclass(frozen=True)

@@ -28,12 +28,9 @@ Array = NDArray[np.float64]
 
 RIDGE = 1.0
 """Directions of a channel in which typical effects make less than a sigma in all are outside its space."""
-LEAST_STATE = 0.5
-"""Least square of a state in the references, in units of its variance."""
-STEPS = 3
-"""Rounds of the linear fit, after each of which channels are weighted anew."""
-WIDE = 30.0
-"""1 sigma of an effect's size in it, typical sizes: the data decide."""
+LEAST_STATE = 0.5  # least square of a state in the references, in units of its variance
+STEPS = 3  # rounds of the linear fit, after each of which channels are weighted anew
+WIDE = 30.0  # 1 sigma of an effect's size in it, typical sizes: the data decide
 
 
 @dataclass(frozen=True, eq=False)

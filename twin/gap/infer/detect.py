@@ -28,18 +28,12 @@ from terrafusion.twin.gap.null.score import Score
 
 Array = NDArray[np.float64]
 
-TAIL_FREEDOM = 10
-"""Degrees of freedom of the tail of the statistic: heavier than normal (assumed)."""
-EQUAL = 1e-9
-"""Deviations that differ by less than this share are equal."""
-LEAST_SQUARE = 1.5
-"""Least typical square of an effect's deviation: one and a half parameters."""
-LEAST_SPREAD = 0.25
-"""Least 1 sigma of the logarithm of a reference's greatest deviation (assumed)."""
-LEAVE_OUTS = 20
-"""Choices of references that are judged by the rest."""
-PERMUTATIONS = 99
-"""Most other choices of runs that the judged ones are compared with."""
+TAIL_FREEDOM = 10  # degrees of freedom of the tail of the statistic: heavier than normal (assumed)
+EQUAL = 1e-9  # deviations that differ by less than this share are equal
+LEAST_SQUARE = 1.5  # least typical square of an effect's deviation: one and a half parameters
+LEAST_SPREAD = 0.25  # least 1 sigma of the logarithm of a reference's greatest deviation (assumed)
+LEAVE_OUTS = 20  # choices of references that are judged by the rest
+PERMUTATIONS = 99  # most other choices of runs that the judged ones are compared with
 
 
 @dataclass(frozen=True, eq=False)

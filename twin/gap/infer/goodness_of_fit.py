@@ -20,16 +20,11 @@ from terrafusion.twin.gap.infer.channels import ChannelTable, ErrorProducts, run
 
 Array = NDArray[np.float64]
 
-LEVEL = 0.05
-"""Probability that a correct law differs from the references in some channel."""
-LEAST_GAP = 1.0
-"""Least gap that a share is taken of, a sum of logarithms (assumed)."""
-LEAST_SPREAD = 0.05
-"""Least 1 sigma of the logarithm of a channel's energy from run to run (assumed)."""
-FEWEST = 4
-"""References without which the scatter is unknown."""
-MOST_ABOVE, MOST_QUIETER = 3.0, 2.0
-"""Limits of `GoodnessOfFit.above` and `quieter` (assumed)."""
+LEVEL = 0.05  # probability that a correct law differs from the references in some channel
+LEAST_GAP = 1.0  # least gap that a share is taken of, a sum of logarithms (assumed)
+LEAST_SPREAD = 0.05  # least 1 sigma of the logarithm of a channel's energy from run to run (assumed)
+FEWEST = 4  # references without which the scatter is unknown
+MOST_ABOVE, MOST_QUIETER = 3.0, 2.0  # limits of `GoodnessOfFit.above` and `quieter` (assumed)
 
 
 @dataclass(frozen=True)

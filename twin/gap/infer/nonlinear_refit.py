@@ -26,21 +26,16 @@ from terrafusion.twin.gap.rollout.delay import DELAYS
 from terrafusion.twin.gap.rollout.residuals import soil_columns
 
 Array = NDArray[np.float64]
-Point = tuple[Hypothesis, Array]
-"""A law and sizes (k,) of its parameters, in typical ones."""
+Point = tuple[Hypothesis, Array]  # a law and sizes (k,) of its parameters, in typical ones
 
-MULTIPLES = (0.4, 1.0, 2.0, 4.0)
-"""Sizes tried, in that of the linear fit."""
+MULTIPLES = (0.4, 1.0, 2.0, 4.0)  # sizes tried, in that of the linear fit
 SMALL, SIZES = 0.7, (1.0, 3.0, 8.0)
 """Below that size of the linear fit, these typical sizes are tried beside it."""
 EXTRAPOLATE, MARGIN = 1.0, 0.05
 """Step beyond the last size, in the step to it; margin at the ends of an interval, as a share of it."""
-AS_GOOD = 0.5
-"""Excess that the size of weighted least squares may leave over the best one (assumed)."""
-SAME_SIZE = 1e-3
-"""Sizes closer than this, typical ones, are not tried again."""
-ROUNDS, IMPROVED = 3, 5
-"""Rounds of improvement, and how many of the best laws take part in them."""
+AS_GOOD = 0.5  # excess that the size of weighted least squares may leave over the best one (assumed)
+SAME_SIZE = 1e-3  # sizes closer than this, typical ones, are not tried again
+ROUNDS, IMPROVED = 3, 5  # rounds of improvement, and how many of the best laws take part in them
 DELAY_SHARES = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Sizes of a delay that are tried on both sides, in that of its range: beyond half a period of the motion the
 sensitivity is meaningless, and the shared run makes them cheap."""

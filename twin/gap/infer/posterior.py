@@ -23,15 +23,11 @@ from terrafusion.twin.gap.null.score import Score
 
 Array = NDArray[np.float64]
 
-SIZES = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""1 sigma of an effect's size, in typical sizes; equal weights."""
-WIDE = 10.0
-"""1 sigma of an effect's size where it is fitted: the data decide."""
+SIZES = (0.1, 0.3, 1.0, 3.0, 10.0)  # 1 sigma of an effect's size, in typical sizes; equal weights
+WIDE = 10.0  # 1 sigma of an effect's size where it is fitted: the data decide
 UNKNOWN_SIZES = (0.3, 1.0, 3.0, 10.0)
-UNKNOWN_PRIOR = 0.1
-"""Prior probability that a gap has a cause outside the catalogue (assumed)."""
-DISCREPANCY_SIGMA = 0.1
-"""1 sigma of the model discrepancy, in the effect's size (tuned on twin trials)."""
+UNKNOWN_PRIOR = 0.1  # prior probability that a gap has a cause outside the catalogue (assumed)
+DISCREPANCY_SIGMA = 0.1  # 1 sigma of the model discrepancy, in the effect's size (tuned on twin trials)
 
 
 @dataclass(frozen=True, eq=False)

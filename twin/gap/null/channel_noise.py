@@ -19,13 +19,10 @@ from terrafusion.twin.gap.rollout.residuals import (
 )
 
 Array = NDArray[np.float64]
-Series = list[tuple[Indices, Array]]
-"""Slots and residuals of a channel in each window."""
+Series = list[tuple[Indices, Array]]  # slots and residuals of a channel in each window
 
-ANY_SIZE = 30.0
-"""1 sigma of effects, in typical sizes, in a run without references (assumed)."""
-LEAST_SCALE = 0.2
-"""Least scale of a channel's noise, in that of its data sheet (assumed)."""
+ANY_SIZE = 30.0  # 1 sigma of effects, in typical sizes, in a run without references (assumed)
+LEAST_SCALE = 0.2  # least scale of a channel's noise, in that of its data sheet (assumed)
 
 
 def data_sheet_noise(runs: Sequence[RunResiduals]) -> dict[str, ResidualNoise]:

@@ -18,10 +18,8 @@ from terrafusion.twin.gap.null.score import Score
 
 Array = NDArray[np.float64]
 
-SHRINK_RUNS = 8.0
-"""Weight of the Fisher information, in reference runs (tuned on twin trials)."""
-JITTER = 0.02
-"""Variance added to a standardised score: no combination of scores is taken as exact."""
+SHRINK_RUNS = 8.0  # weight of the Fisher information, in reference runs (tuned on twin trials)
+JITTER = 0.02  # variance added to a standardised score: no combination of scores is taken as exact
 
 
 @dataclass(frozen=True, eq=False)

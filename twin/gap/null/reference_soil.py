@@ -27,13 +27,11 @@ from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predicti
 
 Array = NDArray[np.float64]
 
-RUNS, STEPS = 3, 5
-"""References that are used, and most steps of the search."""
+RUNS, STEPS = 3, 5  # references that are used, and most steps of the search
 LEAST_STEP, MOST_STEP = 0.1, 1.0
 """The search ends with a step shorter than the first, and takes none longer than the second (typical
 sizes)."""
-SHORTER = 0.4
-"""Factor of a step that did not reduce the errors."""
+SHORTER = 0.4  # factor of a step that did not reduce the errors
 
 
 def all_residuals(

@@ -18,12 +18,9 @@ from terrafusion.twin.gap.rollout.residuals import WhitenedRun
 Array = NDArray[np.float64]
 
 EM_STEPS = 6
-PRIOR_RUNS = 3.0
-"""Weight of the assumed variance of theta, in runs."""
-LEAST_SIGMA = 0.03
-"""Least 1 sigma of theta, as a share of its unit."""
-REPLICATES = 20
-"""Twin replicates that stand in for references."""
+PRIOR_RUNS = 3.0  # weight of the assumed variance of theta, in runs
+LEAST_SIGMA = 0.03  # least 1 sigma of theta, as a share of its unit
+REPLICATES = 20  # twin replicates that stand in for references
 
 
 @dataclass(frozen=True, eq=False)

@@ -37,20 +37,16 @@ from terrafusion.twin.sensors.effects import DEAD_TIME, as_driven
 
 Array = NDArray[np.float64]
 Effects = Mapping[str, float]
-MotionEffects = tuple[tuple[str, float], ...]
-"""Effects of a set that change the motion, with their values."""
+MotionEffects = tuple[tuple[str, float], ...]  # effects of a set that change the motion, with their values
 
 SOIL_KEYS = ("soil_strength/shear", "soil_strength/bearing", "motion_resistance/rolling")
 """Parameters by which the soil differs from run to run: in every graph."""
-GROUP_SIZE = 16
-"""Other effects in one graph: the number of lanes of a vector."""
-NOMINAL = ""
-"""Stands for the twin without a further effect, in the first group."""
+GROUP_SIZE = 16  # other effects in one graph: the number of lanes of a vector
+NOMINAL = ""  # stands for the twin without a further effect, in the first group
 INTEGRATOR_ORDER = 3
 """On loose sand, the most sensitive case, results differ from fourth order by no more than those from half
 the step do (docs/gap.md)."""
-SINGLE_PRECISION = True
-"""Rounding of 32-bit numbers is below the integration error (docs/gap.md)."""
+SINGLE_PRECISION = True  # rounding of 32-bit numbers is below the integration error (docs/gap.md)
 FULL_GRAPH_COST = 1.8
 """Time of a run in the graph of all effects over that in the graph of one group (measured)."""
 ABSENT_SHARE = 1e-12

@@ -24,8 +24,7 @@ Array = NDArray[np.float64]
 IMU = ("yaw_rate_radps", "accel_x_mps2", "accel_y_mps2")
 VELOCITY = ("gnss_v_e_mps", "gnss_v_n_mps")
 FIXES = ("gnss_east_m", "gnss_north_m", *VELOCITY)
-CLOCK_DRIFT = "imu_time_offset/drift"
-"""The delay that grows with time: its value is that after `CLOCK_S`."""
+CLOCK_DRIFT = "imu_time_offset/drift"  # the delay that grows with time: its value is that after `CLOCK_S`
 DELAYS = {
     "imu_time_offset/shift": IMU, CLOCK_DRIFT: IMU, "gnss_latency/both": FIXES,
     "gnss_latency/velocity": VELOCITY,

@@ -21,8 +21,7 @@ Array = NDArray[np.float64]
 BASIS = (
     "constant", "speed", "turn_rate", "acceleration", "turn_acceleration", "speed2", "abs_turn", "lateral",
 )  # fmt: skip
-SMOOTH_S = 0.2
-"""Interval over which rates of the commands are taken."""
+SMOOTH_S = 0.2  # interval over which rates of the commands are taken
 NORTH_OF = {"gnss_east_m": "gnss_north_m", "gnss_v_e_mps": "gnss_v_n_mps"}
 """North channel by east channel: for these the functions act along and across the robot's heading."""
 CHANNEL_NAMES = {

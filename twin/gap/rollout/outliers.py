@@ -30,8 +30,7 @@ HEAVY_TAILED = 0.02
 CHANGED = 1.5
 """Where half of the judged runs' errors exceed the noise by this factor, the runs themselves have changed:
 their limit is in their own sigmas."""
-NORMAL_MAD = 1.4826
-"""Standard deviation over median absolute deviation of normal errors."""
+NORMAL_MAD = 1.4826  # standard deviation over median absolute deviation of normal errors
 
 
 def limit_outliers(

@@ -40,8 +40,7 @@ OFFSET_SIGMAS = {"yaw_rate_radps": 0.001, "accel_x_mps2": 0.02, "accel_y_mps2": 
 """IMU channels with a turn-on offset, and its first 1 sigma (assumed)."""
 CURRENTS = ("current_left_a", "current_right_a")
 """Channels with an offset and a gain that are drawn with every run, of the vehicle file's 1 sigma."""
-LEAST_OFFSET_A, LEAST_GAIN = 0.05, 1e-3
-"""Least 1 sigma of those (assumed)."""
+LEAST_OFFSET_A, LEAST_GAIN = 0.05, 1e-3  # least 1 sigma of those (assumed)
 SAME_YAW_RAD = 0.2
 """Runs with equal commands share a linearisation if they start within such a sector of headings."""
 OUTLIER_SIGMAS, ROBUST_STEPS = 4.0, 8

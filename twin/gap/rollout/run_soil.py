@@ -30,14 +30,12 @@ from terrafusion.twin.gap.rollout.sensitivities import Rollout, aligned_predicti
 
 Array = NDArray[np.float64]
 
-MOST_SOIL = 4.0
-"""Limit of a run's soil, in typical sizes from the model's."""
+MOST_SOIL = 4.0  # limit of a run's soil, in typical sizes from the model's
 LIMIT_SIGMAS = 3.0
 """A run's soil is also limited to so many sigmas of the references' soils: what goes beyond is a gap."""
 STEPS, ENOUGH, GOOD = 4, 0.97, 1.2
 """Steps of the search; it ends when one gains less than 3 %, or the errors are near the noise."""
-EFFECT_SIGMA = 0.3
-"""1 sigma of the effects, in typical sizes, while a run's soil is sought."""
+EFFECT_SIGMA = 0.3  # 1 sigma of the effects, in typical sizes, while a run's soil is sought
 
 
 @dataclass(eq=False)

@@ -12,8 +12,7 @@ Array = NDArray[np.float64]
 
 PEAK_SHARE = 0.4
 """Where the pressure under a wheel is highest, over the entry angle (Wong and Reece 1967: c1 about 0.43)."""
-RESIDUAL = 0.95
-"""Shear stress far past the hump over that at the hump (assumed; Wong 2008 has 0.4 to 1)."""
+RESIDUAL = 0.95  # shear stress far past the hump over that at the hump (assumed; Wong 2008 has 0.4 to 1)
 HUMP = 1.0 / (1.0 - np.exp(-1.0)) - RESIDUAL
 REST_MPS = 0.005
 """Slip counts against this speed where nothing moves: a parked robot creeps no faster than about 1e-5 m/s."""
@@ -74,8 +73,7 @@ def mean_shear_over_share(x: Array) -> Array:
     return np.asarray((RESIDUAL * (x - rising) + 0.5 * np.e * HUMP * rising * rising) / (x * x))
 
 
-INITIAL_SLOPE = RESIDUAL + np.e * HUMP
-"""Twice the slope of the mean shear at x = 0."""
+INITIAL_SLOPE = RESIDUAL + np.e * HUMP  # twice the slope of the mean shear at x = 0
 
 
 def hump_modulus(modulus: Array, strength: Array, mohr: Array) -> Array:

@@ -15,8 +15,7 @@ WAVES = 10
 QUANTITIES = ("strength", "bearing", "modulus")
 WEIGHTS = {"strength": 1.0, "bearing": 2.0, "modulus": -1.5}
 """How far each quantity's logarithm varies beside that of the strength (assumed)."""
-SHARED = 0.7
-"""Correlation of the quantities: dense ground is strong, stiff and shears early (assumed)."""
+SHARED = 0.7  # correlation of the quantities: dense ground is strong, stiff and shears early (assumed)
 
 
 class SoilField:

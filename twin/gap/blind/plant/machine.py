@@ -22,10 +22,8 @@ Array = NDArray[np.float64]
 
 SIDES = np.array([1.0, -1.0, 1.0, -1.0])[:, None]
 ENDS = np.array([1.0, 1.0, -1.0, -1.0])[:, None]
-TRANSFER_S = 0.05
-"""Time constant with which loads follow the body's acceleration."""
-SUPPLY_S = 0.05
-"""Time constant of the battery's current."""
+TRANSFER_S = 0.05  # time constant with which loads follow the body's acceleration
+SUPPLY_S = 0.05  # time constant of the battery's current
 DRAG_MPS, BRAKE_RADPS, PLAY_S = 0.02, 0.05, 0.03
 AIR_KG_PER_M3 = 1.2
 WHEEL_STATES = ("speed", "angle", "torque", "integral", "force_x", "force_y", "play")
