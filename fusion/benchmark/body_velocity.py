@@ -1,8 +1,9 @@
 """Forward and sideways body velocity from noisy poses and a gyro.
 
-The two speeds are piecewise linear between knots and fitted to the positions by penalised least squares (Whittaker
-1923; penalty on the change of acceleration) with Huber weights (1964) against outliers. The heading is the
-gyro's, rotated once a chunk to the yaw of the poses: over two seconds it is better than a lidar's.
+The two speeds are piecewise linear between knots and fitted to the positions by penalised least squares
+(Whittaker 1923; penalty on the change of acceleration) with Huber weights (1964) against outliers. The
+heading is the gyro's, rotated once a chunk to the yaw of the poses: over two seconds it is better than a
+lidar's.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Paired comparison of methods: median error ratios with intervals, wins and losses.
 
-The errors of two methods are divided run by run; the result is the median ratio over independent units (seeds;
-for a field log the median over its outages). Its interval is that of the sign test, between two ordered ratios
-(Thompson 1936, Ann. Math. Statist. 7(3)): distribution-free, from `LEAST_UNITS` units on. The interval of a
-share of two gains is the percentile bootstrap's over units, both methods resampled together.
+The errors of two methods are divided run by run; the result is the median ratio over independent units
+(seeds; for a field log the median over its outages). Its interval is that of the sign test, between two
+ordered ratios (Thompson 1936, Ann. Math. Statist. 7(3)): distribution-free, from `LEAST_UNITS` units on. The
+interval of a share of two gains is the percentile bootstrap's over units, both methods resampled together.
 
 A failed replay has an infinite error. Runs on which the base failed are left out.
 """
@@ -62,7 +62,7 @@ class Contrast:
 
 @dataclass(frozen=True)
 class GainShare:
-    """Share of the oracle's gain over fixed noise that the detected ground reaches; None without such a gain."""
+    """Share of the oracle's gain over fixed noise that the detected ground reaches; None without a gain."""
 
     family: str
     plant: str

@@ -40,7 +40,7 @@ MIN_OUTAGE_M = 3.0
 """Outages with a shorter wheel path are left out."""
 SLIPPING = ("medium_sand", "loose_sand", "sandy_loam", "ploughed_soil", "mud", "snow", "ice")
 UNFORESEEN = (ArithmeticError, RuntimeError, ValueError)
-"""Unexpected errors of readers and solver: they end one replay, are reported, and do not end the benchmark."""
+"""Unexpected errors of readers and solver: reported, and ending one replay only."""
 Result = TypeVar("Result")
 SET_GROUND = {"husky_parkinglot": "firm"}
 """Ground of sets whose title names it and whose logs have no label."""

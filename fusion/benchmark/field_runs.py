@@ -193,7 +193,7 @@ def _commanded(
 
 
 def _poses(chain: Sequence[Recording], starts: Sequence[float]) -> Poses:
-    """Truth or good fixes; every window, and every `CHUNK_S` of a long run, is a chunk with its own origin."""
+    """Truth or good fixes; every window, and every `CHUNK_S` of a long run, is a chunk with an origin."""
     times, places, yaws, chunks = (
         [np.zeros(0)],
         [np.zeros((0, 2))],

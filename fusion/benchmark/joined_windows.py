@@ -1,8 +1,9 @@
 """Consecutive windows of a log joined into one run.
 
-Public sets cut runs into windows of two seconds, each with a truth in a frame of its own. Wheels and IMU of the joined
-run are the samples of the windows; its truth is the path with the gyro's heading and the forward and sideways
-speeds that best explain the poses of every window (`body_velocity`). It contains the error of the gyro.
+Public sets cut runs into windows of two seconds, each with a truth in a frame of its own. Wheels and IMU of
+the joined run are the samples of the windows; its truth is the path with the gyro's heading and the forward
+and sideways speeds that best explain the poses of every window (`body_velocity`). It contains the error of
+the gyro.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ MAX_TRUTH_GAP_S = 1.0
 def joined_runs(name: str, recordings: Sequence[Recording]) -> list[Recording]:
     """The runs of two or more consecutive windows among `recordings`, in their order.
 
-    A run starts at time 0 in the origin, heading along x, and has wheels, IMU and truth only; no truth if that
-    has a gap of more than `MAX_TRUTH_GAP_S`.
+    A run starts at time 0 in the origin, heading along x, and has wheels, IMU and truth only; no truth if
+    that has a gap of more than `MAX_TRUTH_GAP_S`.
 
     Raises:
         DataError: the windows have no wheels or no gyro, or do not say which vehicle it is.

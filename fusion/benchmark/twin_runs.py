@@ -1,8 +1,9 @@
 """Simulated runs of the benchmark.
 
-A case is a family of runs, a plant and a seed. Commands, route, slope, heading and outage depend on family and
-seed alone, so that all plants drive the same; soils and sensor noise are drawn for each plant. The policy, the
-terrain model and the tuning use seeds far below `FIRST_SEED`; those from 100 000 on served development.
+A case is a family of runs, a plant and a seed. Commands, route, slope, heading and outage depend on family
+and seed alone, so that all plants drive the same; soils and sensor noise are drawn for each plant. The
+policy, the terrain model and the tuning use seeds far below `FIRST_SEED`; those from 100 000 on served
+development.
 """
 
 from __future__ import annotations
@@ -103,8 +104,8 @@ class BenchmarkCase:
 class BenchmarkRun:
     """A recording, its outage (None: the whole run is scored) and its true ground where known.
 
-    `unit` names the independent unit: the seed, or the log from which several outages are taken. A run without
-    reference is not `judged`: only its divergence is checked.
+    `unit` names the independent unit: the seed, or the log from which several outages are taken. A run
+    without reference is not `judged`: only its divergence is checked.
     """
 
     family: str

@@ -38,7 +38,7 @@ class ClassificationScores:
 def classification_scores(
     classes: Sequence[str], true: NDArray[np.intp], winner: NDArray[np.intp], confidence: Array
 ) -> ClassificationScores:
-    """Scores of n windows: true and most probable class (n,), as indices, and the probability of the latter."""
+    """Scores of n windows: indices (n,) of true and most probable class, and the latter's probability (n,)."""
     from sklearn.metrics import accuracy_score, confusion_matrix, f1_score
 
     every: list[int] = list(range(len(classes)))
@@ -54,7 +54,7 @@ def classification_scores(
 
 
 def calibration_error(confidence: Array, correct: NDArray[np.bool_]) -> float:
-    """Expected calibration error (Naeini et al. 2015), ten bins, of probabilities (n,); scikit-learn has none."""
+    """Expected calibration error (Naeini et al. 2015) of probabilities (n,); scikit-learn has none."""
     bins = np.minimum((confidence * ECE_BINS).astype(int), ECE_BINS - 1)
     gap = np.bincount(bins, weights=confidence - correct, minlength=ECE_BINS)
     return float(np.abs(gap).sum() / len(confidence))

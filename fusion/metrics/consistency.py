@@ -1,18 +1,18 @@
-"""Consistency of the estimator: NEES and NIS by terrain and over time, with the band of a consistent estimator.
+"""NEES and NIS of an estimate by terrain and over time, with the band of a consistent estimator.
 
-An error e with covariance P is whitened, u = L^-1 e with P = L L'. For a consistent estimator u has zero mean and
-unit variance and |u|^2 is chi-square with d degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001, sec. 5.4.2):
-NEES for errors against a reference, NIS for innovations. Both per dimension, |u|^2 / d: 1 is consistent, above 1
-overconfident, below 1 cautious.
+An error e with covariance P is whitened, u = L^-1 e with P = L L'. For a consistent estimator u has zero
+mean and unit variance and |u|^2 is chi-square with d degrees of freedom (Bar-Shalom, Li, Kirubarajan 2001,
+sec. 5.4.2): NEES for errors against a reference, NIS for innovations. Both per dimension, |u|^2 / d: 1 is
+consistent, above 1 overconfident, below 1 cautious.
 
-Samples of one run are correlated. For a Gaussian process with autocorrelation rho the mean square of N samples has
-the variance of N_eff independent ones,
+Samples of one run are correlated. For a Gaussian process with autocorrelation rho the mean square of N
+samples has the variance of N_eff independent ones,
 
     1 / N_eff = sum over all pairs (s, t) of rho(|s - t|)^2 / N^2
 
-(Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8(2)), and N_eff d times the mean is close to chi-square with
-d N_eff degrees of freedom. rho is estimated about zero, the known mean (a constant error counts as one sample), and
-truncated at its first value that is not positive (Geyer 1992, initial positive sequence).
+(Bayley and Hammersley 1946, J. R. Stat. Soc. Suppl. 8(2)), and N_eff d times the mean is close to chi-square
+with d N_eff degrees of freedom. rho is estimated about zero, the known mean (a constant error counts as one
+sample), and truncated at its first value that is not positive (Geyer 1992, initial positive sequence).
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ def verdict(mean: float, low: float, high: float) -> str:
 
 
 def position(errors: Errors) -> Whitened:
-    """Horizontal position errors by the Cholesky factor of their covariance; NaN where it is not positive definite."""
+    """Horizontal position errors by the Cholesky factor of their covariance; NaN if not positive definite."""
     e, P = errors.position_error_m(), errors.covariance_m2
     off = 0.5 * (P[:, 0, 1] + P[:, 1, 0])
     with np.errstate(invalid="ignore", divide="ignore"):

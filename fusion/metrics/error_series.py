@@ -91,8 +91,8 @@ def errors_against_truth(
 ) -> Errors | None:
     """The error series against the truth, or None if nothing can be compared.
 
-    The denser of the two is interpolated at the times of the sparser, except inside gaps. Only channels listed
-    in `truth_channels`, if any, are used.
+    The denser of the two is interpolated at the times of the sparser, except inside gaps. Only channels
+    listed in `truth_channels`, if any, are used.
     """
     truth, listed = recording.truth, set(recording.truth_channels)
     if truth is None or len(truth) < 2 or len(estimate.trajectory) < 2:

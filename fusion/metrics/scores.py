@@ -1,14 +1,14 @@
 """Scores of an estimate against truth or held-out GNSS fixes, in the horizontal plane.
 
-- ATE: rms of the position error (Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems", IROS,
-  eq. 5) without alignment, because estimate and reference share the ENU frame. Only a run without GNSS is aligned,
-  once, at its start.
-- RPE: Sturm et al. (2012), eq. 2, over pairs 10, 50 or 100 m of path apart, as percent of that length, averaged over
-  all pairs as in Geiger et al. (2012, KITTI). Without a reference heading, displacements are compared in the
-  world frame, so heading errors count in full.
-- NEES: mean of e' P^-1 e / 2 for the 2-D position error e and its covariance P (Bar-Shalom, Li, Kirubarajan 2001,
-  sec. 5.4.2, divided by the dimension): 1 is consistent, above 1 overconfident. Against fixes, P includes the
-  covariance of the fix. By terrain and over time: `consistency`.
+- ATE: rms of the position error (Sturm et al. 2012, "A benchmark for the evaluation of RGB-D SLAM systems",
+  IROS, eq. 5) without alignment, because estimate and reference share the ENU frame. Only a run without GNSS
+  is aligned, once, at its start.
+- RPE: Sturm et al. (2012), eq. 2, over pairs 10, 50 or 100 m of path apart, as percent of that length,
+  averaged over all pairs as in Geiger et al. (2012, KITTI). Without a reference heading, displacements are
+  compared in the world frame, so heading errors count in full.
+- NEES: mean of e' P^-1 e / 2 for the 2-D position error e and its covariance P (Bar-Shalom, Li, Kirubarajan
+  2001, sec. 5.4.2, divided by the dimension): 1 is consistent, above 1 overconfident. Against fixes, P
+  includes the covariance of the fix. By terrain and over time: `consistency`.
 - Outage: errors inside a span without GNSS, never realigned: position and heading errors at its start count.
 
 Times in seconds count from the start of the recording.
@@ -95,8 +95,8 @@ class HeldOut:
 class Scores:
     """All scores of one run; None without a reference.
 
-    `errors` are the underlying series, `notes` describe alignment and exclusions. `consistency` holds NEES and
-    NIS of the whole run and by terrain, `consistency_over_time` the same in windows.
+    `errors` are the underlying series, `notes` describe alignment and exclusions. `consistency` holds NEES
+    and NIS of the whole run and by terrain, `consistency_over_time` the same in windows.
     """
 
     against: str | None

@@ -25,8 +25,8 @@ SEEN_WITHIN_S = 2.0
 class ChangeDetection:
     """Detection of changes of ground: quantiles of the delays, s, and shares of all changes.
 
-    A change is detected when the new ground first has the largest probability, and missed (`never`) if that does
-    not happen before the next change; `right` is the share of correctly classified windows.
+    A change is detected when the new ground first has the largest probability, and missed (`never`) if that
+    does not happen before the next change; `right` is the share of correctly classified windows.
     """
 
     median_s: float

@@ -133,7 +133,7 @@ def evaluate(model: TerrainModel, routes: Sequence[LabelledRoute]) -> DetectorSc
 def _switches(
     route: LabelledRoute, winner: NDArray[Any], true: NDArray[Any], moving: NDArray[np.bool_]
 ) -> tuple[list[float], int, int]:
-    """Delays of the detected changes of ground (s of driving), and the number of missed and false switches."""
+    """Delays of the detected changes of ground, s of driving; number of missed and of false switches."""
     delays, missed = [], 0
     settled = np.ones(len(winner), dtype=bool)
     for first, end in itertools.pairwise([*route.starts, len(winner)]):

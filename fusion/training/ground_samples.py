@@ -2,17 +2,20 @@
 
 Against the truth of a simulated run, only while the wheels turn:
 
-- slip: 1 - v / (omega R) of 0.5 s means above 0.15 m/s. Of every immobilised spell only the first second counts:
-  a policy must cover its onset, while its length is arbitrary. `policy_fit` fits a line over the grade (sine of
-  the pitch) and the correlation time of an Ornstein-Uhlenbeck process, tau = -2 s / ln(rho), rho the
-  autocorrelation at a lag of 2 s. The error of the rolling radius, about 1 %, is added to both: the twin has none.
+- slip: 1 - v / (omega R) of 0.5 s means above 0.15 m/s. Of every immobilised spell only the first second
+  counts: a policy must cover its onset, while its length is arbitrary. `policy_fit` fits a line over the
+  grade (sine of the pitch) and the correlation time of an Ornstein-Uhlenbeck process, tau = -2 s / ln(rho),
+  rho the autocorrelation at a lag of 2 s. The error of the rolling radius, about 1 %, is added to both: the
+  twin has none.
 - wheel sigma: speed over 0.1 s not explained by the slip averaged over 1 s, in quadrature with the vehicle
   file's `speed_sigma_mps` (mounting, backlash, uneven ground: the twin's encoders are only quantised).
-- yaw scale: true over wheel yaw rate less one, 0.5 s means, while the wheels turn the robot faster than 0.1 rad/s.
-- side-slip: lateral over forward speed of the body origin above 0.2 m/s, less the part proportional to the yaw
-  rate (the centre of rotation is a state of the estimator).
+- yaw scale: true over wheel yaw rate less one, 0.5 s means, while the wheels turn the robot faster than 0.1
+  rad/s.
+- side-slip: lateral over forward speed of the body origin above 0.2 m/s, less the part proportional to the
+  yaw rate (the centre of rotation is a state of the estimator).
 - IMU: mean error over tau less its 60 s running mean (the bias), as a multiple of the data sheet's density /
-  sqrt(tau). Vibration is band-limited, so the multiple falls with tau; tau is the time over which the estimator
+  sqrt(tau). Vibration is band-limited, so the multiple falls with tau; tau is the time over which the
+  estimator
   integrates the sensor: 2 s for the specific force, 5 s for the rate.
 - GNSS: horizontal error over the reported sigma.
 

@@ -1,7 +1,7 @@
 """Gaussian mixtures fitted by EM to features with missing values, the class densities of the terrain model.
 
-Missing features are NaN; the E-step uses their conditional moments given the observed ones (Ghahramani and Jordan
-1994). scikit-learn's GaussianMixture takes no missing values.
+Missing features are NaN; the E-step uses their conditional moments given the observed ones (Ghahramani and
+Jordan 1994). scikit-learn's GaussianMixture takes no missing values.
 """
 
 from __future__ import annotations

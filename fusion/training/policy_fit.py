@@ -1,8 +1,9 @@
 """Fits the sensor noise of each ground to simulated runs and labelled logs.
 
-From the samples of `ground_samples`; every rms is of samples winsorised at 0.5 and 99.5 %. `fixed` is fitted to all
-grounds pooled with equal weight, the best single noise for the same runs. `unknown`, for any other ground, is
-the moment match of the grounds with standard deviations (but the receiver's) `UNKNOWN_SPREAD` times larger.
+From the samples of `ground_samples`; every rms is of samples winsorised at 0.5 and 99.5 %. `fixed` is fitted
+to all grounds pooled with equal weight, the best single noise for the same runs. `unknown`, for any other
+ground, is the moment match of the grounds with standard deviations (but the receiver's) `UNKNOWN_SPREAD`
+times larger.
 """
 
 from __future__ import annotations
@@ -65,8 +66,8 @@ def fit_policy(
 ) -> Policy:
     """Simulate the runs of `grid` and fit the sensor noise of each ground; `tick` is called after each run.
 
-    Logs update the twin's noise of their ground, or of all grounds pooled if the twin has no such ground. With
-    logs, `fixed` is the moment match of the updated noise.
+    Logs update the twin's noise of their ground, or of all grounds pooled if the twin has no such ground.
+    With logs, `fixed` is the moment match of the updated noise.
 
     Raises:
         TerrafusionError: on a ground the wheels hardly turned.
@@ -169,8 +170,8 @@ def _yaw_scale_of(found: list[Array]) -> tuple[float, float]:
 def _slip_line(grounds: list[GroundSamples]) -> tuple[float, float]:
     """Slip on the level and its slope over the grade, means of the grounds' lines.
 
-    Least absolute deviations by reweighted least squares: the line stands for steady driving, and bursts of slip
-    (long tails) are seen by the IMU. A constant grade leaves the slope at zero.
+    Least absolute deviations by reweighted least squares: the line stands for steady driving, and bursts of
+    slip (long tails) are seen by the IMU. A constant grade leaves the slope at zero.
     """
     lines = []
     for e in grounds:
@@ -209,7 +210,7 @@ def _spread(row: SensorNoise) -> SensorNoise:
 
 
 def _rounded(row: SensorNoise) -> SensorNoise:
-    """Rounded to `DIGITS` significant digits, equal on every machine, and limited to the ranges of the file."""
+    """Rounded to `DIGITS` digits, equal on every machine, and limited to the ranges of the file."""
     digits = (float(f"{value:.{DIGITS}g}") for value in dataclasses.astuple(row))
     return within_ranges(SensorNoise(*digits))
 

@@ -1,12 +1,13 @@
 """Slip, yaw scale and side-slip on the grounds of labelled logs, for the weighting policy.
 
-A log needs wheels of both sides, a truth with position and orientation, and ground labels. All other noise stays the
-twin's: a lidar or motion-capture truth shows neither wheel speed over 0.1 s nor IMU noise, and receiver errors
-need a truth in the receiver's frame.
+A log needs wheels of both sides, a truth with position and orientation, and ground labels. All other noise
+stays the twin's: a lidar or motion-capture truth shows neither wheel speed over 0.1 s nor IMU noise, and
+receiver errors need a truth in the receiver's frame.
 
-Speeds are means over `MEAN_S` of the displacement in body axes, every 0.5 s. Pose time stamps good to 50 ms cause
-slip errors of 0.07 s over that length: the sigma of a Warthog on asphalt is 0.071 for 2 s, 0.041 for 6 s and 0.026
-for 10 s. Shorter variation is not seen, so logs give no correlation time and reduce no standard deviation.
+Speeds are means over `MEAN_S` of the displacement in body axes, every 0.5 s. Pose time stamps good to 50 ms
+cause slip errors of 0.07 s over that length: the sigma of a Warthog on asphalt is 0.071 for 2 s, 0.041 for 6
+s and 0.026 for 10 s. Shorter variation is not seen, so logs give no correlation time and reduce no standard
+deviation.
 """
 
 from __future__ import annotations

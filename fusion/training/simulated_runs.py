@@ -77,7 +77,7 @@ class Condition:
 
 
 def scattered_soil(terrain: str, rng: np.random.Generator, folder: Path) -> Path:
-    """A soil file in `folder`: the library's `terrain` scattered by `SOIL_SCATTER` within the valid ranges."""
+    """A soil file in `folder`: the library's soil scattered by `SOIL_SCATTER` inside its valid ranges."""
     from ruamel.yaml import YAML
 
     raw = copy.deepcopy(read_named("soils", terrain, kind="terrain")[0])

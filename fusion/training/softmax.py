@@ -1,8 +1,8 @@
 """Ground classifier of one robot: calibrated softmax regression over its surface features, in a YAML file.
 
-Multinomial logistic regression, fitted by scikit-learn, evaluated here without it. Cross-validated by run it is
-better than a forest on BorealTC (docs/detector.md). Missing features count as the training mean; training on
-copies of the windows without whole feature groups keeps it calibrated then.
+Multinomial logistic regression, fitted by scikit-learn, evaluated here without it. Cross-validated by run it
+is better than a forest on BorealTC (docs/detector.md). Missing features count as the training mean; training
+on copies of the windows without whole feature groups keeps it calibrated then.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ UNKNOWN = "unknown"
 PATCH_LENGTH_M = 10.0
 BREAK_MEMORY = 6
 BREAK_FROM = 0.75
-"""A last second whose class probabilities differ from the mean of the six before (total variation above this) ends
-the patch: errors within a patch are correlated, so the filter alone is slow to leave a ground."""
+"""Total variation between the class probabilities of the last second and the mean of the six before above which
+the patch ends: errors within a patch are correlated, so the filter alone is slow to leave a ground."""
 STRADDLES = round(WINDOW_S / HOP_S)
 """Windows after a change that contain some of the ground before: for them only the last second is used."""
 STRENGTH = 0.1

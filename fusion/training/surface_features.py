@@ -1,9 +1,10 @@
 """Surface features of a labelled log, for the ground classifier of one robot.
 
-The detector of the estimator (`terrain.features`) has seven features that do not depend on the robot. With labelled
+The detector of the estimator (`terrain.features`) has seven features that do not depend on the robot. With
+labelled
 logs of one robot more can be used: spectra of six vibration axes, wheels, gyro and motor current over two
-seconds, as logarithms, so that speed, load and sensor gain are shifts. Missing features are NaN. Bias, tilt and
-absolute heading, which would identify the place or day, are left out.
+seconds, as logarithms, so that speed, load and sensor gain are shifts. Missing features are NaN. Bias, tilt
+and absolute heading, which would identify the place or day, are left out.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Training of the terrain model on simulated runs.
 
-Three disjoint sets of seeds: for the densities, for the calibration of temperature and weight of `unknown`, and for
-the scores.
+Three disjoint sets of seeds: for the densities, for the calibration of temperature and weight of `unknown`,
+and for the scores.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def _log_loss(
     temperature: float,
     unknown_log_weight: float,
 ) -> tuple[float, float]:
-    """Mean -log posterior of the true ground along a route, and the share of windows classified as unknown."""
+    """Mean -log posterior of the true ground along a route, and the share of windows called unknown."""
     patch = PatchFilter(len(model.classes) + 1, model.patch_length_m)
     weight = np.append(np.zeros(len(model.classes)), unknown_log_weight)
     loss, unknown = 0.0, 0
