@@ -19,9 +19,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.config import read_yaml, shown, structure
+from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.quantity import shown
+from terrafusion.datasets.core.yaml_file import read_yaml
 
 HERE = Path(__file__).parent
 DATA_VARIABLE, CATALOG_VARIABLE = "TERRAFUSION_DATA", "TERRAFUSION_CATALOG"

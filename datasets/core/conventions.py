@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Channel, Imu, Terrain
-from terrafusion.datasets.core.config import Position, Sourced
+from terrafusion.datasets.core.quantity import Position, Sourced
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory

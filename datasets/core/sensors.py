@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.config import Position, Sourced
+from terrafusion.datasets.core.quantity import Position, Sourced
 
 AXES = {
     "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0),

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import ClockError, DataError
+from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.decimals import NotADecimal, to_ns
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.quantity import shown
 
 Array = NDArray[np.float64]
 

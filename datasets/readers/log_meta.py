@@ -7,17 +7,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from terrafusion.datasets.core.config import (
-    Prepared,
-    Quantity,
-    Switch,
-    Whole,
-    Word,
-    read_yaml,
-    shown,
-    structure,
-)
+from terrafusion.datasets.core.config import Prepared, structure
+from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, shown
 from terrafusion.datasets.core.recording import ClockJump, Overrides
+from terrafusion.datasets.core.yaml_file import read_yaml
 
 TRUTH_CHANNELS = ("position", "yaw", "orientation", "velocity")
 MAX_START_NS = 8 * 10**18

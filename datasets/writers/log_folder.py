@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Wheels
-from terrafusion.datasets.core.config import MAX_BYTES
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.yaml_file import MAX_BYTES
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META

@@ -8,7 +8,9 @@ from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any
 
-from terrafusion.datasets.core.config import Quantity, Word, quantities, read_yaml, structure
+from terrafusion.datasets.core.config import quantities, structure
+from terrafusion.datasets.core.quantity import Quantity, Word
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 
 SCHEMA = "terrafusion.modes/1"

@@ -17,8 +17,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from terrafusion.datasets.core.config import Quantity, Word, quantities, read_yaml, structure
+from terrafusion.datasets.core.config import quantities, structure
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity, Word
+from terrafusion.datasets.core.yaml_file import read_yaml
 
 SCHEMA = "terrafusion.policy/2"
 

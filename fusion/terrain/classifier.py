@@ -20,7 +20,9 @@ from typing import Annotated, Any
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.config import Quantity, Word, read_yaml, refuse, structure
+from terrafusion.datasets.core.config import refuse, structure
+from terrafusion.datasets.core.quantity import Quantity, Word
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.features import FEATURES, SLIP
 
 SCHEMA = "terrafusion.terrain/1"

@@ -16,8 +16,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import read_yaml
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.training.surface_features import (
     GROUPS,

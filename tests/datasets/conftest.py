@@ -15,11 +15,11 @@ from ruamel.yaml import YAML
 
 from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, FILE_COLUMNS, HERE, sha256_of
 from terrafusion.datasets.core.channels import Command, Fix, Gnss, Imu, Motor, Terrain, Wheels
-from terrafusion.datasets.core.config import read_yaml
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import GnssSpec, ImuSpec, Rig, SensorSuite, WheelSpec
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.core.yaml_file import read_yaml
 
 START_NS = 1_700_000_000_123_456_789
 TRACK_M = 0.555

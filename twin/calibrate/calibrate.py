@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import Quantity, checked_number
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
+from terrafusion.datasets.core.quantity import Quantity, checked_number
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.answer import answer_of
 from terrafusion.twin.calibrate.coordinates import Prior

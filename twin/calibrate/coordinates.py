@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from terrafusion.datasets.core.config import Quantity
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.twin.effects.catalogue import lookup
 
 PRIOR_FACTOR = 0.5

@@ -16,8 +16,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import Quantity, quantities
+from terrafusion.datasets.core.config import quantities
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.twin.effects.catalogue import parameters
 from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector

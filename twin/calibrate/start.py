@@ -6,8 +6,8 @@ import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from terrafusion.datasets.core.config import Quantity
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
 from terrafusion.twin.calibrate.log import PreparedLog, grounds

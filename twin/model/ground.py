@@ -15,8 +15,8 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import Quantity
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.twin.model.plant import RouteTable, SoilField, smoothstep
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, SOIL_PARAMETERS, VEHICLE_PARAMETERS
 

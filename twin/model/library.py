@@ -8,8 +8,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.config import read_yaml
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.model.soil_table import is_published, published_soil
 
 

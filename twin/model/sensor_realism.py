@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Sourced
+from terrafusion.datasets.core.quantity import Sourced
 
 
 @dataclass(frozen=True)

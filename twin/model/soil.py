@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Sourced, structure
+from terrafusion.datasets.core.config import structure
+from terrafusion.datasets.core.quantity import Sourced
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.soil_table import is_published, published_soil
 

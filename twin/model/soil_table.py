@@ -13,8 +13,8 @@ import math
 from importlib import resources
 from typing import Any
 
-from terrafusion.datasets.core.config import read_yaml
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.yaml_file import read_yaml
 
 _COLUMNS = {
     "k_c_kn_per_m_n1": ("pressure", "k_c_n_per_m_n1", 1e3),

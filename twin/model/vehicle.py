@@ -14,9 +14,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
-from terrafusion.datasets.core.config import Sourced, refuse, structure
+from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
+from terrafusion.datasets.core.quantity import Sourced
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import Rig, SensorSuite
 from terrafusion.twin.model.library import known_names, read_named

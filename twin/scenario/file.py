@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.config import OneOf, Quantity, Word, refuse, structure
+from terrafusion.datasets.core.config import OneOf, refuse, structure
+from terrafusion.datasets.core.quantity import Quantity, Word
 from terrafusion.twin.model.ground import SoilPatches, Variation
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.scenario.scenario import (

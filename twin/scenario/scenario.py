@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.config import Quantity, checked_number
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity, checked_number
 from terrafusion.twin.model.ground import SoilPatches, Variation
 
 Array = NDArray[np.float64]

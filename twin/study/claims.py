@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from importlib import resources
 from typing import Any
 
-from terrafusion.datasets.core.config import read_yaml
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.study.spread import Spread
 
 AGREE, PARTLY, DISAGREE = "agree", "partly", "disagree"

@@ -21,17 +21,9 @@ from typing import Annotated, Any, get_args, get_type_hints
 
 import numpy as np
 
-from terrafusion.datasets.core.config import (
-    Parsed,
-    Quantity,
-    RejectedError,
-    Switch,
-    Whole,
-    refuse,
-    shown,
-    structure,
-)
+from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Parsed, Quantity, RejectedError, Switch, Whole, shown
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.soil import SoilParams, load_soil
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle

@@ -17,8 +17,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.sets.pickled_frame import (
     ALLOWED,
     MAX_CELLS,

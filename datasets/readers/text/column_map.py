@@ -11,10 +11,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
-from terrafusion.datasets.core.config import Prepared, Quantity, Word, read_yaml, refuse, shown, structure
+from terrafusion.datasets.core.config import Prepared, refuse, structure
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
+from terrafusion.datasets.core.quantity import Quantity, Word, shown
 from terrafusion.datasets.core.sensors import axes_matrix
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.channel_tables import (
     ACCEL,
     COVARIANCE,

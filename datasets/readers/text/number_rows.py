@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.clock import in_order, repair_together
-from terrafusion.datasets.core.config import shown
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.delimited import (
     BLANKS,

@@ -9,19 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.core.config import (
-    OneOf,
-    Prepared,
-    Quantity,
-    Sourced,
-    Switch,
-    Whole,
-    Word,
-    quantities,
-    refuse,
-    structure,
-)
+from terrafusion.datasets.core.config import OneOf, Prepared, quantities, refuse, structure
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.quantity import Quantity, Sourced, Switch, Whole, Word
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from terrafusion.datasets.core.config import read_yaml
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.api.file_schemas import KINDS, write_schemas
 
 STORED = Path(__file__).parents[3] / "docs" / "schemas"

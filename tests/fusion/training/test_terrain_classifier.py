@@ -174,7 +174,7 @@ BROKEN = [
 
 @pytest.fixture(scope="module")
 def content(model: TerrainModel, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    from terrafusion.datasets.core.config import read_yaml
+    from terrafusion.datasets.core.yaml_file import read_yaml
 
     path = tmp_path_factory.mktemp("model") / "model.yaml"
     write_model(model, path)

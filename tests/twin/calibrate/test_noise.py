@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from terrafusion.datasets.core.config import Quantity
+from terrafusion.datasets.core.quantity import Quantity
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.covariance import long_run_variance
 from terrafusion.twin.calibrate.identifiability import COMBINED, IDENTIFIED, NOT_IDENTIFIED, examine

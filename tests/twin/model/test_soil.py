@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.channels import TERRAINS
-from terrafusion.datasets.core.config import read_yaml
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.model.soil import Validity, load_soil, soil_names
 from terrafusion.twin.model.soil_table import published_soils
 from terrafusion.twin.model.vectors import soil_vector

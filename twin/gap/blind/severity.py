@@ -33,7 +33,7 @@ def observed(key: str, kind: str) -> float:
 @functools.cache
 def stored_points() -> dict[str, Any]:
     """`severity.yaml`: `scale` by kind of drive, `points` by shape and kind."""
-    from terrafusion.datasets.core.config import read_yaml
+    from terrafusion.datasets.core.yaml_file import read_yaml
 
     with resources.as_file(resources.files("terrafusion.twin.gap.blind") / "severity.yaml") as path:
         return read_yaml(path)

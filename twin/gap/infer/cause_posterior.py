@@ -88,7 +88,8 @@ def posterior_weights() -> PosteriorWeights:
     Raises:
         ConfigError: the file lacks one.
     """
-    from terrafusion.datasets.core.config import read_yaml, structure
+    from terrafusion.datasets.core.config import structure
+    from terrafusion.datasets.core.yaml_file import read_yaml
 
     with resources.as_file(resources.files("terrafusion.twin.gap.infer") / "cause_posterior.yaml") as path:
         weights = read_yaml(path).get("weights")
