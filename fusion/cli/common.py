@@ -1,4 +1,4 @@
-"""What commands that take a log share: its options, and opening it."""
+"""Options of a log, opening and checking it, and progress: shared by the commands."""
 
 from __future__ import annotations
 
@@ -37,17 +37,15 @@ TopicOption = Annotated[
     ),
 ]
 StampsOption = Annotated[
-    str, typer.Option("--stamps", help="Times of a bag: 'header' (measured) or 'receipt' (recorded).")
+    str, typer.Option("--stamps", help="Times of a bag: 'header' (measurement) or 'receipt' (recording).")
 ]
 ColumnsOption = Annotated[
     Path | None,
-    typer.Option("--columns", metavar="FILE", help="YAML that says what the columns of a plain table are."),
+    typer.Option("--columns", metavar="FILE", help="YAML that describes the columns of a plain table."),
 ]
 RepairClockOption = Annotated[
     bool,
-    typer.Option(
-        "--repair-clock", help="Take steps of a clock out of the times instead of refusing the log."
-    ),
+    typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log."),
 ]
 
 
@@ -63,14 +61,14 @@ def parse_topics(entries: list[str] | None) -> dict[str, str]:
 
 
 def check_stamps(stamps: str) -> str:
-    """`stamps` when it is one of the two words; otherwise wrong usage (exit status 2)."""
+    """`stamps` if it is "header" or "receipt"; otherwise wrong usage (exit status 2)."""
     if stamps not in ("header", "receipt"):
         raise typer.BadParameter(f"'{stamps}' is neither 'header' nor 'receipt'", param_hint="--stamps")
     return stamps
 
 
 def load_rig(vehicle: str | None) -> Rig | None:
-    """The sensor geometry of a vehicle, or None where none is named.
+    """The sensor geometry of a vehicle; None without one.
 
     Raises:
         ConfigError: no such vehicle.
@@ -121,7 +119,7 @@ def opened(names: Sequence[str], options: dict[str, Any], repair_clock: bool) ->
 
 
 def clock_accepted(recording: Recording) -> Recording:
-    """The recording whose clock was repaired as asked: the steps become notes, and no finding any more."""
+    """The recording with its repaired clock steps as notes, so that the log checks accept it."""
     import dataclasses
 
     notes = [
@@ -165,13 +163,13 @@ def _refuse(log: str, findings: list[Finding]) -> None:
     if first.repair is not None:
         remedy += f": `terrafusion convert {shlex.quote(log)} OUT --apply-fixes` does it"
     if more:
-        remedy += f" (`terrafusion inspect` tells {more} more)"
+        remedy += f" (`terrafusion inspect` lists {more} more)"
     raise DataError(f"{first.what} ({first.evidence})", file=log, channel=first.channel, remedy=remedy)
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
-    """A progress bar on a terminal, told the share done (0 to 1); None in a pipe."""
+    """A progress bar on a terminal, updated with the share done (0 to 1); None in a pipe."""
     if not sys.stderr.isatty():
         yield None
         return

@@ -17,18 +17,20 @@ if TYPE_CHECKING:
 def fetch(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="A set, or SET/RECORDING; none shows the catalogue."),
+        typer.Argument(
+            metavar="[NAME]...", help="A set, or SET/RECORDING; without names the catalogue is shown."
+        ),
     ] = None,
     to: Annotated[
         Path | None, typer.Option("--to", help="Folder for the files; the user's cache folder otherwise.")
     ] = None,
-    offline: Annotated[bool, typer.Option("--offline", help="Use what is here, download nothing.")] = False,
+    offline: Annotated[bool, typer.Option("--offline", help="Use local files only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
 ) -> None:
     """Show the catalogue of public recordings, or download from it.
 
-    Every file is pinned by its SHA-256; one that is in TERRAFUSION_DATA or in the cache is not
-    downloaded again, and one that broke off is gone on with. The licences are those of the authors.
+    Every file is checked against its SHA-256. Files in TERRAFUSION_DATA or in the cache are not downloaded
+    again, and interrupted downloads are resumed. The licences are those of the authors.
 
     Examples:
 

@@ -1,7 +1,7 @@
-"""`terrafusion`: the command line. Each command's body lives in a file of its own.
+"""`terrafusion`: the command line, one file a command.
 
 Heavy packages are imported inside the command that needs them, so that
-`terrafusion --help` answers at once.
+`terrafusion --help` is fast.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from terrafusion.fusion.cli import (
 
 app = typer.Typer(
     name="terrafusion",
-    help="Terrain-aware localisation of ground robots, and the honest comparison of a robot with its twin.",
+    help="Terrain-aware localisation of ground robots, and diagnosis of the gap between a robot and its twin.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,
 )
 
 
-def _told(value: bool) -> None:
+def _print_version(value: bool) -> None:
     if value:
         from importlib.metadata import version
 
@@ -52,7 +52,8 @@ def _told(value: bool) -> None:
 @app.callback()
 def options(
     version: Annotated[
-        bool, typer.Option("--version", help="Print the version and stop.", callback=_told, is_eager=True)
+        bool,
+        typer.Option("--version", help="Print the version and stop.", callback=_print_version, is_eager=True),
     ] = False,
 ) -> None:
     """Options of the program itself."""
@@ -91,5 +92,5 @@ def main() -> None:
     except OSError as error:
         if error.errno != errno.ENOSPC:
             raise
-        print("error: there is no room to write to; make some, or write elsewhere", file=sys.stderr)
+        print("error: no space left on the device; free some, or write elsewhere", file=sys.stderr)
         sys.exit(1)

@@ -32,25 +32,25 @@ OutageOption = Annotated[
     typer.Option(
         "--gnss-outage",
         metavar="START:SECONDS",
-        help="Keep all fixes of a stretch from the estimator and score there; repeat for more.",
+        help="Hold out all fixes of a stretch and score there; repeat for more.",
     ),
 ]
 ModeOption = Annotated[
     str,
     typer.Option(
-        help="adaptive: noise follows the detected terrain; fixed: one noise for all grounds; robust: "
-        "fixed with a robust loss; innovation: noise learned from the innovations."
+        help="adaptive: noise follows the detected terrain; fixed: one noise for all terrains; robust: "
+        "fixed with a robust loss; innovation: noise estimated from the innovations."
     ),
 ]
 PolicyOption = Annotated[Path | None, typer.Option(help="Weighting policy; by default the one shipped.")]
 BatchOption = Annotated[
-    bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of as live.")
+    bool, typer.Option("--batch", help="Smooth the whole drive at once, instead of with a fixed lag as live.")
 ]
 CalibrateOption = Annotated[
     bool,
     typer.Option(
         "--calibrate",
-        help="Also estimate what the vehicle file may have wrong: wheel radius, antenna, IMU mounting, "
+        help="Also estimate corrections of the vehicle file: wheel radius, antenna, IMU mounting, "
         "delays of wheels and GNSS.",
     ),
 ]
@@ -73,7 +73,7 @@ DeclinationOption = Annotated[
         metavar="DEG",
         min=-180.0,
         max=180.0,
-        help="Magnetic north, degrees east of north: the magnetometer then tells the heading at rest.",
+        help="Magnetic north, degrees east of north: the magnetometer then gives the heading at rest.",
     ),
 ]
 
@@ -98,8 +98,7 @@ def replay(
 ) -> None:
     """Estimate a recorded drive as it would have run live, and score it.
 
-    Scored against the log's truth; without one, every fifth GNSS fix is kept from the estimator and
-    scored against. Writes metrics.json, estimate.csv, trajectory.tum, weights.jsonl and report.html.
+    Scored against the log's truth; without one, against every fifth GNSS fix, held out of the estimator. Writes metrics.json, estimate.csv, trajectory.tum, weights.jsonl and report.html.
 
     Example: terrafusion replay drive.bag --vehicle husky --gnss-outage 150:60 --out results
 
@@ -149,7 +148,7 @@ def replay(
 
 
 def _write_bag(result: ReplayResult, path: Path) -> None:
-    """The log and the estimate beside it; prints what is not in standard messages."""
+    """The log and the estimate in one bag; prints what is not in standard messages."""
     from terrafusion.datasets.writers.mcap import write_mcap
     from terrafusion.fusion.outputs.ros_estimate import written_estimate
 
@@ -159,7 +158,7 @@ def _write_bag(result: ReplayResult, path: Path) -> None:
 
 
 def summary(result: ReplayResult) -> list[str]:
-    """The result in a few lines of text."""
+    """The result as lines of text."""
     from terrafusion.fusion.outputs.linear_states import calibration, cells
     from terrafusion.fusion.outputs.replay_files import final_status
 
@@ -173,7 +172,7 @@ def summary(result: ReplayResult) -> list[str]:
     if scores.held_out is not None:
         held = scores.held_out
         lines.append(
-            f"{held.fixes} fixes kept back: median error {held.median_m:.2f} m, 95 % {held.p95_m:.2f} m"
+            f"{held.fixes} held-out fixes: median error {held.median_m:.2f} m, 95 % {held.p95_m:.2f} m"
         )
     if scores.against == "truth" and scores.ate_m is not None:
         lines.append(f"against truth: position error {scores.ate_m:.3f} m (root mean square)")

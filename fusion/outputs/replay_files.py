@@ -5,13 +5,13 @@
     trajectory.tum   `t x y z qx qy qz qw`, for evo and the like
     weights.jsonl    one change of a sensor's weight a line, with its reason
 
-Each file is written whole under another name and then renamed, so a reader
-never sees half of one. Numbers that are unknown or not finite are null in JSON
-and empty cells in CSV. The same estimate gives the same bytes.
+Each file appears when it is whole. Numbers that are unknown or not finite are null in JSON and empty cells in
+CSV. The same estimate gives the same bytes.
 """
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -63,7 +63,7 @@ def build_metrics(
         latencies_ms: (K,) time that each update took.
         terrain: share of the time spent on each class (see `terrain_shares`).
         changes: how many times a weight changed.
-        rejected: measurements turned away by a gate, by sensor (see `rejected_counts`).
+        rejected: measurements rejected by a gate, by sensor (see `rejected_counts`).
         status: `value` and `message` (see `final_status`).
         notes: what was assumed; notes on the scoring are added.
         calibration: rows of `linear_states.calibration`; empty where none was asked for.
@@ -120,7 +120,7 @@ def terrain_shares(estimate: Estimate) -> dict[str, float]:
 
 
 def rejected_counts(estimate: Estimate) -> dict[str, int]:
-    """Measurements turned away by a gate; `gnss` counts its velocities too, `wheels` their side-slip too."""
+    """Measurements rejected by a gate, by sensor; `gnss` with its velocities, `wheels` with their side-slip."""
     counts = {"gnss": 0, "wheels": 0}
     for innovation in estimate.innovations:
         if not innovation.accepted:
@@ -170,11 +170,12 @@ def write_outputs(
     Raises:
         TerrafusionError: the folder cannot be made or written.
     """
+    changes = [change_record(change, recording.start_ns) for change in estimate.changes]
     writers: dict[str, Callable[[Path], object]] = {
         "metrics.json": lambda path: path.write_text(to_json(metrics, indent=2) + "\n", encoding="utf-8"),
         "estimate.csv": lambda path: _write_csv(path, estimate_columns(estimate, recording.start_ns)),
         "trajectory.tum": lambda path: write_tum(estimate.trajectory, path),
-        "weights.jsonl": lambda path: _write_lines(path, _change_lines(estimate, recording.start_ns)),
+        "weights.jsonl": lambda path: _write_lines(path, map(to_json, changes)),
     }
     return {name: write_atomically(directory / name, write) for name, write in writers.items()}
 
@@ -213,33 +214,31 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     table |= _numbers(("v_e_mps", "v_n_mps", "v_u_mps"), estimate.velocity_mps, ".6f")
     table |= _numbers(("yaw_rate_radps",), twist[:, 5:], ".6f")
     table |= _numbers(("slip", "slip_sigma"), np.stack([estimate.slip, estimate.slip_sigma], axis=1), ".6f")
-    table["terrain"] = [_cell(name) for name in estimate.dominant_terrain()] if estimate.classes else [""] * n
+    table["terrain"] = (
+        [_one_line(name) for name in estimate.dominant_terrain()] if estimate.classes else [""] * n
+    )
     table |= _numbers([f"p_{name}" for name in estimate.classes], estimate.terrain, ".6f")
     table |= _numbers(("sigma_x_m", "sigma_y_m", "sigma_yaw_rad"), sigma[:, [0, 1, 5]], ".6g")
     table |= _numbers([f"gyro_bias_{a}_radps" for a in "xyz"], estimate.gyro_bias_radps, ".6g")
     table |= _numbers([f"accel_bias_{a}_mps2" for a in "xyz"], estimate.accel_bias_mps2, ".6g")
     for name, values in estimate.weights.items():
         table |= _numbers((f"w_{name}",), np.reshape(values, (n, 1)), ".6g")
-    table["status"] = [_cell(value) for value in estimate.status]
+    table["status"] = [_one_line(value) for value in estimate.status]
     for name, flags in (("slipping", estimate.slipping), ("immobilised", estimate.immobilised)):
         table[name] = [""] * n if flags is None else [str(int(flag)) for flag in flags]
     biases = [f"sigma_gyro_bias_{a}_radps" for a in "xyz"] + [f"sigma_accel_bias_{a}_mps2" for a in "xyz"]
     unknown = np.full((n, 6), np.nan)
     table |= _numbers(biases, unknown if estimate.bias_sigma is None else estimate.bias_sigma, ".6g")
     for state in LINEAR[1:]:
-        found = series(estimate, state)
-        if found is not None:
-            table |= _numbers((state, f"sigma_{state}"), np.stack(found, axis=1), ".6g")
+        value_and_sigma = series(estimate, state)
+        if value_and_sigma is not None:
+            table |= _numbers((state, f"sigma_{state}"), np.stack(value_and_sigma, axis=1), ".6g")
     return table
 
 
 def change_record(change: WeightChange, start_ns: int) -> dict[str, Any]:
     """One line of `weights.jsonl`: t_s, t_ns, sensor, before, after, unit, reason."""
     return {"t_s": (change.t_ns - start_ns) * 1e-9} | dataclasses.asdict(change)
-
-
-def _change_lines(estimate: Estimate, start_ns: int) -> Iterable[str]:
-    return (to_json(change_record(change, start_ns)) for change in estimate.changes)
 
 
 def _numbers(names: Sequence[str], values: NDArray[Any], spec: str) -> dict[str, list[str]]:
@@ -255,14 +254,15 @@ def _seconds(t_ns: int) -> str:
     return f"{'-' if t_ns < 0 else ''}{whole}.{rest:09d}"
 
 
-def _cell(value: object) -> str:
-    text = " ".join(str(value).split())
-    return '"' + text.replace('"', '""') + '"' if any(c in text for c in ',"') else text
+def _one_line(value: object) -> str:
+    return " ".join(str(value).split())
 
 
 def _write_csv(path: Path, table: Mapping[str, list[str]]) -> None:
-    header = ",".join(_cell(name) for name in table)
-    _write_lines(path, [header, *(",".join(row) for row in zip(*table.values(), strict=True))])
+    with path.open("w", encoding="utf-8", newline="") as out:
+        writer = csv.writer(out, lineterminator="\n")
+        writer.writerow(_one_line(name) for name in table)
+        writer.writerows(zip(*table.values(), strict=True))
 
 
 def _write_lines(path: Path, lines: Iterable[str]) -> None:

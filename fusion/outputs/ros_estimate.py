@@ -21,7 +21,7 @@ EVERY_S = 1.0
 
 def written_estimate(estimate: Estimate) -> WrittenEstimate:
     """The estimate, ready for `write_mcap`."""
-    rows = told_rows(estimate)
+    rows = diagnostic_rows(estimate)
     t_ns = estimate.trajectory.t_ns[rows]
     rejected = _rejected_by(estimate, t_ns)
     waits = _seconds_in_status(estimate)
@@ -40,7 +40,7 @@ def written_estimate(estimate: Estimate) -> WrittenEstimate:
     return WrittenEstimate(estimate.trajectory, estimate.twist_covariance, frame, t_ns, diagnostics)
 
 
-def told_rows(estimate: Estimate) -> NDArray[np.int64]:
+def diagnostic_rows(estimate: Estimate) -> NDArray[np.int64]:
     """The keyframes that get diagnostics: the first of each second, and those where a state changes."""
     t_ns = estimate.trajectory.t_ns
     if not len(t_ns):
@@ -111,7 +111,7 @@ def _gates(rejected: dict[str, int]) -> Status:
 
 
 def _rejected_by(estimate: Estimate, t_ns: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-    """By sensor, how many measurements a gate has turned away up to each time (N,)."""
+    """By sensor, measurements rejected by a gate up to each time (N,)."""
     sensors = dict.fromkeys(["gnss", "wheels", *(i.sensor for i in estimate.innovations)])
     counts = {}
     for sensor in sensors:
@@ -121,7 +121,7 @@ def _rejected_by(estimate: Estimate, t_ns: NDArray[np.int64]) -> dict[str, NDArr
 
 
 def _seconds_in_status(estimate: Estimate) -> NDArray[np.float64]:
-    """How long (N,) the status of each keyframe has lasted already."""
+    """Seconds (N,) since the status of each keyframe began."""
     t_ns, status = estimate.trajectory.t_ns, estimate.status
     began = np.arange(len(t_ns))
     began[1:][status[1:] == status[:-1]] = 0

@@ -25,6 +25,7 @@ from terrafusion.fusion.benchmark.twin_runs import FAMILIES, FIELD, PLANTS
 from terrafusion.fusion.metrics.pooled_consistency import VERDICT_SIGNS, PooledConsistency
 
 Cells = list[str]
+NOT_SIGNIFICANT = " (not significant)"
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def _targets(found: Iterable[Target]) -> Section:
 def _reasons(found: Iterable[Reason]) -> Section:
     lines = [
         [
-            group_name(r.family, r.plant), f"{r.winner}, {r.ratio:.2f}{'' if r.sure else ' (not significant)'}",
+            group_name(r.family, r.plant), f"{r.winner}, {r.ratio:.2f}{'' if r.sure else NOT_SIGNIFICANT}",
             number(r.oracle), r.blame(), f"{r.ground}: {r.kind}" if r.ground else "unknown",
             _percent(r.recognised[0]), _percent(r.recognised[1]),
         ]
@@ -135,8 +136,8 @@ def _shares(rows: Sequence[RunScore]) -> Section:
             after = f"{np.median(delays):.1f} s" if delays else "-"
             lines.append([group_name(s.family, s.plant), share, _percent(known), after])
     about = (
-        f"Gain of adaptive over {BASELINE} as a share of the gain with true labels, the share of the outages in "
-        "which the detector is right, and its delay after a change (median over drives). "
+        f"Gain of adaptive over {BASELINE} as a share of the gain with true labels, the share of the outages "
+        "in which the detector is right, and its delay after a change (median over drives). "
         "No gain: the oracle gains no more than 3 %."
     )
     return Section(
@@ -205,8 +206,8 @@ def _ends(interval: Interval | None, decimals: int | None = None) -> str:
 def _cell(cell: PooledConsistency) -> str:
     if cell.drives < LEAST_UNITS:
         return f"{cell.mean:.2f}"
-    (low, high), band = cell.interval, cell.band
-    return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {VERDICT_SIGNS[cell.verdict()]} {band[0]:.2f}..{band[1]:.2f}"
+    (low, high), band, sign = cell.interval, cell.band, VERDICT_SIGNS[cell.verdict()]
+    return f"{cell.mean:.2f} [{low:.2f}, {high:.2f}] {sign} {band[0]:.2f}..{band[1]:.2f}"
 
 
 def _percent(share: float | None) -> str:

@@ -1,4 +1,4 @@
-"""The files of a diagnosis: `diagnosis.json`, `judge.json` where the estimator's gap is known, `report.html`."""
+"""The files of a diagnosis: `diagnosis.json`, `judge.json` with the estimator's gap, and `report.html`."""
 
 from __future__ import annotations
 

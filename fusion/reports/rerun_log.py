@@ -1,8 +1,8 @@
 """A replay as a recording for the Rerun viewer: `terrafusion replay ... --rerun FILE.rrd`.
 
-    world/path, world/truth                        lines; the estimate coloured by the most probable ground
+    world/path, world/truth                        lines; the estimate coloured by the most probable terrain
     world/base_link                                the body, as a transform over time
-    world/gnss/{used,rejected,kept_back}           points
+    world/gnss/{used,rejected,held_out}           points
     world/two_sigma                                ellipses of the position, as in the report
     slip, speed, sigma, bias, terrain, weights     numbers over time
     states/<name>, states/sigma_<name>             the other linear states and their 1 sigma
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 TimesNs = NDArray[np.int64]
 Array = NDArray[np.float64]
 
-GNSS_COLOUR, REFUSED_COLOUR, BODY_COLOUR = "#9a9a9a", "#111111", "#0072b2"
+GNSS_COLOUR, REJECTED_COLOUR, BODY_COLOUR = "#9a9a9a", "#111111", "#0072b2"
 
 
 def require_rerun() -> Any:
@@ -124,11 +124,11 @@ def _world(log: _Log, result: ReplayResult) -> None:
     if recording.truth is not None and len(recording.truth) and not is_local(estimate):
         points = np.nan_to_num(recording.truth.position_m)
         log.fixed("world/truth", rr.LineStrips3D([points], colors=_rgba(style.TRUTH), radii=0.04))
-    refused = np.isin(result.used.t_ns, rejected_fixes(estimate)) if result.used is not None else None
+    rejected = np.isin(result.used.t_ns, rejected_fixes(estimate)) if result.used is not None else None
     for name, gnss, rows, colour in (
-        ("used", result.used, None if refused is None else ~refused, GNSS_COLOUR),
-        ("rejected", result.used, refused, REFUSED_COLOUR),
-        ("kept_back", result.held_out, slice(None), style.HELD_OUT),
+        ("used", result.used, None if rejected is None else ~rejected, GNSS_COLOUR),
+        ("rejected", result.used, rejected, REJECTED_COLOUR),
+        ("held_out", result.held_out, slice(None), style.HELD_OUT),
     ):
         if gnss is not None and len(gnss):
             points = np.nan_to_num(gnss.enu_m[rows])
@@ -164,17 +164,21 @@ def _numbers(log: _Log, estimate: Estimate) -> None:
 
 
 def _events(log: _Log, estimate: Estimate) -> None:
-    told = [
+    events = [
         (c.t_ns, f"{c.sensor}: {c.before:.4g} -> {c.after:.4g} {c.unit} ({c.reason})", "INFO")
         for c in estimate.changes
     ]
     for first, _ in style.runs_of(estimate.status):
         status = str(estimate.status[first])
         level = "INFO" if status == "running" else "WARN"
-        told.append((int(estimate.trajectory.t_ns[first]), f"{status}: {STATUS.get(status, status)}", level))
-    told.sort(key=lambda event: event[0])
-    times = np.array([event[0] for event in told], dtype=np.int64)
-    columns = log.rr.TextLog.columns(text=[event[1] for event in told], level=[event[2] for event in told])
+        events.append(
+            (int(estimate.trajectory.t_ns[first]), f"{status}: {STATUS.get(status, status)}", level)
+        )
+    events.sort(key=lambda event: event[0])
+    times = np.array([event[0] for event in events], dtype=np.int64)
+    columns = log.rr.TextLog.columns(
+        text=[event[1] for event in events], level=[event[2] for event in events]
+    )
     log.over_time("events", times, columns)
 
 

@@ -173,7 +173,7 @@ def _counts_text(found: Mapping[str, int]) -> str:
 
 
 def _statement(row: ClaimResult) -> tuple[tuple[str, str], str, str, str | tuple[str, str]]:
-    """Cells: the statement and what is measured, the study's and the twin's value, the verdict and its basis."""
+    """Cells: the statement and what is measured, value of study and twin, the verdict and its basis."""
     verdict = row.verdict if row.basis == PREDICTED else (row.verdict, row.basis)
     return (f"{row.source}: {row.statement}", row.quantity), row.study, row.twin, verdict
 

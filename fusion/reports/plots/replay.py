@@ -200,7 +200,7 @@ def plot_skid_steering(estimate: Estimate, start_ns: int, *, outages: Sequence[O
 def important_changes(
     changes: Sequence[WeightChange], most: int = 12, apart_s: float = 2.0
 ) -> list[WeightChange]:
-    """The `most` largest changes by ratio, in order of time, at the same time or `apart_s` from each other."""
+    """The `most` largest changes by ratio, in order of time; their times are `apart_s` apart or equal."""
 
     def size(change: WeightChange) -> float:
         low, high = sorted((abs(change.before), abs(change.after)))

@@ -83,7 +83,7 @@ class CellAxis:
 
 
 def per_cell(cell: NDArray[np.int64], values: Array, count: int, statistic: str) -> Array:
-    """Statistic (count,) of the finite values (N,) in each cell ("median" or "mean"); NaN where there is none."""
+    """Statistic (count,), "median" or "mean", of the finite values (N,) in each cell; NaN for none."""
     good = np.isfinite(values) & (cell >= 0)
     found = pd.Series(values[good]).groupby(cell[good]).agg(statistic)
     out = np.full(count, np.nan)

@@ -85,7 +85,7 @@ def test_the_body_moves_along_the_path(chunks: Any) -> None:
     moved = values(found["/world/base_link"], "Transform3D:translation")[:, 0]
     np.testing.assert_allclose(moved, d.estimate.trajectory.position_m, rtol=1e-6, atol=1e-6)
     assert {"/world/path", "/world/truth", "/world/two_sigma", "/world/gnss/used"} <= found.keys()
-    assert "/world/gnss/kept_back" not in found
+    assert "/world/gnss/held_out" not in found
     refused = [i for i in d.estimate.innovations if not i.accepted]
     (drawn,) = values(found["/world/gnss/rejected"], "Points3D:positions")
     assert len(drawn) == len(refused) > 0

@@ -17,7 +17,7 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_mcap
 from terrafusion.datasets.writers.mcap_estimate import Level
-from terrafusion.fusion.outputs.ros_estimate import told_rows, written_estimate
+from terrafusion.fusion.outputs.ros_estimate import diagnostic_rows, written_estimate
 
 
 def with_outage(d: Any, first: int = 405, last: int = 705) -> Any:
@@ -93,7 +93,7 @@ def test_diagnostics_come_each_second_and_at_each_change(bag: Any) -> None:
     assert np.diff(t_ns).max() <= 1_000_000_000
     changes = {int(estimate.trajectory.t_ns[i]) for i in (405, 705)}
     assert changes <= set(t_ns.tolist())
-    assert len(told) == len(told_rows(estimate)) < 0.12 * len(estimate.trajectory)
+    assert len(told) == len(diagnostic_rows(estimate)) < 0.12 * len(estimate.trajectory)
     for t, message in told:
         i = int(np.searchsorted(estimate.trajectory.t_ns, t))
         found_here = statuses(message)
@@ -127,9 +127,9 @@ def test_slipping_is_warned_of_at_once(drive: Any) -> None:
     flag = np.zeros(len(estimate.status), dtype=bool)
     flag[33:37] = True
     told = dataclasses.replace(estimate, slipping=flag, immobilised=~flag & False)
-    assert {33, 37} <= set(told_rows(told).tolist())
+    assert {33, 37} <= set(diagnostic_rows(told).tolist())
     ground = {
-        i: found[1] for i, found in zip(told_rows(told), written_estimate(told).diagnostics, strict=True)
+        i: found[1] for i, found in zip(diagnostic_rows(told), written_estimate(told).diagnostics, strict=True)
     }
     assert (ground[33].level, ground[33].values["slipping"]) == (Level.WARN, "true")
     assert (ground[37].level, ground[37].values["slipping"]) == (Level.OK, "false")
