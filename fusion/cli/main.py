@@ -34,7 +34,7 @@ from terrafusion.fusion.cli import (
 
 app = typer.Typer(
     name="terrafusion",
-    help="Terrain-aware localisation of ground robots, and diagnosis of the gap between a robot and its twin.",
+    help="Terrain-aware localisation of ground robots, and diagnosis of the gap to their twins.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     add_completion=False,

@@ -98,7 +98,8 @@ def replay(
 ) -> None:
     """Estimate a recorded drive as it would have run live, and score it.
 
-    Scored against the log's truth; without one, against every fifth GNSS fix, held out of the estimator. Writes metrics.json, estimate.csv, trajectory.tum, weights.jsonl and report.html.
+    Scored against the log's truth; without one, against every fifth GNSS fix, held out of the
+    estimator. Writes metrics.json, estimate.csv, trajectory.tum, weights.jsonl and report.html.
 
     Example: terrafusion replay drive.bag --vehicle husky --gnss-outage 150:60 --out results
 

@@ -1,4 +1,4 @@
-"""The linear states of an `Estimate` as people read them: series by name, and what a calibration told."""
+"""The linear states of an `Estimate`: series by name, and the result of an online calibration."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def calibration(estimate: Estimate) -> list[dict[str, Any]]:
 
 def cells(row: Mapping[str, Any]) -> list[str]:
     """A row of `calibration` as text: quantity, value, sigma, prior's sigma, verdict."""
-    told = QUANTITIES[row["state"]]
-    numbers = [f"{row[key] * told.scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
+    shown = QUANTITIES[row["state"]]
+    numbers = [f"{row[key] * shown.scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
     verdict = "observed" if row["observed"] else "not observable on this drive"
-    return [f"{told.label}, {told.unit}", *numbers, verdict]
+    return [f"{shown.label}, {shown.unit}", *numbers, verdict]

@@ -120,7 +120,7 @@ def terrain_shares(estimate: Estimate) -> dict[str, float]:
 
 
 def rejected_counts(estimate: Estimate) -> dict[str, int]:
-    """Measurements rejected by a gate, by sensor; `gnss` with its velocities, `wheels` with their side-slip."""
+    """Measurements rejected by a gate, by sensor: `gnss` with velocities, `wheels` with side-slip."""
     counts = {"gnss": 0, "wheels": 0}
     for innovation in estimate.innovations:
         if not innovation.accepted:

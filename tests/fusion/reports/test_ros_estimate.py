@@ -129,7 +129,8 @@ def test_slipping_is_warned_of_at_once(drive: Any) -> None:
     told = dataclasses.replace(estimate, slipping=flag, immobilised=~flag & False)
     assert {33, 37} <= set(diagnostic_rows(told).tolist())
     ground = {
-        i: found[1] for i, found in zip(diagnostic_rows(told), written_estimate(told).diagnostics, strict=True)
+        i: found[1]
+        for i, found in zip(diagnostic_rows(told), written_estimate(told).diagnostics, strict=True)
     }
     assert (ground[33].level, ground[33].values["slipping"]) == (Level.WARN, "true")
     assert (ground[37].level, ground[37].values["slipping"]) == (Level.OK, "false")
