@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.datasets.core.tables import text_table
 from terrafusion.fusion.cli.common import progress_bar
 
 if TYPE_CHECKING:
@@ -67,11 +68,9 @@ def _comparison(results: list[ReplayResult]) -> list[str]:
     ]
     recording = results[0].recording
     labels = [] if recording.terrain is None else map(str, recording.terrain.label)
-    lines = [
+    cells = [[name, *("-" if v is None else f"{v:.2f}" for v in values)] for name, values in rows]
+    return [
         f"{recording.duration_s():.0f} s over {', '.join(dict.fromkeys(labels))}; "
         f"no GNSS from {OUTAGE_START_S:.0f} to {OUTAGE_START_S + OUTAGE_S:.0f} s",
-        f"{'':36s}" + "".join(f"{r.mode:>12s}" for r in results),
+        *text_table(["", *(r.mode for r in results)], cells, right=(1, 2), gap=4),
     ]
-    for name, values in rows:
-        lines.append(f"{name:36s}" + "".join(f"{'-':>12s}" if v is None else f"{v:12.2f}" for v in values))
-    return lines
