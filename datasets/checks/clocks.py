@@ -68,14 +68,14 @@ def clock_jumps(recording: Recording, pairs: SensorPairs) -> dict[str, list[Jump
         if not candidates:
             continue
         own = [(pair.index(name), signals) for pair, signals in pairs.items() if name in pair]
-        ends_late = _ends_late(recording, name, sum(leap.step_ns for leap in candidates))
+        ends_late = _ends_late(recording, name, sum(candidate.step_ns for candidate in candidates))
         jumps: list[JumpAhead] = []
-        for leap, after in zip(candidates, [*candidates[1:], JumpAhead(len(t_ns), 0)], strict=True):
-            rows, moved_ns = slice(leap.row, after.row), sum(jump.step_ns for jump in jumps)
-            answers = (_fits_moved_back(i, signals, rows, moved_ns, leap) for i, signals in own)
+        for candidate, after in zip(candidates, [*candidates[1:], JumpAhead(len(t_ns), 0)], strict=True):
+            rows, moved_ns = slice(candidate.row, after.row), sum(jump.step_ns for jump in jumps)
+            answers = (_fits_moved_back(i, signals, rows, moved_ns, candidate) for i, signals in own)
             moved = next((answer for answer in answers if answer is not None), None)
-            if moved or (moved is None and ends_late and leap.step_ns > SURE_JUMP_S * 1e9):
-                jumps.append(leap)
+            if moved or (moved is None and ends_late and candidate.step_ns > SURE_JUMP_S * 1e9):
+                jumps.append(candidate)
         if jumps:
             found[name] = jumps
     return found
@@ -83,26 +83,24 @@ def clock_jumps(recording: Recording, pairs: SensorPairs) -> dict[str, list[Jump
 
 def jump_findings(context: CheckContext, jumps: dict[str, list[JumpAhead]]) -> Iterator[Finding]:
     """One finding a channel that jumps."""
-    for name, leaps in jumps.items():
-        at_s = context.since_start_s(clocks_of(context.recording)[name][leaps[0].row])
-        total_s = sum(leap.step_ns for leap in leaps) * 1e-9
+    for name, own in jumps.items():
+        at_s = context.since_start_s(clocks_of(context.recording)[name][own[0].row])
+        total_s = sum(jump.step_ns for jump in own) * 1e-9
 
-        def repair(recording: Recording, name: str = name, leaps: list[JumpAhead] = leaps) -> Recording:
+        def repair(recording: Recording, name: str = name, own: list[JumpAhead] = own) -> Recording:
             t_ns = getattr(recording, name).t_ns.copy()
-            for leap in leaps:
-                t_ns[leap.row :] -= leap.step_ns
+            for jump in own:
+                t_ns[jump.row :] -= jump.step_ns
             return retimed(recording, name, t_ns)
 
         yield Finding(
-            "clock-jump",
-            "error",
-            name,
-            f"its clock jumps ahead {counted(len(leaps), 'time')}",
+            "clock-jump", "error", name,
+            f"its clock jumps ahead {counted(len(own), 'time')}",
             f"by {total_s:.2f} s in all, first at t = {at_s:.2f} s; the other channels continue meanwhile, "
             "and the samples after it fit them only when moved back",
             "move the samples after it back",
             repair,
-        )
+        )  # fmt: skip
 
 
 def _candidates(t_ns: TimesNs) -> list[JumpAhead]:
@@ -117,15 +115,15 @@ def _candidates(t_ns: TimesNs) -> list[JumpAhead]:
 
 
 def _fits_moved_back(
-    own: int, signals: tuple[Signal, Signal], rows: slice, moved_ns: int, leap: JumpAhead
+    own: int, signals: tuple[Signal, Signal], rows: slice, moved_ns: int, jump: JumpAhead
 ) -> bool | None:
     """Whether the rows after a jump fit the other signal only when shifted back; None where nothing fits."""
     other, (t_ns, values) = signals[1 - own], signals[own]
-    before = near_lag(other, (t_ns[: leap.row], values[: leap.row]))
+    before = near_lag(other, (t_ns[: jump.row], values[: jump.row]))
     usual_s = before.seconds if before is not None and before.r > LEAST_R and not moved_ns else 0.0
     t_ns, values = t_ns[rows] - moved_ns, values[rows]
-    stay, back = (near_lag(other, (t_ns - step, values)) for step in (0, leap.step_ns))
-    r_stay, r_back = (_fit(lag, usual_s, leap.step_ns * 1e-9) for lag in (stay, back))
+    stay, back = (near_lag(other, (t_ns - step, values)) for step in (0, jump.step_ns))
+    r_stay, r_back = (_fit(lag, usual_s, jump.step_ns * 1e-9) for lag in (stay, back))
     return r_back > r_stay + 0.05 if max(r_stay, r_back) > LEAST_R else None
 
 
@@ -220,12 +218,10 @@ def drift_finding(recording: Recording, drifts: dict[Pair, Drift]) -> Finding:
         return retimed(recording, name, scaled.corrected(getattr(recording, name).t_ns))
 
     return Finding(
-        "clock-drift",
-        "error",
-        name,
+        "clock-drift", "error", name,
         f"its clock runs {abs(rate):.2%} too {'fast' if rate > 0 else 'slow'}",
         f"{rate:+.3%} +- {drift.spread:.3%} against {against} by the lags at both ends of the log "
         f"(correlation {drift.r:.2f}); their durations differ by the same rate",
         f"scale the times of {name} about its first; {reason(name, set(drifts))}",
         repair,
-    )
+    )  # fmt: skip

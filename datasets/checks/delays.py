@@ -106,7 +106,7 @@ def _without_smoothing(lag: Lag, one: Signal, other: Signal) -> Lag:
 
     Odometry often averages its last samples, which delays it by half their span. The length is that
     which makes the first signal most like the second. Where the second is not averaged, averaging
-    both makes them more alike still, since it only removes noise.
+    both makes them more similar still, since it only removes noise.
     """
     from scipy.ndimage import uniform_filter1d
 

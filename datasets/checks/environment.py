@@ -44,14 +44,12 @@ def check_pressure(context: CheckContext) -> Iterator[Finding]:
     beyond = (known < PRESSURE_PA[0]) | (known > PRESSURE_PA[1])
     if PRESSURE_PA[0] <= size <= PRESSURE_PA[1] and beyond.any():
         yield Finding(
-            "pressure-range",
-            "warning",
-            "barometer",
+            "pressure-range", "warning", "barometer",
             f"{int(beyond.sum())} of {len(known)} pressures are outside the atmosphere's range",
             f"from {known.min():.6g} to {known.max():.6g} Pa",
             "leave these rows out",
             _within_range,
-        )
+        )  # fmt: skip
 
 
 def check_field(context: CheckContext) -> Iterator[Finding]:
@@ -86,16 +84,14 @@ def _range(
         return
     meant = next((u for u, factor in units.items() if limits[0] <= size * factor <= limits[1]), None)
     yield Finding(
-        CODES[channel],
-        "warning",
-        channel,
+        CODES[channel], "warning", channel,
         f"the {quantity} looks like {meant}, not {unit}"
         if meant
         else f"the {quantity} is outside Earth's range",
         f"median size {size:.4g}; possible are {limits[0]:g} to {limits[1]:g} {unit}",
         f"multiply by {units[meant]:g}" if meant else fix,
         partial(_scaled, channel=channel, factor=units[meant]) if meant else None,
-    )
+    )  # fmt: skip
 
 
 def _scaled(recording: Recording, channel: str, factor: float) -> Recording:
@@ -125,15 +121,13 @@ def _hard_iron(field: Array) -> Iterator[Finding]:
         return with_fields(recording, "magnetometer", field_t=field_t)
 
     yield Finding(
-        "hard-iron",
-        "warning",
-        "magnetometer",
+        "hard-iron", "warning", "magnetometer",
         f"the robot's own iron turns the compass by up to {worst:.0f} deg",
         f"over the turns of the run the horizontal field circles ({centre[0] * 1e6:.1f}, "
         f"{centre[1] * 1e6:.1f}) uT at a radius of {radius * 1e6:.1f} uT",
         "subtract that offset, assuming level ground",
         repair,
-    )
+    )  # fmt: skip
 
 
 def circle(points: Array) -> tuple[Array, float] | None:

@@ -39,16 +39,14 @@ def check_classes(context: CheckContext) -> Iterator[Finding]:
         return
     every = bool(none.sum() == placed.sum())
     yield Finding(
-        "fix-none",
-        "warning",
-        "gnss",
+        "fix-none", "warning", "gnss",
         f"{int(none.sum())} of {len(gnss)} fixes have positions but the class 'none'",
         f"first at t = {context.since_start_s(gnss.t_ns[int(np.argmax(none))]):.2f} s",
         "give the class of fix, if the log only lacks it: as it is, none is used"
         if every
         else "drop them: they are not used",
         None if every else without_rows("gnss", none),
-    )
+    )  # fmt: skip
 
 
 def check_jumps(context: CheckContext) -> Iterator[Finding]:
@@ -63,16 +61,14 @@ def check_jumps(context: CheckContext) -> Iterator[Finding]:
     worst = int(jumps[np.argmax(np.abs(off[jumps]))])
     away, closed = _displaced(off, jumps, len(gnss))
     yield Finding(
-        "gnss-jumps",
-        "warning",
-        "gnss",
+        "gnss-jumps", "warning", "gnss",
         f"{counted(jumps.size, 'jump')} of position",
         f"largest {abs(off[worst]):.2f} m at t = {context.since_start_s(gnss.t_ns[worst + 1]):.2f} s",
         f"drop the {int(away.sum())} fixes that are away from the path"
         if closed
         else "multipath or a changed fix; the path does not come back: nothing shows which part is right",
         without_rows("gnss", away) if closed else None,
-    )
+    )  # fmt: skip
 
 
 def _unexplained_steps(gnss: Gnss) -> tuple[Complex, float]:
@@ -128,12 +124,10 @@ def check_frozen(context: CheckContext) -> Iterator[Finding]:
     worst = int(np.flatnonzero(frozen)[np.argmax(distance[frozen])])
     times = "once" if frozen.sum() == 1 else f"{int(frozen.sum())} times"
     yield Finding(
-        "gnss-frozen",
-        "warning",
-        "gnss",
+        "gnss-frozen", "warning", "gnss",
         f"the position stands still {times} while the wheels roll",
         f"from t = {t_fix[begins[worst]]:.1f} s for {t_fix[ends[worst]] - t_fix[begins[worst]]:.1f} s "
         f"and {distance[worst]:.1f} m of wheel path",
         f"drop the {int(repeats.sum())} repeated fixes",
         without_rows("gnss", repeats),
-    )
+    )  # fmt: skip

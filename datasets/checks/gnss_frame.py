@@ -47,20 +47,18 @@ def check_degrees(context: CheckContext) -> Iterator[Finding]:
         if low < ratio < high and largest * to_degrees <= 180.0:
             swapped, assumed = _latitude_east(context, gnss, to_degrees)
             yield Finding(
-                "gnss-degrees",
-                "error",
-                "gnss",
+                "gnss-degrees", "error", "gnss",
                 f"positions look like latitude and longitude in {unit}, not metres",
                 f"they spread {ratio:.2g} times as far as the path of the wheels",
                 f"convert to east and north about the first fix, using {'east' if swapped else 'north'} "
                 f"as the latitude{' (assumed)' if assumed else ''}",
                 partial(_to_metres, to_degrees=to_degrees, swapped=swapped),
-            )
+            )  # fmt: skip
             return
 
 
 def _latitude_east(context: CheckContext, gnss: Gnss, to_degrees: float) -> tuple[bool, bool]:
-    """Whether the latitude stands in the east column, and whether that is only assumed."""
+    """Whether the latitude is in the east column, and whether that is only assumed."""
     known = np.abs(gnss.enu_m[np.isfinite(gnss.enu_m[:, :2]).all(axis=1), :2]) * to_degrees
     if known.max(axis=0).max() > 90.0:
         return bool(known[:, 1].max() > 90.0), False
@@ -157,7 +155,7 @@ def check_velocity(context: CheckContext) -> Iterator[Finding]:
 
 
 def _positions_mirrored(context: CheckContext, gnss: Gnss) -> bool:
-    """Whether it is the positions that turn the wrong way, by the gyro: see yaw_agreement.check_turns."""
+    """Whether the positions turn against the gyro: see yaw_agreement.check_turns."""
     yaw = gyro_angle(context.recording)
     both = course_agreement(yaw, gnss, context.recording.start_ns) if yaw is not None else None
     return both is not None and both.r < -0.5

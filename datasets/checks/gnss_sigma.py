@@ -44,15 +44,13 @@ def check_sigma(context: CheckContext) -> Iterator[Finding]:
     missing_only = bool(np.isnan(gnss.sigma_enu_m[bad]).all())  # such fixes are left out, others mislead
     usual = ", ".join(f"{fix.name.lower()} {sigma:g}" for fix, sigma in ASSUMED_SIGMA_M.items() if fix)
     yield Finding(
-        "sigma-impossible",
-        "warning" if missing_only else "error",
-        "gnss",
+        "sigma-impossible", "warning" if missing_only else "error", "gnss",
         f"{int(rows.sum())} of {len(rows)} fixes have a sigma that is zero, negative or missing",
         f"first at t = {context.since_start_s(gnss.t_ns[first]):.2f} s: {gnss.sigma_enu_m[first].tolist()} m",
         "use the median of the other fixes of the class; where there is none, the usual value "
         f"({usual} m, heights twice), or the scatter about wheels and gyro where that is larger",
         partial(_with_usual_sigma, least_m=scatter_m(context) or 0.0),
-    )
+    )  # fmt: skip
 
 
 def _impossible(gnss: Gnss) -> Mask:
@@ -88,14 +86,12 @@ def check_velocity_sigma(context: CheckContext) -> Iterator[Finding]:
     first = int(np.argmax(bad))
     velocity = np.where(bad[:, None], np.nan, gnss.velocity_enu_mps)
     yield Finding(
-        "velocity-sigma-impossible",
-        "warning",
-        "gnss",
+        "velocity-sigma-impossible", "warning", "gnss",
         f"{int(bad.sum())} of {int(measured.sum())} velocities have a sigma that is zero or negative",
         f"first at t = {context.since_start_s(gnss.t_ns[first]):.2f} s: {gnss.sigma_v_mps[first]:g} m/s",
         "leave these velocities out, or give the receiver's own sigma in m/s",
         lambda recording: with_fields(recording, "gnss", velocity_enu_mps=velocity),
-    )
+    )  # fmt: skip
 
 
 def check_scatter(context: CheckContext) -> Iterator[Finding]:
@@ -109,14 +105,12 @@ def check_scatter(context: CheckContext) -> Iterator[Finding]:
     factor = scatter / sigma
     hint = ", as if variances were given for sigmas" if 0.5 < sigma / scatter**2 < 2.0 else ""
     yield Finding(
-        "sigma-too-small",
-        "warning",
-        "gnss",
+        "sigma-too-small", "warning", "gnss",
         f"the fixes scatter {factor:.0f} times more than their sigma{hint}",
         f"{scatter:.3f} m about the path by wheels and gyro, median sigma {sigma:.4f} m",
         f"multiply the sigmas by {factor:.1f}",
         partial(_scaled, factor=factor),
-    )
+    )  # fmt: skip
 
 
 def _scaled(recording: Recording, factor: float) -> Recording:
@@ -144,9 +138,7 @@ def check_dilution(context: CheckContext) -> Iterator[Finding]:
     usual = ", ".join(f"{fix.name.lower()} {ASSUMED_SIGMA_M[fix]:g} m" for fix in classes)
     same = all(ASSUMED_SIGMA_M[fix] == 1.0 for fix in classes)
     yield Finding(
-        "sigma-dilution",
-        "warning",
-        "gnss",
+        "sigma-dilution", "warning", "gnss",
         "the sigmas look like dilutions of precision, not metres",
         f"{len(np.unique(sigma[:, 0]))} values from {sigma[:, 0].min():.3g} to {sigma[:, 0].max():.3g}, "
         + ("for fixes of class fixed" if contradicts else "in steps of a tenth, the same east and north"),
@@ -154,7 +146,7 @@ def check_dilution(context: CheckContext) -> Iterator[Finding]:
         if same
         else f"multiply them by the accuracy assumed for the class ({usual}); better, give the receiver's",
         None if same else _times_class_sigma,
-    )
+    )  # fmt: skip
 
 
 def _with_sigma(gnss: Gnss) -> Mask:

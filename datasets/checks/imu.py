@@ -125,15 +125,13 @@ def check_bias(context: CheckContext) -> Iterator[Finding]:
         return with_fields(recording, "imu", gyro_radps=recording.imu.gyro_radps - bias)
 
     yield Finding(
-        "gyro-bias",
-        "warning",
-        "imu",
+        "gyro-bias", "warning", "imu",
         f"the gyro turns at rest by up to {np.degrees(np.abs(bias).max()):.1f} deg/s",
         f"mean ({', '.join(f'{value:.3f}' for value in bias)}) rad/s in {resting.sum()} samples while the "
         "wheels stand",
         "subtract these means",
         repair,
-    )
+    )  # fmt: skip
 
 
 def at_rest(context: CheckContext) -> NDArray[np.bool_]:
@@ -278,14 +276,12 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
     axes = {1: ("-y", "+x", "+z"), 2: ("-x", "-y", "+z"), 3: ("+y", "-x", "+z")}.get(quarter, ())
     near = bool(axes) and off < NEAR_AXIS
     yield Finding(
-        "imu-forward",
-        "error" if near else "warning",
-        "imu",
+        "imu-forward", "error" if near else "warning", "imu",
         "x does not point forward",
         f"by change of speed and speed times yaw rate it is turned by {np.degrees(angle):.0f} deg",
         _pointing("IMU", axes) if near else "give the IMU's mounting",
         (lambda recording: _turned(recording, axes, gyro=True)) if near else None,
-    )
+    )  # fmt: skip
 
 
 def _pointing(sensor: str, axes: Axes) -> str:

@@ -18,7 +18,7 @@ CLIPPED_SHARE, CLIPPED_ROWS, PILE = 0.002, 10, 5.0
 LEAST_STEPS = 50
 """Signals of fewer distinct values are too coarse to decide."""
 FAR_SPIKE = 6.0
-"""A spike stands this many times further out than anything near it."""
+"""A spike is this many times further out than anything near it."""
 NEAR_ROWS = 12
 MOST_SPIKES = 0.02
 FLOORS = {"gyro_radps": (0.5, 30.0), "accel_mps2": (150.0, 0.0), "speed": (0.5, 15.0)}
@@ -27,7 +27,7 @@ wheel shakes a Husky by 100 m/s2 for one sample of 100 Hz (BorealTC)."""
 
 
 def check_saturated(context: CheckContext) -> Iterator[Finding]:
-    """Inertial sensors must not stand at the end of their range."""
+    """Inertial sensors must not reach the end of their range."""
     masks = [(s, _clipped(s)) for s in sensors_of(context.recording) if s.channel == "imu"]
     found = [(sensor, mask) for sensor, mask in masks if mask.any()]
     if not found:
@@ -38,14 +38,12 @@ def check_saturated(context: CheckContext) -> Iterator[Finding]:
             extremes = " and ".join(f"{value:.4g}" for value in np.unique(sensor.values[mask[:, k], k]))
             evidence.append(f"{sensor.names[k]} {int(mask[:, k].sum())} times at {extremes}")
     yield Finding(
-        "saturated",
-        "warning",
-        "imu",
+        "saturated", "warning", "imu",
         "values stand at the end of a range",
         f"{'; '.join(evidence)}; nothing lies beyond",
         "empty these cells: the true values are larger by an unknown amount",
         without_cells([(sensor.field, mask) for sensor, mask in found], "imu"),
-    )
+    )  # fmt: skip
 
 
 def _clipped(sensor: SensorAxes) -> Mask:
@@ -67,7 +65,7 @@ def _clipped(sensor: SensorAxes) -> Mask:
 
 
 def _piles_up(values: Array, top: float, count: int) -> bool:
-    """Whether values stand at the top far more often than next to it, in a signal that is fine enough."""
+    """Whether values are at the top far more often than next to it, in a signal of fine resolution."""
     below = values[values < top]
     if not below.size:
         return False
@@ -101,14 +99,12 @@ def check_spikes(context: CheckContext) -> Iterator[Finding]:
         worst, name, row = largest[channel]
         at_s = context.since_start_s(getattr(context.recording, channel).t_ns[row])
         yield Finding(
-            "spikes",
-            "warning",
-            channel,
+            "spikes", "warning", channel,
             f"{counted(int(mask.sum()), 'spike')} of one sample",
             f"largest {worst:.3g} off its neighbours, {name} at t = {at_s:.2f} s",
             "leave these samples out",
             without_rows(channel, mask),
-        )
+        )  # fmt: skip
 
 
 def _spike_sizes(values: Array, floor: float) -> Array:

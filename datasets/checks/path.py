@@ -33,7 +33,7 @@ LEAST_FIXES, LEAST_WINDOWS = 5, 5
 LEAST_COHERENCE = 0.9
 """Correlation of the two paths in a window below which its scale is not used."""
 WHEEL_UNITS = (5e-4, 50.0)
-"""From speeds in mm/s to speeds taken for rates; beyond these the positions have another unit."""
+"""From speeds in mm/s to speeds mistaken for rates; beyond these the positions have another unit."""
 BENDS = 6.0
 """Variance of the second difference of white noise over its own."""
 RESAMPLES, SEED = 400, 20_240_811

@@ -52,15 +52,13 @@ def check_magnitude(context: CheckContext) -> Iterator[Finding]:
         first = int(np.argmax(mask))
         few = rows.sum() < MOST_ROWS * len(rows)
         yield Finding(
-            "impossible-value",
-            "error",
-            name,
+            "impossible-value", "error", name,
             f"{column} is {columns[column][first]:g}, beyond anything possible",
             f"at t = {context.since_start_s(t_ns[first]):.3f} s; {int(mask.sum())} of {len(mask)} values "
             f"beyond {limits[column]:g}" + (f", {int(rows.sum())} rows in all" if len(beyond) > 1 else ""),
             "leave these rows out" if few else "is the unit right? too many rows are wrong to leave them out",
             without_rows(name, rows) if few else None,
-        )
+        )  # fmt: skip
 
 
 def _check_duration(context: CheckContext, name: str, t_ns: TimesNs) -> Iterator[Finding]:
@@ -69,13 +67,11 @@ def _check_duration(context: CheckContext, name: str, t_ns: TimesNs) -> Iterator
         row = int(np.argmax(np.diff(t_ns)))
         leap_s = (float(t_ns[row + 1]) - float(t_ns[row])) * 1e-9
         yield Finding(
-            "impossible-time",
-            "error",
-            name,
+            "impossible-time", "error", name,
             f"its times span {days:.0f} days",
             f"longest interval {leap_s:.3g} s after t = {context.since_start_s(t_ns[row]):.3f} s",
             "is the unit of time right? split the log where the clock jumps",
-        )
+        )  # fmt: skip
 
 
 def _tables(recording: Recording) -> dict[str, tuple[TimesNs, dict[str, NDArray[Any]]]]:

@@ -65,25 +65,21 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
         factor = units[0].factor
         names = " or ".join(unit.name for unit in units)
         yield Finding(
-            "wheel-unit",
-            "error",
-            "wheels",
+            "wheel-unit", "error", "wheels",
             f"the speeds look like {names}: the ground speed is {scale.ratio:.3g} times as large",
             evidence,
             f"multiply them by {factor:.6g}" if len(units) == 1 else "give the unit: more than one fits",
             partial(_scaled, factor=factor) if len(units) == 1 else None,
-        )
+        )  # fmt: skip
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
     elif scale.ratio < SMALL and is_firm(context.recording):
         yield Finding(
-            "wheel-scale",
-            "warning",
-            "wheels",
+            "wheel-scale", "warning", "wheels",
             f"ground speed is {scale.ratio:.2f} times the wheel speed",
             evidence,
             "it may be slip; if the ground is firm, check wheel radius and unit",
-        )
+        )  # fmt: skip
 
 
 def _too_slow(context: CheckContext, scale: PathScale, evidence: str, unit: str, radius: float) -> Finding:

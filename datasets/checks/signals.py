@@ -21,7 +21,7 @@ TimesNs = NDArray[np.int64]
 
 HELD_SHARE, LEAST_UPDATES = 0.5, 10
 STUCK_S, STUCK_ZERO_S, STUCK_ROWS = 2.0, 5.0, 20
-"""A value that stays for so long, and so many updates, is stuck; wheels may stand for a while."""
+"""A value that stays for this time, and this many updates, is stuck; wheels may stand for a while."""
 CLIPPED_ROWS = 10
 """A value at the end of the range that occurs this often elsewhere is the sensor's limit."""
 LIVELY = 0.1
@@ -75,15 +75,13 @@ def check_held(context: CheckContext) -> Iterator[Finding]:
             return dataclasses.replace(recording, **{name: channel.select(updates)})
 
         yield Finding(
-            "held-values",
-            "warning",
-            name,
+            "held-values", "warning", name,
             "values are held",
             f"{share:.0%} of the samples repeat the one before while the signal changes; "
             f"a new value comes every {run:.1f} samples",
             f"keep the true updates: the first row of each run, and every {rows} rows where nothing changes",
             repair,
-        )
+        )  # fmt: skip
 
 
 def _measured(channel: Channel) -> Array:
@@ -132,14 +130,12 @@ def check_stuck(context: CheckContext) -> Iterator[Finding]:
                 names.append(sensor.names[k])
                 evidence.append(f"{sensor.names[k]} is {value:.4g} from {first:.2f} to {last:.2f} s")
         yield Finding(
-            "stuck",
-            "error",
-            channel,
+            "stuck", "error", channel,
             f"{' and '.join(names)} {'keeps' if len(names) == 1 else 'keep'} one value",
             "; ".join(evidence) + "; the other axes move meanwhile",
             "leave these rows out" if channel == "wheels" else "empty these cells: their values are unknown",
             without_cells([(sensor.field, mask) for sensor, mask in found], channel),
-        )
+        )  # fmt: skip
 
 
 def without_stuck(recording: Recording) -> Recording:
@@ -233,14 +229,12 @@ def check_dead(context: CheckContext) -> Iterator[Finding]:
     extent_m = _extent_m(recording) if standing else 0.0
     if wheels is not None and len(wheels) >= STUCK_ROWS and standing and extent_m > LEAST_EXTENT_M:
         yield Finding(
-            "dead",
-            "error",
-            "wheels",
+            "dead", "error", "wheels",
             "the wheels stand throughout",
             f"every speed is zero while the robot covers {extent_m:.0f} m",
             "leave the wheels out",
             lambda recording: dataclasses.replace(recording, wheels=None),
-        )
+        )  # fmt: skip
     if imu is None or len(imu) < STUCK_ROWS or np.isnan(imu.gyro_radps[:, 2]).all():
         return
     constant = [bool((v[1:] == v[:-1]).all()) for v in imu.gyro_radps.T if np.isfinite(v).any()]
@@ -249,14 +243,12 @@ def check_dead(context: CheckContext) -> Iterator[Finding]:
     shaking = len(lively) == 3 and all(lively)
     if all(constant) and not still and (shaking or _turn_radps(context) > LEAST_TURN_RADPS):
         yield Finding(
-            "dead",
-            "error",
-            "imu",
+            "dead", "error", "imu",
             "the gyro is constant",
             f"gyro z is {imu.gyro_radps[0, 2]:g} rad/s throughout, while the robot drives",
             "leave the gyro out",
             without_cells([("gyro_radps", np.ones((len(imu), 3), dtype=bool))], "imu"),
-        )
+        )  # fmt: skip
 
 
 def _extent_m(recording: Recording) -> float:
@@ -298,11 +290,9 @@ def check_missing(context: CheckContext) -> Iterator[Finding]:
         empty = np.all([columns[column] for column in share], axis=0)
         whole_rows = empty.mean() >= max(share.values())
         yield Finding(
-            "missing-values",
-            "warning",
-            name,
+            "missing-values", "warning", name,
             f"{share[worst]:.0%} of {worst} is missing",
             f"{sum(value > 0 for value in share.values())} of {len(share)} columns have empty cells",
             "leave the empty rows out" if whole_rows else "expect larger uncertainty there",
             without_rows(name, empty) if whole_rows else None,
-        )
+        )  # fmt: skip

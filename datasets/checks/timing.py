@@ -50,9 +50,7 @@ def check_spans(context: CheckContext) -> Iterator[Finding]:
     late = own[0] > ends
     alike = abs(int(own[-1]) - int(own[0]) - (ends - begins)) <= SAME_SPAN * (ends - begins)
     yield Finding(
-        "no-common-time",
-        "error",
-        lonely,
+        "no-common-time", "error", lonely,
         f"begins after {' and '.join(apart[lonely])} ended" if late else "ended before the others begin",
         f"it runs from {context.since_start_s(own[0]):.2f} to {context.since_start_s(own[-1]):.2f} s, "
         f"the others from {context.since_start_s(np.int64(begins)):.2f} "
@@ -61,7 +59,7 @@ def check_spans(context: CheckContext) -> Iterator[Finding]:
         if alike
         else "bring the channels onto one clock; their durations differ, so the offset is unknown",
         _moved(lonely, begins - int(own[0])) if alike else None,
-    )
+    )  # fmt: skip
 
 
 def _moved(name: str, by_ns: int) -> Repair:
@@ -87,14 +85,12 @@ def check_steps(context: CheckContext) -> Iterator[Finding]:
             return dataclasses.replace(recording, clock_jumps=left)
 
         yield Finding(
-            "clock-jump",
-            "error",
-            name,
+            "clock-jump", "error", name,
             f"its clock was set {counted(len(own), 'time')}",
             f"largest step {worst.step_s:+.3f} s at t = {context.since_start_s(np.int64(worst.t_ns)):.2f} s",
             "keep the times as repaired on reading: good to a sampling period",
             repair,
-        )
+        )  # fmt: skip
 
 
 def check_coarse(context: CheckContext) -> Iterator[Finding]:
@@ -115,14 +111,12 @@ def check_coarse(context: CheckContext) -> Iterator[Finding]:
 
         rate_hz = (len(channel) - 1) / max(float(channel.t_ns[-1] - channel.t_ns[0]) * 1e-9, 1e-9)
         yield Finding(
-            "coarse-times",
-            "error" if tick_s > 0.1 else "warning",
-            name,
+            "coarse-times", "error" if tick_s > 0.1 else "warning", name,
             f"its stamps are {'cut' if cut else 'rounded'} to {tick_s:g} s",
             f"all times are multiples of {tick_s:g} s apart, at {rate_hz:.3g} rows a second",
             f"fit an even clock, taking the stamps as {'cut off' if cut else 'rounded'}",
             repair,
-        )
+        )  # fmt: skip
 
 
 def coarse_tick_s(channel: Channel) -> float:
@@ -186,16 +180,14 @@ def check_jitter(context: CheckContext) -> Iterator[Finding]:
             return retimed(recording, name, _even(getattr(recording, name).t_ns, GAP_S))
 
         yield Finding(
-            "uneven-sampling",
-            "warning",
-            name,
+            "uneven-sampling", "warning", name,
             "uneven sampling",
             f"{share:.0%} of the intervals are more than half off the median of {period * 1e3:.3g} ms",
             "fit an even clock: the times scatter about one like times of arrival; their mean delay stays"
             if regular
             else "use the sensor's own time stamps; the log does not have them",
             repair if regular else None,
-        )
+        )  # fmt: skip
 
 
 def gap_findings(context: CheckContext, jumps: Mapping[str, Sequence[int]]) -> Iterator[Finding]:
@@ -244,14 +236,12 @@ def check_duplicates(context: CheckContext) -> Iterator[Finding]:
             return dataclasses.replace(recording, **{name: channel.select(first)})
 
         yield Finding(
-            "repeated-times",
-            "warning",
-            name,
+            "repeated-times", "warning", name,
             f"{repeated.size} repeated times",
             f"first at t = {context.since_start_s(channel.t_ns[repeated[0]]):.3f} s",
             "keep the first sample of each time",
             repair,
-        )
+        )  # fmt: skip
 
 
 def _clocked(recording: Recording) -> list[tuple[str, Channel]]:

@@ -16,7 +16,7 @@ from terrafusion.datasets.core.recording import Recording
 
 CHORD_S, LEAST_CHORD_M = 1.0, 0.2
 LEAST_CHORDS, LEAST_R = 20, 0.95
-"""Chords that are needed, and how alike their offsets must be (length of the mean of unit vectors)."""
+"""Chords that are needed, and the resultant length of their offsets (length of the mean of unit vectors)."""
 LARGE_OFFSET = np.radians(30.0)
 """Robots that side-slip across a slope crab by less."""
 UNITS = {"mm": 1000.0, "cm": 100.0, "feet": 1.0 / 0.3048}
@@ -30,18 +30,16 @@ def check_yaw(context: CheckContext) -> Iterator[Finding]:
         return
     angle, chords, r = offset
     yield Finding(
-        "truth-yaw",
-        "warning",
-        "truth",
+        "truth-yaw", "warning", "truth",
         f"the truth's yaw is {np.degrees(angle):.0f} deg off its course",
         f"mean over {chords} chords of {CHORD_S:g} s on which the wheels run; resultant length {r:.2f}",
         f"turn its body frame by {-np.degrees(angle):.0f} deg about z",
         partial(_turned, angle=-angle),
-    )
+    )  # fmt: skip
 
 
 def yaw_offset(context: CheckContext) -> tuple[float, int, float] | None:
-    """Mean of yaw less course of the truth (rad), number of chords, and how alike they are.
+    """Mean of yaw less course of the truth (rad), number of chords, and resultant length.
 
     Where the wheels run backwards the course is reversed. None where the truth, or the sign of the
     wheels' speed, is not known well enough.
@@ -97,14 +95,12 @@ def check_unit(context: CheckContext) -> Iterator[Finding]:
     for unit, factor in UNITS.items():
         if abs(ratio / factor - 1.0) < UNIT_ERROR:
             yield Finding(
-                "truth-unit",
-                "error",
-                "truth",
+                "truth-unit", "error", "truth",
                 f"positions look like {unit}",
                 f"the truth spreads {ratio:.4g} times as far as the path of the wheels",
                 f"divide them by {factor:.6g}, and leave velocities and covariances out",
                 partial(_scaled, factor=1.0 / factor),
-            )
+            )  # fmt: skip
             return
 
 

@@ -53,14 +53,12 @@ def check_each_wheel(context: CheckContext) -> Iterator[Finding]:
             continue
         wheel, partner, factor, evidence = odd
         yield Finding(
-            "wheel-odd",
-            "error",
-            "wheels",
+            "wheel-odd", "error", "wheels",
             f"{wheels.names[wheel].replace('_', ' ')} does not run as the other wheel of its side",
             evidence,
             f"multiply its speed by {factor:.3g}" if factor else "use the other wheel of the side for it",
             partial(_one_wheel, wheel=wheel, partner=partner, factor=factor),
-        )
+        )  # fmt: skip
 
 
 def _odd_one(speed: Array, power: Array, front: int, rear: int) -> tuple[int, int, float | None, str] | None:
@@ -102,16 +100,14 @@ def check_wheel_signs(context: CheckContext) -> Iterator[Finding]:
     left, right = np.nansum(wheels.side_speeds_mps(1.0), axis=0)
     side = "left" if left < right else "right"
     yield Finding(
-        "wheel-sign",
-        "error" if evidence else "warning",
-        "wheels",
+        "wheel-sign", "error" if evidence else "warning", "wheels",
         "left and right turn against each other nearly always",
         evidence or "no other channel shows whether the robot spins on the spot",
         f"change the sign of the {side} side"
         if evidence
         else "if the robot did not only spin on the spot, change the sign of one side",
         partial(_change_signs, sides=(side,)) if evidence else None,
-    )
+    )  # fmt: skip
 
 
 def check_direction(context: CheckContext) -> Iterator[Finding]:
@@ -120,14 +116,12 @@ def check_direction(context: CheckContext) -> Iterator[Finding]:
     if evidence is None or sides_opposed(context) is not None:
         return
     yield Finding(
-        "wheel-reversed",
-        "error",
-        "wheels",
+        "wheel-reversed", "error", "wheels",
         "the wheels run backwards when the robot drives forward",
         evidence,
         "change the sign of all wheels",
         partial(_change_signs, sides=("left", "right")),
-    )
+    )  # fmt: skip
 
 
 def _change_signs(recording: Recording, sides: tuple[str, ...]) -> Recording:

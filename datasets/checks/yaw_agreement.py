@@ -66,14 +66,12 @@ def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
             continue
         unit = "rad/s per m/s between the sides" if other == "wheels" else f"times that of {NAMES[other]}"
         yield Finding(
-            "gyro-in-degrees",
-            "error",
-            "imu",
+            "gyro-in-degrees", "error", "imu",
             f"gyro z is far larger than the turn rate of {NAMES[other]}: it looks like deg/s",
             f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}",
             "multiply by pi / 180",
             _to_radians,
-        )
+        )  # fmt: skip
         return
 
 
@@ -88,13 +86,11 @@ def check_turns(context: CheckContext) -> Iterator[Finding]:
     if not blamed:
         one, other = against[0]
         yield Finding(
-            "yaw-contradiction",
-            "warning",
-            "imu",
+            "yaw-contradiction", "warning", "imu",
             f"{NAMES[one]} {_verb(one)} against {NAMES[other]}",
             _evidence(against, signs, found) + "; no single sign explains all",
             "check the axes and signs of all of them",
-        )
+        )  # fmt: skip
         return
     if frozenset({"wheels"}) in blamed and runs_backwards(context) is not None:
         return  # one fault explains both: see wheels.check_direction
@@ -125,13 +121,11 @@ def check_unrelated(context: CheckContext) -> Iterator[Finding]:
     if both.is_significant() or both.r > UNRELATED_R:
         return
     yield Finding(
-        "yaw-unrelated",
-        "warning",
-        "imu",
+        "yaw-unrelated", "warning", "imu",
         "gyro z does not follow the wheels",
         f"correlation {both.r:.2f} of the half-second means",
         "check the IMU's axes and the two clocks; on slippery ground it may be real",
-    )
+    )  # fmt: skip
 
 
 def _agreements(context: CheckContext) -> Agreements:

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 TimesNs = NDArray[np.int64]
 
 TERRAINS = ("asphalt", "gravel", "grass", "medium_sand", "loose_sand", "ploughed_soil", "mud", "snow")
-"""Terrain classes by name; `unknown` stands for none of them."""
+"""Terrain classes by name; `unknown` is none of them."""
 
 
 class Fix(IntEnum):
@@ -130,7 +130,7 @@ class Wheels(Channel):
     """Wheel speeds `speed` (N, k) of the wheels or sides `names` in `unit` "radps" or "mps".
 
     `names` is one of the tuples of `LAYOUTS`; ("speed",) is the mean of both
-    sides and says nothing about yaw. `angle_rad` (N, k) is the accumulated
+    sides, without information on yaw. `angle_rad` (N, k) is the accumulated
     wheel angle where the log has it.
     """
 
@@ -163,7 +163,7 @@ class Wheels(Channel):
         return table
 
     def has_sides(self) -> bool:
-        """Whether left and right are told apart."""
+        """Whether left and right are measured separately."""
         return len(self.names) > 1
 
     def side_speeds_mps(self, wheel_radius_m: float) -> Array:
@@ -286,7 +286,7 @@ class Barometer(Channel):
 
 @dataclass(frozen=True, eq=False)
 class Magnetometer(Channel):
-    """Magnetic flux density `field_t` (N, 3), body axes, tesla; the field that the robot stands in."""
+    """Magnetic flux density `field_t` (N, 3), body axes, tesla; at the robot."""
 
     name: ClassVar[str] = "magnetometer"
     field_t: Array
@@ -308,7 +308,7 @@ class Magnetometer(Channel):
 class Terrain(Channel):
     """Terrain `label` (N,) of str, and `probabilities` (N, k) over `classes` where known.
 
-    `source` tells who says so: "annotation", "camera", "detector", "simulation".
+    `source` is its origin: "annotation", "camera", "detector", "simulation".
     A label holds from its time until the next.
     """
 

@@ -136,7 +136,7 @@ def _steps(t_ns: TimesNs, channel: str, forwards: bool, beside: TimesNs | None) 
 
 
 def _period_ns(interval: TimesNs, row: int) -> float:
-    """Median of the intervals about a row."""
+    """Median of the intervals around a row."""
     near = interval[max(row - 1 - NEAR_ROWS, 0) : row + NEAR_ROWS]
     return max(float(np.median(near)), 0.0) if near.size else 0.0
 

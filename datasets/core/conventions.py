@@ -85,7 +85,7 @@ def _inertial(recording: Recording, c: Conventions) -> Recording:
     if field is not None and c.imu_axes != BODY_AXES:
         turned = dataclasses.replace(field, field_t=_turned(axes_matrix(c.imu_axes), field.field_t))
         recording = dataclasses.replace(recording, magnetometer=turned).with_notes(
-            "magnetometer: taken to have the IMU's axes, and turned with it"
+            "magnetometer: assumed to have the IMU's axes, and turned with it"
         )
     if imu is None:
         return recording
@@ -116,8 +116,8 @@ def _wheels(recording: Recording, c: Conventions) -> Recording:
     )
     angle = None if wheels.angle_rad is None else wheels.angle_rad * signs
     turned = dataclasses.replace(wheels, speed=wheels.speed * signs, angle_rad=angle)
-    told = (("left", c.left_wheels_sign), ("right", c.right_wheels_sign))
-    sides = " and ".join(side for side, s in told if s < 0)
+    signs_by_side = (("left", c.left_wheels_sign), ("right", c.right_wheels_sign))
+    sides = " and ".join(side for side, sign in signs_by_side if sign < 0)
     note = f"wheels: the {sides} side was negative when driving forward; its sign is changed"
     return dataclasses.replace(recording, wheels=turned).with_notes(note)
 

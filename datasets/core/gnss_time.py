@@ -43,4 +43,4 @@ def leap_note(unix_ns: NDArray[np.int64]) -> str:
     seconds = " and ".join(str(int(s)) for s in taken)
     late = int(unix_ns[-1]) > int(np.datetime64(KNOWN_UNTIL, "ns").astype(np.int64))
     doubt = f" (the table ends on {KNOWN_UNTIL}: a later leap second is not known)" if late else ""
-    return f"gnss: GPS time to UTC: {seconds} leap seconds taken off (IERS Bulletin C){doubt}"
+    return f"gnss: GPS time to UTC: {seconds} leap seconds subtracted (IERS Bulletin C){doubt}"

@@ -1,4 +1,4 @@
-"""`Recording`: one drive, real or simulated, as channels on their own clocks.
+"""`Recording`: one log, real or simulated, as channels on their own clocks.
 
 Absent channels are None. Reality and twin emit this same type.
 """
@@ -35,7 +35,7 @@ from terrafusion.datasets.core.channels import (
 
 @dataclass(frozen=True)
 class Overrides:
-    """What a log says of its robot that differs from the vehicle file (None: nothing)."""
+    """Robot geometry given by a log, which overrides the vehicle file (None: not given)."""
 
     wheel_radius_m: float | None = None
     track_m: float | None = None
@@ -45,7 +45,7 @@ class Overrides:
 
 @dataclass(frozen=True)
 class ClockJump:
-    """A step of a channel's clock that was taken out on reading, because it was asked for.
+    """A clock step of a channel that was removed on reading, on request.
 
     From `t_ns` on (repaired time) the log's own times stood `step_s` off: negative where time ran back.
     """
@@ -57,7 +57,7 @@ class ClockJump:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recording:
-    """One drive.
+    """One log.
 
     `datum` is (latitude deg, longitude deg, height m) of the ENU origin where
     it is known. `truth_channels` names what the truth really holds ("position",

@@ -85,7 +85,7 @@ class Trajectory:
         return out
 
     def quaternions_at(self, t_ns: NDArray[np.int64]) -> Array:
-        """Orientations (M, 4) at the times (M,), interpolated by slerp; NaN outside the span or when unknown."""
+        """Orientations (M, 4) at the times (M,), by slerp; NaN outside the span or when unknown."""
         out = np.full((len(t_ns), 4), np.nan)
         if self.quaternion is None or len(self) < 2:
             return out

@@ -1,4 +1,4 @@
-"""Logs that are short, lack sensors, or drive oddly are no faulty logs."""
+"""Logs that are short, lack sensors, or show unusual motion have no finding."""
 
 from __future__ import annotations
 

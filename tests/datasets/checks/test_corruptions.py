@@ -1,4 +1,4 @@
-"""One good log, corrupted in many ways: each fault is found under its code, no other error, and is repaired."""
+"""One good log, corrupted in many ways: each fault is found and repaired, with no other error."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ route:
   - {terrain: asphalt}
 """
 
-Spoil = Callable[[Recording], Recording]
+Corrupt = Callable[[Recording], Recording]
 RADIUS_M = 0.175
 """Of the twin's default vehicle."""
 
 
 @dataclass(frozen=True)
 class Case:
-    """A corruption, the finding it must be named by, and whether `repair` mends it.
+    """A corruption, the code it must be found under, and whether it can be repaired.
 
     Mended means: of the channel at least `kept` of the rows are left, their times those of the good
     log to `time_s`, their values to `share` of the largest in the column, and no finding but those of
@@ -58,7 +58,7 @@ class Case:
     `good` makes of the good log what the repaired one is to be compared with.
     """
 
-    corrupt: Spoil
+    corrupt: Corrupt
     code: str
     channel: str
     repaired: bool = True
@@ -67,7 +67,7 @@ class Case:
     kept: float = 1.0
     left: tuple[str, ...] = ()
     lost: tuple[str, ...] = ()
-    good: Spoil = lambda r: r
+    good: Corrupt = lambda r: r
 
 
 @pytest.fixture(scope="module")
@@ -87,7 +87,7 @@ def rig() -> Rig:
     return load_vehicle("elevate").rig()
 
 
-def change(channel: str, **changed: Callable[[Any], Any]) -> Spoil:
+def change(channel: str, **changed: Callable[[Any], Any]) -> Corrupt:
     """Replace fields of a channel by functions of them."""
 
     def corrupt(r: Recording) -> Recording:
@@ -98,7 +98,7 @@ def change(channel: str, **changed: Callable[[Any], Any]) -> Spoil:
     return corrupt
 
 
-def rows(channel: str, choose: Callable[[Any], Any]) -> Spoil:
+def rows(channel: str, choose: Callable[[Any], Any]) -> Corrupt:
     """Take the chosen rows of a channel, by mask, slice or index."""
 
     def corrupt(r: Recording) -> Recording:
@@ -108,12 +108,12 @@ def rows(channel: str, choose: Callable[[Any], Any]) -> Spoil:
     return corrupt
 
 
-def chain(*spoils: Spoil) -> Spoil:
+def chain(*corruptions: Corrupt) -> Corrupt:
     """One after the other."""
-    return lambda r: functools.reduce(lambda done, corrupt: corrupt(done), spoils, r)
+    return lambda r: functools.reduce(lambda done, corrupt: corrupt(done), corruptions, r)
 
 
-def turned(axes: Any) -> Spoil:
+def turned(axes: Any) -> Corrupt:
     """The IMU mounted another way: rows of the matrix are its axes in the body."""
     R = np.array(axes, dtype=float)
     return change("imu", gyro_radps=lambda w: w @ R.T, accel_mps2=lambda a: a @ R.T)
@@ -130,12 +130,12 @@ def at(indices: Any, values: Callable[[Any], Any]) -> Callable[[Any], Any]:
     return changed
 
 
-def wheels_scaled(factor: Any) -> Spoil:
+def wheels_scaled(factor: Any) -> Corrupt:
     """Speeds and angles of the wheels times a factor, or one for each wheel."""
     return change("wheels", speed=lambda s: s * factor, angle_rad=lambda a: a * factor)
 
 
-def in_mps(factor: float) -> Spoil:
+def in_mps(factor: float) -> Corrupt:
     """Wheel speeds as rim speeds, called m/s, times a factor."""
 
     def corrupt(r: Recording) -> Recording:
@@ -146,18 +146,18 @@ def in_mps(factor: float) -> Spoil:
     return corrupt
 
 
-def sigmas(horizontal_m: float, up_m: float) -> Spoil:
+def sigmas(horizontal_m: float, up_m: float) -> Corrupt:
     """The same sigmas for all fixes."""
     return change("gnss", sigma_enu_m=lambda s: 0 * s + [horizontal_m, horizontal_m, up_m])
 
 
-def noisy_fixes(sigma_m: float) -> Spoil:
+def noisy_fixes(sigma_m: float) -> Corrupt:
     """Fixes that scatter more, and say so."""
     noise = np.random.default_rng(7).normal(0.0, sigma_m, (501, 3))
     return chain(change("gnss", enu_m=lambda p: p + noise), sigmas(sigma_m, sigma_m))
 
 
-def dilutions(worth_m: float) -> Spoil:
+def dilutions(worth_m: float) -> Corrupt:
     """The dilution of precision that changes with the satellites, times what one is worth."""
     dop = np.random.default_rng(8).integers(7, 13, (501, 1)) / 10
     return change("gnss", sigma_enu_m=lambda s: 0 * s + dop * worth_m * [1.0, 1.0, 2.0])
@@ -168,7 +168,7 @@ def without_angles(r: Recording) -> Recording:
     return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, angle_rad=None))
 
 
-def held(channel: str, each: int) -> Spoil:
+def held(channel: str, each: int) -> Corrupt:
     """Every value stands for so many rows."""
 
     def corrupt(r: Recording) -> Recording:
@@ -181,7 +181,7 @@ def held(channel: str, each: int) -> Spoil:
     return corrupt
 
 
-def late(channel: str, by_s: float, after_s: float = -1.0) -> Spoil:
+def late(channel: str, by_s: float, after_s: float = -1.0) -> Corrupt:
     """Times later than they were, all of them or those after a moment."""
     return change(channel, t_ns=lambda t: t + np.where(t - t[0] > after_s * 1e9, round(by_s * 1e9), 0))
 
@@ -363,8 +363,8 @@ def test_good_logs_have_no_finding(terrain: str, seed: int, scenario: Scenario, 
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_corruption_is_named_and_repaired(name: str, good: Recording, rig: Rig) -> None:
-    """By its finding, and no other error; repaired, or left and still told."""
+def test_corruption_is_found_and_repaired(name: str, good: Recording, rig: Rig) -> None:
+    """Found under its code, and no other error; repaired, or left and still reported."""
     case = CASES[name]
     corrupted = case.corrupt(good)
     findings = run_checks(corrupted, rig)
@@ -405,7 +405,7 @@ def assert_like(repaired: Channel, good: Channel, case: Case) -> None:
         assert error.max() <= case.share * np.abs(values).max() + 1e-12, name
 
 
-def test_clock_set_back_is_named_and_repaired(good: Recording, rig: Rig, tmp_path: Path) -> None:
+def test_clock_set_back_is_found_and_repaired(good: Recording, rig: Rig, tmp_path: Path) -> None:
     """Times that run back never get into a recording: the reader takes the step out where asked."""
     write_log_folder(good, tmp_path / "log")
     table = tmp_path / "log" / "imu.csv"

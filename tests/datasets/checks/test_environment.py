@@ -1,4 +1,4 @@
-"""Barometer and magnetometer: log folder, bags, and what the input doctor says of them."""
+"""Barometer and magnetometer: log folder, bags, and their log checks."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_the_log_folder_has_a_file_for_each(tmp_path: Path) -> None:
         ("magnetometer.csv", "t_s,field_x_t,field_y_t,field_z_t\n0,1e-5,x,1e-5\n", "field_y_t"),
     ],
 )
-def test_a_broken_file_is_told(tmp_path: Path, file: str, text: str, word: str) -> None:
+def test_a_broken_file_is_refused(tmp_path: Path, file: str, text: str, word: str) -> None:
     folder = write_log_folder(turning(), tmp_path / "log")
     (folder / file).write_text(text)
     with pytest.raises(DataError, match=word):
@@ -123,7 +123,7 @@ def test_a_sound_log_has_no_finding() -> None:
 
 
 @pytest.mark.parametrize(("name", "factor"), [("hPa", 1e-2), ("kPa", 1e-3)])
-def test_pressure_units_are_named_and_repaired(name: str, factor: float) -> None:
+def test_pressure_units_are_found_and_repaired(name: str, factor: float) -> None:
     good = turning()
     assert good.barometer is not None
     corrupted = dataclasses.replace(
@@ -141,7 +141,7 @@ def test_pressure_units_are_named_and_repaired(name: str, factor: float) -> None
 @pytest.mark.parametrize(
     ("name", "factor"), [("uT", 1e6), ("gauss", 1e4), ("milligauss", 1e7), ("nT", 1e9), ("", 1.0 / 49.5e-6)]
 )
-def test_field_units_are_named_and_repaired(name: str, factor: float) -> None:
+def test_field_units_are_found_and_repaired(name: str, factor: float) -> None:
     """A field divided by its own size (Xsens) cannot be repaired: only its direction is left."""
     good = turning()
     assert good.magnetometer is not None
@@ -183,7 +183,7 @@ def test_hard_iron_is_found_and_taken_off() -> None:
     np.testing.assert_allclose(repaired.magnetometer.field_t, good.field_t, atol=2e-8)
 
 
-def test_without_a_full_turn_an_offset_is_not_told() -> None:
+def test_without_a_full_turn_there_is_no_offset_finding() -> None:
     """Half a turn about an offset is also a part of some other circle: no guess."""
     assert codes(turning(offset_t=(6e-6, -3e-6), turns=0.5)) == []
 

@@ -45,7 +45,7 @@ def means(t_ns: np.ndarray, values: np.ndarray, edges_ns: np.ndarray) -> np.ndar
 
 
 def fits(recording: Recording) -> dict[str, float]:
-    """What the IMU says beside gravity and the wheels: positive where its axes are the body's.
+    """The IMU against gravity and the wheels: positive where its axes are the body's.
 
     Means of half a second: gravity on z (share of g), gyro z with the wheels' yaw rate, x with the change
     of the wheels' speed, y with speed times yaw rate (correlations).

@@ -1,4 +1,4 @@
-"""The doctor finds from the data alone what the catalogue knows of the public logs."""
+"""The checks recover from the data alone the conventions that the catalogue lists for public logs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Measures and the page made of them: known answers, and nothing that any recording could break."""
+"""Measures and their page: known answers, and no failure for any recording."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def cut(recording: Recording, seconds: float) -> list[Recording]:
     return parts
 
 
-def test_windows_tell_as_a_pool_what_the_drive_tells(drive: Recording, husky_rig: Rig) -> None:
-    """A minute in windows of 3 s, none of which says anything by itself."""
+def test_pooled_windows_measure_what_the_whole_run_does(drive: Recording, husky_rig: Rig) -> None:
+    """A minute in windows of 3 s, none of which suffices alone."""
     windows = cut(drive, 3.0)
     whole, pool, alone = (measure(part, husky_rig) for part in ([drive], windows, windows[:1]))
     assert alone.yaw is None

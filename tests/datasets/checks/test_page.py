@@ -34,11 +34,11 @@ def codes_of(module_name: str) -> Iterator[tuple[str, int]]:
                 yield value, node.lineno
 
 
-def test_every_code_is_told_and_no_other() -> None:
+def test_every_code_is_listed_and_no_other() -> None:
     given = {code for name in MODULES for code, _ in codes_of(name)}
-    told = re.findall(r"^\| `([a-z-]+)` (?:error|warning)", TEXT, re.MULTILINE)
-    assert len(told) == len(set(told))
-    assert set(told) == given
+    listed = re.findall(r"^\| `([a-z-]+)` (?:error|warning)", TEXT, re.MULTILINE)
+    assert len(listed) == len(set(listed))
+    assert set(listed) == given
 
 
 QUOTED = re.findall(r"`(\w+)\.([A-Z][A-Z0-9_]*)`(?: (-?[\d.]+(?:e-?\d+)?))?", TEXT)

@@ -134,7 +134,7 @@ def after(*steps: Fault) -> Fault:
 
 
 def rad_for_metres(r: Recording) -> Recording:
-    """Wheel rates (rad/s) given as speeds, in a log that tells the radius as well."""
+    """Wheel rates (rad/s) given as speeds, in a log that gives the radius as well."""
     assert r.wheels is not None
     return dataclasses.replace(r, wheels=dataclasses.replace(r.wheels, unit="mps"))
 
@@ -206,7 +206,7 @@ def tilted(r: Recording) -> Recording:
 
 
 def other_gyro(r: Recording) -> Recording:
-    """Gyro z of a drive that turned otherwise; nothing else tells of turns."""
+    """Gyro z of a run that turned otherwise; no other channel shows turns."""
     rng = np.random.default_rng(3)
     steps = np.repeat(rng.normal(0.0, 0.3, 46), 100)[:4500]
     bare = without(r, "gnss", "truth", "command")
@@ -397,7 +397,7 @@ def test_slip_on_soft_ground_is_no_finding() -> None:
     assert run_checks(slipping) == []
 
 
-def test_the_gyro_is_assumed_where_nothing_tells() -> None:
+def test_the_gyro_is_assumed_where_nothing_decides() -> None:
     bare = without(lively_drive(), "gnss", "truth", "command")
     assert bare.imu is not None
     gyro_only = imu_with(

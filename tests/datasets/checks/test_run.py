@@ -1,4 +1,4 @@
-"""The input doctor: a clean drive has no finding, each fault has its own."""
+"""Log checks: a clean run has no finding, each fault has its own."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_each_fault_is_found(drive: Recording, fault: tuple[Callable[..., Record
     assert set(found.to_dict()) == {"code", "severity", "channel", "what", "evidence", "fix", "repairable"}
 
 
-def test_held_value_count_is_told(drive: Recording) -> None:
+def test_held_value_count_is_given(drive: Recording) -> None:
     found = next(f for f in run_checks(held_wheels(drive)) if f.what == "values are held")
     assert "every 4" in found.evidence
 
@@ -136,7 +136,7 @@ def test_errors_come_first(drive: Recording) -> None:
     assert severities == sorted(severities, key=lambda s: s != "error")
 
 
-def test_sparse_logs_do_not_trip_it(drive: Recording) -> None:
+def test_sparse_logs_have_no_finding(drive: Recording) -> None:
     for name, channel in drive.channels().items():
         for n in (1, 2, 5):
             alone = Recording("x", drive.start_ns, **{name: channel.select(slice(0, n))})

@@ -1,4 +1,4 @@
-"""The input doctor on clocks and signals: clean drives are silent, each fault is named and repaired."""
+"""Log checks of clocks and signals: clean runs have no finding, each fault is found and repaired."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from terrafusion.datasets.core.recording import ClockJump, Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 
-Spoil = Callable[[Recording], Recording]
+Corrupt = Callable[[Recording], Recording]
 START_NS = 1_700_000_000_123_456_789
 
 CODES = {
@@ -38,7 +38,7 @@ def seconds(t_ns: np.ndarray) -> np.ndarray:
     return (t_ns - t_ns[0]) * 1e-9
 
 
-def retimed(name: str, new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def retimed(name: str, new: Callable[[np.ndarray], np.ndarray]) -> Corrupt:
     """A channel with other times."""
 
     def corrupt(r: Recording) -> Recording:
@@ -49,15 +49,15 @@ def retimed(name: str, new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
     return corrupt
 
 
-def late(name: str, by_s: float, from_s: float = 0.0) -> Spoil:
+def late(name: str, by_s: float, from_s: float = 0.0) -> Corrupt:
     return retimed(name, lambda t: t + np.where(seconds(t) >= from_s, round(by_s * 1e9), 0))
 
 
-def drifting(name: str, rate: float) -> Spoil:
+def drifting(name: str, rate: float) -> Corrupt:
     return retimed(name, lambda t: t[0] + np.rint((t - t[0]) * (1.0 + rate)))
 
 
-def rows(name: str, choose: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def rows(name: str, choose: Callable[[np.ndarray], np.ndarray]) -> Corrupt:
     """A channel with some of its rows, by seconds from its start."""
 
     def corrupt(r: Recording) -> Recording:
@@ -67,7 +67,7 @@ def rows(name: str, choose: Callable[[np.ndarray], np.ndarray]) -> Spoil:
     return corrupt
 
 
-def with_field(name: str, field: str, new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def with_field(name: str, field: str, new: Callable[[np.ndarray], np.ndarray]) -> Corrupt:
     """A channel with other values in one field."""
 
     def corrupt(r: Recording) -> Recording:
@@ -99,11 +99,11 @@ def plus(value: float, *cells: object) -> Callable[[np.ndarray], np.ndarray]:
     return changed
 
 
-def gyro(new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def gyro(new: Callable[[np.ndarray], np.ndarray]) -> Corrupt:
     return with_field("imu", "gyro_radps", new)
 
 
-def wheel_speed(new: Callable[[np.ndarray], np.ndarray]) -> Spoil:
+def wheel_speed(new: Callable[[np.ndarray], np.ndarray]) -> Corrupt:
     return with_field("wheels", "speed", new)
 
 
@@ -135,7 +135,7 @@ def arrival(t_ns: np.ndarray) -> np.ndarray:
 
 
 # code, channel, corrupt, largest error of the repaired times in seconds
-CLOCK_FAULTS: dict[str, tuple[str, str, Spoil, float]] = {
+CLOCK_FAULTS: dict[str, tuple[str, str, Corrupt, float]] = {
     "imu is 0.4 s late": ("clock-offset", "imu", late("imu", 0.4), 0.05),
     "wheels are 0.8 s early": ("clock-offset", "wheels", late("wheels", -0.8), 0.03),
     "wheels are 7 s late": ("clock-offset", "wheels", late("wheels", 7.0), 0.05),
@@ -155,7 +155,7 @@ CLOCK_FAULTS: dict[str, tuple[str, str, Spoil, float]] = {
 
 
 @pytest.mark.parametrize("name", CLOCK_FAULTS)
-def test_clock_faults_are_named_and_repaired(drive: Recording, name: str) -> None:
+def test_clock_faults_are_found_and_repaired(drive: Recording, name: str) -> None:
     code, channel, corrupt, tolerance_s = CLOCK_FAULTS[name]
     corrupted = corrupt(drive)
     assert [(f.code, f.channel) for f in found_in(corrupted)] == [(code, channel)]
@@ -186,7 +186,7 @@ def test_a_clock_that_is_surely_off_by_half_a_second_is_an_error(
     assert offset_finding(drive, {pair: lag}, {pair}).severity == severity
 
 
-VALUE_FAULTS: dict[str, tuple[str, str, Spoil]] = {
+VALUE_FAULTS: dict[str, tuple[str, str, Corrupt]] = {
     "gyro z is stuck for 8 s": ("stuck", "imu", gyro(to(0.05, slice(2000, 2800), 2))),
     "gyro z is stuck all along": ("stuck", "imu", gyro(to(0.05, slice(None), 2))),
     "left wheel is stuck": ("stuck", "wheels", wheel_speed(to(3.0, slice(400, 520), 0))),
@@ -208,14 +208,14 @@ VALUE_FAULTS: dict[str, tuple[str, str, Spoil]] = {
 
 
 @pytest.mark.parametrize("name", VALUE_FAULTS)
-def test_value_faults_are_named_and_repaired(drive: Recording, name: str) -> None:
+def test_value_faults_are_found_and_repaired(drive: Recording, name: str) -> None:
     code, channel, corrupt = VALUE_FAULTS[name]
     corrupted = corrupt(drive)
     assert [(f.code, f.channel) for f in found_in(corrupted)] == [(code, channel)]
     repaired, _ = repair(corrupted)
     left = found_in(repaired)
     assert code not in [f.code for f in left]
-    assert {f.code for f in left} <= {"missing-values", "gaps"}  # what is gone stays gone, and is told
+    assert {f.code for f in left} <= {"missing-values", "gaps"}  # what is lost stays lost, and is reported
     assert all(f.repair is None for f in left)
     after = getattr(repaired, channel)
     if after is None:  # dead wheels are left out
@@ -245,7 +245,7 @@ def test_value_faults_are_named_and_repaired(drive: Recording, name: str) -> Non
     ],
     ids=["a gap", "dropped messages"],
 )
-def test_what_is_missing_stays_missing(drive: Recording, corrupt: Spoil, words: str) -> None:
+def test_what_is_missing_stays_missing(drive: Recording, corrupt: Corrupt, words: str) -> None:
     corrupted = corrupt(drive)
     (finding,) = found_in(corrupted)
     assert finding.code == "gaps"
@@ -289,7 +289,7 @@ def test_repeated_times_keep_their_first_row(drive: Recording) -> None:
     np.testing.assert_array_equal(repaired.gnss.enu_m, drive.gnss.enu_m)
 
 
-def test_steps_taken_out_on_reading_are_told_once(drive: Recording) -> None:
+def test_steps_removed_on_reading_are_one_finding(drive: Recording) -> None:
     jumps = (ClockJump("imu", START_NS + 10**10, -2.5), ClockJump("imu", START_NS + 2 * 10**10, 0.5))
     corrupted = dataclasses.replace(drive, clock_jumps=jumps)
     (finding,) = found_in(corrupted)
@@ -308,7 +308,7 @@ def lags(recording: Recording) -> dict[str, Lag]:
     return {f"{other} after {one}": lag for (one, other), lag in found.items() if lag is not None}
 
 
-def test_lags_are_told_by_pair(drive: Recording) -> None:
+def test_lags_by_pair(drive: Recording) -> None:
     found = lags(late("wheels", 0.5)(drive))
     assert set(found) == {
         "wheels after imu", "imu after truth", "wheels after truth", "wheels after gnss", "gnss after truth"
@@ -338,7 +338,7 @@ def test_a_moving_mean_of_odometry_is_no_offset(drive: Recording) -> None:
     assert [f.code for f in found_in(late("wheels", 0.5)(r))] == ["clock-offset"]
 
 
-def test_clean_drives_are_silent(drive: Recording, husky_rig: Rig) -> None:
+def test_clean_runs_have_no_finding(drive: Recording, husky_rig: Rig) -> None:
     assert found_in(drive, husky_rig) == []
     assert drive.imu is not None
     assert drive.wheels is not None
@@ -354,7 +354,7 @@ def test_clean_drives_are_silent(drive: Recording, husky_rig: Rig) -> None:
     assert found_in(slow) == []
 
 
-def test_standstill_and_straight_drives_are_silent(drive: Recording) -> None:
+def test_standstill_and_straight_runs_have_no_finding(drive: Recording) -> None:
     assert drive.imu is not None
     assert drive.wheels is not None
     rng = np.random.default_rng(0)
@@ -367,7 +367,7 @@ def test_standstill_and_straight_drives_are_silent(drive: Recording) -> None:
         assert found_in(r) == []
 
 
-def test_short_logs_are_silent(drive: Recording) -> None:
+def test_short_logs_have_no_finding(drive: Recording) -> None:
     for n in (1, 2, 5):
         channels = {name: channel.select(slice(0, n)) for name, channel in drive.channels().items()}
         assert found_in(Recording("x", START_NS, **channels)) == []
@@ -375,7 +375,7 @@ def test_short_logs_are_silent(drive: Recording) -> None:
         assert found_in(dataclasses.replace(drive, truth=drive.truth.select(slice(0, n)))) == []
 
 
-def test_the_husky_bag_is_silent(field_logs: Path, husky_rig: Rig) -> None:
+def test_the_husky_bag_has_no_finding(field_logs: Path, husky_rig: Rig) -> None:
     assert found_in(open_recording(field_logs / "test1.bag", rig=husky_rig), husky_rig) == []
 
 

@@ -1,4 +1,4 @@
-"""What the Michigan Husky's numbers mean: signs, axes, scales and clocks, checked by physics."""
+"""Conventions of the Michigan Husky's logs: signs, axes, scales and clocks, checked by physics."""
 
 from __future__ import annotations
 

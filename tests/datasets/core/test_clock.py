@@ -1,4 +1,4 @@
-"""Clocks that step, rows out of order, and which is which."""
+"""Clock steps and rows out of order are distinguished."""
 
 from __future__ import annotations
 
@@ -137,8 +137,8 @@ def test_channels_of_one_clock_step_together(step_s: float) -> None:
     """GNSS at 1 Hz does not show a step of 0.3 s, yet is on the same clock."""
     truth = {"imu": ticks(6000), "wheels": ticks(1200, 50 * MS, 0.1), "gnss": ticks(60, S)}
     at = START_NS + 30 * S + 5 * MS
-    heard = {name: np.where(t >= at, t - round(step_s * S), t) for name, t in truth.items()}
-    repaired, jumps = repair_together(heard)
+    recorded = {name: np.where(t >= at, t - round(step_s * S), t) for name, t in truth.items()}
+    repaired, jumps = repair_together(recorded)
     for name, t in truth.items():
         np.testing.assert_array_equal(repaired[name], t)
     assert {jump.channel for jump in jumps} == set(truth)
@@ -153,7 +153,7 @@ def test_a_clock_of_its_own_steps_alone() -> None:
     assert repaired["gnss"] is truth["gnss"]
 
 
-def test_another_clock_tells_a_leap_from_a_gap() -> None:
+def test_another_clock_distinguishes_a_jump_from_a_gap() -> None:
     t = np.delete(ticks(3000), range(1000, 1500))
     leapt = stepped(t, (2000, 60.0))
     repaired, jumps = repair_together({"imu": leapt}, beside={"imu": t + 3 * MS})

@@ -1,4 +1,4 @@
-"""Decimal times -> nanoseconds: many at once what `decimal` says of each."""
+"""Decimal times to nanoseconds: the vectorised conversion equals that of `decimal`."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def test_as_decimal_says(texts: list[str], unit: str) -> None:
      "9223372036.854775808", "é", "٣", "1" * 41, "1 2", "1e"],
 )  # fmt: skip
 def test_what_is_no_time(text: str) -> None:
-    with pytest.raises(NotADecimal) as told:
+    with pytest.raises(NotADecimal) as error:
         to_ns(["1.5", text])
-    assert told.value.row == 1
+    assert error.value.row == 1
 
 
-def test_plain_times_take_the_fast_way(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_plain_times_use_the_fast_conversion(monkeypatch: pytest.MonkeyPatch) -> None:
     """Unix times as loggers write them never go one by one."""
     monkeypatch.setattr(decimals, "_one_to_ns", None)
     for text, unit in (

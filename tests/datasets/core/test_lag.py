@@ -1,4 +1,4 @@
-"""Lags by correlation: recovered, with an interval that holds what it says, or refused."""
+"""Lags by correlation: recovered, with an interval of nominal coverage, or refused."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_unix_times_are_as_good() -> None:
     assert far.seconds == pytest.approx(near.seconds, abs=1e-3)
 
 
-def test_what_cannot_be_told_is_none() -> None:
+def test_undetermined_lags_are_none() -> None:
     t_a, a, t_b, b = pair(0, 0.3)
     empty = np.zeros(0)
     assert lag_between(empty, empty, t_b, b) is None

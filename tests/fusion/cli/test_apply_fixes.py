@@ -1,4 +1,4 @@
-"""`convert --apply-fixes`: each repair is lines, kept as a note, and leaves a log that replays."""
+"""`convert --apply-fixes`: each repair is printed and noted, and the repaired log replays."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def set_back(log: Path, channel: str, after_s: float, by_s: float) -> None:
     table.to_csv(log / f"{channel}.csv", index=False, float_format="%.9f")
 
 
-def test_repairs_are_told_and_kept(log: Path, good_log: Path, terrafusion) -> None:
+def test_repairs_are_printed_and_noted(log: Path, good_log: Path, terrafusion) -> None:
     corrupt(log, "imu", ACCEL, 1 / 9.80665)
     outcome = terrafusion("convert", "log", "out", "--apply-fixes")
     assert (outcome.status, outcome.err) == (0, "")
@@ -89,7 +89,7 @@ def test_a_refused_replay_names_the_remedy(log: Path, terrafusion) -> None:
     assert terrafusion("replay", "out", "--out", "results").status == 0
 
 
-def test_mending_a_good_log_changes_nothing(good_log: Path, terrafusion) -> None:
+def test_repairing_a_good_log_changes_nothing(good_log: Path, terrafusion) -> None:
     outcome = terrafusion("convert", good_log, "same", "--apply-fixes")
     assert (outcome.status, outcome.err) == (0, "")
     assert "repaired" not in outcome.out

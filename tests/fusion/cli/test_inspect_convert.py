@@ -81,7 +81,7 @@ def test_inspect_json(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert page["findings"] == []
 
 
-def test_inspect_tells_a_gap(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_inspect_shows_a_gap(log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     lines = (log / "imu.csv").read_text().splitlines(keepends=True)
     (log / "imu.csv").write_text("".join(lines[:100] + lines[200:]))
     _, out, _ = run(capsys, "inspect", log)
@@ -145,7 +145,7 @@ def test_inspect_measures(known_log: Path, capsys: pytest.CaptureFixture[str]) -
     assert measured["sigma_m"] == {"min": 0.02, "median": 0.02, "max": 0.02}
 
 
-def test_page_tells_the_same_and_fits(known_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_page_shows_the_same_and_fits(known_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     _, out, _ = run(capsys, "inspect", known_log)
     assert max(len(line) for line in out.splitlines()) <= 100
     text = " ".join(out.split())
@@ -252,7 +252,7 @@ def test_convert_to_mcap_and_back(log: Path, tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "message"),
     [
         (("inspect", "nowhere.bag"), "nowhere.bag"),
         (("inspect", "."), "meta.yaml"),
@@ -262,7 +262,7 @@ def test_convert_to_mcap_and_back(log: Path, tmp_path: Path, capsys: pytest.Capt
     ],
 )
 def test_known_errors_are_one_line(
-    log: Path, words: tuple[str, ...], told: str, capsys: pytest.CaptureFixture[str],
+    log: Path, words: tuple[str, ...], message: str, capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     monkeypatch.chdir(log.parent)
@@ -271,7 +271,7 @@ def test_known_errors_are_one_line(
     assert (status, out) == (1, "")
     assert err.startswith("error: ")
     assert err.count("\n") == 1
-    assert told in err
+    assert message in err
 
 
 def test_bad_cell_is_one_line(log: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Dilutions of precision are told from sigmas, and sigmas are left alone."""
+"""Dilutions of precision are recognised, and true sigmas have no finding."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_dilutions_are_named(drive: Recording, fix: Fix) -> None:
     assert codes(with_sigma(drive, TENTHS, fix)) == {"sigma-dilution"}
 
 
-def test_they_survive_the_square_root_of_a_covariance(drive: Recording) -> None:
+def test_dilutions_are_named_after_a_square_root_of_a_covariance(drive: Recording) -> None:
     assert codes(with_sigma(drive, np.sqrt(TENTHS**2), Fix.SINGLE)) == {"sigma-dilution"}
 
 
@@ -49,11 +49,11 @@ def test_a_class_that_contradicts_its_sigma_is_named(drive: Recording) -> None:
         (TENTHS / 10, 1.0),  # centimetres in steps of one
     ],
 )
-def test_sigmas_are_left_alone(drive: Recording, flat: np.ndarray, north: float) -> None:
+def test_true_sigmas_have_no_finding(drive: Recording, flat: np.ndarray, north: float) -> None:
     assert codes(with_sigma(drive, flat, Fix.SINGLE, north)) == set()
 
 
-def test_the_repair_takes_the_class_for_its_worth(drive: Recording) -> None:
+def test_the_repair_multiplies_by_the_usual_sigma_of_the_class(drive: Recording) -> None:
     repaired, done = repair(with_sigma(drive, TENTHS, Fix.SINGLE))
     assert [finding.code for finding in done] == ["sigma-dilution"]
     assert repaired.gnss is not None
