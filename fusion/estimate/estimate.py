@@ -1,4 +1,4 @@
-"""What the estimator gives back: states as they come, and whole drives."""
+"""Results of the estimator: single states, and whole runs."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ class Innovation:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Estimate:
-    """A whole drive as estimated.
+    """The estimate of a whole run.
 
     `trajectory` has the twist (body) and the covariance of every keyframe; the
     other arrays run along it. `classes` names the columns of `terrain`, `linear_names` those of `linear`.

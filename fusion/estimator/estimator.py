@@ -27,13 +27,9 @@ from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
 from terrafusion.fusion.estimator.alignment import (
-    WINDOW_NS,
-    KnownStart,
     Start,
     checked_start,
-    heading_from_motion,
     initial_state,
-    level_start,
 )
 from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
@@ -43,10 +39,10 @@ from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
+from terrafusion.fusion.estimator.starting import StartSearch
 from terrafusion.fusion.estimator.stationarity import (
     StationarityDetector,
     add_zero_velocity,
-    drop_before_start,
 )
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
@@ -99,9 +95,7 @@ class Estimator:
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
         self._step_ns = round(config.keyframe_s * 1e9)
         self._keep = round(config.lag_s / config.keyframe_s) + LAG_MARGIN
-        self._start: Start | None = None
-        self._given: KnownStart | None = None
-        self._level: Start | None = None
+        self._search = StartSearch(config, self.aids, self.gnss)
         self._state: State | None = None
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
@@ -174,7 +168,7 @@ class Estimator:
 
         A wrong heading is corrected from the motion. Must come before the start.
         """
-        self._given = checked_start(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
+        self._search.known = checked_start(position_m, yaw_rad, position_sigma_m, yaw_sigma_rad)
 
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with those of the detector."""
@@ -216,7 +210,7 @@ class Estimator:
         """A key of `STATUS`, also before the first state."""
         if self._state is not None:
             return self._state.status
-        return "waiting" if self._level is None else "aligning"
+        return "waiting" if self._search.level is None else "aligning"
 
     def finish(self) -> None:
         """No more data come: keyframes no longer wait for late samples."""
@@ -224,8 +218,11 @@ class Estimator:
         self._advance(last=True)
 
     def _advance(self, last: bool = False) -> None:
-        if self._start is None and not self._try_start(last):
-            return
+        if not self.chain.nodes:
+            start = self._search.find(self.imu, self.wheels, last)
+            if start is None:
+                return
+            self._begin(start)
         newest = self.chain.last
         while self._ready(t := self.chain.nodes[-1].t_ns + self._step_ns, last):
             self._keyframe(t)
@@ -239,38 +236,9 @@ class Estimator:
         waited = t_ns + round(self.config.wheel_wait_s * 1e9)
         return last or self.wheels.covers(t_ns) or self.imu.covers(waited)
 
-    def _try_start(self, last: bool) -> bool:
-        """Start the graph once heading is known, or once GNSS has been waited for long enough."""
-        if not self.imu.t_ns or not self.wheels.t_ns:
-            return False
-        begin = max(self.imu.t_ns[0], self.wheels.t_ns[0])
-        level_ns = begin + WINDOW_NS
-        covered = self.wheels.covers(level_ns) or self.imu.covers(level_ns + WINDOW_NS)
-        if not last and not (covered and self.imu.covers(level_ns)):
-            return False
-        elapsed = (self.imu.t_ns[-1] - begin) * 1e-9
-        if self._level is None:
-            self._level = level_start(self.imu, self.wheels, begin)
-        if self._given is None:
-            self._given = self.aids.start(self._level, self.imu, self.gnss.waiting)
-        if self._given is not None:
-            self._begin(self._given.at(self._level))
-        elif self.gnss.waiting and self.gnss.have_new():
-            antenna = np.array(self.config.rig.sensors.gnss.antenna_m)
-            start = heading_from_motion(self.imu, self.wheels, self.gnss.waiting, self._level, antenna)
-            if start is not None and start.yaw_sigma_rad <= self.config.yaw_sigma_start_rad:
-                self._begin(start)
-            elif drop_before_start(self.imu, self.wheels, self.gnss.waiting):
-                self._level = None
-        elif not self.gnss.waiting and (last or elapsed > self.config.longest_wait_s):
-            self.gnss.local = True
-            self._begin(self._level)
-        return self._start is not None
-
     def _begin(self, start: Start) -> None:
-        self._start = start
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
-        from_fixes = not self.gnss.local and self._given is None
+        from_fixes = not self.gnss.local and self._search.known is None
         spec, drift_m = self.config.rig.sensors.imu, self.gnss.drift_sigma_m
         point, sigmas = initial_state(start, self.weights.noise, spec, drift_m, from_fixes)
         self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))

@@ -71,8 +71,8 @@ class GnssGate:
         points = np.array([point for point, _ in recent])
         order = np.arange(len(points)) - 0.5 * (len(points) - 1)
         points = points - points.mean(axis=0)
-        rest = points - np.outer(order, order @ points) / float(order @ order)
-        spread = float(np.sqrt((rest**2).sum() / (len(points) - 2)))
+        left_m = points - np.outer(order, order @ points) / float(order @ order)
+        spread = float(np.sqrt((left_m**2).sum() / (len(points) - 2)))
         return spread <= self.agreement_sigma * max(sigma for _, sigma in recent)
 
 

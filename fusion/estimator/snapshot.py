@@ -1,15 +1,13 @@
-"""A running estimator as bytes, and back, so that it goes on with the same bits.
+"""A running estimator as bytes, and back, so that it continues with the same bits.
 
-The file is a tree of JSON and a block of arrays; nothing in it is executed, no
-class is named that the library does not have, and no sizes are taken from it
-that its own length does not bear out. `restore` builds an estimator from the
-configuration, which the file does not hold, and fills in what the drive has
-made of it. The tree is walked over the attributes of whatever objects the
-estimator is made of, so a new array or a new object in it is covered without a
-word here; what cannot be written makes `dump` fail, not `restore`.
+The file is a tree of JSON and a block of arrays; nothing in it is executed, no class is named that the
+library does not have, and no sizes are taken from it that its own length does not bear out. `restore`
+builds an estimator from the configuration, which the file does not hold, and fills in the state of the
+run. The tree is walked over the attributes of the estimator's objects, so that a new array or object is
+covered; what cannot be written makes `dump` fail, not `restore`.
 
-Layout: `MAGIC`, SHA-256 of the rest (32 bytes), length of the tree (8 bytes,
-little endian), the tree in UTF-8, the arrays end to end.
+Layout: `MAGIC`, SHA-256 of the rest (32 bytes), length of the tree (8 bytes, little endian), the tree in
+UTF-8, the arrays end to end.
 """
 
 from __future__ import annotations
@@ -52,12 +50,12 @@ _FIXED = (
     Propagator,
     gtsam.Values,
 )
-"""What follows from the configuration or from the rest of the estimator: not written, kept at `restore`."""
+"""Determined by the configuration or by the rest of the estimator: not written, kept at `restore`."""
 _OWN = ("terrafusion.fusion.", "terrafusion.datasets.")
 
 
 class Running(Protocol):
-    """What a snapshot needs to know of an estimator."""
+    """The part of an estimator that a snapshot uses."""
 
     config: EstimatorConfig
     chain: Chain
@@ -67,7 +65,7 @@ R = TypeVar("R", bound=Running)
 
 
 def dump(estimator: Running) -> bytes:
-    """The estimator's state; the configuration is not part of it, only its hash.
+    """The estimator's state; of the configuration only its hash.
 
     Raises:
         ConfigError: the estimator keeps an archive for a batch solution.
@@ -224,7 +222,7 @@ class _Writer:
 
 
 class _Reader:
-    """What `_Writer` wrote, into the places where a fresh estimator has the like."""
+    """What `_Writer` wrote, put where a fresh estimator has the like."""
 
     def __init__(self, arrays: memoryview) -> None:
         self._arrays = arrays
@@ -309,7 +307,7 @@ class _Reader:
 
 
 def _filled(present: Any, read: Any) -> Any:
-    """`read`, in the container that a fresh estimator has there: others may hold it, too."""
+    """`read`, in the container of a fresh estimator: others may hold it, too."""
     if type(present) is not type(read):
         return read
     present.clear()
@@ -327,7 +325,7 @@ def _parts(value: object) -> dict[str, Any]:
 
 
 def _misfit(cls: type, parts: dict[str, Any], of_fresh: dict[str, Any]) -> str | None:
-    """The first part whose type is not that of the class's annotations, nor that of a fresh object."""
+    """The first part whose type differs from the class's annotations or from a fresh object's."""
     hints = hints_of(cls) if dataclasses.is_dataclass(cls) else {}
     for name, value in parts.items():
         own = of_fresh.get(name)

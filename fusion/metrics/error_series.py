@@ -31,10 +31,6 @@ NOT_SCORED = ("waiting", "aligning")
 """Status of keyframes before the pose is initialised."""
 
 
-_COMPLEX = np.array([1.0, 1j])
-"""From points (N, 2) to complex numbers (N,)."""
-
-
 @dataclass(frozen=True, eq=False)
 class Errors:
     """Estimate and reference at M common times.

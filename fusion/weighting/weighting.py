@@ -78,8 +78,8 @@ def wheel_innovation_test(
 ) -> InnovationTest:
     """A wheel increment against its prediction, along body x."""
     own = wheels.sigma[0] ** 2
-    rest = max(variance_m2 - own, 0.0)
-    return InnovationTest(t_ns, np.array([innovation_m]), np.array([rest]), np.array([own]), np.array([dt_s]))
+    predicted = max(variance_m2 - own, 0.0)
+    return InnovationTest(t_ns, np.array([innovation_m]), np.array([predicted]), np.array([own]), np.array([dt_s]))
 
 
 def inflated(wheels: WheelIncrement, scale: float) -> WheelIncrement:

@@ -1,4 +1,4 @@
-"""A robot that slides: fixes that refute the wheels are used, whatever the wheels say; others are not."""
+"""A skidding robot: fixes that refute the wheels are used; others are not."""
 
 from __future__ import annotations
 

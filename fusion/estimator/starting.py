@@ -1,0 +1,61 @@
+"""The start of an estimator: waits until heading is known, or until GNSS has been waited for long enough."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.aiding import AidingSensors
+from terrafusion.fusion.estimator.alignment import (
+    WINDOW_NS,
+    KnownStart,
+    Start,
+    heading_from_motion,
+    level_start,
+)
+from terrafusion.fusion.estimator.gnss import GnssUpdater
+from terrafusion.fusion.estimator.stationarity import drop_before_start
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+
+
+class StartSearch:
+    """Finds the first state.
+
+    Attributes:
+        known: position and heading given beforehand or by aiding sensors, None where they come from motion.
+        level: attitude at the beginning of the samples, once known.
+    """
+
+    def __init__(self, config: EstimatorConfig, aids: AidingSensors, gnss: GnssUpdater) -> None:
+        self.known: KnownStart | None = None
+        self.level: Start | None = None
+        self._config, self._aids, self._gnss = config, aids, gnss
+        self._antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
+
+    def find(self, imu: ImuStream, wheels: WheelStream, last: bool) -> Start | None:
+        """The start, or None as long as there is none; `last`: no more samples will come."""
+        if not imu.t_ns or not wheels.t_ns:
+            return None
+        begin = max(imu.t_ns[0], wheels.t_ns[0])
+        level_ns = begin + WINDOW_NS
+        covered = wheels.covers(level_ns) or imu.covers(level_ns + WINDOW_NS)
+        if not last and not (covered and imu.covers(level_ns)):
+            return None
+        elapsed_s = (imu.t_ns[-1] - begin) * 1e-9
+        if self.level is None:
+            self.level = level_start(imu, wheels, begin)
+        if self.known is None:
+            self.known = self._aids.start(self.level, imu, self._gnss.waiting)
+        if self.known is not None:
+            return self.known.at(self.level)
+        fixes = self._gnss.waiting
+        if fixes and self._gnss.have_new():
+            start = heading_from_motion(imu, wheels, fixes, self.level, self._antenna_m)
+            if start is not None and start.yaw_sigma_rad <= self._config.yaw_sigma_start_rad:
+                return start
+            if drop_before_start(imu, wheels, fixes):
+                self.level = None
+        elif not fixes and (last or elapsed_s > self._config.longest_wait_s):
+            self._gnss.local = True
+            return self.level
+        return None

@@ -1,0 +1,36 @@
+"""`terrafusion live`: times and the last state, and a log that is not there in one line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.cli.main import app
+
+
+def test_a_log_gives_times_and_the_last_state(good_log: Path) -> None:
+    done = CliRunner().invoke(app, ["live", str(good_log)])
+    assert done.exit_code == 0
+    lines = done.output.splitlines()
+    assert [line.split()[0] for line in lines[:3]] == ["keyframe", "sample", "odometry"]
+    assert lines[3].startswith("running: [")
+
+
+def test_a_log_that_is_not_there_is_a_known_error() -> None:
+    done = CliRunner().invoke(app, ["live", "no-such-log"])
+    assert isinstance(done.exception, TerrafusionError)
+
+
+def test_a_log_without_wheels_is_refused(good_log: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "log"
+    folder.mkdir()
+    for file in good_log.iterdir():
+        if not file.name.startswith("wheels"):
+            (folder / file.name).write_bytes(file.read_bytes())
+    done = CliRunner().invoke(app, ["live", str(folder)])
+    assert isinstance(done.exception, TerrafusionError)
+    with pytest.raises(TerrafusionError, match="IMU or wheels"):
+        raise done.exception
