@@ -64,7 +64,7 @@ class PathFit:
 
 @dataclass(frozen=True, eq=False)
 class FixPair:
-    """A fix (east + i north, m) with its reported sigma, and the dead-reckoned antenna `z` (m) at its time."""
+    """A fix (east + i north, m) its reported sigma, and the dead-reckoned antenna `z` (m) then."""
 
     t_ns: int
     z: complex
@@ -86,7 +86,7 @@ class DeadReckoning:
         self._forgotten = np.zeros(2)
 
     def step(self, chain: Chain) -> None:
-        """Extend the path to the newest keyframe by its wheels, or by its velocity where they are rejected."""
+        """Extend the path to the newest keyframe by its wheels, or its velocity where they are rejected."""
         node, state = chain.nodes[-1], chain.state(chain.last)
         R = state.pose.rotation().matrix()
         self._yaw_chain = float(np.arctan2(R[1, 0], R[0, 0]))
@@ -196,7 +196,7 @@ class DeadReckoning:
         return abs(recent[3].fix - led) <= SMOOTH_SIGMA * math.hypot(*reported) + jerk
 
     def heading_correction(self, yaw_sigma_rad: float, scale: float) -> float | None:
-        """Angle by which the filter's heading must turn to agree with the motion, once confirmed; else None."""
+        """Turn of the filter's heading that agrees with the motion, rad, once confirmed; else None."""
         turn = self._heading_error(yaw_sigma_rad, scale)
         self._confirmed = self._confirmed + 1 if turn is not None else 0
         return turn if self._confirmed >= CONFIRMED else None

@@ -34,7 +34,7 @@ from terrafusion.fusion.noise.policy import SensorNoise
 FRICTION_MPS2 = np.array([0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8, 4.0, 5.6])
 """Friction limits of the models: mu g from ice to dry ground."""
 SLIPPERY_MPS2 = 2.0
-"""Up to this limit (ice, wet or snowy ground) the friction model may lead; above it wheels do nearly as well."""
+"""Limit (ice, wet or snowy ground) up to which friction may lead; above it wheels do nearly as well."""
 SLIPPERY = FRICTION_MPS2[FRICTION_MPS2 <= SLIPPERY_MPS2]
 LEAD_PROBABILITY = 0.9999
 """Probability of friction, at any limit, from which it leads on dry ground too: other causes of a bent path
@@ -43,7 +43,7 @@ PRIOR_MPS2, PRIOR_SPREAD = 1.0, 0.7
 """Median friction limit of a skidding robot before any fix, and standard deviation of its logarithm
 (assumed)."""
 ROLLING_PRIOR = 0.9
-"""Prior probability that the wheels hold: half for pure rolling, half for the limits of dry ground (assumed)."""
+"""Prior probability that the wheels hold: half rolling, half the limits of dry ground (assumed)."""
 LEAST_INTERVAL_S, LONGEST_INTERVAL_S = 0.9, 1.6
 """Interval between the fixes that are compared."""
 PATH_SHARE, PATH_SIGMA_M = 0.1, 0.05
@@ -98,7 +98,7 @@ class FrictionEstimator:
         return self._leading() is not None
 
     def _leading(self) -> slice | None:
-        """The models that lead: those of slippery ground where likely, all where friction is nearly certain."""
+        """The leading models: of slippery ground where likely, all where friction is nearly certain."""
         weight = self._weights()
         if float(weight[: len(SLIPPERY)].sum()) > 0.5:
             return slice(len(SLIPPERY))
@@ -309,7 +309,7 @@ class FrictionEstimator:
 def friction_estimator(
     config: EstimatorConfig, preintegrator: Preintegrator, report: Callable[[WeightChange], None]
 ) -> FrictionEstimator | None:
-    """The `FrictionEstimator` of a configuration; None unless planar with gyro and both sides, and adaptive."""
+    """The friction estimator; None unless planar with gyro and both sides, and adaptive."""
     inputs = config.inputs
     usable = inputs.planar and inputs.sides and inputs.yaw == "gyro" and not config.calibrate
     return (

@@ -76,7 +76,7 @@ def no_motion_factor(k: int) -> gtsam.NonlinearFactor:
 
 
 def bridge(k: int, before: KeyState, carried: KeyState, dt_s: float) -> gtsam.NonlinearFactorGraph:
-    """Loose links across a gap in the IMU, to the state that wheels or a constant velocity `carried` there."""
+    """Loose links across a gap in the IMU, to the state that is `carried` there."""
     graph = gtsam.NonlinearFactorGraph()
     sigmas = np.array([0.05, 0.05, 0.3, 0.3, 0.3, 0.1]) * math.sqrt(dt_s) + 1e-3
     step = before.pose.between(carried.pose)

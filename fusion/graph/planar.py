@@ -124,7 +124,7 @@ class PlanarPreintegrator(Preintegrator):
 
 
 def planar_spec(spec: ImuSpec, yaw: str) -> ImuSpec:
-    """The IMU's specification for the planar graph: unobservable biases are zero, and it sits at the origin."""
+    """The IMU's specification for the planar graph: no unobservable biases, no lever arm."""
     seen = yaw == "gyro"
     return dataclasses.replace(
         spec,

@@ -40,7 +40,7 @@ SIDE_SLIP_PER_GRADE, SIDE_SLIP_DOUBT = 0.7, 0.3
 """Side-slip on a cross slope over the slip on a grade as steep (twin: 0.70 on loose sand across 10 deg, 0.69
 on medium sand across 15 deg), and its relative error (assumed)."""
 SURGE_TIME_S, SURGE_DOUBT = 60.0, 0.5
-"""An acceleration needs the thrust, and so the slip, of a grade of a / g; relative error of that (assumed)."""
+"""An acceleration a needs the thrust, and so the slip, of a grade a / g; its relative error (assumed)."""
 CALIBRATION_SIGMA = {
     "radius_scale": 0.02,
     "antenna_x_m": 0.05,

@@ -79,7 +79,9 @@ def wheel_innovation_test(
     """A wheel increment against its prediction, along body x."""
     own = wheels.sigma[0] ** 2
     predicted = max(variance_m2 - own, 0.0)
-    return InnovationTest(t_ns, np.array([innovation_m]), np.array([predicted]), np.array([own]), np.array([dt_s]))
+    return InnovationTest(
+        t_ns, np.array([innovation_m]), np.array([predicted]), np.array([own]), np.array([dt_s])
+    )
 
 
 def inflated(wheels: WheelIncrement, scale: float) -> WheelIncrement:
