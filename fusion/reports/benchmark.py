@@ -39,27 +39,27 @@ CAPTION = (
 )
 
 
-def write_benchmark(out: Path, found: BenchmarkResult, origin: Mapping[str, str]) -> list[Section]:
+def write_benchmark(out: Path, result: BenchmarkResult, origin: Mapping[str, str]) -> list[Section]:
     """All files but the parts; returns the tables.
 
     Raises:
         TerrafusionError: a file cannot be written.
     """
-    sections = tables(found.rows)
-    write_text(out / "benchmark.json", to_json(_content(found, origin), indent=1) + "\n")
-    write_text(out / "benchmark.md", "\n".join(document_lines(sections, found, origin)) + "\n")
-    ratios = plot_ratios(contrasts(found.rows))
+    sections = tables(result.rows)
+    write_text(out / "benchmark.json", to_json(_content(result, origin), indent=1) + "\n")
+    write_text(out / "benchmark.md", "\n".join(document_lines(sections, result, origin)) + "\n")
+    ratios = plot_ratios(contrasts(result.rows))
     write_png(out / "ratios.png", ratios, dpi=110)
     write_page(
         out / "report.html", "benchmark.html.j2", "Fixed against adaptive weighting",
         provenance=origin, packages=LIBRARIES, tables=sections, ratios=ratios, caption=CAPTION,
-        refused=[one.line for one in found.refused],
+        refused=[one.line for one in result.refused],
     )  # fmt: skip
     return sections
 
 
 def write_document(
-    path: Path, made: Sequence[Section], found: BenchmarkResult, origin: Mapping[str, str]
+    path: Path, made: Sequence[Section], result: BenchmarkResult, origin: Mapping[str, str]
 ) -> None:
     """Replace what follows the line `MARK` of a document by the tables.
 
@@ -67,12 +67,12 @@ def write_document(
         ConfigError: the file is not there, or has no such line.
         TerrafusionError: it cannot be written.
     """
-    lines = document_lines(made, found, origin)
+    lines = document_lines(made, result, origin)
     write_text(path, document_head(path) + MARK + "\n\n" + "\n".join(lines) + "\n")
 
 
 def document_head(path: Path) -> str:
-    """What stands before the line `MARK` of a document.
+    """What precedes the line `MARK` of a document.
 
     Raises:
         ConfigError: the file is not there, or has no such line.
@@ -125,16 +125,16 @@ def _git(folder: Path, *words: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=True, timeout=10).stdout.strip()
 
 
-def document_lines(made: Sequence[Section], found: BenchmarkResult, origin: Mapping[str, str]) -> list[str]:
+def document_lines(made: Sequence[Section], result: BenchmarkResult, origin: Mapping[str, str]) -> list[str]:
     """The tables as Markdown, and where they come from."""
     lines = [line for section in made for line in [*section.markdown(), ""]]
-    if found.refused:
-        lines += ["## Logs not run", "", *(f"- {one.line}" for one in found.refused), ""]
+    if result.refused:
+        lines += ["## Logs not run", "", *(f"- {one.line}" for one in result.refused), ""]
     return [*lines, "## Made by", "", *(f"- {name}: `{text}`" for name, text in origin.items())]
 
 
-def _content(found: BenchmarkResult, origin: Mapping[str, str]) -> dict[str, Any]:
-    rows = found.rows
+def _content(result: BenchmarkResult, origin: Mapping[str, str]) -> dict[str, Any]:
+    rows = result.rows
     return {
         "schema": SCHEMA,
         "origin": dict(origin),
@@ -145,7 +145,7 @@ def _content(found: BenchmarkResult, origin: Mapping[str, str]) -> dict[str, Any
         "targets": [dataclasses.asdict(t) | {"verdict": t.verdict()} for t in targets(rows)],
         "reasons": [dataclasses.asdict(r) | {"blame": r.blame()} for r in reasons(rows)],
         "consistency": [_cell(c) for c in pooled_nees(rows)],
-        "refused": [dataclasses.asdict(one) for one in found.refused],
+        "refused": [dataclasses.asdict(one) for one in result.refused],
         "rows": [dataclasses.asdict(row) for row in rows],
     }
 

@@ -58,11 +58,11 @@ def group_name(family: str, plant: str) -> str:
 
 def _main(rows: Sequence[RunScore]) -> Section:
     """Median error of the fixed noise, and the ratios to it."""
-    found = contrasts(rows)
+    results = contrasts(rows)
     arms = [arm.name for arm in METHODS if arm.name != BASELINE]
     lines = []
     for family, plant in groups_of(rows):
-        of = {c.arm: c for c in found if (c.family, c.plant) == (family, plant)}
+        of = {c.arm: c for c in results if (c.family, c.plant) == (family, plant)}
         if BASELINE in of:
             units = of[BASELINE].units
             head = [group_name(family, plant), str(units), number(of[BASELINE].error_m)]
@@ -76,14 +76,14 @@ def _main(rows: Sequence[RunScore]) -> Section:
     return Section("Errors", about, ("drives", "pairs", f"{BASELINE}, m", *arms), tuple(lines))
 
 
-def _targets(found: Iterable[Target]) -> Section:
+def _targets(results: Iterable[Target]) -> Section:
     lines = [
         [
             t.name, t.what, f"{'<=' if t.most else '>='} {t.limit:g}{f' {t.unit}' if t.unit else ''}",
             f"{number(t.found)}{_ends(t.interval)}{f'; {t.broken} failed or diverged' if t.broken else ''}",
             t.verdict(),
         ]
-        for t in found
+        for t in results
     ]  # fmt: skip
     about = (
         "Reached or missed: the whole interval is on one side of the limit. Open: it contains the limit, or "
@@ -93,14 +93,14 @@ def _targets(found: Iterable[Target]) -> Section:
     return Section("Targets", about, ("target", "what", "limit", "measured", "verdict"), tuple(lines))
 
 
-def _reasons(found: Iterable[Reason]) -> Section:
+def _reasons(results: Iterable[Reason]) -> Section:
     lines = [
         [
             group_name(r.family, r.plant), f"{r.winner}, {r.ratio:.2f}{'' if r.sure else NOT_SIGNIFICANT}",
             number(r.oracle), r.blame(), f"{r.ground}: {r.kind}" if r.ground else "unknown",
             _percent(r.recognised[0]), _percent(r.recognised[1]),
         ]
-        for r in found
+        for r in results
     ]  # fmt: skip
     about = (
         "Groups in which some baseline beats adaptive by more than 3 %: error of adaptive over that "
@@ -110,10 +110,10 @@ def _reasons(found: Iterable[Reason]) -> Section:
     return Section("Where adaptive loses", about, heads, tuple(lines))
 
 
-def _wins(found: Iterable[Contrast]) -> Section:
+def _wins(results: Iterable[Contrast]) -> Section:
     arms = [arm.name for arm in METHODS if arm.name != BASELINE]
     groups: dict[tuple[str, str], dict[str, Contrast]] = {}
-    for c in found:
+    for c in results:
         groups.setdefault((c.family, c.plant), {})[c.arm] = c
     lines = [
         [group_name(*key), *(f"{of[a].wins} : {of[a].losses}" if a in of else "-" for a in arms)]
@@ -177,8 +177,8 @@ def _field(rows: Sequence[RunScore]) -> Section:
 
 
 def _failures(rows: Sequence[RunScore]) -> Section:
-    found = [(row, row.failed or f"diverged: {row.diverged}") for row in rows if row.failed or row.diverged]
-    lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.arm, why] for row, why in found)
+    results = [(row, row.failed or f"diverged: {row.diverged}") for row in rows if row.failed or row.diverged]
+    lines = tuple([f"{row.family}, {row.plant}, {row.drive}", row.arm, why] for row, why in results)
     return Section("Replays that failed or diverged", "All of them.", ("drive", "arm", "why"), lines)
 
 

@@ -158,9 +158,9 @@ def _numbers(log: _Log, estimate: Estimate) -> None:
     log.scalars("terrain", t_ns, dict(zip(estimate.classes, estimate.terrain.T, strict=True)))
     log.scalars("weights", t_ns, estimate.weights)
     for sensor in dict.fromkeys(i.sensor for i in estimate.innovations):
-        found = [i for i in estimate.innovations if i.sensor == sensor and i.dof > 0]
-        times = np.array([i.t_ns for i in found], dtype=np.int64)
-        log.scalars("nis", times, {sensor: np.array([i.nis / i.dof for i in found])})
+        tested = [i for i in estimate.innovations if i.sensor == sensor and i.dof > 0]
+        times = np.array([i.t_ns for i in tested], dtype=np.int64)
+        log.scalars("nis", times, {sensor: np.array([i.nis / i.dof for i in tested])})
 
 
 def _events(log: _Log, estimate: Estimate) -> None:

@@ -97,7 +97,7 @@ def metrics_of(study: Study) -> dict[str, Any]:
         "quick": study.plan.quick,
         "agreement": counts(study.rows),
         "agreement_by_basis": {basis: counts(study.rows, basis) for basis in BASES},
-        "measured": {name: dataclasses.asdict(found) for name, found in study.measured.items()},
+        "measured": {name: dataclasses.asdict(value) for name, value in study.measured.items()},
         "gnss_noise": [dataclasses.asdict(fit) for fit in study.noise],
     }
 
@@ -125,10 +125,10 @@ def _csv(columns: Iterable[str], rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def _write_page(path: Path, study: Study, provenance: Mapping[str, object] | None) -> None:
-    found, predicted = counts(study.rows), counts(study.rows, PREDICTED)
+    every, predicted = counts(study.rows), counts(study.rows, PREDICTED)
     lead = (
         f"{TITLE}, by the twin with {study.plan.seed_count()} seeds a case. Of {len(study.rows)} statements "
-        f"and numbers: {_counts_text(found)}. Of the {sum(predicted.values())} that the twin was neither "
+        f"and numbers: {_counts_text(every)}. Of the {sum(predicted.values())} that the twin was neither "
         f"calibrated to nor given: {_counts_text(predicted)}."
     )
     disagreeing = [row for verdict in VERDICTS[:0:-1] for row in study.rows if row.verdict == verdict]
@@ -168,8 +168,8 @@ def _figures(study: Study) -> dict[str, Figure]:
     }
 
 
-def _counts_text(found: Mapping[str, int]) -> str:
-    return ", ".join(f"{found[verdict]} {verdict}" for verdict in VERDICTS)
+def _counts_text(number: Mapping[str, int]) -> str:
+    return ", ".join(f"{number[verdict]} {verdict}" for verdict in VERDICTS)
 
 
 def _statement(row: ClaimResult) -> tuple[tuple[str, str], str, str, str | tuple[str, str]]:

@@ -20,9 +20,9 @@ RANGE = (0.1, 20.0)
 TICKS = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
 
 
-def plot_ratios(found: Sequence[Contrast]) -> Figure:
+def plot_ratios(contrasts: Sequence[Contrast]) -> Figure:
     """A line a family and plant, a marker an arm with its 95 % interval; below 1 its errors are smaller."""
-    shown = [c for c in found if c.arm != BASELINE]
+    shown = [c for c in contrasts if c.arm != BASELINE]
     groups = list(dict.fromkeys((c.family, c.plant) for c in shown))
     arms = list(dict.fromkeys(c.arm for c in shown))
     fig, ax = style.canvas(None, (9.0, 1.3 + GROUP_IN * len(groups)))

@@ -81,11 +81,11 @@ def plot_reliability(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Ax
     fig, ax = style.canvas(ax, (6.0, 4.0))
     ax.plot([0, 1], [0, 1], color=style.NEUTRAL, linewidth=0.8)
     for family in ("same", "shifted"):
-        found = scores["confidence"][family]
-        if not found["bins"]:
+        confidence = scores["confidence"][family]
+        if not confidence["bins"]:
             continue
-        stated, true, count = np.array(found["bins"]).T
-        label = f"{FAMILY_LABELS[family]}: ECE {found['ece']:.3f}, Brier {found['brier']:.3f}"
+        stated, true, count = np.array(confidence["bins"]).T
+        label = f"{FAMILY_LABELS[family]}: ECE {confidence['ece']:.3f}, Brier {confidence['brier']:.3f}"
         ax.plot(stated, true, "-", color=FAMILY_COLOURS[family], linewidth=1.0)
         ax.scatter(stated, true, s=10.0 + 4.0 * count, color=FAMILY_COLOURS[family], label=label, alpha=0.7)
     ax.set_xlim(0.0, 1.03)

@@ -66,28 +66,28 @@ class CellAxis:
     @classmethod
     def of(cls, values: Array) -> CellAxis:
         """One cell a level where there are few; equal bins otherwise."""
-        found = levels(values)
-        if len(found) > MAX_LEVELS:
+        distinct = levels(values)
+        if len(distinct) > MAX_LEVELS:
             bins = int(np.clip(np.sqrt(len(values) / RUNS_A_CELL), 3, MAX_LEVELS))
-            edges = np.linspace(found[0], found[-1], bins + 1)
+            edges = np.linspace(distinct[0], distinct[-1], bins + 1)
             return cls(0.5 * (edges[1:] + edges[:-1]), edges)
-        middle = 0.5 * (found[1:] + found[:-1])
-        first = found[0] - (middle[0] - found[0] if len(middle) else 0.5)
-        last = found[-1] + (found[-1] - middle[-1] if len(middle) else 0.5)
-        return cls(found, np.concatenate([[first], middle, [last]]))
+        middle = 0.5 * (distinct[1:] + distinct[:-1])
+        first = distinct[0] - (middle[0] - distinct[0] if len(middle) else 0.5)
+        last = distinct[-1] + (distinct[-1] - middle[-1] if len(middle) else 0.5)
+        return cls(distinct, np.concatenate([[first], middle, [last]]))
 
     def cells(self, values: Array) -> NDArray[np.int64]:
         """Number of the cell (N,) of each value; -1 for NaN."""
-        found = np.clip(np.searchsorted(self.edges, values, side="right") - 1, 0, len(self.centres) - 1)
-        return np.where(np.isfinite(values), found, -1)
+        cell = np.clip(np.searchsorted(self.edges, values, side="right") - 1, 0, len(self.centres) - 1)
+        return np.where(np.isfinite(values), cell, -1)
 
 
 def per_cell(cell: NDArray[np.int64], values: Array, count: int, statistic: str) -> Array:
     """Statistic (count,), "median" or "mean", of the finite values (N,) in each cell; NaN for none."""
     good = np.isfinite(values) & (cell >= 0)
-    found = pd.Series(values[good]).groupby(cell[good]).agg(statistic)
+    result = pd.Series(values[good]).groupby(cell[good]).agg(statistic)
     out = np.full(count, np.nan)
-    out[found.index] = found
+    out[result.index] = result
     return out
 
 
