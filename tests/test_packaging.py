@@ -52,6 +52,7 @@ def test_data_files_are_installed() -> None:
         assert resources.files(f"terrafusion.{package}").joinpath(pattern).is_file()
     assert resources.files("terrafusion.fusion.terrain").joinpath("model.yaml").is_file()
     assert resources.files("terrafusion.twin.engine").joinpath("driver.c").is_file()
+    assert resources.files("terrafusion.fusion.reports").joinpath("templates/base.html.j2").is_file()
 
 
 def test_help_answers_at_once_and_lists_the_commands() -> None:

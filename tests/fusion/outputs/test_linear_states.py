@@ -63,7 +63,7 @@ def test_a_series_is_there_only_where_the_state_was_estimated(drive: Any) -> Non
     assert series(with_states(plain, calibrated=False), "radius_scale") is None
 
 
-def test_every_state_of_a_calibration_is_told_with_unit_and_prior(drive: Any) -> None:
+def test_every_state_of_a_calibration_has_its_unit_and_prior(drive: Any) -> None:
     rows = calibration(with_states(drive().estimate, calibrated=True))
     assert tuple(row["state"] for row in rows) == CALIBRATION == tuple(QUANTITIES) == tuple(CALIBRATION_SIGMA)
     assert [row["state"] for row in rows if row["observed"]] == ["antenna_x_m", "antenna_y_m"]

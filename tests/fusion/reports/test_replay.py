@@ -98,7 +98,7 @@ def test_a_comparison_has_all_sections_and_nothing_outside(drive, tmp_path):
     runs = [make_run(good, "adaptive"), make_run(bad, "fixed")]
     path = write_report(
         tmp_path / "report.html",
-        "Two ways",
+        "Two runs",
         runs,
         good.recording,
         held_out=good.fixes,
@@ -178,7 +178,7 @@ def test_the_same_runs_give_the_same_page(drive, tmp_path):
     assert pages[0] == pages[1]
 
 
-def test_losses_are_told_like_wins(drive):
+def test_losses_are_worded_like_wins(drive):
     good, bad = make_run(drive(drift_mps=0.005), "fixed"), make_run(drive(drift_mps=0.03), "adaptive")
     metrics = [good.metrics, bad.metrics]
     ours, theirs = pick_pair(metrics)
