@@ -74,7 +74,7 @@ def test_readme(folder: Path) -> None:
 
 def test_tutorial(folder: Path) -> None:
     """One session from top to bottom."""
-    document = ROOT / "docs" / "tutorial.md"
+    document = ROOT / "docs" / "tutorials" / "tutorial.md"
     session: dict[str, Any] = {"__name__": "tutorial"}
     for line, language, text in blocks(document):
         if language == "python":
@@ -146,7 +146,7 @@ def test_log_folder_columns_are_told() -> None:
     """Every column and key the reader knows stands in the conventions."""
     from terrafusion.datasets.readers import channel_tables, log_folder, log_meta
 
-    text = (ROOT / "docs" / "conventions.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "conventions.md").read_text(encoding="utf-8")
     columns = [
         *channel_tables.GYRO,
         *channel_tables.ACCEL,
@@ -164,7 +164,7 @@ def test_formats_and_units_are_told() -> None:
     from terrafusion.datasets.readers import formats
     from terrafusion.datasets.readers.text import column_map, units
 
-    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    text = (ROOT / "docs" / "reference" / "formats.md").read_text(encoding="utf-8")
     words = [form.name for form in formats.FORMATS] + [
         unit for known in units.UNITS.values() for unit in known
     ]

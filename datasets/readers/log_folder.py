@@ -1,4 +1,4 @@
-"""The log folder: `meta.yaml` and one CSV a channel (the format is stated in docs/conventions.md).
+"""The log folder: `meta.yaml` and one CSV a channel (the format is stated in docs/reference/conventions.md).
 
 An absent file is an absent channel, an empty cell a missing value. Anything
 else that is not a number is an error: this reader never guesses.

@@ -24,7 +24,7 @@ POSE_GAP_S = 0.6
 """The true velocity is unknown in longer gaps between poses."""
 MIN_POSES = 20
 FIX_SIGMA_M = 0.1
-"""Fixes with a larger sigma do not determine the speed over 5 s (docs/field.md)."""
+"""Fixes with a larger sigma do not determine the speed over 5 s (docs/evidence/field.md)."""
 
 
 @dataclass(frozen=True, eq=False)

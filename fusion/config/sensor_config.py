@@ -21,7 +21,7 @@ from terrafusion.fusion.graph.preintegration import Preintegrator
 
 IMU_KINDS = ("six_axis", "gyro_z", "none")
 YAW_RATIO = 0.6
-"""True over geometric yaw rate, for skid steer: measured 0.44 to 0.71 (`docs/planar.md`)."""
+"""True over geometric yaw rate, for skid steer: measured 0.44 to 0.71 (`docs/explanation/planar.md`)."""
 COMPLETE_SHARE = 0.5
 """Least share of IMU samples with all six axes for which the log counts as a six-axis one."""
 

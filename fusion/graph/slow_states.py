@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SLIP_STEADY = 30.0
 """Correlation time of slip at constant wheel speed over the policy's, which is that of whole runs with
 starts, stops and hills. Longer is better on one soil, shorter where grounds change without GNSS; see
-docs/monitor.md."""
+docs/explanation/monitor.md."""
 SLIP_RENEWAL = 1.1
 """Where the wheels change their speed by a share x, `SLIP_RENEWAL x^2` of the slip is new, as traction
 changes with speed (tuned)."""

@@ -1,4 +1,4 @@
-"""The integrator's accuracy, as docs/twin.md quotes it."""
+"""The integrator's accuracy, as docs/explanation/twin.md quotes it."""
 
 from __future__ import annotations
 

@@ -2,7 +2,7 @@
 
     python -m tests.studies.calibration_trials --seeds 5
 
-prints the tables of docs/calibration-states.md.
+prints the tables of docs/explanation/calibration-states.md.
 """
 
 from __future__ import annotations

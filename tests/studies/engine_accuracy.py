@@ -1,6 +1,6 @@
 """The integrator's accuracy and speed, measured.
 
-`python -m tests.studies.engine_accuracy` prints what docs/twin.md quotes: the
+`python -m tests.studies.engine_accuracy` prints what docs/explanation/twin.md quotes: the
 position error of the default step, the creep of a parked robot, and how long
 300 s of motion take.
 """

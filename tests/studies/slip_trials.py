@@ -2,7 +2,7 @@
 
     python -m tests.studies.slip_trials --seeds 5
 
-prints the tables of docs/monitor.md.
+prints the tables of docs/explanation/monitor.md.
 """
 
 from __future__ import annotations

@@ -68,7 +68,7 @@ def lookup(key: str) -> tuple[Form, Parameter]:
     near = [name for name in known if name.split("/")[0] == stem]
     near = near or difflib.get_close_matches(key, list(known), n=3, cutoff=0.4)
     near = near or [name for name in known if stem and stem in name][:3]
-    remedy = f"did you mean {' or '.join(near)}" if near else "see docs/effects.md"
+    remedy = f"did you mean {' or '.join(near)}" if near else "see docs/reference/effects.md"
     raise ConfigError(f"unknown effect '{key}'", remedy=remedy)
 
 

@@ -1,4 +1,4 @@
-"""The column map of a plain table: a YAML file that says what its columns are (docs/formats.md)."""
+"""The column map of a plain table: a YAML file that says what its columns are (docs/reference/formats.md)."""
 
 from __future__ import annotations
 

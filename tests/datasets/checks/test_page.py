@@ -1,4 +1,4 @@
-"""`docs/log-checks.md` lists every code that a check can give, and quotes the thresholds of the code."""
+"""`docs/reference/log-checks.md` lists every code that a check can give, and quotes the thresholds of the code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from terrafusion.datasets import checks
 
-TEXT = (Path(__file__).parents[3] / "docs" / "log-checks.md").read_text(encoding="utf-8")
+TEXT = (Path(__file__).parents[3] / "docs" / "reference" / "log-checks.md").read_text(encoding="utf-8")
 MODULES = [f"{checks.__name__}.{module.name}" for module in pkgutil.iter_modules(checks.__path__)]
 
 

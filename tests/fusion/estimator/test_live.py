@@ -1,4 +1,4 @@
-"""Live use: odometry between keyframes, the message loop, and the ROS 2 node of docs/integration.md."""
+"""Live use: odometry between keyframes, the message loop, and the ROS 2 node of docs/how-to/integration.md."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.run_recording import DATUM
 from terrafusion.twin.simulate import simulate
 
-PAGE = Path(__file__).parents[3] / "docs" / "integration.md"
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "integration.md"
 
 
 @pytest.fixture(scope="module")

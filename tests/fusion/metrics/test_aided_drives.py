@@ -31,7 +31,7 @@ WRONG = {"declination_rad": DECLINATION_RAD + math.radians(20.0)}
 
 
 def aided(name: str) -> VehicleParams:
-    """With the figures of docs/barometer-magnetometer.md."""
+    """With the figures of docs/explanation/barometer-magnetometer.md."""
     car = load_vehicle(name)
     field = MagnetometerSpec(30.0, 5e-8, 1e-6)
     return dataclasses.replace(

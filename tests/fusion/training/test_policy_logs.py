@@ -265,5 +265,5 @@ def test_a_real_warthog_on_grass() -> None:
     logged = read_logs([str(log)])
     row = policy_fit.row_of([logged.grounds["grass"]])
     assert 0.0 < row.slip_mean < 0.1
-    assert -0.6 < row.yaw_scale_mean < -0.3  # docs/planar.md: what its yaw loses on any ground
+    assert -0.6 < row.yaw_scale_mean < -0.3  # docs/explanation/planar.md: what its yaw loses on any ground
     assert list(logged.inputs) == [f"{log.parent.name}/{log.name}"]

@@ -133,7 +133,7 @@ def test_binomial_interval() -> None:
 
 @pytest.mark.parametrize("number", [0, 1, 2])
 def test_truth_lies_where_sigma_says(number: int) -> None:
-    """A small fixed part of the coverage study (docs/calibration.md has the whole)."""
+    """A small fixed part of the coverage study (docs/how-to/calibration.md has the whole)."""
     case = dataclasses.replace(Case.drawn(number, seed=77), drive="figure_eight")
     identified = [o for o in outcomes(case) if o.status == IDENTIFIED]
     assert len(identified) >= 4

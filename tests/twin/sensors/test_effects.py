@@ -26,7 +26,7 @@ from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate, simulate_run
 
-DOCS = Path(__file__).parents[3] / "docs" / "effects.md"
+DOCS = Path(__file__).parents[3] / "docs" / "reference" / "effects.md"
 SHORT = dataclasses.replace(load_scenario("figure_eight"), duration_s=20.0)
 
 
@@ -175,7 +175,7 @@ def test_words_of_the_command_line() -> None:
 
 
 def test_an_own_effect_of_the_docs_takes_part_in_everything(own_forms) -> None:
-    """The example of docs/effects.md, as it stands there."""
+    """The example of docs/reference/effects.md, as it stands there."""
     block = next(b for b in re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S) if "register" in b)
     exec(block, {})
     key = "trailer/drag"

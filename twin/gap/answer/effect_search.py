@@ -29,7 +29,7 @@ order."""
 FURTHER_ODDS = 4.0  # log odds that each further effect costs
 FURTHER_SHARE, FURTHER_LEFT = 0.15, 0.5
 """Least reduction by a further effect of what remains, as a share and in its units. These three are set on
-development trials (docs/gap-blind.md)."""
+development trials (docs/evidence/gap-blind.md)."""
 
 
 @dataclass(frozen=True, eq=False)

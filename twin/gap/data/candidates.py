@@ -113,5 +113,5 @@ def _check_names(effects: tuple[str, ...] | None) -> None:
     for name in effects or ():
         if name not in effect_names():
             near = difflib.get_close_matches(name, effect_names(), n=3, cutoff=0.5)
-            remedy = f"did you mean {' or '.join(near)}" if near else "see docs/effects.md"
+            remedy = f"did you mean {' or '.join(near)}" if near else "see docs/reference/effects.md"
             raise ConfigError(f"unknown effect '{name}'", remedy=remedy)

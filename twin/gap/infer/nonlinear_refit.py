@@ -43,7 +43,7 @@ REFINEMENTS = ((-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (-0.05, -0.025, 0.025, 0.05))
 """Relative offsets tried around the best size of a delay or of an insensitive law, in two rounds."""
 INSENSITIVE = 10.0
 """A law is insensitive where its sensitivity, at the ends of its range, makes a smaller square in all runs;
-32-bit rounding makes 3 at most (docs/gap.md)."""
+32-bit rounding makes 3 at most (docs/how-to/gap.md)."""
 INSENSITIVE_SHARES = (0.4, 0.7, 0.85, 1.0)
 """Sizes of an insensitive law that are tried, in that of its range: it acts beyond a threshold, if at all."""
 SCREEN_SHARES = (0.12, 0.4)

@@ -45,8 +45,8 @@ GROUP_SIZE = 16  # other effects in one graph: the number of lanes of a vector
 NOMINAL = ""  # stands for the twin without a further effect, in the first group
 INTEGRATOR_ORDER = 3
 """On loose sand, the most sensitive case, results differ from fourth order by no more than those from half
-the step do (docs/gap.md)."""
-SINGLE_PRECISION = True  # rounding of 32-bit numbers is below the integration error (docs/gap.md)
+the step do (docs/how-to/gap.md)."""
+SINGLE_PRECISION = True  # rounding of 32-bit numbers is below the integration error (docs/how-to/gap.md)
 FULL_GRAPH_COST = 1.8
 """Time of a run in the graph of all effects over that in the graph of one group (measured)."""
 ABSENT_SHARE = 1e-12
