@@ -181,7 +181,7 @@ def print_scores(name: str, scores: DetectorScores) -> None:
             print(f"{truth:13s} " + " ".join(f"{share:12.3f}" for share in row))
     print(f"macro-F1 {scores.macro_f1:.3f}; ECE {scores.ece:.3f}; unknown {scores.unknown_share:.3f}")
     print(
-        f"change of ground detected after {median:.1f} s (median), {p95:.1f} s (95 %), {largest:.1f} s (max); "
+        f"ground change detected after {median:.1f} s (median), {p95:.1f} s (95 %), {largest:.1f} s (max); "
         f"missed {scores.switches_missed:.1%}; false changes {scores.false_switches_per_min:.2f}/min"
     )
     print(f"one update {scores.update_ms:.2f} ms")

@@ -38,7 +38,7 @@ class ClassificationScores:
 def classification_scores(
     classes: Sequence[str], true: NDArray[np.intp], winner: NDArray[np.intp], confidence: Array
 ) -> ClassificationScores:
-    """Scores of n windows: indices (n,) of true and most probable class, and the latter's probability (n,)."""
+    """Scores of n windows: indices (n,) of true and most probable class, and its probability (n,)."""
     from sklearn.metrics import accuracy_score, confusion_matrix, f1_score
 
     every: list[int] = list(range(len(classes)))

@@ -34,8 +34,8 @@ UNKNOWN = "unknown"
 PATCH_LENGTH_M = 10.0
 BREAK_MEMORY = 6
 BREAK_FROM = 0.75
-"""Total variation between the class probabilities of the last second and the mean of the six before above which
-the patch ends: errors within a patch are correlated, so the filter alone is slow to leave a ground."""
+"""Total variation between the class probabilities of the last second and the mean of the six before above
+which the patch ends: errors within a patch are correlated, so the filter alone is slow to leave a ground."""
 STRADDLES = round(WINDOW_S / HOP_S)
 """Windows after a change that contain some of the ground before: for them only the last second is used."""
 STRENGTH = 0.1

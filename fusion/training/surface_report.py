@@ -111,7 +111,7 @@ def leaking(runs: Sequence[LabelledRun]) -> dict[str, float]:
 
 
 def never_seen(runs: Sequence[LabelledRun]) -> dict[str, dict[str, float]]:
-    """Share of windows beyond the novelty threshold, of a ground left out of the training and of known ones."""
+    """Share of windows beyond the novelty threshold, of a ground left out of training and of known ones."""
     shares: dict[str, dict[str, float]] = {}
     fold_of = assign_folds(runs)
     for ground in sorted({r.label for r in runs}):
@@ -227,7 +227,8 @@ def _change(change: dict[str, Any] | None) -> str:
         return f"change of ground: not measured, no fold has two grounds with runs above {MIN_RUN_S:g} s"
     return (
         f"change of ground detected after {change['median_s']:.1f} s (median), "
-        f"{change['p95_s']:.1f} s (95 %); within 2 s {change['within_2_s']:.0%}, never {change['never']:.0%} of {change['changes']}"
+        f"{change['p95_s']:.1f} s (95 %); within 2 s "
+        f"{change['within_2_s']:.0%}, missed {change['never']:.0%} of {change['changes']}"
     )
 
 

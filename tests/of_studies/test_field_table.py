@@ -22,8 +22,8 @@ from terrafusion.twin.simulate import simulate
 from tests.studies.field_table import table as field_table
 from tests.studies.field_table.page import markdown, plot_lines, write
 from tests.studies.field_table.summary import (
-    Beside,
-    beside_each,
+    BaselineComparison,
+    compare_with_baselines,
     condense,
     in_order,
     ratio_of,
@@ -111,23 +111,23 @@ def test_an_interval_holds_the_ratio_as_often_as_it_says() -> None:
     assert inside / n > 0.88
 
 
-def test_own_mode_is_set_beside_each_baseline_by_ground() -> None:
+def test_own_mode_is_compared_with_each_baseline_by_ground() -> None:
     runs = [
         made_run("a", "adaptive", 1.0), made_run("a", "fixed", 2.0), made_run("a", "robust", 0.5),
         made_run("b", "adaptive", 3.0, ground="slipping"), made_run("b", "fixed", 3.0, ground="slipping"),
     ]  # fmt: skip
-    assert beside_each(runs) == [
-        Beside("firm", "fixed", 1, pytest.approx(0.5), 1, 0, 0, 0.5),
-        Beside("firm", "robust", 1, pytest.approx(2.0), 0, 1, 0, 2.0),
-        Beside("slipping", "fixed", 1, pytest.approx(1.0), 0, 0, 0, 1.0),
+    assert compare_with_baselines(runs) == [
+        BaselineComparison("firm", "fixed", 1, pytest.approx(0.5), 1, 0, 0, 0.5),
+        BaselineComparison("firm", "robust", 1, pytest.approx(2.0), 0, 1, 0, 2.0),
+        BaselineComparison("slipping", "fixed", 1, pytest.approx(1.0), 0, 0, 0, 1.0),
     ]
     sure = [
         made_run("a", mode, e * times, start_s=float(i))
         for mode, times in (("adaptive", 1.2), ("fixed", 1.0))
         for i, e in enumerate((1.0, 2.0, 3.0))
     ]
-    assert beside_each(sure)[0].surely_worse == 1
-    assert "| firm | fixed | 1 | 1.20 | 0 | 1 | 1 | 1.20 |" in markdown([], [], beside_each(sure))
+    assert compare_with_baselines(sure)[0].significantly_worse == 1
+    assert "| firm | fixed | 1 | 1.20 | 0 | 1 | 1 | 1.20 |" in markdown([], [], compare_with_baselines(sure))
 
 
 def test_further_noise_is_drawn_for_made_fixes_alone() -> None:

@@ -14,9 +14,9 @@ from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.reports.plots import style
 from tests.studies.field_table.summary import (
     OWN,
-    Beside,
+    BaselineComparison,
     Line,
-    beside_each,
+    compare_with_baselines,
     condense,
     in_order,
     verdicts,
@@ -40,7 +40,7 @@ def write(out: Path, runs: Sequence[Run], refusals: Sequence[Refusal]) -> str:
         TerrafusionError: the folder cannot be written.
     """
     lines = condense(runs)
-    text = markdown(lines, refusals, beside_each(runs))
+    text = markdown(lines, refusals, compare_with_baselines(runs))
     for name, rows in (("runs", runs), ("lines", lines), ("refused", refusals)):
         write_atomically(out / f"{name}.csv", lambda path, rows=rows: _csv(path, rows))  # type: ignore[misc]
     write_atomically(out / "field_table.md", lambda path: path.write_text(text, encoding="utf-8"))
@@ -50,17 +50,19 @@ def write(out: Path, runs: Sequence[Run], refusals: Sequence[Refusal]) -> str:
     return text
 
 
-def markdown(lines: Sequence[Line], refusals: Sequence[Refusal], beside: Sequence[Beside] = ()) -> str:
+def markdown(
+    lines: Sequence[Line], refusals: Sequence[Refusal], compared: Sequence[BaselineComparison] = ()
+) -> str:
     """Four tables (verdicts, each baseline, scored logs, logs without reference) and the refused logs."""
     scored = [line for line in lines if line.error_m is not None]
     others = [line for line in lines if line.error_m is None]
     parts = []
     if any(line.mode == OWN and line.ratio is not None for line in lines):
-        parts.append(f"## {OWN.capitalize()} beside the best baseline\n\n{_verdict_table(lines)}")
-    if beside:
-        head = [field.name.replace("_", " ") for field in dataclasses.fields(Beside)]
-        rows = [dataclasses.astuple(row) for row in beside]
-        parts.append(f"## {OWN.capitalize()} beside each baseline\n\n{_table(head, rows)}")
+        parts.append(f"## {OWN.capitalize()} against the best baseline\n\n{_verdict_table(lines)}")
+    if compared:
+        head = [field.name.replace("_", " ") for field in dataclasses.fields(BaselineComparison)]
+        rows = [dataclasses.astuple(row) for row in compared]
+        parts.append(f"## {OWN.capitalize()} against each baseline\n\n{_table(head, rows)}")
     if scored:
         parts.append(f"## Scored logs\n\n{_scored_table(scored)}")
     if others:
@@ -115,20 +117,30 @@ def _verdict_table(lines: Sequence[Line]) -> str:
         "logs",
         "better",
         "worse",
-        "surely worse",
-        "mean of error over best baseline's",
+        "significantly worse",
+        "mean ratio to the best baseline",
         "largest",
         "% of distance",
     )
-    keys = ("ground", "test", "logs", "better", "worse", "surely_worse", "mean_ratio", "worst", "percent")
+    keys = (
+        "ground",
+        "test",
+        "logs",
+        "better",
+        "worse",
+        "significantly_worse",
+        "mean_ratio",
+        "worst",
+        "percent",
+    )
     return _table(head, [[row[key] for key in keys] for row in verdicts(lines)])
 
 
 def _scored_table(lines: Sequence[Line]) -> str:
     """A row a log and test, a column a mode."""
     modes = list(dict.fromkeys(line.mode for line in lines))
-    head = ["log", "ground", "reference", "test", "runs", "way, m", *(f"{mode}, m" for mode in modes),
-            f"{OWN} over best baseline", f"NEES of {OWN}", "diverged"]  # fmt: skip
+    head = ["log", "ground", "reference", "test", "runs", "distance, m", *(f"{mode}, m" for mode in modes),
+            f"{OWN} over the best baseline", f"NEES of {OWN}", "diverged"]  # fmt: skip
     rows = []
     for by_mode in _by_test(lines):
         first, own = next(iter(by_mode.values())), by_mode.get(OWN)

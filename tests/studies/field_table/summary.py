@@ -98,7 +98,7 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
         ratios = np.array([line.ratio for line in found], dtype=float)
         row: dict[str, str | int | float | None] = {"ground": ground, "test": test, "logs": len(found)}
         row |= {"better": int((ratios < 1 - EVEN).sum()), "worse": int((ratios > 1 + EVEN).sum())}
-        row["surely_worse"] = sum((line.ratio_low or 0.0) > 1 + EVEN for line in found)
+        row["significantly_worse"] = sum((line.ratio_low or 0.0) > 1 + EVEN for line in found)
         row["mean_ratio"] = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
         row["worst"] = float(ratios.max())
         row["percent"] = known_median([line.percent for line in found])
@@ -107,9 +107,9 @@ def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]
 
 
 @dataclass(frozen=True)
-class Beside:
-    """`OWN` beside one baseline on one kind of ground: `rows` are logs and tests; `better` and `worse` by
-    more than `EVEN`, `surely_worse` with the whole interval."""
+class BaselineComparison:
+    """`OWN` against one baseline on one kind of ground: `rows` are logs and tests; `better` and `worse` by
+    more than `EVEN`, `significantly_worse` with the whole interval."""
 
     ground: str
     baseline: str
@@ -117,12 +117,12 @@ class Beside:
     mean_ratio: float
     better: int
     worse: int
-    surely_worse: int
+    significantly_worse: int
     worst: float
 
 
-def beside_each(runs: Sequence[Run]) -> list[Beside]:
-    """`OWN` beside every baseline, by ground."""
+def compare_with_baselines(runs: Sequence[Run]) -> list[BaselineComparison]:
+    """`OWN` against every baseline, by ground."""
     found: dict[tuple[str, str], list[tuple[float, float]]] = {}
     for by_mode in _rows(runs):
         for mode, theirs in by_mode.items():
@@ -134,8 +134,12 @@ def beside_each(runs: Sequence[Run]) -> list[Beside]:
         ratios, lows = np.array(pairs).T
         mean = float(np.exp(np.log(np.maximum(ratios, 1e-9)).mean()))
         beyond = ratios < 1 - EVEN, ratios > 1 + EVEN, lows > 1 + EVEN
-        better, worse, surely = (int(rows.sum()) for rows in beyond)
-        out.append(Beside(ground, baseline, len(pairs), mean, better, worse, surely, float(ratios.max())))
+        better, worse, significantly = (int(rows.sum()) for rows in beyond)
+        out.append(
+            BaselineComparison(
+                ground, baseline, len(pairs), mean, better, worse, significantly, float(ratios.max())
+            )
+        )
     return out
 
 

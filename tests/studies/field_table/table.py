@@ -92,7 +92,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Task:
-    """One log in one mode, so that tasks can run beside each other.
+    """One log in one mode, so that tasks can run in parallel.
 
     `again` runs what other noise changes: fixes made from the truth, no whole drives, no fixes of a receiver.
     """
@@ -131,7 +131,7 @@ def run_tasks(
     """Run the tasks of which `out` does not hold the results yet, and keep them there.
 
     Args:
-        jobs: processes beside each other; the times measured are those of loaded processors then.
+        jobs: processes; times are then those of loaded processors.
 
     Raises:
         TerrafusionError: workers died, or the folder cannot be written.
@@ -262,7 +262,7 @@ def main() -> int:
     parser.add_argument("--starts", type=int, default=4, help="outages of each length in a log, at most")
     parser.add_argument("--seed", type=int, default=1, help="of the noise on fixes made from truth")
     parser.add_argument("--seeds", type=int, default=1, help="how many draws of that noise, from --seed on")
-    parser.add_argument("--jobs", type=int, default=1, help="processes beside each other")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
     parser.add_argument("--collect", action="store_true", help="run nothing, write what has been run")
     words = parser.parse_args()
     if words.seeds < 1:
