@@ -228,8 +228,8 @@ def _line_error(
     """An error about a line of these cells, with its time where that can be read."""
     first = [] if layout.strict or not layout.time else next(_rows(path, data, layout), (0, []))[1]
     time_s, origin_s = layout.seconds(cells), 0.0 if layout.strict else layout.seconds(first)
-    known = time_s is not None and origin_s is not None
-    return DataError(what, file=path, time_s=time_s - origin_s if known else None, remedy=remedy)
+    since_s = None if time_s is None or origin_s is None else time_s - origin_s
+    return DataError(what, file=path, time_s=since_s, remedy=remedy)
 
 
 def _misfits(data: bytes, layout: TextLayout) -> Iterator[tuple[int, str, int]]:
@@ -333,14 +333,14 @@ def _rows(path: Path, data: bytes, layout: TextLayout) -> Iterator[tuple[int, li
         text.readline()
     lines = ("\n" if layout.comment and line.startswith(layout.comment) else line for line in text)
     reader = csv.reader(lines, delimiter=layout.separator, skipinitialspace=not layout.strict)
-    line = layout.first_line
+    at = layout.first_line
     try:
         for cells in reader:
-            line = reader.line_num + layout.first_line
+            at = reader.line_num + layout.first_line
             if len(cells) > 1 or "".join(cells).strip():
-                yield line - 1, cells
+                yield at - 1, cells
     except csv.Error as error:
-        raise not_a_table(path, line, error) from None
+        raise not_a_table(path, at, error) from None
 
 
 def not_a_table(path: Path, line: int, error: csv.Error) -> DataError:
