@@ -121,8 +121,8 @@ def accelerations_mps2(run: CaseRun) -> float:
     dt_s = float(p.t_s[1] - p.t_s[0])
     starts = np.flatnonzero(p.moving()[1:] & ~p.moving()[:-1])
     ends = starts + round(2.0 / dt_s)
-    kept = ends < len(p.t_s)
-    return float(np.mean((p.truth[ends[kept]] - p.truth[starts[kept]]) / 2.0))
+    inside = ends < len(p.t_s)
+    return float(np.mean((p.truth[ends[inside]] - p.truth[starts[inside]]) / 2.0))
 
 
 def keeps_moving_percent(run: CaseRun) -> float:

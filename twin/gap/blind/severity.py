@@ -1,7 +1,7 @@
 """The unit of severity: the size at which an effect is detected half of the time.
 
-A point has two factors: how effects compare, told by an observer that is independent of the diagnosis, and
-one number a kind of drive for the diagnosis itself. `python -m tests.studies.blind.severity` and
+A point has two factors: how effects compare, measured by an observer that is independent of the diagnosis,
+and one number a kind of drive for the diagnosis itself. `python -m tests.studies.blind.severity` and
 `tests.studies.blind.power` measure them into `severity.yaml`.
 """
 

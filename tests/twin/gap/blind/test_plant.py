@@ -166,7 +166,7 @@ def test_every_knob_turns_something_and_zero_is_absent() -> None:
     assert idle == []
 
 
-def test_runs_side_by_side_are_those_alone() -> None:
+def test_batched_runs_equal_single_ones() -> None:
     """What else is computed in one call does not matter, to the bit."""
     many = [spec(noiseless=False, seed=i) for i in range(3)]
     together = record(many)

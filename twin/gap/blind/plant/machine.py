@@ -251,21 +251,21 @@ class Machine:
         s, f = self.s, self.frame
         u, v = _rotated(s["u"], s["v"], -s["r"] * h)
         keep, slip, side = self._slip_secants(u, v, h)
-        kept, (torque_0, torque_per_speed) = keep * s["force_x"], self._torque_line(command, h)
+        carried, (torque_0, torque_per_speed) = keep * s["force_x"], self._torque_line(command, h)
         # While the gear crosses its gap, half of the torque does not arrive.
         arriving = 1.0 - 0.5 * (self.n["change_gap_rad"] > 0.0) * (1.0 - s["play"] ** 2)
         radius, inertia_h = f["radius"], self.n["wheel_inertia_kgm2"] / h
         spin_drag = f["brake"] / (np.abs(s["speed"]) + BRAKE_RADPS)
         divisor = inertia_h + arriving * torque_per_speed + slip * radius * radius + spin_drag
-        alpha = (inertia_h * s["speed"] + arriving * torque_0 - radius * kept) / divisor
+        alpha = (inertia_h * s["speed"] + arriving * torque_0 - radius * carried) / divisor
         beta = slip * radius / divisor
-        # Along x the wheel gives kept + slip (R w+ - u+), with w+ = alpha + beta u+; along y push - side v+.
-        push_x, secant_x = kept + slip * radius * alpha, slip * (1.0 - radius * beta) + f["drag"]
+        # Along x the wheel gives carried + slip (R w+ - u+), with w+ = alpha + beta u+; y: push - side v+.
+        push_x, secant_x = carried + slip * radius * alpha, slip * (1.0 - radius * beta) + f["drag"]
         push_y, secant_y = keep * s["force_y"], side + f["drag"]
         new_u, new_v, new_r = self._body(u, v, (push_x, secant_x), (push_y, secant_y), h)
         hub_u, hub_v = new_u - new_r * f["arm_y"], new_v + new_r * f["arm_x"]
         speed = alpha + beta * hub_u
-        s["force_x"] = kept + slip * (radius * speed - hub_u)
+        s["force_x"] = carried + slip * (radius * speed - hub_u)
         s["force_y"] = push_y - side * hub_v
         s["torque"] = torque_0 - torque_per_speed * speed
         error = command - speed
@@ -277,7 +277,7 @@ class Machine:
         self._moved(new_u, new_v, new_r, h)
 
     def _slip_secants(self, u: Array, v: Array, h: float) -> tuple[Array, Array, Array]:
-        """Share of the old slip force that is kept, and the new share's secants along x and y, N s/m."""
+        """Share of the old slip force that remains, and the new share's secants along x and y, N s/m."""
         n, s, f = self.n, self.s, self.frame
         hub_u, hub_v = u - s["r"] * f["arm_y"], v + s["r"] * f["arm_x"]
         rim = s["speed"] * f["radius"]
