@@ -237,7 +237,7 @@ def test_the_command_takes_soils_and_logs(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_a_ground_on_which_the_wheels_never_turn_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     still = logged_samples(circled(seconds=7.0))["grass"]
-    monkeypatch.setattr(policy_fit, "evidence_of", lambda recording: still)
+    monkeypatch.setattr(policy_fit, "samples_of", lambda recording: still)
     with pytest.raises(TerrafusionError, match=r"asphalt.*never turned"):
         fit_policy(GRID)
 
@@ -263,7 +263,7 @@ def test_a_real_warthog_on_grass() -> None:
     if not log.exists():
         pytest.skip("no norlab_drive among the field logs")
     logged = read_logs([str(log)])
-    row = policy_fit.row_of([logged.grounds["grass"]])
+    row = policy_fit.noise_of([logged.grounds["grass"]])
     assert 0.0 < row.slip_mean < 0.1
     assert -0.6 < row.yaw_scale_mean < -0.3  # docs/explanation/planar.md: what its yaw loses on any ground
     assert list(logged.inputs) == [f"{log.parent.name}/{log.name}"]
