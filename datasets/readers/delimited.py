@@ -227,7 +227,8 @@ def _line_error(
 ) -> DataError:
     """An error about a line of these cells, with its time where that can be read."""
     first = [] if layout.strict or not layout.time else next(_rows(path, data, layout), (0, []))[1]
-    time_s, origin_s = layout.seconds(cells), 0.0 if layout.strict else layout.seconds(first)
+    time_s = layout.seconds(cells)
+    origin_s = 0.0 if layout.strict else layout.seconds(first)
     since_s = None if time_s is None or origin_s is None else time_s - origin_s
     return DataError(what, file=path, time_s=since_s, remedy=remedy)
 

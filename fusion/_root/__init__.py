@@ -18,7 +18,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from terrafusion import policy as policy
+    import terrafusion.policy as policy
     from terrafusion.datasets.core.errors import ConfigError as ConfigError
     from terrafusion.datasets.core.errors import DataError as DataError
     from terrafusion.datasets.core.errors import TerrafusionError as TerrafusionError

@@ -29,7 +29,8 @@ def benchmark(
         ),
     ] = None,
     docs: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Put the tables into a document (docs/evidence/benchmark.md).")
+        Path | None,
+        typer.Option(metavar="FILE", help="Put the tables into a document (docs/evidence/benchmark.md)."),
     ] = None,
 ) -> None:
     """Compare weighting methods on the same runs: twin, perturbed soils, other terramechanics, field logs.

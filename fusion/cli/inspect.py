@@ -28,7 +28,9 @@ def inspect(
     columns: ColumnsOption = None,
     as_json: Annotated[
         bool,
-        typer.Option("--json", help="Print JSON instead of a page; its keys are in docs/reference/conventions.md."),
+        typer.Option(
+            "--json", help="Print JSON instead of a page; its keys are in docs/reference/conventions.md."
+        ),
     ] = False,
 ) -> None:
     """Show the contents of a log, measures between its channels, and the findings of the log checks.

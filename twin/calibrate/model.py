@@ -155,5 +155,7 @@ def _unknown(name: str, known: list[str]) -> ConfigError:
     last = name.rpartition(".")[2]
     same = [k for k in known if k.rpartition(".")[2].startswith(last)]
     close = same[:3] or difflib.get_close_matches(name, known, n=3, cutoff=0.5)
-    remedy = f"did you mean {' or '.join(close)}?" if close else "see docs/how-to/calibration.md for the names"
+    remedy = (
+        f"did you mean {' or '.join(close)}?" if close else "see docs/how-to/calibration.md for the names"
+    )
     return ConfigError(f"unknown parameter '{name}'", remedy=remedy)

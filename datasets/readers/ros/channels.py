@@ -182,8 +182,8 @@ class ChannelBuilder:
         stream, t_ns = stream.select(held), t_ns[held]
         speed = joint_values(stream, [*joints.values()], "velocity")
         angle = joint_values(stream, [*joints.values()], "position")
-        names = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
-        self.notes.append(f"wheels: joints of {stream.topic}: {names}")
+        chosen = ", ".join(f"{wheel} = {joint}" for wheel, joint in joints.items())
+        self.notes.append(f"wheels: joints of {stream.topic}: {chosen}")
         if speed is None and angle is not None and len(t_ns) > 1:
             dt = np.diff(t_ns) * 1e-9
             keep = np.concatenate([[False], dt > 0])

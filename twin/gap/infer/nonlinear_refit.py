@@ -36,7 +36,7 @@ EXTRAPOLATE, MARGIN = 1.0, 0.05
 AS_GOOD = 0.5  # excess that the size of weighted least squares may leave over the best one (assumed)
 SAME_SIZE = 1e-3  # sizes closer than this, typical ones, are not tried again
 ROUNDS, IMPROVED = 3, 5  # rounds of improvement, and how many of the best laws take part in them
-DELAY_SHARES = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+DELAY_SHARES: tuple[float, ...] = (0.04, 0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 """Sizes of a delay that are tried on both sides, in that of its range: beyond half a period of the motion the
 sensitivity is meaningless, and the shared run makes them cheap."""
 REFINEMENTS = ((-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (-0.05, -0.025, 0.025, 0.05))
@@ -44,7 +44,7 @@ REFINEMENTS = ((-0.3, -0.2, -0.1, 0.1, 0.2, 0.3), (-0.05, -0.025, 0.025, 0.05))
 INSENSITIVE = 10.0
 """A law is insensitive where its sensitivity, at the ends of its range, makes a smaller square in all runs;
 32-bit rounding makes 3 at most (docs/how-to/gap.md)."""
-INSENSITIVE_SHARES = (0.4, 0.7, 0.85, 1.0)
+INSENSITIVE_SHARES: tuple[float, ...] = (0.4, 0.7, 0.85, 1.0)
 """Sizes of an insensitive law that are tried, in that of its range: it acts beyond a threshold, if at all."""
 SCREEN_SHARES = (0.12, 0.4)
 """Sizes, in that of its range, at which each law is tried on one run, as its linearisation may mislead

@@ -64,7 +64,7 @@ def limit_outliers(
 def _fit_states(run: WhitenedRun, sigma: Array) -> tuple[Array, Array]:
     """Gain (T, n) of the states, and the error (n,) that they do not explain."""
     J, e = run.by_state, run.error
-    gain = np.linalg.solve(run.state_information(sigma), J.T)
+    gain: Array = np.asarray(np.linalg.solve(run.state_information(sigma), J.T))
     return gain, e - explained_by_states(J, gain, e, OUTLIER_SIGMAS, ROBUST_STEPS)
 
 
