@@ -94,8 +94,8 @@ def simulate_run(
         noiseless: exact sensors (no noise, bias, quantisation, vibration, latency).
         backend: "c", "vm" or "auto", see `integrate.integrate`.
         soils: grounds by name, in place of the library's.
-        effects: optional effects by name (docs/reference/effects.md), added to those of the vehicle's file or in
-            their place; others are absent.
+        effects: optional effects by name (docs/reference/effects.md), added to those of the vehicle's file
+            or in their place; others are absent.
 
     Raises:
         ConfigError: unknown name, bad file, or a number out of range.

@@ -1,6 +1,7 @@
 """Contents, measures and findings of recordings as plain data: what `terrafusion inspect --json` prints.
 
-Numbers are in the unit of their key; None (null) is unknown. The keys are described in docs/reference/conventions.md.
+Numbers are in the unit of their key; None (null) is unknown. The keys are described in
+docs/reference/conventions.md.
 """
 
 from __future__ import annotations

@@ -95,7 +95,7 @@ class Channel:
         raise TypeError(f"{type(self).__name__} has no messages")
 
     def columns(self) -> dict[str, NDArray[Any]]:
-        """Columns of the log folder (see docs/reference/conventions.md) without `t_s`; absent ones left out."""
+        """Columns of the log folder without `t_s`; absent ones left out."""
         raise TypeError(f"{type(self).__name__} has no table form")
 
     def to_pandas(self) -> pd.DataFrame:

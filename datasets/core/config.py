@@ -1,8 +1,8 @@
 """Strict loading of parameter files into frozen dataclasses, by pydantic.
 
-A section of a file is a dataclass, a number in it is annotated with unit and range (see `quantity`). All errors
-of a file (unknown or missing keys, wrong types, numbers out of range) are reported together, a line each: file,
-key, value and what is allowed. `schema` gives the JSON schema of a kind of file, for editors.
+A section of a file is a dataclass, a number in it is annotated with unit and range (see `quantity`). All
+errors of a file (unknown or missing keys, wrong types, numbers out of range) are reported together, a line
+each: file, key, value and what is allowed. `schema` gives the JSON schema of a kind of file, for editors.
 """
 
 from __future__ import annotations

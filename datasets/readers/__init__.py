@@ -9,11 +9,11 @@ and tables) with two functions, and list it in `formats.FORMATS`:
 - `claims(path, head) -> bool`: whether the file is of this format, by its name and its first
   `HEAD_BYTES` bytes (none for a folder). It is asked for every file that is opened, so it is quick, imports
   no parser and never raises.
-- `read(request) -> list[Recording]`: the recordings in it, in SI units and body axes as docs/reference/conventions.md
-  states, times in int64 ns. What was assumed or left out goes into `Recording.notes`, what is wrong with the
-  file into a `DataError` with place, value and remedy. A time that runs backwards is refused unless
-  `request.repair_clock` (`text.row_times`). Bytes are of unknown origin: no count is believed before it was
-  compared with what is there.
+- `read(request) -> list[Recording]`: the recordings in it, in SI units and body axes as
+  docs/reference/conventions.md states, times in int64 ns. What was assumed or left out goes into
+  `Recording.notes`, what is wrong with the file into a `DataError` with place, value and remedy. A time that
+  runs backwards is refused unless `request.repair_clock` (`text.row_times`). Bytes are of unknown origin: no
+  count is believed before it was compared with what is there.
 - Optionally `companions(path) -> Sequence[Path]`: the files that are read with this one.
 
 Helpers: `delimited` parses text tables, `text.fixes` places latitudes and longitudes, `channel_tables` makes

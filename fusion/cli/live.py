@@ -17,8 +17,8 @@ RealtimeOption = Annotated[bool, typer.Option("--realtime", help="At the pace of
 def live(log: LogArgument, vehicle: VehicleOption = None, realtime: RealtimeOption = False) -> None:
     """Run the estimator as on a robot: message by message, odometry after every IMU sample.
 
-    Prints how long updates and odometry take, and the last state. docs/how-to/integration.md has the same loop as a
-    ROS 2 node.
+    Prints how long updates and odometry take, and the last state. docs/how-to/integration.md has the same
+    loop as a ROS 2 node.
 
     Example: terrafusion live drive.bag --vehicle husky --realtime
     """

@@ -60,7 +60,7 @@ SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
 SEEN_LATE_NS, SWITCHED = 1_000_000_000, 0.1
-"""Detection latency of a change of ground (`docs/explanation/terrain.md`); smaller shifts of probability are ignored."""
+"""Detection latency of a change of ground (docs/explanation/terrain.md); smaller shifts are ignored."""
 KEPT_NS = 2_000_000_000
 """Samples are kept for so long after their keyframe."""
 UNKNOWN = np.full(3, np.nan)

@@ -14,8 +14,8 @@ from terrafusion.fusion.metrics.error_series import travelled_m
 SPEED_FACTOR, SPEED_SLACK_MPS = 1.5, 1.0
 """Largest plausible speed: a multiple of the fastest wheel speed plus a margin for rolling downhill."""
 LEAST_PATH, MOST_PATH, PATH_SLACK_M = 0.2, 1.2, 5.0
-"""Plausible path as a share of the wheels' path, with a margin for short runs. The median measured slip on ice
-is 0.64 (docs/evidence/field.md), a share of 0.36."""
+"""Plausible path as a share of the wheels' path, with a margin for short runs. The median measured slip on
+ice is 0.64 (docs/evidence/field.md), a share of 0.36."""
 
 
 @dataclass(frozen=True)

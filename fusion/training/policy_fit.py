@@ -42,7 +42,7 @@ SCENARIOS = ("staircase", "figure_eight")
 SLOPES_DEG = (0.0, 3.0, 6.0)
 PAYLOADS_KG = (0.0, 30.0)
 UNSEEN_YAW_SCALE, LEAST_YAW_SCALE_SIGMA = (-0.4, 0.2), 0.02
-"""Mean and sigma without turns: robots turn at 0.44 to 0.71 of the rate by their track (docs/explanation/planar.md)."""
+"""Mean and sigma without turns: robots turn at 0.44 to 0.71 of the rate by their track."""
 TAIL = 0.005
 GRADE_RIDGE, LAD_STEPS, LAD_FLOOR = 1e-5, 30, 5e-3
 RADIUS_SIGMA = 0.01

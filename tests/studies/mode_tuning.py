@@ -73,7 +73,7 @@ LIMITS = {
     ("adaptive", "slip_factor"): (1.0, 100.0),
     ("adaptive", "gnss_factor"): (0.01, 1.0),
 }
-"""Beyond these positions still get better, and slip (beyond the last: covariances) worse (docs/reference/modes.md)."""
+"""Beyond these positions still get better, and slip (beyond the last: covariances) worse."""
 MODE_OF: dict[str, tuple[str, dict[str, str]]] = {
     "fixed": ("fixed", {}),
     "adaptive": ("adaptive", {}),

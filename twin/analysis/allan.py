@@ -1,4 +1,4 @@
-"""Overlapping Allan deviation of an IMU, and the noise parameters read from it (IEEE Std 952-1997, annex C)."""
+"""Overlapping Allan deviation of an IMU and its noise parameters (IEEE Std 952-1997, annex C)."""
 
 from __future__ import annotations
 

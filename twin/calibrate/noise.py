@@ -1,10 +1,10 @@
 """Scale and autocorrelation of the residuals of a channel, and whitening by them.
 
 Neighbouring residuals are correlated: a chassis vibrates in a band, GNSS errors drift, unmodelled physics
-lasts for seconds. Taken as independent they would make sigma too small. So each channel has a covariance, that of an autoregressive process fitted to its own
-residuals (Yule-Walker; order by the corrected Akaike criterion, Hurvich and Tsai 1989) or, where a data
-sheet gives the time constant, of white plus first-order Gauss-Markov noise; rows are whitened by its Cholesky
-factor before they are squared.
+lasts for seconds. Taken as independent they would make sigma too small. So each channel has a covariance,
+that of an autoregressive process fitted to its own residuals (Yule-Walker; order by the corrected Akaike
+criterion, Hurvich and Tsai 1989) or, where a data sheet gives the time constant, of white plus first-order
+Gauss-Markov noise; rows are whitened by its Cholesky factor before they are squared.
 """
 
 from __future__ import annotations

@@ -111,9 +111,9 @@ class VehicleParams:
     """A four-wheel differential-drive robot: body, drive, odometry and sensors.
 
     Without a battery the motors are fed with `drive.supply_v`, whatever they draw. `effects` are optional
-    effects by key (docs/reference/effects.md) that this robot, or what it drives on, is known to have, as `terrafusion
-    gap` finds them: the twin has them in every run. `measured` are numbers, by dotted name, that were found
-    for the body of this very robot: the geometry that a log assumes does not replace them.
+    effects by key (docs/reference/effects.md) that this robot, or what it drives on, is known to have, as
+    `terrafusion gap` finds them: the twin has them in every run. `measured` are numbers, by dotted name,
+    that were found for the body of this very robot: the geometry that a log assumes does not replace them.
     """
 
     name: str

@@ -1,4 +1,4 @@
-"""`docs/reference/log-checks.md` lists every code that a check can give, and quotes the thresholds of the code."""
+"""The page on log checks lists every code that a check can give, and quotes the thresholds of the code."""
 
 from __future__ import annotations
 

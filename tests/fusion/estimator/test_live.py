@@ -1,4 +1,4 @@
-"""Live use: odometry between keyframes, the message loop, and the ROS 2 node of docs/how-to/integration.md."""
+"""Live use: odometry between keyframes, the message loop, and the ROS 2 node."""
 
 from __future__ import annotations
 

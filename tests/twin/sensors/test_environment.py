@@ -1,4 +1,4 @@
-"""Barometer and magnetometer of the twin: absent unless asked for, exact when noiseless, calibrated when not."""
+"""Barometer and magnetometer of the twin: absent unless asked for, exact when noiseless."""
 
 from __future__ import annotations
 

@@ -34,7 +34,8 @@ UNKNOWN = OUTSIDE_SHARE
 """Probability of an unknown cause, given a gap, above which that is the verdict: more than its prior."""
 LAW_SIGMA_MOTION, LAW_SIGMA_SENSOR = 0.2, 0.03
 """1 sigma, as a share of its value, by which the size of an effect on the motion, and of one of the sensors
-alone, is wrong because the robot's law is not the twin's. Set on development trials (docs/evidence/gap-blind.md)."""
+alone, is wrong because the robot's law is not the twin's. Set on development trials
+(docs/evidence/gap-blind.md)."""
 CLASSED = 5  # most probable causes whose look-alikes are sought
 
 
