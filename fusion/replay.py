@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
 from terrafusion.fusion.config.sensor_config import sensor_config_of
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -66,7 +65,7 @@ def replay(
     batch: bool = False,
     progress: Callable[[float], None] | None = None,
     magnetometer: bool = False,
-    settings: Mapping[str, Any] | None = None,
+    settings: EstimatorOptions | None = None,
 ) -> ReplayResult:
     """Estimate and score one run.
 
@@ -78,7 +77,7 @@ def replay(
         batch: smooth the whole run at once, instead of a fixed lag as live.
         progress: called with the share done, 0 to 1.
         magnetometer: use the log's magnetometer, too; a barometer is used wherever there is one.
-        settings: further fields of `EstimatorConfig`.
+        settings: fields of `EstimatorConfig` that are not its defaults.
 
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.

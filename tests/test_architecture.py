@@ -56,3 +56,12 @@ def test_nothing_shipped_imports_a_test_or_a_study() -> None:
 def test_the_drawing_is_of_these_imports() -> None:
     text = PAGE.read_text(encoding="utf-8")
     assert text == drawn(text), "run: python -m tests.architecture --write"
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    homes: dict[str, list[str]] = {}
+    for name, path in modules().items():
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                homes.setdefault(node.name, []).append(name)
+    assert {name: found for name, found in homes.items() if len(found) > 1} == {}

@@ -22,7 +22,7 @@ from terrafusion.datasets.core.channels import (
 )
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.trajectory import Trajectory
-from terrafusion.datasets.readers.csv_table import ChannelTable
+from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
 
 Layouts = tuple[tuple[tuple[str, ...], str], ...]
@@ -55,7 +55,7 @@ class TableSource(Protocol):
 
     def table(
         self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> ChannelTable | None:
+    ) -> CsvTable | None:
         """The table of a channel, None where there is none; columns as in `read_table`."""
 
     def place(self, channel: str) -> Path:
@@ -94,7 +94,7 @@ class ChannelReader:
         speed = table.stack([f"{n}_{unit}" for n in names])
         return Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
 
-    def _wheel_layout(self, table: ChannelTable) -> tuple[tuple[str, ...], str]:
+    def _wheel_layout(self, table: CsvTable) -> tuple[tuple[str, ...], str]:
         speeds = [c for c in table.numbers if not c.endswith("_rad")]
         for names, unit in self.layouts:
             if sorted(speeds) == sorted(f"{n}_{unit}" for n in names):
@@ -135,7 +135,7 @@ class ChannelReader:
             table.numbers.get("sigma_v_mps"),
         )
 
-    def _fix(self, table: ChannelTable) -> NDArray[np.uint8]:
+    def _fix(self, table: CsvTable) -> NDArray[np.uint8]:
         if "fix" not in table.texts:
             self.notes.append("gnss: the log has no fix class; all fixes are taken as 'single'")
             return np.full(len(table.t_ns), Fix.SINGLE, dtype=np.uint8)
@@ -198,7 +198,7 @@ class ChannelReader:
         except DataError as error:
             raise self._error("truth", error.what, error.remedy or "", time_s=error.time_s) from None
 
-    def _quaternion(self, table: ChannelTable) -> NDArray[np.float64] | None:
+    def _quaternion(self, table: CsvTable) -> NDArray[np.float64] | None:
         present = [name for name in QUATERNION if name in table.numbers]
         if not present:
             return None
@@ -213,7 +213,7 @@ class ChannelReader:
             raise self._row_error("truth", table, int(off[0]), what, "give unit quaternions x, y, z, w")
         return q
 
-    def _covariance(self, table: ChannelTable) -> NDArray[np.float64] | None:
+    def _covariance(self, table: CsvTable) -> NDArray[np.float64] | None:
         """(N, 6, 6); what is missing below the diagonal is taken from above it."""
         present = [name for name in COVARIANCE if name in table.numbers]
         if not present:
@@ -226,7 +226,7 @@ class ChannelReader:
             out[:, i, j] = table.numbers[name if name in table.numbers else mirrored]
         return out
 
-    def _t(self, table: ChannelTable) -> NDArray[np.int64]:
+    def _t(self, table: CsvTable) -> NDArray[np.int64]:
         return table.t_ns + np.int64(self.meta.start_ns)
 
     def _table(
@@ -237,7 +237,7 @@ class ChannelReader:
         required: Sequence[str] = (),
         texts: Sequence[str] = (),
         prefixes: Sequence[str] = (),
-    ) -> ChannelTable | None:
+    ) -> CsvTable | None:
         """The channel's rows that hold a value, or None when the file is absent or has none."""
         table = self.source.table(channel, known, texts, prefixes)
         if table is None:
@@ -249,7 +249,7 @@ class ChannelReader:
             raise self._error(channel, what, f"needed: t_s, {', '.join(required)}")
         return table if self.meta.keep_empty else self._with_values(channel, table)
 
-    def _with_values(self, channel: str, table: ChannelTable) -> ChannelTable | None:
+    def _with_values(self, channel: str, table: CsvTable) -> CsvTable | None:
         held = rows_with_values(table.numbers, len(table.t_ns))
         if channel == "terrain":
             held = table.texts["label"] != ""
@@ -265,7 +265,7 @@ class ChannelReader:
     def _error(self, channel: str, what: str, remedy: str, *, time_s: float | None = None) -> DataError:
         return DataError(what, file=self.source.place(channel), time_s=time_s, remedy=remedy)
 
-    def _row_error(self, channel: str, table: ChannelTable, row: int, what: str, remedy: str) -> DataError:
+    def _row_error(self, channel: str, table: CsvTable, row: int, what: str, remedy: str) -> DataError:
         time_s = float(table.t_ns[row]) * 1e-9
         return self._error(channel, f"{what} at data row {row + 1}", remedy, time_s=time_s)
 

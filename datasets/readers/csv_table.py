@@ -23,7 +23,7 @@ MAX_T_S = 1e9
 
 
 @dataclass(frozen=True, eq=False)
-class ChannelTable:
+class CsvTable:
     """The rows of one CSV.
 
     Attributes:
@@ -43,9 +43,9 @@ class ChannelTable:
         missing = np.full(len(self.t_ns), np.nan)
         return np.stack([self.numbers.get(name, missing) for name in names], axis=1)
 
-    def select(self, rows: NDArray[Any]) -> ChannelTable:
+    def select(self, rows: NDArray[Any]) -> CsvTable:
         """The rows of a boolean mask or index array."""
-        return ChannelTable(
+        return CsvTable(
             self.t_ns[rows],
             {name: column[rows] for name, column in self.numbers.items()},
             {name: column[rows] for name, column in self.texts.items()},
@@ -60,7 +60,7 @@ def read_table(
     texts: Sequence[str] = (),
     prefixes: Sequence[str] = (),
     in_order: bool = True,
-) -> ChannelTable:
+) -> CsvTable:
     """Read one channel's `.csv` or `.csv.gz`.
 
     Args:
@@ -83,7 +83,7 @@ def read_table(
     table = read_columns(path, data, layout, [n for n in header if n not in (*words, "t_s")], ["t_s", *words])
     t_ns = table.times_ns("t_s", remedy="every row needs its time, in seconds from start_ns")
     _check_times(path, t_ns, in_order=in_order)
-    return ChannelTable(t_ns, table.numbers, {name: table.texts[name] for name in words}, table.notes)
+    return CsvTable(t_ns, table.numbers, {name: table.texts[name] for name in words}, table.notes)
 
 
 def _header(

@@ -20,7 +20,7 @@ from terrafusion.datasets.core.errors import ClockError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.channel_tables import ChannelReader
-from terrafusion.datasets.readers.csv_table import ChannelTable, read_table, read_times
+from terrafusion.datasets.readers.csv_table import CsvTable, read_table, read_times
 from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 
@@ -127,7 +127,7 @@ class _Folder:
 
     def table(
         self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> ChannelTable | None:
+    ) -> CsvTable | None:
         path = self._path(channel)
         if path is None:
             return None

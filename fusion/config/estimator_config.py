@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import TypedDict
 
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.sensors import Rig
@@ -11,6 +12,24 @@ from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.noise.policy import Policy, load_policy
+
+
+class EstimatorOptions(TypedDict, total=False):
+    """Fields of `EstimatorConfig` that a caller may set beside robot, mode, policy and sensors."""
+
+    tuning: ModeTuning
+    robust_loss: str
+    innovation_method: str
+    keyframe_s: float
+    lag_s: float
+    wheel_wait_s: float
+    gnss_gate: float
+    wheel_gate_sigma: float
+    yaw_sigma_start_rad: float
+    start_without_gnss_s: float
+    calibrate: bool
+    declination_rad: float | None
+    labels: GroundLabels | None
 
 
 @dataclass(frozen=True)

@@ -21,7 +21,7 @@ OBSERVED_SHARE = 0.5
 
 
 @dataclass(frozen=True)
-class Quantity:
+class StateQuantity:
     """How a state of a calibration is shown: `value * scale` in `unit`."""
 
     label: str
@@ -31,14 +31,14 @@ class Quantity:
 
 _DEGREES = math.degrees(1.0)
 QUANTITIES = {
-    "radius_scale": Quantity("wheel radius, beyond the vehicle file's", "%", 100.0),
-    "antenna_x_m": Quantity("GNSS antenna, further forward", "m", 1.0),
-    "antenna_y_m": Quantity("GNSS antenna, further left", "m", 1.0),
-    "imu_roll_rad": Quantity("IMU turned about x", "deg", _DEGREES),
-    "imu_pitch_rad": Quantity("IMU turned about y", "deg", _DEGREES),
-    "imu_yaw_rad": Quantity("IMU turned about z", "deg", _DEGREES),
-    "wheel_delay_s": Quantity("wheel stamps later than the IMU's", "s", 1.0),
-    "gnss_delay_s": Quantity("GNSS stamps later than the IMU's", "s", 1.0),
+    "radius_scale": StateQuantity("wheel radius, beyond the vehicle file's", "%", 100.0),
+    "antenna_x_m": StateQuantity("GNSS antenna, further forward", "m", 1.0),
+    "antenna_y_m": StateQuantity("GNSS antenna, further left", "m", 1.0),
+    "imu_roll_rad": StateQuantity("IMU turned about x", "deg", _DEGREES),
+    "imu_pitch_rad": StateQuantity("IMU turned about y", "deg", _DEGREES),
+    "imu_yaw_rad": StateQuantity("IMU turned about z", "deg", _DEGREES),
+    "wheel_delay_s": StateQuantity("wheel stamps later than the IMU's", "s", 1.0),
+    "gnss_delay_s": StateQuantity("GNSS stamps later than the IMU's", "s", 1.0),
 }
 """Of each state of `key_state.CALIBRATION`."""
 

@@ -23,7 +23,7 @@ from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import ChannelReader, Layouts
-from terrafusion.datasets.readers.csv_table import ChannelTable
+from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
 from terrafusion.datasets.readers.log_meta import Meta, parse_meta
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
@@ -149,7 +149,7 @@ class _BagTables:
 
     def table(
         self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> ChannelTable | None:
+    ) -> CsvTable | None:
         columns = self.saved.tables[channel]
         strange = [c for c in columns if c not in (*known, *texts) and not c.startswith(tuple(prefixes))]
         if strange or len(set(columns)) != len(columns):
@@ -168,7 +168,7 @@ class _BagTables:
             raise self._error(channel, "stamps that run backwards")
         numbers = {name: rows[:, len(STAMP) + k].astype(float) for k, name in enumerate(columns)}
         words = {name: self._words(channel, name, numbers.pop(name)) for name in texts if name in numbers}
-        return ChannelTable(t_ns, numbers, words)
+        return CsvTable(t_ns, numbers, words)
 
     def _words(self, channel: str, column: str, codes: NDArray[np.float64]) -> NDArray[Any]:
         words = self.saved.words.get(column, [])

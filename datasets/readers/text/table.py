@@ -19,7 +19,7 @@ from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.gnss_time import gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.channel_tables import GNSS_VELOCITY, QUATERNION, ChannelReader
-from terrafusion.datasets.readers.csv_table import ChannelTable
+from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.delimited import head_lines, separator_of, split
 from terrafusion.datasets.readers.formats import MAP_SUFFIX, PARQUET_MAGIC, Request
 from terrafusion.datasets.readers.log_folder import CHANNELS, recording_of
@@ -185,7 +185,7 @@ class _Source:
 
     def table(
         self, channel: str, known: Sequence[str], texts: Sequence[str], prefixes: Sequence[str]
-    ) -> ChannelTable | None:
+    ) -> CsvTable | None:
         fields = self.found.channels.get(channel, {})
         if not fields:
             return None
@@ -197,7 +197,7 @@ class _Source:
             numbers |= dict(
                 zip(QUATERNION, rpy_to_quaternion(np.stack([zero, zero, yaw], axis=1)).T, strict=True)
             )
-        return ChannelTable(self.t_ns, numbers, words)
+        return CsvTable(self.t_ns, numbers, words)
 
     def _numbers(self, name: str, of: MappedColumn) -> Array:
         values = self.columns.numbers(of.column)[self.times.order]

@@ -16,7 +16,7 @@ from hypothesis.strategies import floats, sampled_from
 from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.gap.blind.plant import contact
-from terrafusion.twin.gap.blind.plant.field import SoilField
+from terrafusion.twin.gap.blind.plant.field import PlantSoilField
 from terrafusion.twin.gap.blind.plant.machine import Machine, motor_current
 from terrafusion.twin.gap.blind.plant.parameters import CHANGES
 from terrafusion.twin.gap.blind.plant.run import record, simulate
@@ -37,7 +37,7 @@ def spec(soil: str = "medium_sand", drive: tuple[Segment, ...] = DRIVE, **more: 
 def machine(soil: str, **state: float) -> Machine:
     """One robot with the motors' demand at zero unless it is told, in a given state."""
     one = [spec(soil)]
-    found = Machine(stacked_numbers(one), SoilField(one))
+    found = Machine(stacked_numbers(one), PlantSoilField(one))
     for name, value in state.items():
         found.s[name] = np.full_like(found.s[name], value)
     return found
@@ -178,7 +178,7 @@ def test_batched_runs_equal_single_ones() -> None:
 def test_the_ground_varies_as_it_is_told() -> None:
     """Within a run by a field of the place, between runs by one draw each."""
     specs = [spec(noiseless=False, seed=i) for i in range(300)]
-    patches = SoilField(specs)
+    patches = PlantSoilField(specs)
     x = np.linspace(0.0, 200.0, 80)
     logs = np.stack([patches.at(np.full((4, 300), at), np.zeros((4, 300)))[0, 0] for at in x])
     assert logs.mean(axis=0).std() == pytest.approx(0.08, rel=0.2)

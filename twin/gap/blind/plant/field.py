@@ -18,7 +18,7 @@ WEIGHTS = {"strength": 1.0, "bearing": 2.0, "modulus": -1.5}
 SHARED = 0.7  # correlation of the quantities: dense ground is strong, stiff and shears early (assumed)
 
 
-class SoilField:
+class PlantSoilField:
     """Logarithms of the gains of `QUANTITIES` at the wheels of all runs.
 
     A sum of plane waves with Gaussian wave vectors has a squared-exponential correlation (random Fourier

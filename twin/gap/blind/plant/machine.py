@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.twin.gap.blind.plant import contact as law
-from terrafusion.twin.gap.blind.plant.field import SoilField
+from terrafusion.twin.gap.blind.plant.field import PlantSoilField
 
 Array = NDArray[np.float64]
 
@@ -33,7 +33,7 @@ BODY_STATES = ("x", "y", "z", "yaw", "u", "v", "r", "travel", "lean_x", "lean_y"
 class Machine:
     """State and laws of B runs. `step` advances a frame; `frame` holds what the slow laws gave last."""
 
-    def __init__(self, n: dict[str, Any], patches: SoilField, gust_n: Array | None = None) -> None:
+    def __init__(self, n: dict[str, Any], patches: PlantSoilField, gust_n: Array | None = None) -> None:
         self.n, self.patches, self._gust_n = dict(n), patches, gust_n
         runs = len(n["mass_kg"])
         self.s: dict[str, Array] = {name: np.zeros(runs) for name in BODY_STATES}

@@ -13,7 +13,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.gap.blind.plant import sensors
 from terrafusion.twin.gap.blind.plant.commands import commanded_twist, side_commands
-from terrafusion.twin.gap.blind.plant.field import SoilField
+from terrafusion.twin.gap.blind.plant.field import PlantSoilField
 from terrafusion.twin.gap.blind.plant.machine import Machine
 from terrafusion.twin.gap.blind.plant.spec import RunSpec, stacked_numbers
 
@@ -57,7 +57,7 @@ def simulate(specs: Sequence[RunSpec], *, substeps: int = SUBSTEPS) -> list[sens
         raise ConfigError("runs that are computed together must last equally long")
     n = stacked_numbers(specs)
     t_s: Array = np.asarray(FRAME_S * np.arange(round(duration / FRAME_S) + 1), dtype=np.float64)
-    machine = Machine(n, SoilField(specs), _gusts(specs, len(t_s)))
+    machine = Machine(n, PlantSoilField(specs), _gusts(specs, len(t_s)))
     sides = side_commands(specs, n, t_s)
     history: dict[str, list[Array]] = {name: [] for name in (*_BODY, *_WHEEL, *_FRAME, "soil")}
     _settle(machine, sides[0])
