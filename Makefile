@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
-SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml' -o -name '*.[ch]') pyproject.toml README.md
+SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml' -o -name '*.[ch]' -o -name '*.j2' -o -name '*.css') pyproject.toml README.md
 
 .PHONY: demo test lint help clean
 
