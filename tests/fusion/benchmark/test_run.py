@@ -225,13 +225,13 @@ def test_families_by_name_with_seeds_of_their_own() -> None:
     assert BenchmarkPlan(families_of(["mixed=7", "firm"]), seeds=3).seed_count("mixed") == 7
     with pytest.raises(ConfigError, match="unknown family 'mixd'"):
         families_of(["mixd"])
-    with pytest.raises(ConfigError, match="'mixed=all' names no number"):
+    with pytest.raises(ConfigError, match="'mixed=all' has no number of seeds"):
         families_of(["mixed=all"])
 
 
 def test_field_alone_without_logs_is_refused(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(plan, "present_logs", lambda starts: [])
-    with pytest.raises(TerrafusionError, match="no field log is at hand"):
+    with pytest.raises(TerrafusionError, match="no field log is present"):
         run_benchmark(BenchmarkPlan({"field": None}), tmp_path)
 
 

@@ -6,7 +6,6 @@ import csv
 import json
 import os
 import re
-import runpy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -145,12 +144,3 @@ def test_wrong_requests_are_refused_in_one_line(tmp_path: Path, terrafusion) -> 
     terrafusion("study", "--out", tmp_path / "file").refused("file")
     assert terrafusion("study", "--out", tmp_path, "--jobs", 0).status == 2
     assert os.listdir(tmp_path) == ["file"]
-
-
-def test_help_of_the_text_form_runs_no_study(capsys, monkeypatch) -> None:
-    monkeypatch.setattr("sys.argv", ["study", "--help"])
-    monkeypatch.setattr("terrafusion.twin.study.study.run_study", lambda plan: pytest.fail("it ran"))
-    with pytest.raises(SystemExit) as ended:
-        runpy.run_module("terrafusion.twin.study", run_name="__main__")
-    assert ended.value.code == 0
-    assert "terrafusion study" in capsys.readouterr().out
