@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from terrafusion.fusion.benchmark.methods import METHODS
-from terrafusion.fusion.benchmark.run_score import measure
+from terrafusion.fusion.benchmark.run_score import score_run
 from terrafusion.fusion.benchmark.twin_runs import (
     FAMILIES,
     FIRST_SEED,
@@ -94,7 +94,7 @@ def test_soils_of_the_twin_stay_in_the_scatter_of_training() -> None:
 
 def test_the_oracle_of_ground_that_the_policy_never_saw_is_right_to_call_it_unknown() -> None:
     drive = simulate_case(BenchmarkCase("unseen", "twin", FIRST_SEED))
-    row = measure(drive, next(arm for arm in METHODS if arm.name == "oracle"))
+    row = score_run(drive, next(arm for arm in METHODS if arm.name == "oracle"))
     assert row is not None
     (ground,) = row.grounds
     assert ground.ground in FAMILIES["unseen"].grounds

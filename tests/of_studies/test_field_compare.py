@@ -198,7 +198,14 @@ def test_a_folder_without_drives_is_refused(tmp_path):
 
 
 def test_command_refuses_in_one_line(tmp_path):
-    words = [sys.executable, "-m", "tests.studies.twin_field", str(tmp_path), "--out", str(tmp_path / "out")]
+    words = [
+        sys.executable,
+        "-m",
+        "tests.studies.twin_field.compare_drives",
+        str(tmp_path),
+        "--out",
+        str(tmp_path / "out"),
+    ]
     done = subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
     assert done.stderr.startswith("error: ")

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 
 from terrafusion.datasets.catalog.catalog import DATA_VARIABLE, load_catalog
-from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers import write_log_folder
+from tests.datasets.conftest import make_drive
 from tests.studies.survey import survey
 from tests.studies.survey.published import FACTS, Fact, Instead
 
@@ -78,9 +78,9 @@ def test_verdicts() -> None:
     assert table.splitlines()[2] == "| * (2 of 3) | q | 10 Hz (9 to 11) | 9.5 to 10.25 | agrees |"
 
 
-def test_quantities_of_a_known_drive(drive: Recording, tmp_path: Path) -> None:
+def test_quantities_of_a_known_drive(tmp_path: Path) -> None:
     """The synthetic drive of the tests: every number is known from how it was made."""
-    drives = survey.Drives("set/drive", write_log_folder(drive, tmp_path / "drive"))
+    drives = survey.Drives("set/drive", write_log_folder(make_drive(), tmp_path / "drive"))
     expected = {
         "drives": 1,
         "duration, s": pytest.approx(60.0, abs=0.3),

@@ -193,7 +193,7 @@ def test_a_scenario_file_takes_every_option(tmp_path) -> None:
 
 
 def test_the_example_of_the_documents_drives(tmp_path) -> None:
-    text = (Path(__file__).parents[3] / "docs" / "reference" / "sensors.md").read_text(encoding="utf-8")
+    text = (Path(__file__).parents[2] / "docs" / "reference" / "sensors.md").read_text(encoding="utf-8")
     own = tmp_path / "wood.yaml"
     own.write_text(text.split("```yaml\n")[1].split("```")[0])
     gnss = simulate(own).gnss

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import jsonschema
@@ -52,7 +53,9 @@ def test_gap_refuses_an_unknown_effect_in_one_line(logs: Path, tmp_path: Path, t
 def test_what_cannot_be_written_is_refused_before_anything_is_computed(
     logs: Path, tmp_path: Path, terrafusion, monkeypatch: pytest.MonkeyPatch, option: str
 ) -> None:
-    monkeypatch.setattr("terrafusion.twin.gap.diagnose.diagnose", lambda *_, **__: pytest.fail("computed"))
+    monkeypatch.setattr(
+        sys.modules["terrafusion.twin.gap.diagnose"], "diagnose", lambda *_, **__: pytest.fail("computed")
+    )
     taken = tmp_path / "taken"
     taken.write_text("mine")
     targets = {"--out": tmp_path / "out", option: taken if option == "--out" else taken / "vehicle.yaml"}

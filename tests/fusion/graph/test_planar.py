@@ -233,7 +233,7 @@ def test_a_stream_admits_only_what_was_declared() -> None:
 
 def test_an_estimator_told_of_no_imu_refuses_one() -> None:
     config = EstimatorConfig(load_vehicle("husky").rig(), inputs=SensorConfig(imu="none"))
-    with pytest.raises(DataError, match="no IMU"):
+    with pytest.raises(DataError, match="without an IMU"):
         Estimator(config).add_imu(0, [0.0, 0.0, 0.0])
 
 

@@ -109,7 +109,7 @@ def test_the_geometry_that_a_log_reports_is_noted() -> None:
     assert geometry_notes(robot, Overrides(0.2, 0.9)) == (note,)
     wide = dataclasses.replace(robot, measured=("body.track_m",))
     assert geometry_notes(wide, Overrides(0.2)) == ("the log's own geometry is used: wheel_radius_m = 0.2",)
-    kept = "; measured on this robot before, and kept for its body: body.track_m"
+    kept = "; measured on this robot before, and retained for its body: body.track_m"
     assert geometry_notes(wide, Overrides(0.2, 0.9)) == (note + kept,)
 
 

@@ -117,7 +117,7 @@ def test_ground_pressure_is_load_over_contact() -> None:
     ("terrain", "moisture", "message"),
     [
         ("mud", 20.0, r"moisture is 20 %, outside .* of 'mud'; .* hold from 38 to 60 %"),
-        ("asphalt", 5.0, r"'asphalt' tells no range of moisture"),
+        ("asphalt", 5.0, r"'asphalt' has no range of moisture"),
     ],
 )  # fmt: skip
 def test_a_moisture_the_soil_was_not_measured_at_is_reported(terrain, moisture, message) -> None:

@@ -188,7 +188,7 @@ def test_the_ground_varies_as_it_is_told() -> None:
 
 
 def test_unknown_knobs_and_clogging_mud_are_refused() -> None:
-    with pytest.raises(ConfigError, match="unknown change"):
+    with pytest.raises(ConfigError, match="unknown parameter"):
         spec(changes={"warp": 1.0})
     with pytest.raises(ConfigError, match="mud"):
         spec("mud")
