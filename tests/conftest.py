@@ -36,7 +36,7 @@ class Outcome:
         assert self.err.startswith("error: "), self.err
         assert all(".yaml: " in line for line in self.err.splitlines()[1:]), self.err
         assert self.err.endswith("\n")
-        assert len(self.err) < 1500, f"{len(self.err)} characters: {self.err[:300]}"
+        assert max(map(len, self.err.splitlines())) < 1500, self.err
         for word in words:
             assert word in self.err, f"'{word}' is not told in: {self.err}"
 
