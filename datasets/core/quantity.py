@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 import reprlib
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,14 +50,20 @@ class RejectedError(ValueError):
         return ConfigError(self.what.replace("{key}", key), file=file, remedy=self.remedy)
 
 
-class Parsed:
-    """Annotation of a field whose value `parse` checks and converts; `schema` is its JSON schema."""
+class Parsed(ABC):
+    """Annotation of a field of a parameter file."""
 
+    @abstractmethod
     def parse(self, raw: Any) -> Any:
-        raise NotImplementedError
+        """The value of a field, checked and converted.
 
+        Raises:
+            RejectedError: it is not allowed.
+        """
+
+    @abstractmethod
     def schema(self) -> dict[str, Any]:
-        raise NotImplementedError
+        """JSON schema of the value."""
 
     def hint(self) -> str:
         """What to write, for a key that is missing."""

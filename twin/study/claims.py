@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -20,21 +21,21 @@ POINTS, SHARE, FACTOR = 1.0, 0.1, 2.0
 FILES = ("claims_tables.yaml", "claims_figures.yaml", "claims_rest.yaml")
 
 
-class Criterion:
+class Criterion(ABC):
     """A rule for one measured quantity."""
 
+    @abstractmethod
     def _holds(self, found: Spread) -> tuple[bool, bool]:
         """Whether the quantity agrees, and whether it does in part."""
-        raise NotImplementedError
 
     def verdict(self, found: Spread) -> str:
         """One of `VERDICTS`; what could not be measured disagrees."""
         agrees, partly = self._holds(found)
         return AGREE if agrees else PARTLY if partly else DISAGREE
 
+    @abstractmethod
     def words(self, unit: str) -> str:
         """The rule in words."""
-        raise NotImplementedError
 
     def wanted(self, unit: str) -> str:
         """What the study says, short."""
