@@ -70,6 +70,10 @@ def keep(study: Study, printed: str, seconds: float, out: Path) -> None:
     if missing:
         raise SystemExit(f"{study.name}: no figure {', '.join(missing)} in what it printed")
     command = study.command if study.command[0] == "terrafusion" else ("python", *study.command)
+    file = RESULTS / f"{study.name}.json"
+    before = json.loads(file.read_text(encoding="utf-8"))["figures"] if file.is_file() else {}
+    if lost := sorted(set(before) - set(figures)):
+        raise SystemExit(f"{study.name}: no pattern of registry.py gives {', '.join(lost)}; add one first")
     result = {
         "study": study.name,
         "question": study.question,
@@ -79,7 +83,7 @@ def keep(study: Study, printed: str, seconds: float, out: Path) -> None:
         "figures": figures,
     }
     RESULTS.mkdir(exist_ok=True)
-    (RESULTS / f"{study.name}.json").write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
+    file.write_text(json.dumps(result, indent=1) + "\n", encoding="utf-8")
     text = f"# {study.question}\n\n`{result['command']}`\n\n```text\n{printed.rstrip()}\n```\n"
     (RESULTS / f"{study.name}.md").write_text(text, encoding="utf-8")
     if study.picture and (out / study.picture).is_file():

@@ -152,7 +152,7 @@ STUDIES = (
         "How do the modes compare on every field log, with fixes and in outages?",
         _module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
         240,
-        picture="field_logs.png",
+        picture="field_table.png",
     ),
     Study(
         "benchmark",
