@@ -190,7 +190,7 @@ STUDIES = (
         "Does the diagnosis hold on a plant that is not the twin, with sealed labels?",
         ("terrafusion", "gap-blind", "--seed", "7", "--jobs", "2", "--out", OUT),
         100,
-        picture="blind.png",
+        picture="sheet.png",
     ),
     Study(
         "blind_power",
