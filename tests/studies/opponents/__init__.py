@@ -1,0 +1,1 @@
+"""Errors in GNSS outages, beside estimators that a competent user would write."""
