@@ -1,6 +1,6 @@
 """A quick look at errors in outages while one works on the estimator: EKF and replay, log by log.
 
-    python -m tests.studies.outage_trial LOG... --seconds 30 60 --modes fixed [--vehicle V] [--unknown] [--ekf]
+    python -m tests.studies.outage_trial LOG... --seconds 30 60 --modes fixed [--unknown] [--ekf]
 
 LOG is a recording of the catalogue, a path, or either with `@rtk` or `@consumer` for fixes made from truth.
 Without LOG: a handful of logs of different robots (`QUICK`); paths in TERRAFUSION_LOGS are added.
