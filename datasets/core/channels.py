@@ -23,8 +23,10 @@ from terrafusion.datasets.core.messages import (
     MagnetometerSample,
     Message,
     MotorSample,
+    SteeringSample,
     TerrainSample,
     WheelSample,
+    axles,
     sides,
 )
 
@@ -264,6 +266,47 @@ class Motor(Channel):
         """One message a row."""
         voltage = [None] * len(self) if self.voltage_v is None else list(self.voltage_v)
         return map(MotorSample, self.t_ns.tolist(), self.current_a, voltage)
+
+
+@dataclass(frozen=True, eq=False)
+class Steering(Channel):
+    """Steering angles `angle_rad` (N, k) of `names`, rad, positive to the left.
+
+    `names` is one of the tuples of `LAYOUTS`: ("angle",) is the mean of the front wheels, ("front", "rear")
+    are the means of each axle, ("steering_wheel",) is the steering wheel, whose angle is the front wheels'
+    times a steering ratio.
+    """
+
+    name: ClassVar[str] = "steering"
+    LAYOUTS: ClassVar[tuple[tuple[str, ...], ...]] = (
+        ("angle",),
+        ("front", "rear"),
+        Wheels.LAYOUTS[1],
+        ("steering_wheel",),
+    )
+    angle_rad: Array
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.names not in self.LAYOUTS:
+            raise ValueError(f"steering: unknown layout {self.names}")
+        if self.angle_rad.shape != (len(self), len(self.names)):
+            raise ValueError(
+                f"steering: angle_rad has shape {self.angle_rad.shape} for {len(self.names)} names"
+            )
+
+    def columns(self) -> dict[str, NDArray[Any]]:
+        return {f"{name}_rad": self.angle_rad[:, i] for i, name in enumerate(self.names)}
+
+    def axle_angles_rad(self, steering_ratio: float = 1.0) -> Array:
+        """Mean angle (N, 2) of front and rear wheels, rad; `steering_ratio` is used for a steering wheel."""
+        return axles(self.angle_rad, self.names, steering_ratio)
+
+    def samples(self) -> Iterator[SteeringSample]:
+        """One message a row."""
+        for t_ns, row in zip(self.t_ns.tolist(), self.angle_rad, strict=True):
+            yield SteeringSample(t_ns, row, self.names)
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,6 +67,14 @@ class TerrainSample(NamedTuple):
     probabilities: dict[str, float] | None
 
 
+class SteeringSample(NamedTuple):
+    """Steering angles (k,) of `names`, rad, positive to the left."""
+
+    t_ns: int
+    angle_rad: Array
+    names: tuple[str, ...]
+
+
 class BarometerSample(NamedTuple):
     """Static pressure, Pa."""
 
@@ -87,6 +95,7 @@ Message = (
     | GnssSample
     | CommandSample
     | MotorSample
+    | SteeringSample
     | TerrainSample
     | BarometerSample
     | MagnetometerSample
@@ -100,3 +109,19 @@ def sides(values: NDArray[Any], names: tuple[str, ...]) -> Array:
     left = [i for i, name in enumerate(names) if name.endswith("left")]
     right = [i for i, name in enumerate(names) if name.endswith("right")]
     return np.stack([values[:, left].mean(axis=1), values[:, right].mean(axis=1)], axis=1)
+
+
+def axles(angles: NDArray[Any], names: tuple[str, ...], steering_ratio: float = 1.0) -> Array:
+    """Mean angle of the front and of the rear wheels (N, 2), of `Steering.angle_rad` (N, k) and its names.
+
+    Rear wheels without a column do not steer. `steering_ratio` is the angle of a steering wheel over that
+    of the front wheels.
+    """
+    still = np.zeros(len(angles))
+    if names == ("front", "rear"):
+        return np.asarray(angles, dtype=float)
+    if len(names) == 1:
+        return np.stack(
+            [angles[:, 0] / (steering_ratio if names == ("steering_wheel",) else 1.0), still], axis=1
+        )
+    return np.stack([angles[:, :2].mean(axis=1), angles[:, 2:].mean(axis=1)], axis=1)

@@ -28,6 +28,7 @@ from terrafusion.datasets.core.channels import (
     Imu,
     Magnetometer,
     Motor,
+    Steering,
     Terrain,
     Wheels,
 )
@@ -41,6 +42,9 @@ class Overrides:
     track_m: float | None = None
     antenna_m: tuple[float, float, float] | None = None
     imu_m: tuple[float, float, float] | None = None
+    drive: str | None = None
+    wheelbase_m: float | None = None
+    steering_ratio: float | None = None
 
 
 @dataclass(frozen=True)
@@ -89,9 +93,11 @@ class Recording:
     imu_frame_id: str = ""
     barometer: Barometer | None = None
     magnetometer: Magnetometer | None = None
+    steering: Steering | None = None
 
     CHANNELS: ClassVar[tuple[str, ...]] = (
         "command", "wheels", "imu", "gnss", "motor", "terrain", "barometer", "magnetometer",
+        "steering",
     )  # fmt: skip
 
     def __repr__(self) -> str:

@@ -22,6 +22,11 @@ AXES = {
     "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
 }  # fmt: skip
 
+DRIVES = ("differential", "skid_steer", "tracked", "ackermann", "four_wheel_steer")
+"""How a robot turns: two driven wheels and casters, wheels or tracks that skid, steered front wheels,
+steered front and rear wheels."""
+STEERED_DRIVES = DRIVES[3:]
+
 ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
 """Sigma of each horizontal axis by class of fix, where neither log nor vehicle gives it; up has twice that.
 Orders of magnitude of receivers' data sheets (RTK fixed 1 cm + 1 ppm, SBAS about 1 m), not measurements."""

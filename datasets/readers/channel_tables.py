@@ -17,6 +17,7 @@ from terrafusion.datasets.core.channels import (
     Imu,
     Magnetometer,
     Motor,
+    Steering,
     Terrain,
     Wheels,
 )
@@ -31,6 +32,7 @@ WHEEL_LAYOUTS: Layouts = (
     (("left", "right"), "radps"),
     (("front_left", "front_right", "rear_left", "rear_right"), "radps"),
     (("left", "right"), "mps"),
+    (("front_left", "front_right", "rear_left", "rear_right"), "mps"),
     (("speed",), "mps"),
 )
 """Layouts of wheels.csv: names and unit; the column is name_unit. name_rad may hold the angle."""
@@ -172,6 +174,17 @@ class ChannelReader:
             tuple(name.removeprefix("p_") for name in table.numbers),
             table.stack(list(table.numbers)) if table.numbers else None,
         )
+
+    def steering(self) -> Steering | None:
+        layouts = [tuple(f"{name}_rad" for name in names) for names in Steering.LAYOUTS]
+        table = self._table("steering", [*dict.fromkeys(column for layout in layouts for column in layout)])
+        if table is None:
+            return None
+        for names, layout in zip(Steering.LAYOUTS, layouts, strict=True):
+            if sorted(table.numbers) == sorted(layout):
+                return Steering(self._t(table), table.stack(layout), names)
+        what = f"columns {', '.join(table.numbers) or '(none)'} are not a layout"
+        raise self._error("steering", what, f"give one of: {' | '.join(map(', '.join, layouts))}")
 
     def barometer(self) -> Barometer | None:
         table = self._table("barometer", ("pressure_pa",), required=("pressure_pa",))

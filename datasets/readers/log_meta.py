@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from terrafusion.datasets.core.config import Prepared, structure
 from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, shown
 from terrafusion.datasets.core.recording import ClockJump, Overrides
+from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.yaml_file import read_yaml
 
 TRUTH_CHANNELS = ("position", "yaw", "orientation", "velocity")
@@ -32,6 +33,9 @@ class DescriptionFile:
     imu_frame_id: str | None = None
     wheel_radius_m: Annotated[float, Quantity("m", 0.01, 2.0)] | None = None
     track_m: Annotated[float, Quantity("m", 0.05, 10.0)] | None = None
+    drive: Annotated[str, Word(DRIVES)] | None = None
+    wheelbase_m: Annotated[float, Quantity("m", 0.05, 10.0)] | None = None
+    steering_ratio: Annotated[float, Quantity("", 0.05, 100.0)] | None = None
     antenna_m: _Metres | None = None
     imu_m: _Metres | None = None
     datum: (
@@ -116,7 +120,7 @@ def parse_meta(content: dict[str, Any], path: Path) -> Meta:
     return Meta(
         start_ns=file.start_ns,
         texts={key: getattr(file, key) for key in TEXT_KEYS if key in given},
-        overrides=Overrides(file.wheel_radius_m, file.track_m, file.antenna_m, file.imu_m),
+        overrides=Overrides(**{key.name: getattr(file, key.name) for key in dataclasses.fields(Overrides)}),
         datum=file.datum,
         truth_channels=file.truth_channels,
         truth_frame=file.truth_frame,

@@ -44,7 +44,7 @@ def write_mcap(
 
     Topics: `/imu/data` Imu, `/joint_states` JointState (wheels in rad/s) or `/wheel/odom` Odometry
     (in m/s), `/fix` NavSatFix, `/fix_velocity` TwistWithCovarianceStamped (east, north, up),
-    `/pressure` FluidPressure, `/imu/mag` MagneticField,
+    `/steering/joint_states` JointState, `/pressure` FluidPressure, `/imu/mag` MagneticField,
     `/datum` NavSatFix (the ENU origin, once), `/cmd_vel` TwistStamped, `/terrain` String,
     `/ground_truth/odom` and `/odometry/filtered` (the estimate) Odometry, map -> base_link,
     `/tf` (the estimate) and `/tf_static` (positions of IMU and antenna where known) TFMessage,
@@ -169,6 +169,8 @@ class _Parts:
             yield from self._wheels(r.wheels)
         if r.imu is not None:
             yield self._imu(r.imu)
+        if r.steering is not None:
+            yield ros.steering(self._complete("steering", r.steering, r.steering.columns()))
         if r.barometer is not None:
             yield ros.pressure(self._complete("barometer", r.barometer, r.barometer.columns()))
         if r.magnetometer is not None:

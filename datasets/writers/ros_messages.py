@@ -18,6 +18,7 @@ from terrafusion.datasets.core.channels import (
     Gnss,
     Imu,
     Magnetometer,
+    Steering,
     Terrain,
     Wheels,
 )
@@ -35,6 +36,7 @@ UNKNOWN_VARIANCE = 1e6
 
 STATUS_OF_FIX = {Fix.NONE: -1, Fix.SINGLE: 0, Fix.DGPS: 1, Fix.FLOAT: 1, Fix.FIXED: 2}
 IDENTITY = (0.0, 0.0, 0.0, 1.0)
+STEERING_JOINTS = {"angle": "steering_joint", "steering_wheel": "steering_wheel_joint"}
 EARTH_M = 1e7
 """ENU coordinates beyond this are nowhere on Earth."""
 
@@ -92,6 +94,16 @@ def joint_states(wheels: Wheels) -> TopicMessages:
     layout.sequence("angle", angle.shape[1]).sequence("speed", len(names)).sequence("effort", 0)
     fields = {"speed": wheels.speed} | ({"angle": angle} if angle.shape[1] else {})
     return _topic("/joint_states", "sensor_msgs/msg/JointState", layout, wheels.t_ns, **fields)
+
+
+def steering(steering: Steering) -> TopicMessages:
+    """sensor_msgs/JointState with the position of one joint an angle, rad."""
+    names = [STEERING_JOINTS.get(name, f"{name}_steering_joint") for name in steering.names]
+    layout = CdrTemplate().header("").strings(names)
+    layout.sequence("angle", len(names)).sequence("speed", 0).sequence("effort", 0)
+    angle = steering.angle_rad if len(names) > 1 else steering.angle_rad[:, 0]
+    kind = "sensor_msgs/msg/JointState"
+    return _topic("/steering/joint_states", kind, layout, steering.t_ns, angle=angle)
 
 
 def _odometry(

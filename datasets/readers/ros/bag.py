@@ -13,7 +13,7 @@ from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.exact import META, restore
-from terrafusion.datasets.readers.ros.joints import joint_names, wheel_joints
+from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
 from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
@@ -60,7 +60,8 @@ def _assemble(container: BagContainer, request: Request) -> Recording:
         file=path,
         user=request.topics,
         usual=rig.topics if rig else None,
-        is_wheel_joints=lambda topic: _has_wheels(container, topic, joints),
+        is_wheel_joints=lambda topic: bool(wheel_joints(_joints(container, topic), joints)),
+        is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
     )
     streams = _streams(container, chosen)
     if META in there:
@@ -113,6 +114,7 @@ def _build(builder: ChannelBuilder, timing: StreamTimes, datum_stream: Stream | 
         terrain=builder.terrain(streams["terrain"], t["terrain"]) if "terrain" in streams else None,
         barometer=barometer,
         magnetometer=magnetometer,
+        steering=builder.steering(streams["steering"], t["steering"]) if "steering" in streams else None,
         truth=truth,
         datum=datum,
         truth_channels=truth_contents(truth) if truth is not None else (),
@@ -138,11 +140,11 @@ def _topics_of(container: BagContainer) -> list[BagTopic]:
     return [BagTopic(name, msgtype, count) for (name, msgtype), count in sorted(counts.items()) if count]
 
 
-def _has_wheels(container: BagContainer, topic: str, joints: dict[str, str]) -> bool:
-    """Whether the first messages of a JointState topic name wheels."""
+def _joints(container: BagContainer, topic: str) -> list[str]:
+    """Joints that the first messages of a JointState topic name."""
     key = topic, JOINTS
     stream = read_streams(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
-    return bool(wheel_joints(joint_names(stream), joints))
+    return joint_names(stream)
 
 
 def _streams(container: BagContainer, chosen: Mapping[str, BagTopic]) -> dict[str, Stream]:

@@ -16,6 +16,7 @@ from terrafusion.datasets.core.channels import (
     Gnss,
     Imu,
     Magnetometer,
+    Steering,
     Terrain,
     Wheels,
 )
@@ -24,8 +25,14 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros import topics
-from terrafusion.datasets.readers.ros.joints import holding, joint_names, joint_values, wheel_joints
-from terrafusion.datasets.readers.ros.messages import UNKNOWN_VARIANCE, Stream, poses, twists
+from terrafusion.datasets.readers.ros.joints import (
+    holding,
+    joint_names,
+    joint_values,
+    steering_joints,
+    wheel_joints,
+)
+from terrafusion.datasets.readers.ros.messages import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.text.fixes import Fixes, located
 
 Array = NDArray[np.float64]
@@ -128,6 +135,10 @@ class ChannelBuilder:
         """Wheel speeds, and the nominal track (m) where one had to be assumed."""
         if stream.msgtype == topics.JOINTS:
             return self._wheels_of_joints(stream, t_ns), None
+        if stream.msgtype in ACKERMANN_AT:
+            speed = stream.column(f"{ACKERMANN_AT[stream.msgtype]}speed").astype(float)[:, None]
+            self._refuse_nan(speed, t_ns, stream.topic, "speed")
+            return Wheels(t_ns, speed, ("speed",), "mps"), None
         twist, variance = twists(stream)
         v, rate = twist[:, 0], twist[:, 5]
         self._refuse_nan(v[:, None], t_ns, stream.topic, "speed")
@@ -197,6 +208,32 @@ class ChannelBuilder:
             raise DataError("joints have neither velocity nor position", file=self.file, channel=stream.topic)
         self._refuse_nan(speed, t_ns, stream.topic, "wheel speed")
         return Wheels(t_ns, speed, tuple(joints), "radps", angle)
+
+    def steering(self, stream: Stream, t_ns: TimesNs) -> Steering | None:
+        """Steering angles, of joints or of an AckermannDrive."""
+        if stream.msgtype in ACKERMANN_AT:
+            angle = stream.column(f"{ACKERMANN_AT[stream.msgtype]}steering_angle").astype(float)[:, None]
+            self._refuse_nan(angle, t_ns, stream.topic, "steering angle")
+            return Steering(t_ns, angle, ("angle",))
+        for names, joints in steering_joints(joint_names(stream)).items():
+            held = holding(stream, joints)
+            angles = joint_values(stream.select(held), joints, "position") if held.any() else None
+            if angles is None:
+                self.notes.append(
+                    f"steering: {', '.join(joints)} of {stream.topic} have no position; left out"
+                )
+                return None
+            self._refuse_nan(angles, t_ns[held], stream.topic, "steering angle")
+            self.notes.append(f"steering: joints of {stream.topic}: {', '.join(names)} = {', '.join(joints)}")
+            if len(joints) > len(names):
+                angles = angles.mean(axis=1, keepdims=True)
+            return Steering(t_ns[held], angles, names)
+        raise DataError(
+            f"joints {', '.join(joint_names(stream)) or '(none)'} name no steering axis",
+            file=self.file,
+            channel=stream.topic,
+            remedy="name another topic with --topic steering=TOPIC",
+        )
 
     def gnss(self, stream: Stream, t_ns: TimesNs, datum: Datum | None) -> tuple[Gnss | None, Datum | None]:
         """Fixes as ENU about `datum`, or about the first valid fix."""

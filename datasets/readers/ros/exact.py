@@ -53,6 +53,7 @@ STANDARD: dict[str, Key] = {
     "imu": ("/imu/data", IMU),
     "barometer": ("/pressure", PRESSURE),
     "magnetometer": ("/imu/mag", FIELD),
+    "steering": ("/steering/joint_states", JOINTS),
     "truth": ("/ground_truth/odom", ODOMETRY),
 }
 """Topics whose standard messages hold a channel to the bit, unless it has a table."""

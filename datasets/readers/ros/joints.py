@@ -1,4 +1,4 @@
-"""Wheels among the joints of a JointState: which joint is which wheel, and its values."""
+"""Wheels and steering axes among the joints of a JointState: which joint is which, and its values."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.channels import Wheels
+from terrafusion.datasets.core.channels import Steering, Wheels
 from terrafusion.datasets.readers.ros.messages import Stream
 
 Array = NDArray[np.float64]
@@ -23,13 +23,17 @@ _SHORT = {
 }
 _SHORT |= {f"l{e}": (end, "left") for e, end in (("f", "front"), ("r", "rear"), ("b", "rear"))}
 _SHORT |= {"rf": ("front", "right"), "rb": ("rear", "right")}
+_STEERING = re.compile(r"steer", re.IGNORECASE)
 _NOT_WHEELS = re.compile(r"steer|arm|flipper|gripper|pan|tilt|caster|suspension|rocker|bogie", re.IGNORECASE)
 
 
 def wheel_of_joint(joint: str) -> str | None:
     """Name of the wheel (left, front_right, ...) by the name of its joint, or None."""
-    if _NOT_WHEELS.search(joint):
-        return None
+    return None if _NOT_WHEELS.search(joint) else _place_of_joint(joint)
+
+
+def _place_of_joint(joint: str) -> str | None:
+    """Where a joint is, by its name: left, front_right, ..., or None."""
     spaced = re.sub(r"([a-z])([A-Z])", r"\1_\2", joint)
     words = [word for word in re.split(r"[^a-z]+", spaced.lower()) if word]
     for word in words:
@@ -56,6 +60,31 @@ def wheel_joints(names: Sequence[str], named: dict[str, str]) -> dict[str, str]:
         if all(wheel in found for wheel in layout):
             return {wheel: found[wheel] for wheel in layout}
     return {}
+
+
+def steering_joints(names: Sequence[str]) -> dict[tuple[str, ...], tuple[str, ...]]:
+    """The best layout of `Steering` that joints fill: names -> joints; empty where they fill none.
+
+    Joints of the front wheels without the rear ones give the mean of the front wheels.
+    """
+    found: dict[str, str] = {}
+    for joint in names:
+        if not _STEERING.search(joint):
+            continue
+        words = re.split(r"[^a-z]+", joint.lower())
+        end = next((_ENDS[word] for word in words if word in _ENDS and len(word) > 1), None)
+        wheel = (
+            "steering_wheel" if "wheel" in words and not {"left", "right"} & {*words} and not end else None
+        )
+        found.setdefault(wheel or _place_of_joint(joint) or end or "angle", joint)
+    for left, right in (("front_left", "front_right"), ("left", "right")):
+        if left in found and right in found:
+            both = tuple(found.get(name, "") for name in Steering.LAYOUTS[2])
+            return {Steering.LAYOUTS[2]: both} if all(both) else {("angle",): (found[left], found[right])}
+    if "front" in found:
+        both = (found["front"], found.get("rear", ""))
+        return {("front", "rear"): both} if both[1] else {("angle",): both[:1]}
+    return next(({(name,): (found[name],)} for name in ("angle", "steering_wheel") if name in found), {})
 
 
 def joint_names(stream: Stream) -> list[str]:

@@ -31,6 +31,8 @@ POSE_AT = {
     topics.POSE_COVARIANCE: ("pose.pose.", "pose.covariance"),
     topics.ODOMETRY: ("pose.pose.", "pose.covariance"),
 }
+ACKERMANN_AT = {topics.ACKERMANN: "", topics.ACKERMANN_STAMPED: "drive."}
+"""What stands before the fields of an AckermannDrive."""
 DIAGONAL = range(0, 36, 7)
 
 
@@ -45,6 +47,8 @@ def wanted_fields(kind: str, msgtype: str) -> tuple[str, ...]:
         fields += [f"position_covariance.{i}" for i in (0, 4, 8)]
     elif msgtype in (topics.PRESSURE, topics.FIELD):
         fields.append("fluid_pressure" if msgtype == topics.PRESSURE else "magnetic_field")
+    elif msgtype in ACKERMANN_AT:
+        fields += [f"{ACKERMANN_AT[msgtype]}{name}" for name in ("steering_angle", "speed")]
     elif msgtype == topics.JOINTS:
         fields += ["name", "position", "velocity"]
     elif msgtype in TWIST_AT or msgtype in POSE_AT:

@@ -22,11 +22,13 @@ POSE = "geometry_msgs/msg/PoseStamped"
 POSE_COVARIANCE = "geometry_msgs/msg/PoseWithCovarianceStamped"
 PRESSURE = "sensor_msgs/msg/FluidPressure"
 FIELD = "sensor_msgs/msg/MagneticField"
+ACKERMANN = "ackermann_msgs/msg/AckermannDrive"
+ACKERMANN_STAMPED = "ackermann_msgs/msg/AckermannDriveStamped"
 STRING = "std_msgs/msg/String"
 
 TYPES: dict[str, tuple[str, ...]] = {
     "imu": (IMU,),
-    "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED),
+    "wheels": (JOINTS, ODOMETRY, TWIST_COVARIANCE, TWIST_STAMPED, ACKERMANN_STAMPED, ACKERMANN),
     "gnss": (FIX,),
     "gnss_velocity": (TWIST_COVARIANCE, TWIST_STAMPED),
     "command": (TWIST_STAMPED, TWIST),
@@ -34,6 +36,7 @@ TYPES: dict[str, tuple[str, ...]] = {
     "terrain": (STRING,),
     "barometer": (PRESSURE,),
     "magnetometer": (FIELD,),
+    "steering": (JOINTS, ACKERMANN_STAMPED, ACKERMANN),
     "datum": (FIX,),
 }
 """Message types of each channel, preferred ones first."""
@@ -48,6 +51,7 @@ ALIASES = {
     "cmd_vel": "command",
     "ground_truth": "truth",
     "mag": "magnetometer",
+    "ackermann": "steering",
     "pressure": "barometer",
 }
 JOINT_PREFIX = "joint."
@@ -84,6 +88,7 @@ def choose_topics(
     user: Mapping[str, str] | None = None,
     usual: Mapping[str, str] | None = None,
     is_wheel_joints: Callable[[str], bool] = lambda topic: True,
+    is_steering_joints: Callable[[str], bool] = lambda topic: False,
 ) -> tuple[dict[str, BagTopic], list[str]]:
     """The topic of each channel, and notes on what was taken and left.
 
@@ -96,7 +101,7 @@ def choose_topics(
         bag: topics with at least one message.
         user: channel -> topic that the user asks for.
         usual: channel -> topic that the vehicle file names.
-        is_wheel_joints: whether a JointState topic holds wheels.
+        is_wheel_joints, is_steering_joints: whether a JointState topic holds wheels, or steering axes.
 
     Raises:
         DataError: an unknown channel, a topic that is not in the bag or has an unfit type.
@@ -110,9 +115,11 @@ def choose_topics(
         if kind not in chosen and fits:
             chosen[kind] = fits[0]
     for kind in TYPES:
-        taken = {t.name for k, t in chosen.items() if k != kind}
+        taken = {t.name for k, t in chosen.items() if k != kind and {k, kind} != {"wheels", "steering"}}
         found = [t for t in bag if t.msgtype in TYPES[kind] and t.name not in taken]
-        fits = [t for t in found if _fits(kind, t, is_wheel_joints)]
+        fits = [
+            t for t in found if _fits(kind, t, is_steering_joints if kind == "steering" else is_wheel_joints)
+        ]
         fits.sort(key=functools.partial(_rank, kind))
         if kind not in chosen and fits:
             chosen[kind] = fits[0]
@@ -176,7 +183,7 @@ def _is_fused(kind: str, topic: BagTopic) -> bool:
     return topic.msgtype != JOINTS and bool(_FUSED.search(topic.name)) and not _TRUTH.search(topic.name)
 
 
-def _fits(kind: str, topic: BagTopic, is_wheel_joints: Callable[[str], bool]) -> bool:
+def _fits(kind: str, topic: BagTopic, has_joints: Callable[[str], bool]) -> bool:
     name = topic.name
     if kind == "truth":
         return bool(_TRUTH.search(name))
@@ -195,7 +202,9 @@ def _fits(kind: str, topic: BagTopic, is_wheel_joints: Callable[[str], bool]) ->
     if kind == "gnss":
         return not _DATUM.search(name)
     if topic.msgtype == JOINTS:
-        return is_wheel_joints(name)
+        return has_joints(name)
+    if topic.msgtype in (ACKERMANN, ACKERMANN_STAMPED):  # mostly a command, which is no measurement
+        return not _COMMAND.search(name)
     if topic.msgtype in (TWIST_STAMPED, TWIST_COVARIANCE):
         return bool(_WHEEL.search(name)) and not _COMMAND.search(name)
     return True

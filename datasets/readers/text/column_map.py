@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
+from terrafusion.datasets.core.channels import Steering
 from terrafusion.datasets.core.config import Prepared, refuse, structure
 from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
@@ -34,7 +35,8 @@ from terrafusion.datasets.readers.text.units import units_of
 
 GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 WHEEL_FIELDS = tuple(dict.fromkeys(f"{n}_{unit}" for names, unit in WHEEL_LAYOUTS for n in names))
-ANGLE_FIELDS = tuple(f"{n}_rad" for n in dict.fromkeys(n for names, _ in WHEEL_LAYOUTS[:3] for n in names))
+ANGLE_FIELDS = tuple(f"{n}_rad" for n in dict.fromkeys(n for names, _ in WHEEL_LAYOUTS[:-1] for n in names))
+STEERING_FIELDS = tuple(f"{n}_rad" for names in Steering.LAYOUTS for n in names)
 FIELDS: dict[str, tuple[str, ...]] = {
     "command": ("v_mps", "yaw_rate_radps"),
     "wheels": (*WHEEL_FIELDS, *ANGLE_FIELDS),
@@ -44,6 +46,7 @@ FIELDS: dict[str, tuple[str, ...]] = {
     "terrain": ("label",),
     "barometer": ("pressure_pa",),
     "magnetometer": FIELD,
+    "steering": STEERING_FIELDS,
     "truth": ("x_m", "y_m", "z_m", "yaw_rad", *QUATERNION, *TRUTH_TWIST, *COVARIANCE),
 }
 """Fields of each channel: the columns of the log folder, latitude and longitude, and a plain yaw.

@@ -324,7 +324,7 @@ def test_writing_here(drive: Recording, tmp_path: Path, monkeypatch: pytest.Monk
 
 def test_writer_refuses_wheels_without_columns(tmp_path: Path) -> None:
     t = np.arange(3, dtype=np.int64)
-    wheels = Wheels(t, np.ones((3, 4)), Wheels.LAYOUTS[1], "mps")
+    wheels = Wheels(t, np.ones((3, 1)), Wheels.LAYOUTS[2], "radps")
     with pytest.raises(TerrafusionError, match="wheels"):
         write_log_folder(Recording("x", 0, wheels=wheels), tmp_path / "x")
 

@@ -20,11 +20,13 @@ from terrafusion.datasets.core.channels import (
     Imu,
     Magnetometer,
     Motor,
+    Steering,
     Terrain,
     Wheels,
 )
 from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.recording import ClockJump, Overrides, Recording
+from terrafusion.datasets.core.sensors import DRIVES
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
@@ -77,7 +79,7 @@ def channels(draw: st.DrawFn, first_ns: int, start_ns: int, last_ns: int) -> dic
             found[name] = Command(t, some(), some())
         elif name == "wheels":
             layouts = [(Wheels.LAYOUTS[0], "radps"), (Wheels.LAYOUTS[1], "radps")]
-            layouts += [(Wheels.LAYOUTS[0], "mps"), (Wheels.LAYOUTS[2], "mps")]
+            layouts += [(names, "mps") for names in Wheels.LAYOUTS]
             names, unit = draw(st.sampled_from(layouts))
             angle = perhaps(len(names)) if names != ("speed",) else None
             found[name] = Wheels(t, some(len(names)), names, unit, angle)
@@ -88,6 +90,9 @@ def channels(draw: st.DrawFn, first_ns: int, start_ns: int, last_ns: int) -> dic
             found[name] = Gnss(t, some(3), some(3), fix, perhaps(3), perhaps())
         elif name == "motor":
             found[name] = Motor(t, some(2), perhaps(2))
+        elif name == "steering":
+            names = draw(st.sampled_from(Steering.LAYOUTS))
+            found[name] = Steering(t, some(len(names)), names)
         elif name == "barometer":
             found[name] = Barometer(t, some())
         elif name == "magnetometer":
@@ -138,7 +143,15 @@ def recordings(draw: st.DrawFn, latest_ns: int) -> Recording:
         ),
         truth_channels=draw(truth),
         truth_frame=draw(st.sampled_from(["base", "antenna"])),
-        overrides=Overrides(draw(st.none() | positive), draw(st.none() | positive), draw(place), draw(place)),
+        overrides=Overrides(
+            draw(st.none() | positive),
+            draw(st.none() | positive),
+            draw(place),
+            draw(place),
+            draw(st.none() | st.sampled_from(DRIVES)),
+            draw(st.none() | positive),
+            draw(st.none() | positive),
+        ),
         description=draw(TEXTS),
         terrain_name=draw(TEXTS),
         licence=draw(TEXTS),
