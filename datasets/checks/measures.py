@@ -283,7 +283,7 @@ def _path_lengths(context: CheckContext) -> Iterator[tuple[str, float]]:
         yield "wheels", float(np.sum(0.5 * (v[1:] + v[:-1]) * np.diff(wheels.t_ns)) * 1e-9)
     if gnss is not None:
         yield "gnss", _ruler_path_m(gnss.enu_m, max(0.5, 3.0 * (typical_sigma(gnss) or 1.0)))
-    if truth is not None:
+    if truth is not None and np.isfinite(truth.position_m[:, 0]).any():
         yield "truth", _ruler_path_m(truth.position_m, 0.1)
 
 

@@ -38,6 +38,7 @@ def summarise(recording: Recording, measures: Measures, findings: Sequence[Findi
         "licence": recording.licence or None,
         "source": recording.source or None,
         "datum": recording.datum,
+        "metadata": recording.metadata,
         "channels": _channels(recording),
         "measured": finite(dataclasses.asdict(measures)),
         "notes": list(recording.notes),
@@ -78,7 +79,7 @@ def _channels(recording: Recording) -> dict[str, dict[str, Any]]:
         found["truth"] = _clock(start_ns, truth.t_ns) | {
             "holds": list(recording.truth_channels),
             "frame": recording.truth_frame,
-            "path_m": path_m if np.isfinite(path_m) else None,
+            "path_m": path_m if np.isfinite(path_m) and np.isfinite(truth.position_m[:, 0]).any() else None,
         }
     return found
 

@@ -9,7 +9,7 @@ import dataclasses
 import heapq
 from collections.abc import Iterator
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from terrafusion.datasets.core.display import CLOCK_COLUMNS, clock_line, clock_rows, table_html
 from terrafusion.datasets.core.messages import (
@@ -65,7 +65,8 @@ class Recording:
 
     `datum` is (latitude deg, longitude deg, height m) of the ENU origin where
     it is known. `truth_channels` names what the truth really holds ("position",
-    "yaw", "orientation", "velocity"); `truth_frame` is "base" or "antenna".
+    "yaw", "orientation", "velocity"; () for all of it): the rest of `truth` is removed.
+    `truth_frame` is "base" or "antenna". `metadata` is what else the log says of itself.
     `imu_frame_id` is the frame the log gives its IMU, where it gives one. `notes` records what a
     reader assumed or left out, in sentences; `clock_jumps` what it repaired in the times.
     """
@@ -94,11 +95,16 @@ class Recording:
     barometer: Barometer | None = None
     magnetometer: Magnetometer | None = None
     steering: Steering | None = None
+    metadata: dict[str, Any] = field(default_factory=dict)
 
     CHANNELS: ClassVar[tuple[str, ...]] = (
         "command", "wheels", "imu", "gnss", "motor", "terrain", "barometer", "magnetometer",
         "steering",
     )  # fmt: skip
+
+    def __post_init__(self) -> None:
+        if self.truth is not None and self.truth_channels:
+            object.__setattr__(self, "truth", self.truth.limited_to(self.truth_channels))
 
     def __repr__(self) -> str:
         return "\n".join([self._title(), *map(clock_line, self._rows())])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Collection
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,17 @@ if TYPE_CHECKING:
     import pandas as pd
 
 Array = NDArray[np.float64]
+
+
+def _level(quaternion: Array) -> Array:
+    """Quaternions (N, 4) of the same yaw, without roll and pitch; the same array where there are none."""
+    if not np.nan_to_num(quaternion[:, :2]).any():
+        return quaternion
+    half = 0.5 * yaw_of(quaternion)
+    level = np.zeros_like(quaternion)
+    level[:, 2], level[:, 3] = np.sin(half), np.cos(half)
+    level[~np.isfinite(quaternion).all(axis=1)] = np.nan
+    return level
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +73,25 @@ class Trajectory:
         fields: dict[str, Any] = {f.name: getattr(self, f.name) for f in dataclasses.fields(self)}
         chosen: dict[str, Any] = {k: None if v is None else v[rows] for k, v in fields.items()}
         return Trajectory(**chosen)
+
+    def limited_to(self, channels: Collection[str]) -> Trajectory:
+        """The same trajectory without what is not in `channels`, of position, yaw, orientation and velocity.
+
+        Positions that are not known become NaN; an orientation of which only the yaw is known becomes level.
+        """
+        q, P = self.quaternion, self.covariance
+        position, twist = self.position_m, self.twist_body
+        if "position" not in channels and not np.isnan(position).all():
+            position = np.full_like(position, np.nan)
+        if "orientation" not in channels and q is not None:
+            q = _level(q) if "yaw" in channels else None
+        if "velocity" not in channels:
+            twist = None
+        if "position" not in channels or q is None:
+            P = None
+        if position is self.position_m and q is self.quaternion and twist is self.twist_body:
+            return self
+        return dataclasses.replace(self, position_m=position, quaternion=q, twist_body=twist, covariance=P)
 
     def yaw_rad(self) -> Array:
         """Yaw angles (N,), rad, in [-pi, pi]."""

@@ -114,6 +114,7 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         notes=(*meta.notes, *(note for note in notes if note not in meta.notes)),
         clock_jumps=meta.clock_jumps,
         imu_frame_id=meta.texts.get("imu_frame_id", ""),
+        metadata=meta.metadata,
     )
 
 

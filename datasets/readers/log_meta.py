@@ -1,13 +1,19 @@
-"""`meta.yaml` of a log folder, strictly; a bag written by this library carries the same keys."""
+"""`meta.yaml` of a log folder; a bag written by this library carries the same keys.
+
+Known keys are read strictly, any others are kept as they are and named in one remark.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
 from terrafusion.datasets.core.config import Prepared, structure
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.quantity import Quantity, Switch, Whole, Word, shown
 from terrafusion.datasets.core.recording import ClockJump, Overrides
 from terrafusion.datasets.core.sensors import DRIVES
@@ -78,6 +84,8 @@ class MetaFile(DescriptionFile):
 
 KEYS = tuple(field.name for field in dataclasses.fields(MetaFile))
 TEXT_KEYS = KEYS[:8]
+OTHER_UNITS = ("mm", "cm", "km", "in", "ft")
+"""Lengths in these are refused: left out, the vehicle's own number would take their place unseen."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +93,8 @@ class Meta:
     """What `meta.yaml` says.
 
     `truth_channels` is None where the file does not tell, `notes` are those of the log, `remarks`
-    what was odd about the file; with `keep_empty` rows and tables without a value are kept.
+    what was odd about the file, `metadata` its unknown keys; with `keep_empty` rows and tables without a
+    value are kept.
     """
 
     start_ns: int
@@ -98,13 +107,14 @@ class Meta:
     clock_jumps: tuple[ClockJump, ...] = ()
     keep_empty: bool = False
     remarks: tuple[str, ...] = ()
+    metadata: dict[str, Any] = field(default_factory=dict)
 
 
 def read_meta(path: Path) -> Meta:
     """Read and check `meta.yaml`.
 
     Raises:
-        ConfigError: not YAML, unknown key, wrong type, value out of range; names key and remedy.
+        ConfigError: not YAML, missing key, wrong type, value out of range; names key and remedy.
     """
     return parse_meta(read_yaml(path), path)
 
@@ -112,11 +122,16 @@ def read_meta(path: Path) -> Meta:
 def parse_meta(content: dict[str, Any], path: Path) -> Meta:
     """Check the keys and values of `meta.yaml`; errors as in `read_meta`, about the file `path`."""
     given = {key: value for key, value in content.items() if value is not None}
-    file = structure(MetaFile, given, file=path)
+    unknown = {key: value for key, value in given.items() if _is_extra(key, given)}
+    file = structure(MetaFile, {k: value for k, value in given.items() if k not in unknown}, file=path)
     strange = [shown(name) for name in file.truth_channels or () if name not in TRUTH_CHANNELS]
-    remark = (
-        f"meta.yaml: truth channels {', '.join(strange)} are not used; known are {', '.join(TRUTH_CHANNELS)}"
-    )
+    remarks = []
+    if unknown:
+        named = ", ".join(map(_named, unknown))
+        remarks.append(f"warning: meta.yaml: unknown keys are kept, but not used: {named}")
+    if strange:
+        known = ", ".join(TRUTH_CHANNELS)
+        remarks.append(f"meta.yaml: truth channels {', '.join(strange)} are not used; known are {known}")
     return Meta(
         start_ns=file.start_ns,
         texts={key: getattr(file, key) for key in TEXT_KEYS if key in given},
@@ -127,5 +142,18 @@ def parse_meta(content: dict[str, Any], path: Path) -> Meta:
         notes=file.notes,
         clock_jumps=tuple(ClockJump(jump.channel, jump.t_ns, jump.step_s) for jump in file.clock_jumps),
         keep_empty=file.keep_empty,
-        remarks=(remark,) if strange else (),
+        remarks=tuple(remarks),
+        metadata=finite(unknown),
     )
+
+
+def _is_extra(key: str, given: Mapping[str, Any]) -> bool:
+    """Whether a key is neither known, nor the compulsory `start_ns` misspelt, nor a length in another unit."""
+    stem, _, unit = key.rpartition("_")
+    start = "start_ns" not in given and bool(difflib.get_close_matches(key, ["start_ns"]))
+    return key not in KEYS and not start and not (unit in OTHER_UNITS and f"{stem}_m" in KEYS)
+
+
+def _named(key: str) -> str:
+    meant = difflib.get_close_matches(key, KEYS, n=1, cutoff=0.8)
+    return f"{shown(key)} (did you mean {meant[0]}?)" if meant else shown(key)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.yaml_file import MAX_BYTES
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
@@ -46,6 +47,7 @@ def write_log_folder(recording: Recording, folder: Path | str) -> Path:
     for name, table in tables.items():
         _check_table(table, recording.start_ns, folder, name)
     meta = meta_of(recording, folder / META, folder.resolve().name)
+    meta = finite(recording.metadata) | meta
     if not all(table.is_full() for table in tables.values()):
         meta["keep_empty"] = True
     text = _meta_text(meta, folder)

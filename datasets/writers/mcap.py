@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import META
@@ -72,6 +73,7 @@ def write_mcap(
         if path.is_dir() or (path.exists() and not overwrite):
             raise DataError("exists already", file=path, remedy="remove it or give another name")
         saved = meta_of(recording, path, path.stem)
+        saved |= {"metadata": finite(recording.metadata)} if recording.metadata else {}
         shift_ns = _shift_ns(recording)
         recording = _later(recording, shift_ns)
         parts = _Parts(recording, rig)

@@ -41,7 +41,8 @@ def file_schema(kind: str) -> dict[str, Any]:
     Raises:
         KeyError: unknown kind.
     """
-    return schema(KINDS[kind], f"terrafusion {kind.replace('_', ' ')} file")
+    found = schema(KINDS[kind], f"terrafusion {kind.replace('_', ' ')} file")
+    return found | {"additionalProperties": True} if kind == "meta" else found  # unknown keys are kept
 
 
 def write_schemas(folder: Path) -> None:

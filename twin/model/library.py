@@ -30,17 +30,26 @@ def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dic
     text = str(name_or_path)
     if text in known_names(folder):
         return _own_file(folder, text), f"{folder}/{text}.yaml"
+    if _is_path(text):
+        return read_yaml(Path(text).expanduser()), text
+    raise ConfigError(
+        f"unknown {kind} '{text}'",
+        remedy=f"known are {', '.join(known_names(folder))}; or give the path of a .yaml file",
+    )
+
+
+def is_named(folder: str, name_or_path: str) -> bool:
+    """Whether it is a name of the library or stands for a file, which may be absent."""
+    return name_or_path in known_names(folder) or _is_path(name_or_path)
+
+
+def _is_path(text: str) -> bool:
     path = Path(text).expanduser()
     try:
         is_file = path.is_file()
     except OSError:  # a name that no file can have
         is_file = False
-    if path.suffix in (".yaml", ".yml") or is_file:
-        return read_yaml(path), text
-    raise ConfigError(
-        f"unknown {kind} '{text}'",
-        remedy=f"known are {', '.join(known_names(folder))}; or give the path of a .yaml file",
-    )
+    return path.suffix in (".yaml", ".yml") or is_file
 
 
 @functools.cache

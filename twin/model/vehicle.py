@@ -259,15 +259,16 @@ def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
     for recording in recordings[1:]:
         if recording.overrides != first.overrides:
             raise DataError(
-                f"it reports another geometry of the vehicle ({_listed(recording.overrides)}) than "
-                f"{first.name} ({_listed(first.overrides)})",
+                f"it reports another geometry of the vehicle ({listed_overrides(recording.overrides)}) than "
+                f"{first.name} ({listed_overrides(first.overrides)})",
                 file=recording.name,
                 remedy="give logs of one vehicle, or the same wheel_radius_m, track_m, antenna_m and imu_m",
             )  # fmt: skip
     return first.overrides
 
 
-def _listed(overrides: Overrides) -> str:
+def listed_overrides(overrides: Overrides) -> str:
+    """The geometry a log reports, in words."""
     values = dataclasses.asdict(overrides).items()
     return ", ".join(f"{name} = {value}" for name, value in values if value is not None) or "none"
 
@@ -276,7 +277,7 @@ def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, .
     """What `with_overrides` takes from a log, and what it leaves, in a sentence."""
     if overrides == Overrides():
         return ()
-    note = f"the log's own geometry is used: {_listed(overrides)}"
+    note = f"the log's own geometry is used: {listed_overrides(overrides)}"
     reported = [number for name, number in GEOMETRY.items() if getattr(overrides, name) is not None]
     retained = [number for number in reported if number in vehicle.measured]
     if retained:

@@ -111,6 +111,7 @@ def _parse(stream: Stream, file: Path) -> SavedChannels:
     try:
         content = json.loads(stream.column("data")[0])
         tables, words, shift_ns = (content.pop(key) for key in ("tables", "words", "shift_ns"))
+        metadata = dict(content.pop("metadata", {}))
         for lists in (tables, words):
             if not all(isinstance(text, str) for key, texts in lists.items() for text in [key, *texts]):
                 raise TypeError("tables and words are lists of texts")
@@ -120,9 +121,11 @@ def _parse(stream: Stream, file: Path) -> SavedChannels:
         raise DataError(
             "is not what this library writes", file=file, channel=META[0], remedy=REMEDY
         ) from None
-    return SavedChannels(
-        dataclasses.replace(parse_meta(content, file), keep_empty=True), tables, words, int(shift_ns)
-    )
+    meta = parse_meta(content, file)
+    if meta.metadata:
+        raise DataError(f"unknown keys {', '.join(meta.metadata)}", file=file, channel=META[0], remedy=REMEDY)
+    meta = dataclasses.replace(meta, keep_empty=True, metadata=metadata)
+    return SavedChannels(meta, tables, words, int(shift_ns))
 
 
 def _standard(builder: ChannelBuilder, name: str, stream: Stream | None, shift_ns: int) -> Any:

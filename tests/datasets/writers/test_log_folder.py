@@ -18,7 +18,7 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers import delimited, open_recording
-from terrafusion.datasets.writers import log_folder, write_log_folder
+from terrafusion.datasets.writers import log_folder, write_log_folder, write_mcap
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
 
@@ -126,6 +126,45 @@ def test_misspelt_channel_file_is_noted(tmp_path: Path) -> None:
     imu = "t_s,gyro_z_radps\n0,0.1\n"
     recording = open_recording(folder_with(tmp_path, imu=imu, wheel="t_s,left_mps,right_mps\n0,1,1\n"))
     assert any("wheel.csv" in note and "wheels.csv" in note for note in recording.notes)
+
+
+def test_unknown_keys_of_meta_are_kept_and_named_in_one_warning(tmp_path: Path) -> None:
+    meta = META + "operator: A. Smith\nweather: {sky: grey, rain: .nan}\nwheel_radus: 0.2\n"
+    recording = open_recording(folder_with(tmp_path, meta, imu="t_s,gyro_z_radps\n0,0.1\n"))
+    warnings = [note for note in recording.notes if "operator" in note]
+    assert len(warnings) == 1
+    assert warnings[0].startswith("warning: meta.yaml")
+    assert "weather, wheel_radus (did you mean wheel_radius_m?)" in warnings[0]
+    kept = {"operator": "A. Smith", "weather": {"sky": "grey", "rain": None}, "wheel_radus": 0.2}
+    assert recording.metadata == kept
+    again = open_recording(write_log_folder(recording, tmp_path / "again"))
+    assert again.metadata == kept
+    assert again.notes == recording.notes
+    write_mcap(recording, tmp_path / "log.mcap")
+    assert open_recording(tmp_path / "log.mcap").metadata == kept
+
+
+TRUTH = "t_s,x_m,y_m,z_m,qx,qy,qz,qw,u_mps,v_mps,r_radps\n0,1,2,0,0.1,0,0.7,0.7071,1,0,0\n1,2,2,0,0,0.1,0,0.995,1,0,0\n"
+
+
+@pytest.mark.parametrize("listed", [("position",), ("position", "yaw"), ("yaw",), ("velocity",)])
+def test_the_truth_is_without_what_truth_channels_does_not_list(
+    tmp_path: Path, listed: tuple[str, ...]
+) -> None:
+    meta = META + f"truth_channels: [{', '.join(listed)}]\n"
+    truth = open_recording(folder_with(tmp_path, meta, truth=TRUTH)).truth
+    (tmp_path / "whole").mkdir()
+    whole = open_recording(folder_with(tmp_path / "whole", truth=TRUTH)).truth
+    assert truth is not None
+    assert whole is not None
+    assert np.isfinite(truth.position_m).all() == ("position" in listed)
+    assert (truth.twist_body is not None) == ("velocity" in listed)
+    if "yaw" in listed:
+        assert truth.quaternion is not None
+        np.testing.assert_allclose(truth.yaw_rad(), whole.yaw_rad(), atol=1e-12)
+        assert not truth.quaternion[:, :2].any()
+    else:
+        assert truth.quaternion is None
 
 
 BAD_META = {

@@ -49,7 +49,6 @@ BAD_META: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "meta is a word": (written("hello\n"), ("meta.yaml", "mapping")),
     "meta is empty": (written(""), ("meta.yaml", "'start_ns' is missing", "Unix time")),
     "meta breaks off": (written("start_ns: [1"), ("meta.yaml", "not valid YAML")),
-    "meta: unknown key": (meta("wheel_diameter_m: 0.3"), ("meta.yaml", "'wheel_diameter_m'", "known")),
     "meta: wrong unit": (
         meta("wheel_radius_mm: 175"),
         ("meta.yaml", "'wheel_radius_mm'", "write 'wheel_radius_m'"),

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+import numpy as np
 import pytest
 
-from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -31,4 +34,41 @@ def test_without_a_name_the_geometry_of_the_log_is_needed() -> None:
     known = dataclasses.replace(NAMELESS, overrides=Overrides(wheel_radius_m=0.2, track_m=0.6))
     vehicle, notes = choose_vehicle(known)
     assert vehicle.rig().track_m == 0.6
-    assert "a generic one is used" in notes[-1]
+    assert "the generic vehicle is used" in notes[-1]
+
+
+GYRO = Imu(np.arange(2), np.zeros((2, 3)), np.full((2, 3), np.nan))
+SIDES = Wheels(np.arange(2), np.zeros((2, 2)), ("left", "right"), "radps")
+
+
+def test_an_unknown_vehicle_is_generic_with_the_geometry_of_the_log() -> None:
+    log = dataclasses.replace(
+        NAMELESS, vehicle="segway_rmp", imu=GYRO, wheels=SIDES, overrides=Overrides(wheel_radius_m=0.24)
+    )
+    vehicle, notes = choose_vehicle(log)
+    assert vehicle.rig().wheel_radius_m == 0.24
+    assert "unknown vehicle 'segway_rmp'" in notes[0]
+    assert "wheel_radius_m = 0.24 of the log" in notes[0]
+    assert f"assumed are its track of {vehicle.odometry.track_m:g} m" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("changes", "missing"),
+    [
+        ({"overrides": Overrides(track_m=0.6)}, "wheel_radius_m"),
+        ({"imu": None, "overrides": Overrides(wheel_radius_m=0.2)}, "track_m"),
+        ({"imu": None}, "wheel_radius_m and track_m"),
+    ],
+)
+def test_an_unknown_vehicle_needs_what_nothing_else_shows(changes: dict[str, Any], missing: str) -> None:
+    log = dataclasses.replace(NAMELESS, vehicle="segway_rmp", imu=GYRO, wheels=SIDES)
+    with pytest.raises(DataError, match=f"unknown vehicle 'segway_rmp', and the log lacks its {missing};"):
+        choose_vehicle(dataclasses.replace(log, **changes))
+
+
+def test_an_unknown_vehicle_that_is_asked_for_and_a_missing_file_are_refused() -> None:
+    log = dataclasses.replace(NAMELESS, imu=GYRO)
+    with pytest.raises(ConfigError, match="unknown vehicle 'segway_rmp'"):
+        choose_vehicle(log, "segway_rmp")
+    with pytest.raises(ConfigError, match="no such file"):
+        choose_vehicle(dataclasses.replace(log, vehicle="segway_rmp.yaml"))
