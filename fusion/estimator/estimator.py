@@ -33,7 +33,7 @@ from terrafusion.fusion.estimator.alignment import (
 )
 from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
-from terrafusion.fusion.estimator.gnss import GnssUpdater, checked_fix
+from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.key_states import state_fields
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
@@ -47,11 +47,12 @@ from terrafusion.fusion.estimator.stationarity import (
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, wheel_increment
+from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, pause, wheel_increment
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
-from terrafusion.fusion.inputs.streams import ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
+from terrafusion.fusion.inputs.streams import LONGEST_PAUSE_NS, ImuSegment, ImuStream, WheelStream
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
@@ -84,7 +85,8 @@ class Estimator:
         self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
-        self.wheels = WheelStream()
+        self.newest = self.imu.late.leap.newest
+        self.wheels = WheelStream(self.newest)
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
@@ -154,7 +156,7 @@ class Estimator:
         `fix` is the class of fix ("single" to "fixed"); it gives the sigma where none is sensible.
         """
         taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
-        if taken is not None:
+        if taken is not None and self.newest.admitted(taken.t_ns, "gnss") is not None:
             self.gnss.queue(taken)
 
     def set_start(
@@ -172,19 +174,23 @@ class Estimator:
 
     def add_terrain(self, t_ns: int, probabilities: Mapping[str, float]) -> None:
         """Class probabilities of an external source, such as a camera, fused with those of the detector."""
-        self.weights.external(t_ns, probabilities)
+        if (t := self.newest.admitted(t_ns, "terrain")) is not None:
+            self.weights.external(t, probabilities)
 
     def add_command(self, t_ns: int, v_mps: float) -> None:
         """Commanded forward speed, which tells a stalled robot from a waiting one."""
-        self.monitor.command(t_ns, v_mps)
+        if (t := self.newest.admitted(t_ns, "command")) is not None:
+            self.monitor.command(t, as_number(v_mps, "speed", "command"))
 
     def add_pressure(self, t_ns: int, pressure_pa: float) -> None:
         """Static pressure of a barometer, Pa; it holds the height of GNSS or of the start."""
-        self.aids.height.add(t_ns, pressure_pa)
+        if (t := self.newest.admitted(t_ns, "barometer")) is not None:
+            self.aids.height.add(t, as_number(pressure_pa, "pressure", "barometer"))
 
     def add_magnetic_field(self, t_ns: int, field_t: ArrayLike) -> None:
         """Magnetic flux density (3,), body axes, tesla; see `magnetometer`."""
-        self.aids.heading.add(t_ns, field_t)
+        if (t := self.newest.admitted(t_ns, "magnetometer")) is not None:
+            self.aids.heading.add(t, as_numbers(field_t, "field", "magnetometer"))
 
     def latest(self) -> State | None:
         """The newest state, or None before the start."""
@@ -224,10 +230,16 @@ class Estimator:
                 return
             self._begin(start)
         newest = self.chain.last
-        while self._ready(t := self.chain.nodes[-1].t_ns + self._step_ns, last):
+        while self._ready(t := self._next_ns(), last):
             self._keyframe(t)
         if self.chain.last == newest or last:
             self._upkeep()
+
+    def _next_ns(self) -> int:
+        """Time of the next keyframe: a step on, or at the end of a pause in the samples of the IMU."""
+        now_ns = self.chain.nodes[-1].t_ns
+        pause_ns = self.imu.pause_ns(now_ns)
+        return now_ns + max(pause_ns // self._step_ns, 1) * self._step_ns
 
     def _ready(self, t_ns: int, last: bool) -> bool:
         """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
@@ -258,7 +270,8 @@ class Estimator:
     def _keyframe(self, t_ns: int) -> None:
         self._upkeep()
         switch = self.weights.take_switch()
-        before_ns, dt = self.chain.nodes[-1].t_ns, self._step_ns * 1e-9
+        before_ns = self.chain.nodes[-1].t_ns
+        dt = (t_ns - before_ns) * 1e-9
         before = self.chain.state(self.chain.last)
         noise, drift = self.weights.noise, (self.gnss.drift_sigma_m, self.gnss.drift_time_s)
         if switch > SWITCHED:
@@ -271,7 +284,9 @@ class Estimator:
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
-        if self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
+        if dt > LONGEST_PAUSE_NS * 1e-9:
+            point, link, wheels = *pause(k, before, dt), None
+        elif self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
             point = carried(before, wheels, dt)
             link = bridge(k, before, point, dt)
         else:

@@ -7,14 +7,11 @@ import math
 from collections.abc import Callable
 
 import numpy as np
-from numpy.typing import ArrayLike
 from scipy.stats import chi2
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
-from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
@@ -26,7 +23,7 @@ from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
 from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
-from terrafusion.fusion.inputs.streams import GnssFix
+from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
 from terrafusion.twin.sensors.gnss import best_fix
@@ -34,6 +31,8 @@ from terrafusion.twin.sensors.gnss import best_fix
 LEAST_SIGMA_M = 0.005
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
 LARGE_TURN_RAD = 0.05
+APART_NS = 1_000_000_000
+"""Keyframes are closer than this; a fix farther from the next one came in a pause of the IMU."""
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
@@ -46,8 +45,6 @@ OPTIMISTIC_SCATTER = 2.0
 OPTIMISM = 3.0
 """A stand-alone receiver may report a sigma so many times below its data sheet and still drift; one that
 reports even less has fixes of a better class (RTK), which drift in proportion to their sigma."""
-LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
-"""Reported sigmas outside this range are replaced by that of the class of fix."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
 """Heading sigma after the heading was corrected from the motion (assumed)."""
 
@@ -344,64 +341,10 @@ class GnssUpdater:
 
 
 def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
-    """The keyframe at or after a fix, its stamp corrected by the estimated delay."""
-    if chain.dim <= GNSS_DELAY:
-        return chain.at_or_after(fix.t_ns)
-    delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
-    return chain.at_or_after(min(fix.t_ns - round(delay_s * 1e9), chain.nodes[-1].t_ns))
-
-
-def checked_fix(
-    t_ns: int,
-    enu_m: ArrayLike,
-    sigma_m: ArrayLike | None,
-    velocity_mps: ArrayLike | None,
-    sigma_v_mps: float,
-    fix: Fix | int | str | None,
-) -> GnssFix | None:
-    """A fix as the graph takes it; None where the receiver reports that it has none.
-
-    A sigma that is missing, NaN, below 1 mm or above 1 km is replaced by that of the class of fix
-    (`ASSUMED_SIGMA_M`; up twice as much). A velocity without a positive sigma is left out, a height
-    without one is free.
-
-    Raises:
-        DataError: no east or north, an unknown class of fix, neither sigma nor class, or a velocity of
-            other than three axes.
-    """
-    position = np.asarray(enu_m, dtype=float)
-    known = _class_of(fix)
-    if known is Fix.NONE:
-        return None
-    if position.shape != (3,) or not np.isfinite(position[:2]).all():
-        raise DataError("a fix without east and north", channel="gnss", remedy="leave invalid fixes out")
-    sigma = np.full(3, np.nan) if sigma_m is None else np.array(sigma_m, dtype=float)
-    sensible = sigma.shape == (3,) and ((sigma[:2] >= LEAST_CLAIM_M) & (sigma[:2] <= MOST_CLAIM_M)).all()
-    if not sensible and known is not None:
-        sigma = ASSUMED_SIGMA_M[known] * np.array([1.0, 1.0, 2.0])
-    elif sigma.shape != (3,) or not ((sigma[:2] > 0) & (sigma[:2] < np.inf)).all():
-        raise DataError(
-            f"sigma {sigma.tolist()} is not positive", channel="gnss", remedy="give metres, 1 sigma"
-        )
-    sigma[2] = sigma[2] if sigma[2] > 0.0 else np.nan
-    velocity = None if velocity_mps is None else np.asarray(velocity_mps, dtype=float)
-    if velocity is not None and velocity.shape != (3,):
-        raise DataError(
-            f"a velocity of shape {velocity.shape}", channel="gnss", remedy="give east, north, up"
-        )
-    if not 0.0 < sigma_v_mps < np.inf:  # as drivers tell that they do not know it
-        velocity = None
-    return GnssFix(t_ns, position, sigma, velocity, sigma_v_mps, known)
-
-
-def _class_of(fix: Fix | int | str | None) -> Fix | None:
-    if fix is None or isinstance(fix, Fix):
-        return fix
-    try:
-        return Fix[fix.upper()] if isinstance(fix, str) else Fix(fix)
-    except (KeyError, ValueError):
-        raise DataError(
-            f"unknown class of fix {fix!r}",
-            channel="gnss",
-            remedy=f"give one of {', '.join(known.name.lower() for known in Fix)}",
-        ) from None
+    """The keyframe at or after a fix, its stamp corrected by the estimated delay; None in a pause."""
+    t_ns = fix.t_ns
+    if chain.dim > GNSS_DELAY:
+        delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
+        t_ns = min(fix.t_ns - round(delay_s * 1e9), chain.nodes[-1].t_ns)
+    k = chain.at_or_after(t_ns)
+    return None if k is None or chain.nodes[k - chain.first].t_ns - t_ns > APART_NS else k

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.door import LEAP_NS, MOST_MPS, MOST_MPS2, MOST_RADPS
 from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 
 
@@ -30,7 +31,20 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             f"{estimator.imu.spikes} IMU samples beyond {SPIN_RADPS:g} rad/s or {SHOCK_MPS2:g} m/s2 were not "
             "believed: the mean of those before stands for each"
         )
+    for name, count, what in (
+        ("imu", estimator.imu.impossible, f"{MOST_RADPS:g} rad/s or {MOST_MPS2:g} m/s2"),
+        ("wheels", estimator.wheels.impossible, f"{MOST_MPS:g} m/s"),
+    ):
+        if count:
+            notes.append(f"{count} samples of {name} beyond {what} were left out: no robot moves so")
+    for name, count in estimator.newest.refused.items():
+        notes.append(f"{count} samples of {name} lay far ahead of IMU and wheels: they were left out")
     for stream in (estimator.imu.late, estimator.wheels.late):
+        if stream.leap.dropped:
+            notes.append(
+                f"{stream.leap.dropped} samples of {stream.channel} lay more than {LEAP_NS * 1e-9:g} s ahead "
+                "of all others: they were left out"
+            )
         if stream.too_late:
             notes.append(f"{stream.too_late} samples of {stream.channel} came after their keyframe was made")
     return (*notes, *estimator.aids.notes())

@@ -4,15 +4,31 @@ from __future__ import annotations
 
 import bisect
 import itertools
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.fusion.inputs.door import (
+    CONFIRMED,
+    MOST_MPS,
+    MOST_MPS2,
+    MOST_RADPS,
+    MOST_TRAVEL_M,
+    Leap,
+    Newest,
+    as_number,
+    as_numbers,
+    beyond,
+    checked_time,
+)
+from terrafusion.fusion.inputs.door import (
+    GnssFix as GnssFix,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,21 +46,6 @@ class ImuSegment:
     accel_density_mps2: tuple[float, float] | None = None
 
 
-@dataclass(frozen=True, eq=False)
-class GnssFix:
-    """One fix: antenna position (3,) and sigma (3,), ENU m; velocity (3,) m/s and its sigma where known.
-
-    `fix` is the receiver's class of fix, None where it reports none.
-    """
-
-    t_ns: int
-    enu_m: Array
-    sigma_m: Array
-    velocity_mps: Array | None = None
-    sigma_v_mps: float = float("nan")
-    fix: Fix | None = None
-
-
 SPIN_RADPS, SHOCK_MPS2 = 10.0, 50.0
 """Beyond these, on any axis, a sample is a spike (assumed): a shock lasts for less than a sample, and taken
 for all of it, at 100 Hz, it is half a metre a second."""
@@ -55,6 +56,8 @@ REPLACED_BY = 10
 MOST_LATE_S = 5.0
 """A sample this much older than its stream's newest is no late message: the clock has jumped."""
 LONGEST_WAIT_S = 0.5
+LONGEST_PAUSE_NS = 20_000_000_000
+"""A longer pause of the IMU has no keyframes: what a call computes is bounded."""
 
 
 class Lateness:
@@ -67,13 +70,25 @@ class Lateness:
         wait_ns: longest lateness so far, at most `LONGEST_WAIT_S`.
         used_ns: end of what the keyframes have used.
         too_late: number of samples left out because their keyframe had been made.
+        leap: samples that come far ahead.
     """
 
-    def __init__(self, channel: str) -> None:
+    def __init__(self, channel: str, newest: Newest | None = None) -> None:
         self.channel = channel
+        self.leap = Leap(newest or Newest())
         self.wait_ns = 0
         self.used_ns: int | None = None
         self.too_late = 0
+
+    def from_future(self, t_ns: int, times: list[int]) -> int:
+        """How many of the newest samples, fewer than show a leap, have times that were wrong; before the
+        start only."""
+        ahead = len(times) - bisect.bisect_right(times, t_ns + round(MOST_LATE_S * 1e9))
+        if self.used_ns is not None or not 0 < ahead < CONFIRMED:
+            return 0
+        self.leap.dropped += ahead
+        self.leap.newest.t_ns = t_ns
+        return ahead
 
     def place(self, t_ns: int, times: list[int]) -> int | None:
         """Index in `times` where a sample belongs, or None when it is too late.
@@ -104,22 +119,28 @@ class ImuStream:
     place the readings of a robot that drives straight on level ground.
 
     A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
-    before; `spikes` counts them.
+    before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
     """
 
-    def __init__(self, six_axis: bool = True) -> None:
+    def __init__(self, six_axis: bool = True, newest: Newest | None = None) -> None:
         self.six_axis = six_axis
-        self.spikes = 0
+        self.spikes = self.impossible = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
         self._accel_held_ns: list[int] = []
-        self.late = Lateness("imu")
+        self.late = Lateness("imu", newest)
         self.t_ns: list[int] = []
         self.gyro: list[Array] = []
         self.accel: list[Array] = []
 
     def add(self, t_ns: int, gyro_radps: ArrayLike, accel_mps2: ArrayLike) -> None:
-        gyro, accel = np.asarray(gyro_radps, dtype=float), np.asarray(accel_mps2, dtype=float)
+        """A sample: rates (3,) and specific forces (3,).
+
+        Raises:
+            DataError: it has no time, a number is missing, or the clock was set back.
+        """
+        t_ns = checked_time(t_ns, "imu")
+        gyro, accel = as_numbers(gyro_radps, "gyro", "imu"), as_numbers(accel_mps2, "accel", "imu")
         known = gyro.shape == accel.shape == (3,) and np.isfinite(
             gyro.sum() + accel.sum() if self.six_axis else gyro[2]
         )
@@ -130,9 +151,19 @@ class ImuStream:
                 channel="imu",
                 remedy="leave out samples with missing axes",
             )
+        if beyond(gyro, MOST_RADPS) or beyond(accel, MOST_MPS2):
+            self.impossible += 1
+            return
+        for sample in self.late.leap.admitted((t_ns, gyro, accel)):
+            self._insert(*sample)
+
+    def _insert(self, t_ns: int, gyro: Array, accel: Array) -> None:
+        for _ in range(self.late.from_future(t_ns, self.t_ns)):
+            for values in (self.t_ns, self.gyro, self.accel):
+                values.pop()
         i = self.late.place(t_ns, self.t_ns)
         if i is not None:
-            spike = _beyond(gyro, SPIN_RADPS), _beyond(accel, SHOCK_MPS2)
+            spike = beyond(gyro, SPIN_RADPS), beyond(accel, SHOCK_MPS2)
             if any(spike):
                 if self._is_spike(i, t_ns):
                     recent = slice(max(i - REPLACED_BY, 0), i)
@@ -155,6 +186,13 @@ class ImuStream:
 
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
+
+    def pause_ns(self, t_ns: int) -> int:
+        """Time from `t_ns` to the next sample where that is longer than `LONGEST_PAUSE_NS`, else 0."""
+        if not self.t_ns or self.t_ns[-1] - t_ns <= LONGEST_PAUSE_NS:
+            return 0
+        ahead_ns = self.t_ns[bisect.bisect_right(self.t_ns, t_ns)] - t_ns
+        return ahead_ns if ahead_ns > LONGEST_PAUSE_NS else 0
 
     def segments(self, start_ns: int, end_ns: int) -> list[ImuSegment]:
         """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""
@@ -203,15 +241,15 @@ class ImuStream:
                 times[:] = [t for t in times if t >= before_ns]
 
 
-def _beyond(reading: Array, limit: float) -> bool:
-    return any(abs(x) > limit for x in reading.tolist())
-
-
 class WheelStream:
-    """Travelled distance of the left and right side over time."""
+    """Travelled distance of the left and right side over time.
 
-    def __init__(self) -> None:
-        self.late = Lateness("wheels")
+    Samples with a speed or travel that no robot has are left out; `impossible` counts them.
+    """
+
+    def __init__(self, newest: Newest | None = None) -> None:
+        self.late = Lateness("wheels", newest)
+        self.impossible = 0
         self.t_ns: list[int] = []
         self.left_m: list[float] = []
         self.right_m: list[float] = []
@@ -225,18 +263,38 @@ class WheelStream:
         left_m: float | None = None,
         right_m: float | None = None,
     ) -> None:
-        """Side speeds and, where encoders count angle, the travelled distances, used instead."""
-        if not np.isfinite(left_mps + right_mps + (left_m or 0.0) + (right_m or 0.0)):
+        """Side speeds and, where encoders count angle, the travelled distances, used instead.
+
+        Raises:
+            DataError: it has no time, a number is missing, or the clock was set back.
+        """
+        t_ns = checked_time(t_ns, "wheels")
+        left_mps, right_mps = (as_number(v, "wheel speed", "wheels") for v in (left_mps, right_mps))
+        travel = (0.0 if m is None else as_number(m, "wheel travel", "wheels") for m in (left_m, right_m))
+        moved = *travel, left_mps, right_mps
+        if not all(math.isfinite(number) for number in moved):
             raise DataError("a wheel speed is not finite", channel="wheels", remedy="leave the sample out")
+        if max(abs(left_mps), abs(right_mps)) > MOST_MPS or max(abs(m) for m in moved) > MOST_TRAVEL_M:
+            self.impossible += 1
+            return
+        counted = None if left_m is None or right_m is None else moved[:2]
+        for sample in self.late.leap.admitted((t_ns, left_mps, right_mps, counted)):
+            self._insert(*sample)
+
+    def _insert(
+        self, t_ns: int, left_mps: float, right_mps: float, counted: tuple[float, float] | None
+    ) -> None:
+        for _ in range(self.late.from_future(t_ns, self.t_ns)):
+            for values in (self.t_ns, self.left_m, self.right_m, self._speeds):
+                values.pop()
         i = self.late.place(t_ns, self.t_ns)
         if i is None:
             return
-        counted = left_m is not None and right_m is not None
         self.t_ns.insert(i, t_ns)
         self._speeds.insert(i, (left_mps, right_mps))
-        self.left_m.insert(i, left_m if counted else 0.0)  # type: ignore[arg-type]
-        self.right_m.insert(i, right_m if counted else 0.0)  # type: ignore[arg-type]
-        if not counted:
+        self.left_m.insert(i, counted[0] if counted else 0.0)
+        self.right_m.insert(i, counted[1] if counted else 0.0)
+        if counted is None:
             self._integrate_from(max(i, 1))
 
     def _integrate_from(self, first: int) -> None:

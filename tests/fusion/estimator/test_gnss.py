@@ -20,7 +20,8 @@ from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
-from terrafusion.fusion.estimator.gnss import WHITE_SHARE, checked_fix
+from terrafusion.fusion.estimator.gnss import WHITE_SHARE
+from terrafusion.fusion.inputs.door import checked_fix
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario

@@ -1,0 +1,228 @@
+"""Samples at the door: what is refused, what is left out, and that the next valid one is used."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.messages import Message
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.notes import notes_of
+from terrafusion.fusion.inputs.door import Leap, Newest, checked_fix, checked_time
+from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
+from terrafusion.twin.scenario.scenario import DriveSegment, Scenario
+from terrafusion.twin.simulate import simulate
+
+HOUR_NS = 3600 * 10**9
+G = [0.0, 0.0, 9.8]
+
+
+@dataclasses.dataclass(frozen=True)
+class Running:
+    """An estimator in the middle of a drive, as a dump, and the messages that follow."""
+
+    first: Estimator
+    dump: bytes
+    now_ns: int
+    rest: list[Message]
+    end_m: np.ndarray
+
+    def again(self) -> Estimator:
+        return Estimator.restore(self.first.config, self.dump)
+
+
+@pytest.fixture(scope="module")
+def running() -> Running:
+    drive = (DriveSegment(2.0), DriveSegment(10.0, v_mps=1.0, yaw_rate_radps=0.1))
+    messages = list(simulate(Scenario("short", 10.0, drive=drive), seed=1, vehicle="elevate").messages())
+    cut = int(0.8 * len(messages))
+    estimator = Estimator.for_vehicle("elevate")
+    for message in messages[:cut]:
+        estimator.add(message)
+    dump = estimator.dump()
+    for message in messages[cut:]:
+        estimator.add(message)
+    state = estimator.latest()
+    assert state is not None
+    return Running(estimator, dump, messages[cut - 1].t_ns, messages[cut:], state.position_m)
+
+
+def finished(running: Running, estimator: Estimator) -> float:
+    """Distance of the end from that of the clean drive, m."""
+    for message in running.rest:
+        estimator.add(message)
+    state = estimator.latest()
+    assert state is not None
+    assert np.isfinite(state.covariance).all()
+    return float(np.linalg.norm(state.position_m - running.end_m))
+
+
+# --- times ---------------------------------------------------------------------------------------------
+
+
+def test_times_are_integers_or_datetimes() -> None:
+    assert checked_time(np.int64(5), "imu") == 5
+    assert checked_time(np.datetime64("1970-01-01T00:00:01"), "imu") == 10**9
+
+
+@pytest.mark.parametrize(
+    "t", [None, 1.5, float("nan"), np.array([5]), "5", True, np.datetime64("NaT"), 2**70]
+)
+def test_what_is_no_time_is_refused(t: Any) -> None:
+    fresh = Estimator.for_vehicle("elevate")
+    for call in (
+        lambda: fresh.add_imu(t, np.zeros(3), G),
+        lambda: fresh.add_wheels(t, 0.0, 0.0),
+        lambda: fresh.add_gnss(t, np.zeros(3), [0.1] * 3),
+        lambda: fresh.add_command(t, 0.0),
+        lambda: fresh.add_pressure(t, 1e5),
+        lambda: fresh.add_magnetic_field(t, np.zeros(3)),
+        lambda: fresh.add_terrain(t, {"asphalt": 1.0}),
+    ):
+        with pytest.raises(DataError, match="time"):
+            call()
+
+
+@pytest.mark.parametrize("ahead_ns", [HOUR_NS, 365 * 24 * HOUR_NS])
+@pytest.mark.parametrize("channel", ["imu", "wheels", "gnss"])
+def test_a_stamp_far_ahead_is_left_out_and_the_stream_goes_on(
+    running: Running, channel: str, ahead_ns: int
+) -> None:
+    estimator, t = running.again(), running.now_ns + ahead_ns
+    begun = time.perf_counter()
+    if channel == "imu":
+        estimator.add_imu(t, np.zeros(3), G)
+    elif channel == "wheels":
+        estimator.add_wheels(t, 1.0, 1.0)
+    else:
+        estimator.add_gnss(t, np.zeros(3), [0.02] * 3)
+    assert time.perf_counter() - begun < 0.5
+    assert finished(running, estimator) < 1e-9
+    assert any(f"samples of {channel}" in note and "left out" in note for note in notes_of(estimator))
+
+
+def test_a_pause_of_an_hour_takes_no_longer_than_a_second_and_its_sigma_covers_it(running: Running) -> None:
+    estimator = running.again()
+    widest, slowest, count = 0.0, 0.0, 0
+    for message in running.rest:
+        begun, before = time.perf_counter(), estimator.latest()
+        estimator.add(message._replace(t_ns=message.t_ns + HOUR_NS))
+        slowest = max(slowest, time.perf_counter() - begun)
+        state = estimator.latest()
+        assert state is not None
+        count += state is not before
+        widest = max(widest, float(np.sqrt(state.covariance[0, 0])))
+    assert slowest < 1.0
+    assert count < 40
+    assert widest > 1000.0, "an hour at walking speed"
+    assert estimator.latest().covariance[0, 0] < 0.1, "the fixes place it again"  # type: ignore[union-attr]
+
+
+def test_a_first_stamp_that_was_wrong_does_not_lock_a_stream() -> None:
+    wheels, imu = WheelStream(), ImuStream()
+    wheels.add(10 * HOUR_NS, 1.0, 1.0)
+    imu.add(10 * HOUR_NS, np.zeros(3), G)
+    for i in range(5):
+        wheels.add(i * 10**8, 1.0, 1.0)
+        imu.add(i * 10**8, np.zeros(3), G)
+    assert wheels.t_ns == imu.t_ns == [i * 10**8 for i in range(5)]
+    assert wheels.late.leap.dropped == imu.late.leap.dropped == 1
+
+
+@given(st.lists(st.tuples(st.integers(0, 3), st.booleans()), max_size=40))
+def test_lone_leaps_are_dropped_and_a_pause_loses_nothing(pattern: list[tuple[int, bool]]) -> None:
+    """Samples a tenth apart, of which some are an hour ahead, never three in a row."""
+    leap, admitted, t, in_a_row, lone = Leap(Newest()), [], 0, 0, 0
+    leap.admitted((0,))
+    for step, ahead in pattern:
+        t += step * 10**8
+        in_a_row = in_a_row + 1 if ahead and in_a_row < 2 else 0
+        lone += in_a_row > 0
+        admitted += leap.admitted((t + HOUR_NS if in_a_row else t,))
+    admitted += leap.admitted((t,))
+    assert all(one[0] < HOUR_NS for one in admitted)
+    assert leap.dropped == lone
+    resumed = [one for i in range(4) for one in leap.admitted((2 * HOUR_NS + i * 10**8,))]
+    assert len(resumed) == 4
+
+
+# --- values --------------------------------------------------------------------------------------------
+
+NUMBERS = st.one_of(
+    st.floats(),
+    st.sampled_from([1e300, -1e300, 1e-300, 9000.0, 1e6, float("inf"), float("nan"), None, "x", [1.0], True]),
+)
+TIMES = st.one_of(st.integers(-(10**10), 10**10), st.sampled_from([None, 0.5, HOUR_NS, -HOUR_NS, 2**80]))
+THREE = st.one_of(st.lists(NUMBERS, min_size=3, max_size=3), NUMBERS)
+CALLS = st.one_of(
+    st.tuples(st.just("add_imu"), THREE, THREE),
+    st.tuples(st.just("add_wheels"), NUMBERS, NUMBERS, NUMBERS, NUMBERS),
+    st.tuples(
+        st.just("add_gnss"), THREE, THREE, THREE, NUMBERS, st.sampled_from([None, "fixed", 1, 99, "?", 1.5])
+    ),
+    st.tuples(st.just("add_command"), NUMBERS),
+    st.tuples(st.just("add_pressure"), NUMBERS),
+    st.tuples(st.just("add_magnetic_field"), THREE),
+    st.tuples(st.just("add_terrain"), st.just({"asphalt": 1.0})),
+)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@given(st.lists(st.tuples(CALLS, TIMES), min_size=1, max_size=3))
+def test_whatever_comes_is_used_left_out_or_a_data_error(
+    running: Running, calls: list[tuple[tuple[Any, ...], Any]]
+) -> None:
+    """And the estimator goes on with the valid samples that follow."""
+    estimator = running.again()
+    for (method, *values), t in calls:
+        at = running.now_ns + t if isinstance(t, int) else t
+        try:
+            getattr(estimator, method)(at, *values)
+        except DataError as error:
+            assert str(error)
+    for message in running.rest[:60]:
+        try:
+            estimator.add(message)
+        except DataError as error:  # a stream whose clock was set on waits for it
+            assert "after a newer one" in str(error)
+    state = estimator.latest()
+    assert state is not None
+    assert np.isfinite(state.position_m).all()
+    assert np.isfinite(state.covariance).all()
+
+
+@pytest.mark.parametrize("gyro", [1e6, 1e300])
+def test_rates_beyond_any_gyro_are_left_out(running: Running, gyro: float) -> None:
+    estimator = running.again()
+    estimator.add_imu(running.now_ns + 10**6, [0.0, 0.0, gyro], G)
+    assert finished(running, estimator) < 1e-9
+    assert "1 samples of imu beyond 100 rad/s or 2000 m/s2 were left out: no robot moves so" in notes_of(
+        estimator
+    )
+
+
+def test_wheels_beyond_any_robot_are_left_out(running: Running) -> None:
+    estimator = running.again()
+    estimator.add_wheels(running.now_ns + 10**6, 1e300, 1e300)
+    estimator.add_wheels(running.now_ns + 10**6, 1.0, 1.0, 1e300, 1e300)
+    assert finished(running, estimator) < 1e-9
+    assert any(note.startswith("2 samples of wheels beyond") for note in notes_of(estimator))
+
+
+def test_the_numbers_of_a_fix() -> None:
+    endless = checked_fix(0, [1.0, 2.0, np.inf], [0.1, 0.1, 0.1], None, np.nan, None)
+    assert endless is not None
+    assert np.isnan(endless.enu_m[2]), "a height that is none is free"
+    tiny = checked_fix(0, np.zeros(3), [1e-300] * 3, None, np.nan, None)
+    assert tiny is not None
+    assert tiny.sigma_m.tolist() == [1e-3] * 3
+    assert checked_fix(0, np.zeros(3), [1e300] * 3, None, np.nan, None) is None
+    with pytest.raises(DataError, match="beyond the earth"):
+        checked_fix(0, [1e300, 0.0, 0.0], [0.1] * 3, None, np.nan, None)
