@@ -150,8 +150,9 @@ def parse_meta(content: dict[str, Any], path: Path) -> Meta:
 def _is_extra(key: str, given: Mapping[str, Any]) -> bool:
     """Whether a key is neither known, nor the compulsory `start_ns` misspelt, nor a length in another unit."""
     stem, _, unit = key.rpartition("_")
-    start = "start_ns" not in given and bool(difflib.get_close_matches(key, ["start_ns"]))
-    return key not in KEYS and not start and not (unit in OTHER_UNITS and f"{stem}_m" in KEYS)
+    if "start_ns" not in given and difflib.get_close_matches(key, ["start_ns"]):
+        return False
+    return key not in KEYS and not (unit in OTHER_UNITS and f"{stem}_m" in KEYS)
 
 
 def _named(key: str) -> str:

@@ -54,7 +54,7 @@ def choose_vehicle(
 
 
 def _missing_geometry(recording: Recording) -> list[str]:
-    """What the generic vehicle cannot stand in for: a radius for rad/s, a track where no gyro shows the yaw."""
+    """What a generic vehicle cannot replace: a radius for rad/s, a track where no gyro shows the yaw."""
     wheels, imu, overrides = recording.wheels, recording.imu, recording.overrides
     missing = []
     if wheels is not None and wheels.unit == "radps" and overrides.wheel_radius_m is None:

@@ -7,18 +7,21 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+import numpy as np
+
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.ros.channels import ChannelBuilder
 from terrafusion.datasets.readers.ros.exact import META, restore
 from terrafusion.datasets.readers.ros.joints import joint_names, steering_joints, wheel_joints
-from terrafusion.datasets.readers.ros.messages import Stream, wanted_fields
+from terrafusion.datasets.readers.ros.messages import Stream, twists, wanted_fields
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
-from terrafusion.datasets.readers.ros.topics import JOINTS, BagTopic, choose_topics, joints_given
+from terrafusion.datasets.readers.ros.topics import FIX, IMU, JOINTS, ODOMETRY, BagTopic, choose_topics, joints_given
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
@@ -61,6 +64,7 @@ def _assemble(container: BagContainer, request: Request) -> Recording:
         user=request.topics,
         usual=rig.topics if rig else None,
         is_wheel_joints=lambda topic: bool(wheel_joints(_joints(container, topic), joints)),
+        one_of=functools.partial(_one_sensor, container, path, rig),
         is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
     )
     streams = _streams(container, chosen)
@@ -145,6 +149,52 @@ def _joints(container: BagContainer, topic: str) -> list[str]:
     key = topic, JOINTS
     stream = read_streams(container, {key: wanted_fields("wheels", JOINTS)}, LOOK_AT_MESSAGES)[key]
     return joint_names(stream)
+
+
+def _one_sensor(
+    container: BagContainer, path: Path, rig: Rig | None, kind: str, rivals: list[BagTopic]
+) -> BagTopic:
+    """The topic of a sensor among several of one type: the one with data, else that in the robot's frame.
+
+    Raises:
+        DataError: both are there; names them and the option to choose.
+    """
+    keys = {topic.name: (topic.name, topic.msgtype) for topic in rivals}
+    streams = read_streams(container, {key: wanted_fields(kind, key[1]) for key in keys.values()})
+    found = [topic for topic in rivals if _holds_data(streams[keys[topic.name]])]
+    if len(found) > 1 and kind == "imu" and rig is not None:
+        frame = rig.sensors.imu.frame_id.lstrip("/")
+        mounted = [topic for topic in found if _usual_frame(streams[keys[topic.name]]).lstrip("/") == frame]
+        found = mounted if len(mounted) == 1 else found
+    if len(found) == 1:
+        return found[0]
+    listed = ", ".join(f"{topic.name} ({_rate(streams[keys[topic.name]])})" for topic in rivals)
+    raise DataError(
+        f"{len(rivals)} sensors of one kind: {listed}",
+        file=path,
+        channel=kind,
+        remedy=f"choose with --topic {kind}={rivals[0].name} (or topics={{'{kind}': ...}} in Python)",
+    )
+
+
+def _holds_data(stream: Stream) -> bool:
+    """Whether a sensor's messages hold anything: a fix, or a number that is not zero."""
+    if stream.msgtype == FIX:
+        return bool((stream.column("status.status") >= 0).any())
+    if stream.msgtype == IMU:
+        values = np.hstack([stream.vectors("angular_velocity"), stream.vectors("linear_acceleration")])
+    elif stream.msgtype == ODOMETRY:
+        values = twists(stream)[0]
+    else:
+        return True
+    return bool(np.nan_to_num(values).any())
+
+
+def _rate(stream: Stream) -> str:
+    times = stream.receipt_ns if stream.header_ns is None else stream.header_ns
+    span_s = float(times.max() - times.min()) * 1e-9
+    count = f"{len(stream)} messages"
+    return f"{count}, {(len(stream) - 1) / span_s:.3g} Hz" if span_s > 0.0 else count
 
 
 def _streams(container: BagContainer, chosen: Mapping[str, BagTopic]) -> dict[str, Stream]:

@@ -54,6 +54,8 @@ ALIASES = {
     "ackermann": "steering",
     "pressure": "barometer",
 }
+SENSORS = ("imu", "wheels", "gnss")
+"""Channels of which a robot may have two sensors, which only the user can tell apart."""
 JOINT_PREFIX = "joint."
 """`joint.front_left` names the joint of that wheel inside a JointState."""
 
@@ -89,19 +91,21 @@ def choose_topics(
     usual: Mapping[str, str] | None = None,
     is_wheel_joints: Callable[[str], bool] = lambda topic: True,
     is_steering_joints: Callable[[str], bool] = lambda topic: False,
+    one_of: Callable[[str, list[BagTopic]], BagTopic] = lambda kind, rivals: rivals[0],
 ) -> tuple[dict[str, BagTopic], list[str]]:
     """The topic of each channel, and notes on what was taken and left.
 
     The user's choice goes first and must be there; then the vehicle's usual topics where the bag has
-    them; then by type. Among several of a type: the preferred type, then the name (wheel
-    controllers before others, raw data last), then the most messages, then the alphabet. A
-    topic that looks like a fused estimate is never taken for a sensor by itself.
+    them; then by type, the preferred one first. Of several sensors of a type `one_of` decides; of other
+    topics the name, then the most messages, then the alphabet. A topic that looks like a fused estimate is
+    never taken for a sensor by itself.
 
     Args:
         bag: topics with at least one message.
         user: channel -> topic that the user asks for.
         usual: channel -> topic that the vehicle file names.
         is_wheel_joints, is_steering_joints: whether a JointState topic holds wheels, or steering axes.
+        one_of: the topic of a sensor, such as "imu", among several of one type; raises where that is open.
 
     Raises:
         DataError: an unknown channel, a topic that is not in the bag or has an unfit type.
@@ -122,7 +126,8 @@ def choose_topics(
         ]
         fits.sort(key=functools.partial(_rank, kind))
         if kind not in chosen and fits:
-            chosen[kind] = fits[0]
+            rivals = [t for t in fits if t.msgtype == fits[0].msgtype]
+            chosen[kind] = one_of(kind, rivals) if kind in SENSORS and len(rivals) > 1 else fits[0]
         left = [f"{t.name} ({t.count})" for t in fits if t.name != chosen[kind].name]
         if left:
             taken_one = chosen[kind]

@@ -12,7 +12,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin
 
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.errors import DataError, TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
@@ -79,24 +79,58 @@ def test_absent_axes_are_absent(tmp_path: Path) -> None:
     assert recording.imu.has_accel()
 
 
-def test_most_messages_win_and_it_is_said(tmp_path: Path) -> None:
-    messages = imu_messages(MAKE1, "/a/imu", n=5) + imu_messages(MAKE1, "/b/imu", n=9)
+def _fixes(topic: str, status: int = 0) -> list[Message]:
+    times = [T0 + i * 10**9 for i in range(5)]
+    return [(topic, "sensor_msgs/msg/NavSatFix", t, MAKE1.fix(t, 46.0, 7.0, status=status)) for t in times]
+
+
+TWO_SENSORS = {
+    "imu": imu_messages(MAKE1, "/a/imu", n=5) + imu_messages(MAKE1, "/b/imu", n=9),
+    "wheels": odometry_messages(MAKE1, "/odom", n=5) + odometry_messages(MAKE1, "/wheel_odom", n=9),
+    "gnss": _fixes("/front/fix") + _fixes("/rear/fix"),
+}
+
+
+@pytest.mark.parametrize("kind", TWO_SENSORS)
+def test_two_sensors_of_a_kind_are_not_chosen_between(tmp_path: Path, kind: str) -> None:
+    messages = TWO_SENSORS[kind]
+    path = write_ros1(tmp_path / "a.bag", messages)
+    one, other = sorted({message[0] for message in messages})
+    with pytest.raises(DataError) as caught:
+        open_recording(path)
+    for words in (one, other, "5 messages", "Hz", f"--topic {kind}="):
+        assert words in str(caught.value)
+    assert "\n" not in str(caught.value)
+    for topic in (one, other):
+        recording = open_recording(path, topics={kind: topic})
+        count = sum(message[0] == topic for message in messages)
+        assert len(recording.channels()[kind]) == count
+        assert f"took {topic}" in notes_of(recording)
+
+
+def test_one_of_two_sensors_is_taken_where_it_alone_has_data_or_the_frame_of_the_robot(
+    tmp_path: Path, husky_rig: Rig
+) -> None:
+    empty = imu_messages(MAKE1, "/b/imu", n=9, accel=(0.0, 0.0, 0.0))
+    without_fix = _fixes("/rear/fix", status=-1)
+    messages = TWO_SENSORS["imu"][:5] + empty + _fixes("/front/fix") + without_fix
     recording = open_recording(write_ros1(tmp_path / "a.bag", messages))
-    assert recording.imu is not None
-    assert len(recording.imu) == 9
-    assert "took /b/imu (9 messages), left /a/imu (5)" in notes_of(recording)
-    recording = open_recording(tmp_path / "a.bag", topics={"imu": "/a/imu"})
-    assert recording.imu is not None
-    assert len(recording.imu) == 5
+    assert "took /a/imu" in notes_of(recording)
+    assert "took /front/fix" in notes_of(recording)
+    frame = husky_rig.sensors.imu.frame_id
+    messages = TWO_SENSORS["imu"][:5] + imu_messages(MAKE1, "/b/imu", n=9, frame=frame)
+    recording = open_recording(write_ros1(tmp_path / "b.bag", messages), rig=husky_rig)
+    assert "took /b/imu" in notes_of(recording)
 
 
 def test_topics_of_the_vehicle_count_when_there(tmp_path: Path, husky_rig: Rig) -> None:
     messages = imu_messages(MAKE1, "/a/imu", n=5) + imu_messages(MAKE1, "/b/imu", n=9)
     path = write_ros1(tmp_path / "a.bag", messages)
-    for topic, count in (("/a/imu", 5), ("/not/here", 9)):
-        imu = open_recording(path, rig=dataclasses.replace(husky_rig, topics={"imu": topic})).imu
-        assert imu is not None
-        assert len(imu) == count
+    imu = open_recording(path, rig=dataclasses.replace(husky_rig, topics={"imu": "/a/imu"})).imu
+    assert imu is not None
+    assert len(imu) == 5
+    with pytest.raises(DataError, match="2 sensors of one kind"):
+        open_recording(path, rig=dataclasses.replace(husky_rig, topics={"imu": "/not/here"}))
 
 
 def test_fused_odometry_is_no_wheel_sensor(tmp_path: Path) -> None:

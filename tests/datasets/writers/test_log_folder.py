@@ -144,7 +144,10 @@ def test_unknown_keys_of_meta_are_kept_and_named_in_one_warning(tmp_path: Path) 
     assert open_recording(tmp_path / "log.mcap").metadata == kept
 
 
-TRUTH = "t_s,x_m,y_m,z_m,qx,qy,qz,qw,u_mps,v_mps,r_radps\n0,1,2,0,0.1,0,0.7,0.7071,1,0,0\n1,2,2,0,0,0.1,0,0.995,1,0,0\n"
+TRUTH = """t_s,x_m,y_m,z_m,qx,qy,qz,qw,u_mps,v_mps,r_radps
+0,1,2,0,0.1,0,0.7,0.7071,1,0,0
+1,2,2,0,0,0.1,0,0.995,1,0,0
+"""
 
 
 @pytest.mark.parametrize("listed", [("position",), ("position", "yaw"), ("yaw",), ("velocity",)])
