@@ -21,7 +21,15 @@ from terrafusion.datasets.readers.ros.messages import Stream, twists, wanted_fie
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
 from terrafusion.datasets.readers.ros.streams import Key, foreign, read_streams
 from terrafusion.datasets.readers.ros.times import StreamTimes, timing_of
-from terrafusion.datasets.readers.ros.topics import FIX, IMU, JOINTS, ODOMETRY, BagTopic, choose_topics, joints_given
+from terrafusion.datasets.readers.ros.topics import (
+    FIX,
+    IMU,
+    JOINTS,
+    ODOMETRY,
+    BagTopic,
+    choose_topics,
+    joints_given,
+)
 
 LOOK_AT_MESSAGES = 20
 """Enough messages of a JointState to learn its joints."""
