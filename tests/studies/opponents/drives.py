@@ -187,6 +187,16 @@ def vehicle_of(recording: Recording, vehicle: str | None) -> VehicleParams:
     return choose_vehicle(recording, vehicle)[0]
 
 
+def longest(drives: Sequence[Drive], most: int) -> list[Drive]:
+    """At most `most` drives of each log and kind of fixes, the longest ones, in their order."""
+    kept = []
+    for name in dict.fromkeys(drive.name for drive in drives):
+        mine = [drive for drive in drives if drive.name == name]
+        chosen = sorted(mine, key=lambda d: -d.recording.duration_s())[:most]
+        kept += [drive for drive in mine if any(drive is c for c in chosen)]
+    return kept
+
+
 def all_drives(names: Sequence[str]) -> list[Drive]:
     """Drives of many logs."""
     return [drive for name in names for drive in drives_of(name)]

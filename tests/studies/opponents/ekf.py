@@ -35,10 +35,10 @@ class Noise:
 PLAIN = Noise()
 
 
-def run(streams: Streams, blocked: Blocked, noise: Noise = PLAIN) -> Array:
-    """Positions (N, 2) at the streams' times, without the fixes whose time is blocked."""
+def run(streams: Streams, blocked: Blocked, noise: Noise = PLAIN) -> tuple[Array, Array]:
+    """The streams' times (N,) and positions (N, 2), without the fixes whose time is blocked."""
     t, v, w, fixes = streams.t_s, streams.v_mps, streams.w_radps, streams.fixes
-    x, P = _start(streams)
+    x, P = start(streams)
     out, j = np.empty((len(t), 2)), 0
     for i in range(len(t)):
         dt = t[i] - t[i - 1] if i else 0.0
@@ -49,10 +49,10 @@ def run(streams: Streams, blocked: Blocked, noise: Noise = PLAIN) -> Array:
                 x, P = _corrected(x, P, fixes[j], noise)
             j += 1
         out[i] = x[:2]
-    return out
+    return t, out
 
 
-def _start(streams: Streams) -> tuple[Array, Array]:
+def start(streams: Streams) -> tuple[Array, Array]:
     """State at the first fix: heading from the fixes of the first metres, less half of what was turned."""
     t, v, w, g = streams.t_s, streams.v_mps, streams.w_radps, streams.fixes
     path = np.r_[0.0, np.cumsum(np.hypot(*np.diff(g[:, 1:3], axis=0).T))]

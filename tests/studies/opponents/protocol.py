@@ -66,13 +66,13 @@ class Streams:
         k = int(np.searchsorted(self.reference[:, 0], start_s + seconds - 1e-6)) - 1
         return self.reference[k] if k >= 0 and self.reference[k, 0] >= start_s else None
 
-    def error_m(self, path_m: Array, start_s: float, seconds: float) -> float | None:
-        """Error of a path (N, 2) at `t_s`, nothing after the outage used."""
+    def error_m(self, t_s: Array, path_m: Array, start_s: float, seconds: float) -> float | None:
+        """Error of a path (N, 2) at times (N,), nothing after the outage used."""
         reference = self.reference_at(start_s, seconds)
         if reference is None:
             return None
-        before = self.t_s < start_s + seconds
-        at = [np.interp(reference[0], self.t_s[before], path_m[before, c]) for c in (0, 1)]
+        before = t_s < start_s + seconds
+        at = [np.interp(reference[0], t_s[before], path_m[before, c]) for c in (0, 1)]
         return float(np.hypot(at[0] - reference[1], at[1] - reference[2]))
 
 
@@ -118,13 +118,13 @@ class Row:
     distance_m: float
 
 
-def scored(streams: Streams, seconds: float, run: Callable[[Blocked], Array]) -> list[Row]:
-    """Rows of an estimator: `run(blocked)` gives its path (N, 2) at the streams' times, fixes blocked."""
+def scored(streams: Streams, seconds: float, run: Callable[[Blocked], tuple[Array, Array]]) -> list[Row]:
+    """Rows of an estimator: `run(blocked)` gives times (N,) and path (N, 2), without the blocked fixes."""
     rows = []
     for starts in streams.passes(seconds):
-        path = run(_blocked(starts, seconds))
+        t_s, path = run(_blocked(starts, seconds))
         for a in starts:
-            error = streams.error_m(path, a, seconds)
+            error = streams.error_m(t_s, path, a, seconds)
             if error is not None:
                 rows.append(Row(a, error, streams.driven_m(a, seconds)))
     return rows

@@ -1,0 +1,105 @@
+"""Tunes the opponents: one noise for all logs, by a grid over the tuning half of them.
+
+    python -m tests.studies.opponents.tuning --split     writes split.json, before anything is fitted
+    python -m tests.studies.opponents.tuning             writes tuned.json
+
+Score of a noise: geometric mean over drives of the median error in outages of 30 s, or 10 s on short drives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import multiprocessing
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+from tests.studies.opponents.drives import Drive, default_logs, drives_of, longest, vehicle_of
+from tests.studies.opponents.estimators import OPPONENTS, TUNED, grid, noise_of, rows_of
+from tests.studies.opponents.inertial import Inertial
+
+SPLIT = Path(__file__).with_name("split.json")
+LENGTHS_S = (30.0, 10.0)
+LEAST_M = 0.01
+"""Smaller medians count as this: no noise is chosen for millimetres."""
+
+
+def split(names: list[str]) -> dict[str, list[str]]:
+    """Every second log of a set is for tuning, the first of them where a set has one log."""
+    halves: dict[str, list[str]] = {"tuning": [], "held_out": []}
+    for set_name in sorted({name.partition("/")[0] for name in names}):
+        mine = sorted(name for name in names if name.startswith(f"{set_name}/"))
+        halves["tuning"] += mine[::2]
+        halves["held_out"] += mine[1::2]
+    return halves
+
+
+_DRIVES: list[tuple[Drive, Inertial]] = []
+
+
+def _score(task: tuple[str, dict[str, float]]) -> tuple[str, dict[str, float], float]:
+    name, values = task
+    logs: list[float] = []
+    for _, inputs in _DRIVES:
+        for seconds in LENGTHS_S:
+            rows = rows_of(name, inputs, seconds, noise_of(name, values))
+            if rows:
+                logs.append(float(np.log(max(LEAST_M, np.median([r.error_m for r in rows])))))
+                break
+    return name, values, float(np.exp(np.mean(logs)))
+
+
+def tune(jobs: int) -> dict[str, dict[str, object]]:
+    """Best noise of each opponent, and the scores of all."""
+    names = json.loads(SPLIT.read_text(encoding="utf-8"))["tuning"]
+    for name in names:
+        for drive in longest(drives_of(name), 1):
+            inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
+            if inputs is not None:
+                _DRIVES.append((drive, inputs))
+    tasks = [(name, values) for name in OPPONENTS for values in grid(name)]
+    best: dict[str, dict[str, object]] = {}
+    scores: dict[str, list[tuple[float, dict[str, float]]]] = {name: [] for name in OPPONENTS}
+    with multiprocessing.get_context("fork").Pool(jobs) as pool:
+        for k, (name, values, score) in enumerate(pool.imap_unordered(_score, tasks), 1):
+            scores[name].append((score, values))
+            if sys.stderr.isatty() or os.environ.get("PROGRESS"):
+                print(f"{k} of {len(tasks)}: {name} {values} {score:.3f} m", file=sys.stderr, flush=True)
+    for name, found in scores.items():
+        found.sort(key=lambda pair: pair[0])
+        best[name] = {
+            "noise": found[0][1],
+            "score_m": round(found[0][0], 4),
+            "worst_m": round(found[-1][0], 4),
+            "tried": len(found),
+        }
+    return best
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.opponents.tuning",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--split", action="store_true", help="write the split alone")
+    parser.add_argument("--jobs", type=int, default=2)
+    given = parser.parse_args()
+    if given.split:
+        SPLIT.write_text(json.dumps(split(default_logs()), indent=1) + "\n", encoding="utf-8")
+        return 0
+    best = tune(given.jobs)
+    TUNED.write_text(json.dumps({"opponents": best}, indent=1) + "\n", encoding="utf-8")
+    for name, found in best.items():
+        print(f"{name}: {found}")
+    return 0
+
+
+if __name__ == "__main__":
+    from tests.studies.opponents import tuning
+
+    sys.exit(tuning.main())
