@@ -58,7 +58,7 @@ def start(streams: Streams) -> tuple[Array, Array]:
     path = np.r_[0.0, np.cumsum(np.hypot(*np.diff(g[:, 1:3], axis=0).T))]
     k = min(int(np.searchsorted(path, max(2.0, 2.0 * float(np.median(g[:, 3]))))), len(g) - 1)
     heading = np.arctan2(g[k, 2] - g[0, 2], g[k, 1] - g[0, 1])
-    if np.mean(v[(t >= g[0, 0]) & (t <= g[k, 0])]) < 0.0:
+    if np.sum(v[(t >= g[0, 0]) & (t <= g[k, 0])]) < 0.0:
         heading += np.pi
     turned = np.interp(g[k, 0], t, np.r_[0.0, np.cumsum(w[1:] * np.diff(t))])
     x = np.array([g[0, 1], g[0, 2], heading - 0.5 * turned, 0.0, 1.0])

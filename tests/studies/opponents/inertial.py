@@ -72,13 +72,8 @@ class Inertial:
         )
         f = streams.fixes
         fixes = np.column_stack([f[:, :3], np.broadcast_to(height, len(f)), f[:, 3]])
-        mean = np.nanmean(accel[(t >= f[0, 0]) & (t <= f[0, 0] + LEVEL_S)], axis=0) if has_accel else None
-        level = (0.0, 0.0)
-        if mean is not None and np.isfinite(mean).all():
-            level = (
-                float(np.arctan2(mean[1], mean[2])),
-                float(np.arctan2(-mean[0], np.hypot(mean[1], mean[2]))),
-            )
+        still = (t >= f[0, 0]) & (t <= f[0, 0] + LEVEL_S) & np.isfinite(accel).all(axis=1)
+        level = _level(accel[still].mean(axis=0)) if has_accel and still.any() else (0.0, 0.0)
         return cls(
             streams, t, gyro, np.nan_to_num(accel), has_accel, fixes, antenna,
             antenna if of_antenna else np.zeros(3), ekf.start(streams)[0][:3], level,
@@ -87,3 +82,8 @@ class Inertial:
     def speed_at(self, t: float) -> float:
         """Speed of the wheels at a time."""
         return float(np.interp(t, self.streams.t_s, self.streams.v_mps))
+
+
+def _level(force: Array) -> tuple[float, float]:
+    """Roll and pitch by a specific force (3,) at rest."""
+    return float(np.arctan2(force[1], force[2])), float(np.arctan2(-force[0], np.hypot(force[1], force[2])))

@@ -1,0 +1,156 @@
+"""The study `opponents` as tables and a figure."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from terrafusion.fusion.reports.plots import style
+from tests.studies.opponents.estimators import MODES, OPPONENTS
+from tests.studies.opponents.summary import geometric_mean, losses, median, ratio
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+BEST = "best opponent"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """Outages of one length on one log with one estimator: errors and paths, m."""
+
+    log: str
+    seconds: float
+    estimator: str
+    known: str
+    errors_m: tuple[float, ...]
+    distances_m: tuple[float, ...]
+
+    @property
+    def median_m(self) -> float:
+        return float(np.median(self.errors_m))
+
+    @property
+    def percent(self) -> float:
+        return float(np.median(100.0 * np.array(self.errors_m) / np.array(self.distances_m)))
+
+
+@dataclass(frozen=True)
+class Compared:
+    """A mode beside an opponent on one log."""
+
+    log: str
+    seconds: float
+    ratio: float
+
+
+def compared(cells: Sequence[Cell], mode: str, known: str, against: str = BEST) -> list[Compared]:
+    """Ratios of medians on all logs and lengths that have both."""
+    out = []
+    for cell in cells:
+        if (cell.estimator, cell.known) != (mode, known):
+            continue
+        theirs = [
+            c.median_m
+            for c in cells
+            if (c.log, c.seconds) == (cell.log, cell.seconds)
+            and c.estimator in (OPPONENTS if against == BEST else (against,))
+        ]
+        if theirs:
+            out.append(Compared(cell.log, cell.seconds, ratio(cell.median_m, min(theirs))))
+    return out
+
+
+def markdown(cells: Sequence[Cell], failures: Sequence[str], missing: int, tasks: int) -> str:
+    """Summary, then a table for each state of knowledge and each length."""
+    kinds = list(dict.fromkeys(c.known for c in cells if c.estimator in MODES))
+    lengths = sorted({c.seconds for c in cells})
+    parts = [
+        "Ratio of median errors to the best of three opponents, geometric mean over logs with 95 % interval:"
+    ]
+    for known in kinds:
+        for mode in MODES:
+            for seconds in lengths:
+                parts.append(_line(cells, mode, known, seconds))
+    parts += ["", "The same, to each opponent, all lengths:"]
+    for known in kinds:
+        for mode in MODES:
+            for name in OPPONENTS:
+                ratios = [c.ratio for c in compared(cells, mode, known, name)]
+                if ratios:
+                    parts.append(
+                        f"{mode} / {name}, {known}: {geometric_mean(ratios).text()}, lost {losses(ratios)} of {len(ratios)}"
+                    )
+    for known in kinds:
+        for seconds in lengths:
+            parts += [
+                "",
+                f"Outages of {seconds:g} s, {known}; median error in m [95 %], per cent of the distance",
+                "",
+            ]
+            parts += _table(cells, known, seconds)
+    if failures:
+        parts += ["", "Failed (counted with the whole distance):", *dict.fromkeys(failures)]
+    if missing:
+        parts += ["", f"{missing} of {tasks} parts not run yet"]
+    return "\n".join(parts)
+
+
+def _line(cells: Sequence[Cell], mode: str, known: str, seconds: float) -> str:
+    ratios = [c.ratio for c in compared(cells, mode, known) if c.seconds == seconds]
+    if not ratios:
+        return f"{mode}, {known}, {seconds:g} s: not run"
+    mean = geometric_mean(ratios)
+    return f"{mode}, {known}, {seconds:g} s: {mean.text()}, lost {losses(ratios)} of {len(ratios)}, worst {max(ratios):.2f}"
+
+
+def _table(cells: Sequence[Cell], known: str, seconds: float) -> list[str]:
+    columns = [*OPPONENTS, *MODES]
+    lines = [
+        "| log | outages | " + " | ".join(columns) + " | " + " | ".join(f"{m} / best" for m in MODES) + " |"
+    ]
+    lines.append("|" + " --- |" * (2 + len(columns) + len(MODES)))
+    here = [c for c in cells if c.seconds == seconds and (c.estimator in OPPONENTS or c.known == known)]
+    for log in dict.fromkeys(c.log for c in here):
+        mine = {c.estimator: c for c in here if c.log == log}
+        count = max(len(c.errors_m) for c in mine.values())
+        texts = [_text(mine.get(name)) for name in columns]
+        ends = []
+        for mode in MODES:
+            ratios = {c.log: c.ratio for c in compared(here, mode, known)}
+            ends.append(f"{ratios[log]:.2f}" if log in ratios else "")
+        lines.append(f"| {log} | {count} | " + " | ".join([*texts, *ends]) + " |")
+    return lines
+
+
+def _text(cell: Cell | None) -> str:
+    return "" if cell is None else f"{median(cell.errors_m).text()}, {cell.percent:.1f} %"
+
+
+def picture(cells: Sequence[Cell]) -> Figure:
+    """Ratio to the best opponent, a row a log, a panel a state of knowledge."""
+    from matplotlib.figure import Figure
+
+    kinds = list(dict.fromkeys(c.known for c in cells if c.estimator in MODES))
+    logs = sorted({c.log for c in cells}, reverse=True)
+    columns = max(len(kinds), 1)
+    figure = Figure(figsize=(3.5 + 4.0 * columns, 1.5 + 0.25 * len(logs)), layout="constrained")
+    axes = figure.subplots(1, columns, sharey=True, squeeze=False)
+    for ax, known in zip(axes[0], kinds, strict=False):
+        for mode, marker in zip(MODES, "os", strict=True):
+            for seconds, colour in zip(sorted({c.seconds for c in cells}), ("C0", "C1", "C3"), strict=False):
+                found = [c for c in compared(cells, mode, known) if c.seconds == seconds]
+                ax.scatter(
+                    [c.ratio for c in found], [logs.index(c.log) for c in found], marker=marker, color=colour, s=22,
+                    alpha=0.75, label=f"{mode}, {seconds:g} s",
+                )  # fmt: skip
+        ax.axvline(1.0, color="0.4", linewidth=1.0)
+        ax.set_xscale("log")
+        style.format_axes(ax, x="median error / best opponent", title=known)
+        ax.set_yticks(range(len(logs)), logs, fontsize=7)
+    if kinds:
+        axes[0, -1].legend(fontsize=7, loc="best")
+    return figure

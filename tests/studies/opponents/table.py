@@ -1,0 +1,148 @@
+"""Errors in outages: terrafusion beside three opponents, on every log with fixes or truth.
+
+    python -m tests.studies.opponents.table --out FOLDER [--logs LOG...] [--seconds 10 30 60] [--jobs 2]
+
+Opponents are tuned on half of the logs (`tuning`), with the vehicle of the log; terrafusion runs with its
+defaults, once with that vehicle and once with wheel radius and track alone. Logs without a receiver get
+fixes made from their truth, RTK-like and consumer-like. Paths in TERRAFUSION_LOGS are added to the logs of
+the catalogue. Results are kept outage by outage: the same command goes on where it was stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from tests.studies.opponents import estimators, ours
+from tests.studies.opponents.drives import Drive, as_unknown, default_logs, drives_of, longest, vehicle_of
+from tests.studies.opponents.inertial import Inertial
+from tests.studies.opponents.page import Cell, markdown, picture
+from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
+
+LENGTHS_S = (10.0, 30.0, 60.0)
+ENVIRONMENT = "TERRAFUSION_LOGS"
+DESCRIBED, UNKNOWN = "vehicle of the log", "wheel radius and track alone"
+HERE = Path(__file__).parent
+
+
+@dataclasses.dataclass(frozen=True)
+class Work:
+    """One drive, one length, one estimator; `known` is DESCRIBED or UNKNOWN."""
+
+    drive: int
+    seconds: float
+    estimator: str
+    known: str
+
+
+_DRIVES: list[tuple[Drive, Inertial]] = []
+"""Loaded once, shared by the workers."""
+
+
+def compute(work: Work) -> dict[str, Any]:
+    """Rows and failures of one task."""
+    drive, inputs = _DRIVES[work.drive]
+    if work.estimator in estimators.OPPONENTS:
+        noise = estimators.noise_of(work.estimator)
+        rows = estimators.rows_of(work.estimator, inputs, work.seconds, noise)
+        return {"rows": [dataclasses.asdict(row) for row in rows], "failures": []}
+    recording = as_unknown(drive.recording) if work.known == UNKNOWN else drive.recording
+    replayed, failures = ours.rows(recording, inputs.streams, work.seconds, work.estimator)
+    return {"rows": [dataclasses.asdict(row) for row in replayed], "failures": failures}
+
+
+def load(names: Sequence[str], runs: int) -> None:
+    """Read the logs; those that cannot be read are named and left out."""
+    _DRIVES.clear()
+    for name in names:
+        try:
+            for drive in longest(drives_of(name), runs):
+                inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
+                if inputs is not None:
+                    _DRIVES.append((drive, inputs))
+        except TerrafusionError as error:
+            print(f"{name}: left out, {error}", file=sys.stderr)
+
+
+def tasks_of(lengths: Sequence[float]) -> list[Task]:
+    """All tasks, the quick opponents first, then one mode after another over all logs."""
+    opponents = code_of(
+        *(HERE / f"{n}.py" for n in ("ekf", "smoother", "ins", "inertial", "protocol", "drives"))
+    )
+    opponents += code_of(estimators.TUNED)
+    library = library_code() + code_of(HERE / "drives.py", HERE / "protocol.py")
+    wanted = [(name, DESCRIBED) for name in estimators.OPPONENTS]
+    wanted += [(mode, known) for known in (DESCRIBED, UNKNOWN) for mode in estimators.MODES]
+    tasks = []
+    for estimator, known in wanted:
+        for i, (drive, inputs) in enumerate(_DRIVES):
+            for seconds in lengths:
+                if inputs.streams.passes(seconds):
+                    code = opponents if estimator in estimators.OPPONENTS else library
+                    name = f"{drive.name} {drive.recording.name} {seconds:g} s {estimator} {known}"
+                    tasks.append(Task(name, code, Work(i, seconds, estimator, known)))
+    return tasks
+
+
+def cells_of(tasks: Sequence[Task], folder: Path) -> tuple[list[Cell], list[str]]:
+    """Outages by log, length, estimator and what is known, and all failures."""
+    errors: dict[tuple[str, float, str, str], list[tuple[float, float]]] = {}
+    failures = []
+    for task in tasks:
+        result = result_of(task, folder)
+        if result is None:
+            continue
+        work: Work = task.what
+        key = (_DRIVES[work.drive][0].name, work.seconds, work.estimator, work.known)
+        errors.setdefault(key, []).extend((r["error_m"], r["distance_m"]) for r in result["rows"])
+        failures += [f"{key[0]}, {key[1]:g} s, {key[2]}, {key[3]}: {line}" for line in result["failures"]]
+    return [Cell(*key, *zip(*rows, strict=True)) for key, rows in errors.items() if rows], failures
+
+
+def main() -> int:
+    """The command line."""
+    parser = argparse.ArgumentParser(
+        prog="python -m tests.studies.opponents.table",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--out", type=Path, required=True, help="folder for parts, tables and figure")
+    parser.add_argument("--logs", nargs="+", metavar="LOG", help="by default all at hand")
+    parser.add_argument("--seconds", nargs="+", type=float, default=LENGTHS_S)
+    parser.add_argument("--runs", type=int, default=1, help="of a file with many runs, the longest")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument(
+        "--minutes", type=float, default=600.0, help="stop after this time, with what there is"
+    )
+    parser.add_argument("--only", nargs="+", metavar="ESTIMATOR", help="run these alone")
+    given = parser.parse_args()
+    further = [p for p in os.environ.get(ENVIRONMENT, "").split(os.pathsep) if p]
+    load(given.logs or [*default_logs(), *further], given.runs)
+    if not _DRIVES:
+        parser.exit(1, "error: no log can be scored; set TERRAFUSION_DATA\n")
+    tasks, parts = tasks_of(given.seconds), given.out / "parts"
+    run_all(
+        [t for t in tasks if not given.only or t.what.estimator in given.only],
+        compute,
+        parts,
+        given.jobs,
+        60.0 * given.minutes,
+    )
+    cells, failures = cells_of(tasks, parts)
+    text = markdown(cells, failures, sum(result_of(t, parts) is None for t in tasks), len(tasks))
+    (given.out / "opponents.md").write_text(text + "\n", encoding="utf-8")
+    picture(cells).savefig(given.out / "opponents.png", dpi=110)
+    print(text)
+    return 0
+
+
+if __name__ == "__main__":
+    from tests.studies.opponents import table
+
+    sys.exit(table.main())  # workers know the tasks by the module's own name
