@@ -10,7 +10,6 @@ Printed: median error in per cent of the distance and in metres, outages in brac
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import multiprocessing
 import os
 import time
@@ -21,7 +20,7 @@ import numpy as np
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from tests.studies.opponents import ekf, ours
-from tests.studies.opponents.drives import Drive, all_drives, as_unknown, described, vehicle_of
+from tests.studies.opponents.drives import Drive, all_drives, as_unknown, vehicle_of
 from tests.studies.opponents.protocol import Row, Streams, scored, streams_of
 
 QUICK = (
@@ -67,9 +66,6 @@ def load(names: Sequence[str], vehicle: str | None, unknown: bool) -> None:
         params = vehicle_of(drive.recording, vehicle)
         streams = streams_of(drive.recording, params)
         recording = as_unknown(drive.recording) if unknown else drive.recording
-        if vehicle is None and not described(recording):
-            print(f"{drive.name}: its vehicle is not known; replayed as generic")
-            recording = dataclasses.replace(recording, vehicle="generic")
         if streams is not None:
             _DRIVES.append((Drive(drive.log, drive.fixes, recording), streams))
 

@@ -17,12 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Fix, Gnss
-from terrafusion.datasets.core.errors import DataError, TerrafusionError
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.benchmark.field_logs import catalogued, read_runs, reference_of
 from terrafusion.twin.model.choose import choose_vehicle
-from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_overrides
+from terrafusion.twin.model.library import is_named
+from terrafusion.twin.model.vehicle import VehicleParams
 
 Array = NDArray[np.float64]
 
@@ -164,26 +165,15 @@ def _slow(rng: np.random.Generator, t_s: Array, receiver: Receiver) -> Array:
 
 def as_unknown(recording: Recording) -> Recording:
     """The recording of a robot without a vehicle file: wheel radius and track are all that is known of it."""
-    known = Overrides(recording.overrides.wheel_radius_m, recording.overrides.track_m)
-    if described(recording):
-        rig = choose_vehicle(recording)[0].rig()
-        known = Overrides(rig.wheel_radius_m, rig.track_m)
+    rig, name = vehicle_of(recording, None).rig(), recording.vehicle
+    named = name is not None and is_named("vehicles", name)
+    track = rig.track_m if named else recording.overrides.track_m
+    known = Overrides(wheel_radius_m=rig.wheel_radius_m, track_m=track)
     return dataclasses.replace(recording, vehicle=None, overrides=known)
 
 
-def described(recording: Recording) -> bool:
-    """Whether the log names a vehicle that there is a file for, or gives its geometry."""
-    try:
-        choose_vehicle(recording)
-    except TerrafusionError:
-        return False
-    return True
-
-
 def vehicle_of(recording: Recording, vehicle: str | None) -> VehicleParams:
-    """The vehicle asked for, else that of the log; where none is known, the generic one with its geometry."""
-    if vehicle is None and not described(recording):
-        return with_overrides(load_vehicle("generic"), recording.overrides)
+    """The vehicle asked for, else that of the log."""
     return choose_vehicle(recording, vehicle)[0]
 
 

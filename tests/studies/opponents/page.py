@@ -104,7 +104,8 @@ def _line(cells: Sequence[Cell], mode: str, known: str, seconds: float) -> str:
     if not ratios:
         return f"{mode}, {known}, {seconds:g} s: not run"
     mean = geometric_mean(ratios)
-    return f"{mode}, {known}, {seconds:g} s: {mean.text()}, lost {losses(ratios)} of {len(ratios)}, worst {max(ratios):.2f}"
+    lost = f"lost {losses(ratios)} of {len(ratios)}, worst {max(ratios):.2f}"
+    return f"{mode}, {known}, {seconds:g} s: {mean.text()}, {lost}"
 
 
 def _table(cells: Sequence[Cell], known: str, seconds: float) -> list[str]:
@@ -143,10 +144,9 @@ def picture(cells: Sequence[Cell]) -> Figure:
         for mode, marker in zip(MODES, "os", strict=True):
             for seconds, colour in zip(sorted({c.seconds for c in cells}), ("C0", "C1", "C3"), strict=False):
                 found = [c for c in compared(cells, mode, known) if c.seconds == seconds]
-                ax.scatter(
-                    [c.ratio for c in found], [logs.index(c.log) for c in found], marker=marker, color=colour, s=22,
-                    alpha=0.75, label=f"{mode}, {seconds:g} s",
-                )  # fmt: skip
+                rows = [logs.index(c.log) for c in found]
+                label = f"{mode}, {seconds:g} s"
+                ax.scatter([c.ratio for c in found], rows, 22, colour, marker, alpha=0.75, label=label)
         ax.axvline(1.0, color="0.4", linewidth=1.0)
         ax.set_xscale("log")
         style.format_axes(ax, x="median error / best opponent", title=known)
