@@ -18,6 +18,7 @@ import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.conventions import Conventions
@@ -47,7 +48,7 @@ class CatalogFile:
         """Where the file can be downloaded."""
         if "://" in self.repository:
             return f"{self.repository}/{self.path}"
-        return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/{self.path}"
+        return f"https://raw.githubusercontent.com/{self.repository}/{self.commit}/{quote(self.path)}"
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Channel, Imu, Terrain
-from terrafusion.datasets.core.quantity import Position, Sourced
+from terrafusion.datasets.core.quantity import Position, Sourced, Word
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.sensors import axes_matrix
+from terrafusion.datasets.core.sensors import DRIVES, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -34,6 +34,7 @@ class Conventions:
         gyro_z_sign: -1 where the yaw rate is positive to the right (after `imu_axes`).
         left_wheels_sign, right_wheels_sign: -1 where that side is negative when driving forward.
         wheel_radius_m, track_m: of the robot; the track is the geometric one.
+        drive, wheelbase_m: how the robot turns, and the distance of its axles.
         antenna_m, imu_m: positions in the body frame.
         held: rows for which a channel holds a value, by channel name ("wheels", "imu", "gnss",
             "truth"); of a run of equal rows the first and then every so many rows are true updates.
@@ -49,6 +50,8 @@ class Conventions:
     right_wheels_sign: Sign = 1.0
     wheel_radius_m: Annotated[float, Sourced("m", 0.01, 2.0)] | None = None
     track_m: Annotated[float, Sourced("m", 0.05, 10.0)] | None = None
+    drive: Annotated[str, Word(DRIVES)] | None = None
+    wheelbase_m: Annotated[float, Sourced("m", 0.05, 10.0)] | None = None
     antenna_m: Position | None = None
     imu_m: Position | None = None
     held: dict[str, Annotated[float, Sourced("rows", 1.0, 1e4)]] = field(default_factory=dict)
@@ -71,7 +74,10 @@ def apply(recording: Recording, conventions: Conventions) -> Recording:
 
 
 def _geometry(recording: Recording, c: Conventions) -> Recording:
-    own = {name: getattr(c, name) for name in ("wheel_radius_m", "track_m", "antenna_m", "imu_m")}
+    own = {
+        name: getattr(c, name)
+        for name in ("wheel_radius_m", "track_m", "drive", "wheelbase_m", "antenna_m", "imu_m")
+    }
     new = {name: value for name, value in own.items() if value is not None}
     return dataclasses.replace(
         recording,

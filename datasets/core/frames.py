@@ -85,6 +85,24 @@ def enu_to_geodetic(enu_m: ArrayLike, datum: ArrayLike) -> Array:
     return np.stack(pymap3d.enu2geodetic(enu[:, 0], enu[:, 1], enu[:, 2], lat0, lon0, height0), axis=-1)
 
 
+def enu_from_ecef(
+    ecef_m: ArrayLike, datum: tuple[float, float, float] | None = None
+) -> tuple[Array, Array, tuple[float, float, float]]:
+    """ENU positions (N, 3) of WGS-84 ECEF positions (N, 3), and the rotation (3, 3) of ECEF vectors to ENU.
+
+    The third value is the datum: the one given, else the first position.
+    """
+    import pymap3d
+
+    x, y, z = np.atleast_2d(np.asarray(ecef_m, dtype=float)).T
+    if datum is None:
+        latitude, longitude, height = (float(value) for value in pymap3d.ecef2geodetic(x[0], y[0], z[0]))
+        datum = latitude, longitude, height
+    east, north, up = pymap3d.ecef2enu(x, y, z, *datum)
+    columns = [pymap3d.ecef2enuv(*axis, datum[0], datum[1]) for axis in np.eye(3)]
+    return np.stack([east, north, up], axis=-1), np.array(columns).T, datum
+
+
 def gtsam_to_ros_covariance(covariance: ArrayLike, R_world_body: ArrayLike) -> Array:
     """Pose covariances (..., 6, 6), rotation first in the body -> translation first in the world."""
     P = np.asarray(covariance, dtype=float)

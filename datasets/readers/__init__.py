@@ -14,6 +14,7 @@ and tables) with two functions, and list it in `formats.FORMATS`:
   `Recording.notes`, what is wrong with the file into a `DataError` with place, value and remedy. A time that
   runs backwards is refused unless `request.repair_clock` (`text.row_times`). Bytes are of unknown origin: no
   count is believed before it was compared with what is there.
+- Optionally, for a folder, `member(path) -> Path | None`: a file in it that the catalogue may know it by.
 - Optionally `companions(path) -> Sequence[Path]`: the files that are read with this one.
 
 Helpers: `delimited` parses text tables, `text.fixes` places latitudes and longitudes, `channel_tables` makes

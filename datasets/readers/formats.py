@@ -60,6 +60,14 @@ class Format:
         recordings: Sequence[Recording] = import_module(self.module).read(request)
         return recordings
 
+    def member(self, path: Path) -> Path | None:
+        """A file that the catalogue may know the log by: itself, or one in its folder."""
+        if path.is_file():
+            return path
+        module = import_module(self.module)
+        found: Path | None = module.member(path) if hasattr(module, "member") else None
+        return found
+
     def files(self, path: Path) -> list[Path]:
         """What `read` opens: all files of a folder; else the file and its companions."""
         if path.is_dir():
@@ -72,6 +80,7 @@ class Format:
 
 _READERS = "terrafusion.datasets.readers"
 FORMATS: tuple[Format, ...] = (
+    Format("comma_segment", "a segment of comma2k19 (its folder)", f"{_READERS}.sets.comma_segment"),
     Format("log_folder", "a log folder (with meta.yaml)", f"{_READERS}.log_folder"),
     Format("ros1", "a ROS 1 .bag", f"{_READERS}.ros.ros1"),
     Format("ros2", "a ROS 2 bag (its folder, .mcap, .db3)", f"{_READERS}.ros.ros2"),

@@ -136,7 +136,8 @@ def _misspelt(name: str, place: Path) -> Path:
 def _known(path: Path, form: Format) -> tuple[CatalogFile | None, Conventions, tuple[str, ...]]:
     """What the catalogue says of a file, by its bytes, else by its format."""
     catalog = load_catalog()
-    entry = catalog.find(path) if path.is_file() else None
+    file = form.member(path)
+    entry = catalog.find(file) if file is not None else None
     if entry is not None:
         known = catalog.sets[entry.set_name]
         return entry, known.conventions_of(entry.recording), known.notes_of(entry.recording)

@@ -69,6 +69,7 @@ def write_samples(folder: Path) -> list[Path]:
         _matlab,
         _umich,
         _borealtc,
+        _comma,
         _tum,
         _xsens,
         _pos,
@@ -222,6 +223,12 @@ def _borealtc(folder: Path) -> None:
     t, v, rate, _ = _drive(6.5)
     table = np.column_stack([t, 3 + 0 * t, 3 + 0 * t, _sides(v, rate)])
     _text(sample / "SNOW" / "pro_00.csv", table, ",", "time,curL,curR,velL,velR")
+
+
+def _comma(folder: Path) -> None:
+    from comma_files import write_segment  # type: ignore[import-not-found]
+
+    write_segment(_sample(folder, "comma", "segment") / "segment")
 
 
 def _tum(folder: Path) -> None:

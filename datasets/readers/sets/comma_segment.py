@@ -1,0 +1,254 @@
+"""One-minute segments of comma2k19: numpy arrays without an extension, in a folder a segment.
+
+`processed_log/*/*/t` holds seconds since the device was switched on, `value` beside it: `CAN/wheel_speed`
+(front left, front right, rear left, rear right, m/s), `CAN/steering_angle` (deg at the steering wheel,
+positive to the left), `IMU/gyro` and `IMU/accelerometer` (forward, right, down), `GNSS/live_gnss_ublox`
+(latitude and longitude deg, speed m/s, UTC ms, altitude m, bearing deg). `global_pose/frame_*` holds the
+camera's pose: ECEF positions, orientations as quaternions w, x, y, z. Any file of a segment opens all of it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Steering, Wheels
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import enu_from_ecef, matrix_to_quaternion, quaternion_to_matrix
+from terrafusion.datasets.core.gnss_time import WEEK_S, gps_to_unix_ns
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.log_folder import META, truth_contents
+from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
+from terrafusion.datasets.readers.text.row_times import row_times
+
+Array = NDArray[np.float64]
+TimesNs = NDArray[np.int64]
+
+MAGIC = b"\x93NUMPY"
+LOG, POSE = "processed_log", "global_pose"
+SIGNALS = {
+    "CAN/wheel_speed": (4, "wheels"),
+    "CAN/steering_angle": (1, "steering"),
+    "IMU/gyro": (3, "imu"),
+    "IMU/accelerometer": (3, "imu"),
+    "GNSS/live_gnss_ublox": (6, "gnss"),
+}
+"""Columns of each signal that is read, and its channel."""
+FRAMES = {"frame_times": 1, "frame_gps_times": 2, "frame_positions": 3, "frame_orientations": 4}
+MAX_VALUE = 1e15
+MAX_BOOT_S = 1e8
+FORWARD_LEFT_UP = np.diag([1.0, -1.0, -1.0])
+"""Forward, right, down turned to forward, left, up."""
+
+
+@dataclass(frozen=True, eq=False)
+class Signal:
+    """Times (N,) in ns since the device was switched on, and values (N, k)."""
+
+    boot_ns: TimesNs
+    value: Array
+
+
+def claims(path: Path, head: bytes) -> bool:
+    """Whether it is a folder of a segment, or one of its arrays."""
+    if path.is_dir():
+        return (path / LOG).is_dir() and not (path / META).exists()
+    return head.startswith(MAGIC) and _segment_of(path) is not None
+
+
+def companions(path: Path) -> list[Path]:
+    """The arrays that are read with this one."""
+    folder = _segment_of(path)
+    assert folder is not None, "claimed by its place"
+    names = [f"{LOG}/{name}/{part}" for name in SIGNALS for part in ("t", "value")]
+    names += [f"{POSE}/{name}" for name in FRAMES]
+    return [folder / name for name in names if (folder / name).is_file()]
+
+
+def member(folder: Path) -> Path | None:
+    """A file by which the catalogue knows the segment."""
+    return next((path for path in sorted((folder / LOG).rglob("value"))), None)
+
+
+def read(request: Request) -> list[Recording]:
+    """The one recording of a segment.
+
+    Raises:
+        DataError: an array is broken, has other rows than its times, or time runs backwards.
+    """
+    folder = request.path if request.path.is_dir() else _segment_of(request.path)
+    assert folder is not None, "claimed by its place"
+    signals = {name: _signal(folder / LOG / name, size) for name, (size, _) in SIGNALS.items()}
+    poses = {name: _array(folder / POSE / name, size) for name, size in FRAMES.items()}
+    frames = {name: values for name, values in poses.items() if values is not None}
+    clock_ns, notes = _unix_less_boot(signals["GNSS/live_gnss_ublox"], frames)
+    times = {n: row_times(request, n, s.boot_ns + clock_ns) for n, s in signals.items() if s is not None}
+    values = {n: s.value[times[n].order] for n, s in signals.items() if s is not None}
+    gnss, datum, about_fixes = _gnss(request, values.get("GNSS/live_gnss_ublox"))
+    imu, about_imu = _imu(
+        {n: (times[n].t_ns, values[n]) for n in ("IMU/gyro", "IMU/accelerometer") if n in values}
+    )
+    truth, datum = _truth(request, frames, clock_ns, datum)
+    wheels, steering = "CAN/wheel_speed", "CAN/steering_angle"
+    channels: dict[str, Any] = {
+        "wheels": Wheels(times[wheels].t_ns, values[wheels], Wheels.LAYOUTS[1], "mps")
+        if wheels in values
+        else None,
+        "steering": Steering(times[steering].t_ns, np.radians(values[steering]), ("steering_wheel",))
+        if steering in values
+        else None,
+        "imu": imu,
+        "gnss": gnss,
+        "truth": truth,
+    }
+    firsts = [int(channel.t_ns[0]) for channel in channels.values() if channel is not None and len(channel)]
+    if not firsts:
+        remedy = f"give a folder that holds {', '.join(f'{LOG}/{name}' for name in SIGNALS)}"
+        raise DataError("no array of the segment is there", file=folder, remedy=remedy)
+    recording = Recording(
+        name=folder.resolve().name,
+        start_ns=min(firsts),
+        **channels,
+        datum=datum,
+        truth_channels=truth_contents(truth) if truth is not None else (),
+        truth_frame="antenna",
+        clock_jumps=tuple(jump for n, t in times.items() for jump in t.jumps_of([SIGNALS[n][1]])),
+        notes=(*notes, *about_fixes, *about_imu, *(note for t in times.values() for note in t.notes)),
+    )
+    if truth is not None:
+        recording = recording.with_notes("truth: pose of the camera; taken as that of the antenna beside it")
+    return [recording]
+
+
+def _segment_of(path: Path) -> Path | None:
+    """The segment's folder of one of its arrays."""
+    for parent in path.parents:
+        if parent.name in (LOG, POSE):
+            return parent.parent
+    return None
+
+
+def _array(path: Path, columns: int) -> Array | None:
+    """Rows (N, columns) of an array, None where the file is absent."""
+    if not path.is_file():
+        return None
+    try:  # mapped, so that a header cannot claim more than the file holds
+        found = np.array(np.load(path, mmap_mode="r", allow_pickle=False), dtype=float)
+    except Exception:  # of an unknown origin: whatever the parser of the header raises
+        raise DataError("is not a whole numpy array of numbers", file=path, remedy="copy it again") from None
+    found = found[:, None] if found.ndim == 1 else found
+    if found.ndim != 2 or found.shape[1] != columns or not len(found):
+        what = f"has the shape {found.shape}"
+        raise DataError(what, file=path, remedy=f"give an array of {columns} columns, as published")
+    if (np.abs(found) > MAX_VALUE).any():
+        raise DataError("holds infinite or absurd values", file=path, remedy="mark unknown values by NaN")
+    return found
+
+
+def _signal(folder: Path, columns: int) -> Signal | None:
+    t_s, value = _array(folder / "t", 1), _array(folder / "value", columns)
+    if t_s is None or value is None:
+        return None
+    return Signal(_boot_ns(folder / "t", t_s, len(value)), value)
+
+
+def _boot_ns(path: Path, t_s: Array, rows: int) -> TimesNs:
+    if len(t_s) != rows:
+        raise DataError(f"has {len(t_s)} times for {rows} rows", file=path, remedy="copy the segment again")
+    if not (np.abs(t_s) < MAX_BOOT_S).all():
+        raise DataError("holds no seconds since the start of the device", file=path, remedy="copy it again")
+    return np.rint(t_s[:, 0] * 1e9).astype(np.int64)
+
+
+def _unix_less_boot(gnss: Signal | None, frames: dict[str, Array]) -> tuple[np.int64, list[str]]:
+    """Unix time less the device's, ns: by the camera's frames, which carry both, else by the receiver."""
+    if "frame_gps_times" in frames and "frame_times" in frames:
+        week, of_week = frames["frame_gps_times"][0]
+        if 0.0 <= week < 1e5 and 0.0 <= of_week < WEEK_S:
+            gps_ns = np.array([round(week) * WEEK_S * 10**9 + round(of_week * 1e9)])
+            boot_ns = np.rint(frames["frame_times"][0, 0] * 1e9).astype(np.int64)
+            return gps_to_unix_ns(gps_ns)[0] - boot_ns, [
+                "times: the device's clock is set by the GPS times of the frames"
+            ]
+    utc = gnss.value[:, 3] if gnss is not None else np.zeros(0)
+    if gnss is not None and _is_utc_ms(utc).any():
+        held = _is_utc_ms(utc)
+        late = np.median(gnss.boot_ns[held] - np.rint(utc[held] * 1e6).astype(np.int64))
+        return np.int64(-late), [
+            "times: the device's clock is set by the receiver's UTC, which comes some 0.1 s late"
+        ]
+    return np.int64(0), ["times: no UTC in the segment; they count from the start of the device"]
+
+
+def _is_utc_ms(utc: Array) -> NDArray[np.bool_]:
+    return np.asarray((utc > 1e11) & (utc < 4e12))
+
+
+def _gnss(request: Request, rows: Array | None) -> tuple[Gnss | None, Datum | None, list[str]]:
+    """Fixes at their own UTC; speed and bearing give the velocity."""
+    if rows is None:
+        return None, None, []
+    held = _is_utc_ms(rows[:, 3])
+    notes = [] if held.all() else [f"gnss: {int((~held).sum())} fixes without UTC left out"]
+    rows = rows[held]
+    if not len(rows):
+        return None, None, notes
+    t_ns = np.rint(rows[:, 3] * 1e6).astype(np.int64)
+    times = row_times(request, "gnss", t_ns)
+    latitude, longitude, speed, _, altitude, bearing = rows[times.order].T
+    course = np.radians(bearing)
+    velocity = np.stack([speed * np.sin(course), speed * np.cos(course), np.full(len(speed), np.nan)], axis=1)
+    fixes = Fixes(
+        times.t_ns,
+        np.stack([latitude, longitude, altitude], axis=1),
+        np.full(len(speed), Fix.SINGLE, dtype=np.uint8),
+        np.full((len(speed), 3), np.nan),
+        velocity,
+    )
+    gnss, datum, about = gnss_channel(request, fixes)
+    return gnss, datum, [*notes, "gnss: times are the fixes' own UTC", *about]
+
+
+def _imu(found: dict[str, tuple[TimesNs, Array]]) -> tuple[Imu | None, list[str]]:
+    """Rates and specific forces at the rates' times."""
+    if not found:
+        return None, []
+    t_ns = next(iter(found.values()))[0]
+    groups, notes = [], []
+    for name in ("IMU/gyro", "IMU/accelerometer"):
+        times, values = found.get(name, (t_ns, np.full((len(t_ns), 3), np.nan)))
+        if not np.array_equal(times, t_ns):
+            notes.append(f"imu: {name} has times of its own; interpolated at those of the gyro")
+            since = (times - t_ns[0]) * 1e-9
+            values = np.stack(
+                [np.interp((t_ns - t_ns[0]) * 1e-9, since, column) for column in values.T], axis=1
+            )
+        groups.append(values)
+    return Imu(t_ns, groups[0], groups[1]), notes
+
+
+def _truth(
+    request: Request, frames: dict[str, Array], clock_ns: np.int64, datum: Datum | None
+) -> tuple[Trajectory | None, Datum | None]:
+    """The camera's poses about `datum`, or about the first of them, which is then the datum."""
+    if not {"frame_times", "frame_positions", "frame_orientations"} <= frames.keys():
+        return None, datum
+    path = request.path / POSE / "frame_times" if request.path.is_dir() else request.path
+    position, orientation = frames["frame_positions"], frames["frame_orientations"]
+    t_ns = _boot_ns(path, frames["frame_times"], len(position)) + clock_ns
+    norms = np.linalg.norm(orientation, axis=1)
+    if len(orientation) != len(position) or not (np.abs(norms - 1.0) < 0.01).all():
+        raise DataError(
+            "frame_orientations are no unit quaternions", file=path, remedy="copy the segment again"
+        )
+    enu, R_enu_ecef, datum = enu_from_ecef(position, datum)
+    R_ecef_camera = quaternion_to_matrix(orientation[:, [1, 2, 3, 0]])
+    quaternion = matrix_to_quaternion(R_enu_ecef @ R_ecef_camera @ FORWARD_LEFT_UP)
+    fresh = np.concatenate([[True], np.diff(t_ns) > 0])
+    return Trajectory(t_ns[fresh], enu[fresh], quaternion[fresh]), datum
