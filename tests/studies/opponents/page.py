@@ -81,9 +81,8 @@ def markdown(cells: Sequence[Cell], failures: Sequence[str], missing: int, tasks
             for name in OPPONENTS:
                 ratios = [c.ratio for c in compared(cells, mode, known, name)]
                 if ratios:
-                    parts.append(
-                        f"{mode} / {name}, {known}: {geometric_mean(ratios).text()}, lost {losses(ratios)} of {len(ratios)}"
-                    )
+                    lost = f"lost {losses(ratios)} of {len(ratios)}"
+                    parts.append(f"{mode} / {name}, {known}: {geometric_mean(ratios).text()}, {lost}")
     for known in kinds:
         for seconds in lengths:
             parts += [
