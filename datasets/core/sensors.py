@@ -120,6 +120,24 @@ class MagnetometerSpec:
 
 
 @dataclass(frozen=True)
+class SteeringSpec:
+    """Steered wheels: their limits, and how well the angle in a log is known.
+
+    Angles are those of the bicycle model, one an axle; `four_wheel_steer` turns the rear wheels against
+    the front ones. `ratio` is the angle of the steering wheel over that of the front wheels, None where it
+    is not known; it matters for logs of a steering wheel only. The curvature that the angles show has the
+    relative 1 sigma `scale_sigma` and their zero `offset_sigma_rad`.
+    """
+
+    max_angle_rad: Annotated[float, Sourced("rad", 0.02, 1.4)] = 0.6
+    max_rate_radps: Annotated[float, Sourced("rad/s", 0.01, 50.0)] = 1.5
+    ratio: Annotated[float, Sourced("", 0.05, 100.0)] | None = None
+    scale_sigma: Annotated[float, Sourced("", 0.0, 1.0)] = 0.05
+    offset_sigma_rad: Annotated[float, Sourced("rad", 0.0, 0.5)] = 0.02
+    noise_rad: Annotated[float, Sourced("rad", 0.0, 0.5)] = 0.002
+
+
+@dataclass(frozen=True)
 class SensorSuite:
     """All sensors of a robot; barometer and magnetometer only where it has them."""
 
@@ -135,10 +153,14 @@ class Rig:
     """The geometry that readers and estimators need to interpret a recording.
 
     `track_m` is the track of the log's wheel odometry: a body twist (v, yaw rate) has the side speeds
-    v -+ yaw rate * track / 2.
+    v -+ yaw rate * track / 2. `drive` is one of `DRIVES`; `steering` is None where no wheel is steered, else
+    its curvature is (tan front - tan rear) / `wheelbase_m`.
     """
 
     wheel_radius_m: float
     track_m: float
     sensors: SensorSuite
     topics: dict[str, str] = field(default_factory=dict)
+    drive: str = "skid_steer"
+    wheelbase_m: float = 0.5
+    steering: SteeringSpec | None = None

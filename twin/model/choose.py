@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 
+from terrafusion.datasets.core.channels import Steering
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.core.sensors import STEERED_DRIVES
 from terrafusion.twin.model.library import is_named
 from terrafusion.twin.model.vehicle import (
     VehicleParams,
@@ -17,6 +20,9 @@ from terrafusion.twin.model.vehicle import (
     vehicle_names,
     with_overrides,
 )
+
+TRACK_OVER_WHEELBASE = 0.6
+"""Of cars and carts (assumed), for a steered robot whose track is not known."""
 
 
 def choose_vehicle(
@@ -32,14 +38,18 @@ def choose_vehicle(
         ConfigError: an unknown vehicle is asked for.
     """
     asked, overrides = vehicle, recording.overrides
+    if overrides.drive is None and recording.steering is not None:
+        overrides = dataclasses.replace(overrides, drive=_drive_of(recording.steering))
     if not asked and recording.vehicle and is_named("vehicles", recording.vehicle):
         asked = recording.vehicle
     if asked:
         loaded = as_vehicle(asked)
+        if loaded.drive.type in STEERED_DRIVES:
+            overrides = dataclasses.replace(overrides, drive=recording.overrides.drive)
         return with_overrides(loaded, overrides), geometry_notes(loaded, overrides)
     name = recording.vehicle
     which = f"unknown vehicle '{name}'" if name else "the log names no vehicle"
-    missing = _missing_geometry(recording)
+    missing = _missing_geometry(recording, overrides)
     if missing:
         raise DataError(
             f"{which}, and the log lacks its {' and '.join(missing)}",
@@ -47,20 +57,34 @@ def choose_vehicle(
             remedy=f"give {' and '.join(missing)} in meta.yaml, or --vehicle with a YAML file or one of "
             + ", ".join(vehicle_names()),
         )
-    chosen = with_overrides(as_vehicle("generic"), overrides)
+    steered, wheelbase_m = overrides.drive in STEERED_DRIVES, overrides.wheelbase_m
+    track_m = overrides.track_m
+    if steered and wheelbase_m is not None and track_m is None:
+        track_m = TRACK_OVER_WHEELBASE * wheelbase_m
+    chosen = with_overrides(as_vehicle("generic"), dataclasses.replace(overrides, track_m=track_m))
     given = f", with {listed_overrides(overrides)} of the log" if overrides != Overrides() else ""
     track = f"its track of {chosen.odometry.track_m:g} m and " if overrides.track_m is None else ""
+    if steered and wheelbase_m is None:
+        track = f"its wheelbase of {chosen.body.wheelbase_m:g} m, {track}"
     return chosen, (f"{which}: the generic vehicle is used{given}; assumed are {track}its sensor noise",)
 
 
-def _missing_geometry(recording: Recording) -> list[str]:
-    """What a generic vehicle cannot replace: a radius for rad/s, a track where no gyro shows the yaw."""
-    wheels, imu, overrides = recording.wheels, recording.imu, recording.overrides
+def _drive_of(steering: Steering) -> str:
+    """The drive that steering angles suggest."""
+    return "four_wheel_steer" if steering.axle_angles_rad()[:, 1].any() else "ackermann"
+
+
+def _missing_geometry(recording: Recording, overrides: Overrides) -> list[str]:
+    """What a generic vehicle cannot replace: a radius for rad/s; track or wheelbase where no gyro shows yaw."""
+    wheels, imu = recording.wheels, recording.imu
     missing = []
     if wheels is not None and wheels.unit == "radps" and overrides.wheel_radius_m is None:
         missing.append("wheel_radius_m")
     yaw_by_gyro = imu is not None and bool(np.isfinite(imu.gyro_radps[:, 2]).any())
     turns = wheels is None or wheels.has_sides()
-    if turns and not yaw_by_gyro and overrides.track_m is None:
+    if recording.steering is not None and overrides.drive in STEERED_DRIVES:
+        if not yaw_by_gyro and overrides.wheelbase_m is None:
+            missing.append("wheelbase_m")
+    elif turns and not yaw_by_gyro and overrides.track_m is None:
         missing.append("track_m")
     return missing

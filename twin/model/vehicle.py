@@ -17,13 +17,17 @@ from typing import Annotated
 from terrafusion.datasets.core.config import refuse, structure
 from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
-from terrafusion.datasets.core.quantity import Sourced
+from terrafusion.datasets.core.quantity import Sourced, Word
 from terrafusion.datasets.core.recording import Overrides, Recording
-from terrafusion.datasets.core.sensors import Rig, SensorSuite
+from terrafusion.datasets.core.sensors import DRIVES, STEERED_DRIVES, Rig, SensorSuite, SteeringSpec
 from terrafusion.twin.model.library import known_names, read_named
 from terrafusion.twin.model.sensor_realism import SensorRealism
 
-GEOMETRY = {"wheel_radius_m": "wheel.radius_m", "track_m": "body.track_m"}
+GEOMETRY = {
+    "wheel_radius_m": "wheel.radius_m",
+    "track_m": "body.track_m",
+    "wheelbase_m": "body.wheelbase_m",
+}
 """Odometry geometry a log may report, and the number of the body that it replaces, unless `measured`."""
 
 
@@ -57,7 +61,7 @@ class Wheel:
 
 @dataclass(frozen=True)
 class DriveTrain:
-    """One motor and gearbox a wheel, its speed loop, and the command limits.
+    """How the robot turns (`type`), one motor and gearbox a wheel, its speed loop, and the command limits.
 
     Torque-speed line: stall torque at rest falling to zero at the no-load
     speed; the current limit caps it at `torque_limit_nm` (motor shaft). The
@@ -78,6 +82,7 @@ class DriveTrain:
     max_accel_mps2: Annotated[float, Sourced("m/s2", 0.05, 50.0)]
     max_yaw_accel_radps2: Annotated[float, Sourced("rad/s2", 0.05, 50.0)]
     no_load_current_a: Annotated[float, Sourced("A", 0.0, 100.0)] = 0.0
+    type: Annotated[str, Word(DRIVES)] = "skid_steer"
 
 
 @dataclass(frozen=True)
@@ -108,7 +113,7 @@ class Odometry:
 
 @dataclass(frozen=True, repr=False)
 class VehicleParams:
-    """A four-wheel differential-drive robot: body, drive, odometry and sensors.
+    """A four-wheel robot: body, drive, steering where it has any, odometry and sensors.
 
     Without a battery the motors are fed with `drive.supply_v`, whatever they draw. `effects` are optional
     effects by key (docs/reference/effects.md) that this robot, or what it drives on, is known to have, as
@@ -128,6 +133,7 @@ class VehicleParams:
     topics: dict[str, str] = field(default_factory=dict)
     effects: dict[str, Annotated[float, Sourced("")]] = field(default_factory=dict)
     measured: tuple[str, ...] = ()
+    steering: SteeringSpec | None = None
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> VehicleParams:
@@ -140,6 +146,7 @@ class VehicleParams:
             f"Vehicle '{self.name}': {self.description}",
             f"  body: {body.mass_kg:g} kg, track {body.track_m:g} m, wheelbase {body.wheelbase_m:g} m",
             f"  odometry: wheel radius {odometry.wheel_radius_m:g} m, track {odometry.track_m:g} m",
+            f"  drive: {self.drive.type}",
             f"  sensors: antenna at {gnss.antenna_m} m, IMU at {self.sensors.imu.position_m} m",
         ]
         if self.effects:
@@ -158,7 +165,14 @@ class VehicleParams:
             track_m=self.odometry.track_m,
             sensors=self.sensors,
             topics=dict(self.topics),
+            drive=self.drive.type,
+            wheelbase_m=self.body.wheelbase_m,
+            steering=self.steered(),
         )
+
+    def steered(self) -> SteeringSpec | None:
+        """Its steering, with assumed limits where the file gives none; None where no wheel is steered."""
+        return (self.steering or SteeringSpec()) if self.drive.type in STEERED_DRIVES else None
 
 
 def vehicle_names() -> tuple[str, ...]:
@@ -185,6 +199,8 @@ def _problems(found: VehicleParams) -> Iterator[tuple[str, str]]:
         section, _, last = name.partition(".")
         if not last or not isinstance(getattr(getattr(found, section, None), last, None), float):
             yield f"measured: there is no number '{name}'", "give dotted names such as body.track_m"
+    if found.steering is not None and found.drive.type not in STEERED_DRIVES:
+        yield f"steering: drive.type is '{found.drive.type}'", f"give one of {', '.join(STEERED_DRIVES)}"
     if found.effects:
         from terrafusion.twin.effects.catalogue import checked
 
@@ -226,9 +242,9 @@ def with_payload(
 
 
 def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParams:
-    """The vehicle with the geometry a log reports: wheel radius, track, antenna and IMU position.
+    """The vehicle with what a log reports: drive, wheel radius, track, wheelbase, steering, sensors' places.
 
-    Radius and track replace the odometry's numbers and, unless `measured`, the body's: the log
+    Radius, track and wheelbase replace the odometry's numbers and, unless `measured`, the body's: the log
     knows one geometry only.
     """
     body, wheel, odometry, sensors = vehicle.body, vehicle.wheel, vehicle.odometry, vehicle.sensors
@@ -240,13 +256,23 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
         if GEOMETRY["track_m"] not in vehicle.measured:
             body = dataclasses.replace(body, track_m=overrides.track_m)
         odometry = dataclasses.replace(odometry, track_m=overrides.track_m)
+    if overrides.wheelbase_m is not None and GEOMETRY["wheelbase_m"] not in vehicle.measured:
+        body = dataclasses.replace(body, wheelbase_m=overrides.wheelbase_m)
+    drive, steering = vehicle.drive, vehicle.steering
+    if overrides.drive is not None:
+        drive = dataclasses.replace(drive, type=overrides.drive)
+        steering = steering if overrides.drive in STEERED_DRIVES else None
+    if overrides.steering_ratio is not None and drive.type in STEERED_DRIVES:
+        steering = dataclasses.replace(steering or SteeringSpec(), ratio=overrides.steering_ratio)
     if overrides.antenna_m is not None:
         gnss = dataclasses.replace(sensors.gnss, antenna_m=overrides.antenna_m)
         sensors = dataclasses.replace(sensors, gnss=gnss)
     if overrides.imu_m is not None:
         imu = dataclasses.replace(sensors.imu, position_m=overrides.imu_m)
         sensors = dataclasses.replace(sensors, imu=imu)
-    return dataclasses.replace(vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors)
+    return dataclasses.replace(
+        vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors, drive=drive, steering=steering
+    )
 
 
 def reported_geometry(recordings: Sequence[Recording]) -> Overrides:

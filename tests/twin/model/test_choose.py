@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from terrafusion.datasets.core.channels import Imu, Wheels
+from terrafusion.datasets.core.channels import Imu, Steering, Wheels
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.core.sensors import DRIVES, STEERED_DRIVES
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
 
@@ -72,3 +73,41 @@ def test_an_unknown_vehicle_that_is_asked_for_and_a_missing_file_are_refused() -
         choose_vehicle(log, "segway_rmp")
     with pytest.raises(ConfigError, match="no such file"):
         choose_vehicle(dataclasses.replace(log, vehicle="segway_rmp.yaml"))
+
+
+STEERED = dataclasses.replace(
+    NAMELESS,
+    wheels=Wheels(np.arange(2), np.zeros((2, 1)), ("speed",), "mps"),
+    steering=Steering(np.arange(2), np.full((2, 1), 0.1), ("angle",)),
+)
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+def test_a_generic_vehicle_of_each_drive(drive: str) -> None:
+    """Of a log that gives drive, wheel radius, track and wheelbase and names no vehicle."""
+    own = Overrides(wheel_radius_m=0.2, track_m=0.6, drive=drive, wheelbase_m=1.1)
+    vehicle, notes = choose_vehicle(dataclasses.replace(NAMELESS, wheels=SIDES, overrides=own))
+    rig = vehicle.rig()
+    assert (rig.drive, rig.wheelbase_m) == (drive, 1.1)
+    assert (rig.steering is not None) == (drive in STEERED_DRIVES)
+    assert f"drive = {drive}" in notes[0]
+
+
+def test_steering_angles_tell_the_drive() -> None:
+    own = Overrides(wheelbase_m=2.5, steering_ratio=15.0)
+    vehicle, _ = choose_vehicle(dataclasses.replace(STEERED, overrides=own))
+    rig = vehicle.rig()
+    assert rig.drive == "ackermann"
+    assert rig.steering is not None
+    assert rig.steering.ratio == 15.0
+    assert rig.track_m == pytest.approx(1.5)
+    both = Steering(np.arange(2), np.array([[0.1, -0.1]] * 2), ("front", "rear"))
+    vehicle, _ = choose_vehicle(dataclasses.replace(STEERED, steering=both, overrides=own))
+    assert vehicle.drive.type == "four_wheel_steer"
+
+
+def test_without_a_gyro_a_steered_robot_needs_its_wheelbase() -> None:
+    with pytest.raises(DataError, match="wheelbase_m"):
+        choose_vehicle(STEERED)
+    vehicle, notes = choose_vehicle(dataclasses.replace(STEERED, imu=GYRO))
+    assert f"wheelbase of {vehicle.body.wheelbase_m:g} m" in notes[0]
