@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
 from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed
 from terrafusion.datasets.checks.motion import Array, Signal
+from terrafusion.datasets.checks.path import path_by
+from terrafusion.datasets.checks.path_model import path_model
 from terrafusion.datasets.checks.sensor_pairs import (
     LEAST_R,
     SPEED_PAIRS,
@@ -34,6 +36,10 @@ SURELY_S = 0.5
 SLIDING_S = 2.0
 """The same where the others lag behind the wheels, as they do where a robot skids: at 1 m/s2 of traction it
 takes 3 s to reach 3 m/s, a mean delay of half of that."""
+LEAST_LATE_S, SURELY_LATE_S = 0.3, 0.2
+"""Fixes count as late from the first on, with the interval of the delay beyond the second."""
+CALIBRATED_S = 3.0
+"""Late fixes are no error up to this: the estimator finds such a delay by itself."""
 GRID_S, LONGEST_MEAN_S, LONGEST_S = 0.02, 2.0, 3600.0
 
 
@@ -47,7 +53,8 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
     elif drifts := clock_drifts(context.recording, pairs):
         yield drift_finding(context.recording, drifts)
     else:
-        yield from _offset_findings(context.recording, pairs)
+        offsets = list(_offset_findings(context.recording, pairs))
+        yield from offsets or _late_fixes(context)
 
 
 def _offset_findings(recording: Recording, pairs: SensorPairs) -> Iterator[Finding]:
@@ -66,6 +73,29 @@ def _offset_findings(recording: Recording, pairs: SensorPairs) -> Iterator[Findi
         yield offset_finding(recording, off, precise | set(off))
 
 
+def _late_fixes(context: CheckContext) -> Iterator[Finding]:
+    """The path of the fixes must bend when wheels and gyro do; speeds from noisy fixes do not show it."""
+    path = path_by(context.recording, "gnss")
+    model = path_model(context, path) if path is not None else None
+    if model is None or abs(model.delay_s.value) < LEAST_LATE_S or not model.delay_s.is_beyond(SURELY_LATE_S):
+        return
+    late = model.delay_s
+    shift_ns = round(late.value * 1e9)
+
+    def repair(recording: Recording) -> Recording:
+        assert recording.gnss is not None
+        return retimed(recording, "gnss", recording.gnss.t_ns - shift_ns)
+
+    yield Finding(
+        "clock-offset", "warning", "gnss",
+        f"its times are {abs(late.value):.2f} s {'late' if late.value > 0 else 'early'} "
+        "against wheels and imu",
+        f"95 % interval {late.low:.2f} to {late.high:.2f} s, by the path in {model.windows} stretches",
+        f"move the times of gnss by {-late.value:+.2f} s",
+        repair,
+    )  # fmt: skip
+
+
 def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pair]) -> Finding:
     """The finding on the channel that disagrees with most others, of those that could be compared."""
     name = odd_one(recording, set(off), measured)
@@ -78,9 +108,10 @@ def offset_finding(recording: Recording, off: dict[Pair, Lag], measured: set[Pai
     def repair(recording: Recording) -> Recording:
         return retimed(recording, name, getattr(recording, name).t_ns - round(lag.seconds * 1e9))
 
+    surely = CALIBRATED_S if name == "gnss" else SLIDING_S if ahead == "wheels" else SURELY_S
     return Finding(
         "clock-offset",
-        "error" if _distance_to_zero_s(lag) > (SLIDING_S if ahead == "wheels" else SURELY_S) else "warning",
+        "error" if _distance_to_zero_s(lag) > surely else "warning",
         name,
         f"its times are {abs(lag.seconds):.3f} s {'late' if lag.seconds > 0 else 'early'} against {against}",
         f"95 % interval {lag.low_s:.3f} to {lag.high_s:.3f} s, correlation {lag.r:.2f}",

@@ -18,12 +18,16 @@ from terrafusion.datasets.checks.motion import (
     typical_sigma,
     wheel_speed,
 )
+from terrafusion.datasets.checks.path import antenna, dead_reckoned
 from terrafusion.datasets.checks.timing import GAP_PERIODS
 from terrafusion.datasets.core.channels import Fix, Gnss
 
 Mask = NDArray[np.bool_]
 
 FROZEN_S = 3.0
+AROUND, LEAST_SHARE, SLIP_SHARE = 8, 0.5, 0.25
+"""Steps around a jump that show how the wheels' path lies on the map. A step is explained where no more is
+left of it than this share of the least jump, or 4 sigma and this share of the distance rolled."""
 FLIGHT_FIXES, CLOSED = 25, 0.3
 """A jump is undone within this many fixes, up to this share of its size; else the path stays displaced."""
 
@@ -56,6 +60,7 @@ def check_jumps(context: CheckContext) -> Iterator[Finding]:
         return
     off, limit = _unexplained_steps(gnss)
     jumps = np.flatnonzero(np.abs(off) > limit)
+    jumps = jumps[~_driven(context, gnss, jumps, limit)] if jumps.size else jumps
     if not jumps.size:
         return
     worst = int(jumps[np.argmax(np.abs(off[jumps]))])
@@ -81,6 +86,35 @@ def _unexplained_steps(gnss: Gnss) -> tuple[Complex, float]:
     off = np.where(near, (speed - smooth) * dt, 0.0)
     noise = float(np.median(np.abs(off[near]))) if near.any() else 0.0
     return off, max(1.0, 8.0 * noise, 4.0 * typical_sigma(gnss))
+
+
+def _driven(context: CheckContext, gnss: Gnss, jumps: NDArray[np.int64], limit: float) -> Mask:
+    """Mask of the steps that wheels and gyro explain, but for sigma, slip and the antenna's arm.
+
+    The step that they predict is turned and scaled as it fits the steps around; where there are too few, or
+    no gyro, only its length counts.
+    """
+    reckoned = dead_reckoned(context, antenna(context))
+    if reckoned is None:
+        return np.zeros(len(jumps), dtype=bool)
+    t, _, path = reckoned
+    t_fix = seconds(gnss.t_ns, context.recording.start_ns)
+    step, predicted = np.diff(on_plane(gnss.enu_m)), np.diff(np.interp(t_fix, t, path))
+    sigma = np.nan_to_num(gnss.sigma_enu_m[:, :2]).max(axis=1)
+    inside = (t_fix[:-1] >= t[0]) & (t_fix[1:] <= t[-1])
+    explained = []
+    for k in jumps.tolist():
+        near = np.arange(max(k - AROUND, 0), min(k + AROUND + 1, len(step)))
+        near = near[~np.isin(near, jumps) & np.isfinite(step[near]) & inside[near]]
+        power = float(np.sum(np.abs(predicted[near]) ** 2))
+        turn = complex(np.vdot(predicted[near], step[near])) / power if power > limit**2 else 0j
+        rest = (
+            abs(step[k] - turn * predicted[k]) if 0.5 < abs(turn) < 2.0 else abs(step[k]) - abs(predicted[k])
+        )
+        noise = float(np.hypot(sigma[k], sigma[k + 1]))
+        most = max(limit * LEAST_SHARE, 4.0 * noise + SLIP_SHARE * abs(predicted[k]))
+        explained.append(bool(inside[k]) and rest < most)
+    return np.array(explained, dtype=bool)
 
 
 def _running_median(values: Array, width: int) -> Array:

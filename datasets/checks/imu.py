@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from itertools import permutations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
 from terrafusion.datasets.checks.motion import (
     Array,
@@ -26,7 +28,9 @@ from terrafusion.datasets.checks.motion import (
     wheel_speed,
     yaw_angles,
 )
+from terrafusion.datasets.checks.signals import ROLLED_OVER, without_stuck
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
+from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
@@ -42,6 +46,9 @@ REST_S, MARGIN_S = 2.0, 0.5
 LARGE_BIAS_RADPS, STILL_RADPS = 0.02, 0.05
 """1.1 deg/s is beyond the bias of MEMS gyros of robots; with a standard deviation above the second the
 robot is not at rest."""
+IMPOSSIBLE_BIAS_RADPS = 0.1
+"""5.7 deg/s; no gyro of a robot is so far off: the axis is broken, or its value is not a rate."""
+LEAST_REST_ROWS = 50
 MOST_TILT = np.cos(np.radians(30.0))
 """Slopes of up to 25 deg tilt the mean specific force by as much."""
 WINDOW_S, SMOOTH_S = 0.5, 8.0
@@ -49,6 +56,10 @@ WINDOW_S, SMOOTH_S = 0.5, 8.0
 LEAST_C, SIGMAS = 0.25, 5.0
 """A correlation counts above the first, and above this many standard errors of noise."""
 NEAR_AXIS = np.radians(25.0)
+SURELY_TURNED = np.radians(12.0)
+"""Slopes, and lever arms of the IMU, seem to turn those of good field logs by up to 8 deg."""
+BLOCK, LEAST_BLOCKS = 20, 4
+"""Windows of a block of the bootstrap, and blocks that are needed."""
 LEAST_GAIN = 0.4
 """Measured acceleration over that of the wheels: a stuck robot only shakes with its wheels."""
 HANDED = 0.1
@@ -108,16 +119,18 @@ def _to_mps2(recording: Recording) -> Recording:
 
 
 def check_bias(context: CheckContext) -> Iterator[Finding]:
-    """The gyro must read next to nothing while the wheels stand."""
-    imu = context.recording.imu
-    resting = at_rest(context)
-    if imu is None or resting.sum() < 50:
+    """The gyro must read next to nothing while the wheels stand, and never roll the robot over."""
+    imu, resting = without_stuck(context.recording).imu, at_rest(context)
+    if imu is None:
         return
-    gyro = imu.gyro_radps[resting]
-    known = np.isfinite(gyro).all(axis=0)
-    bias = np.where(known, np.nan_to_num(gyro).mean(axis=0), 0.0)
-    rough = np.where(known, np.nan_to_num(gyro).std(axis=0), 0.0)
-    if np.abs(bias).max() <= LARGE_BIAS_RADPS or rough.max() > STILL_RADPS:
+    if resting.sum() >= LEAST_REST_ROWS:
+        bias = _bias_at_rest(imu.gyro_radps[resting])
+        what, where = "at rest", f"in {resting.sum()} samples while the wheels stand"
+    else:
+        bias = _bias_of_tilt(imu) if is_upright(context) else np.zeros(3)
+        what, where = "about x or y", "throughout, in which the robot would have rolled over"
+    largest = float(np.abs(bias).max())
+    if largest <= LARGE_BIAS_RADPS:
         return
 
     def repair(recording: Recording) -> Recording:
@@ -125,13 +138,30 @@ def check_bias(context: CheckContext) -> Iterator[Finding]:
         return with_fields(recording, "imu", gyro_radps=recording.imu.gyro_radps - bias)
 
     yield Finding(
-        "gyro-bias", "warning", "imu",
-        f"the gyro turns at rest by up to {np.degrees(np.abs(bias).max()):.1f} deg/s",
-        f"mean ({', '.join(f'{value:.3f}' for value in bias)}) rad/s in {resting.sum()} samples while the "
-        "wheels stand",
+        "gyro-bias", "error" if largest > IMPOSSIBLE_BIAS_RADPS else "warning", "imu",
+        f"the gyro turns {what} by up to {np.degrees(largest):.1f} deg/s",
+        f"mean ({', '.join(f'{value:.3f}' for value in bias)}) rad/s {where}",
         "subtract these means",
         repair,
     )  # fmt: skip
+
+
+def _bias_at_rest(gyro: Array) -> Array:
+    """Mean rates (3,) of a robot at rest; 0 where unknown, or where it is not at rest."""
+    known = np.isfinite(gyro).all(axis=0)
+    values = np.where(known, np.nan_to_num(gyro), 0.0)
+    return np.asarray(values.mean(axis=0) if values.std(axis=0).max() <= STILL_RADPS else np.zeros(3))
+
+
+def _bias_of_tilt(imu: Imu) -> Array:
+    """Mean rates (3,) about x and y, where together they would have turned the robot over; else 0."""
+    bias = np.zeros(3)
+    seconds = float(imu.t_ns[-1] - imu.t_ns[0]) * 1e-9
+    for k in range(2):
+        values = imu.gyro_radps[np.isfinite(imu.gyro_radps[:, k]), k]
+        mean = float(values.mean()) if len(values) else 0.0
+        bias[k] = mean if abs(mean) * seconds > ROLLED_OVER else 0.0
+    return bias
 
 
 def at_rest(context: CheckContext) -> NDArray[np.bool_]:
@@ -163,10 +193,12 @@ class ForceHeading:
             force; None where the gyro contradicts the accelerometer.
         turn: 1 where the specific force in turns fits the gyro, -1 where it points to the other side
             (the gyro has the wrong sign), 0 where the robot hardly turns.
+        spread: half the 95 % interval of the angle, rad, by bootstrap over blocks of 10 s.
     """
 
     angle: float | None
     turn: float
+    spread: float = np.inf
 
 
 def heading_of(context: CheckContext, accel: Array, yaw_rate: Array) -> ForceHeading | None:
@@ -205,7 +237,19 @@ def heading_of(context: CheckContext, accel: Array, yaw_rate: Array) -> ForceHea
         return None
     apart = (abs(common) - abs(mirrored)) / power
     side = float(np.sign(apart)) if abs(apart) > max(HANDED, noise) else 0.0
-    return ForceHeading(None if side < 0.0 else -float(np.angle(common)), side)
+    if side < 0.0:
+        return ForceHeading(None, side)
+    return ForceHeading(-float(np.angle(common)), side, _spread(measured * np.conj(predicted)))
+
+
+def _spread(products: Complex) -> float:
+    """Half the 95 % interval of the angle of a sum of products (N,), rad."""
+    blocks = np.add.reduceat(products, np.arange(0, len(products), BLOCK))
+    if len(blocks) < LEAST_BLOCKS:
+        return float(np.inf)
+    drawn = blocks[resampled_rows(len(blocks), RESAMPLES, SEED)].sum(axis=1)
+    off = interval_of(0.0, np.angle(drawn * np.conj(blocks.sum())), len(blocks))
+    return max(-off.low, off.high)
 
 
 def _detrended(values: Array | Complex) -> Complex:
@@ -266,8 +310,10 @@ def check_axes(context: CheckContext) -> Iterator[Finding]:
 
 def _check_forward(context: CheckContext) -> Iterator[Finding]:
     found = heading(context)
-    angle = found.angle if found is not None else None
-    if angle is None or abs(angle) < 0.25 * np.pi:
+    if found is None or found.angle is None:
+        return
+    angle, sure = found.angle, abs(found.angle) - found.spread > SURELY_TURNED
+    if abs(angle) < 0.25 * np.pi and not sure:
         return
     quarter = round(angle / (0.5 * np.pi)) % 4
     if quarter == 2 and wheels_turn_backwards(context):
@@ -275,13 +321,36 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
     off = abs(np.angle(np.exp(1j * (angle - 0.5 * np.pi * quarter))))
     axes = {1: ("-y", "+x", "+z"), 2: ("-x", "-y", "+z"), 3: ("+y", "-x", "+z")}.get(quarter, ())
     near = bool(axes) and off < NEAR_AXIS
+    fix, repair = "give the IMU's mounting", None
+    if near:
+        fix, repair = _pointing("IMU", axes), partial(_turned, axes=axes, gyro=True)
+    elif sure:
+        fix, repair = (
+            f"turn the IMU by {np.degrees(-angle):.0f} deg about z",
+            partial(_turned_by, angle=angle),
+        )
+    interval = f" +- {np.degrees(found.spread):.0f}" if np.isfinite(found.spread) else ""
     yield Finding(
         "imu-forward", "error" if near else "warning", "imu",
         "x does not point forward",
-        f"by change of speed and speed times yaw rate it is turned by {np.degrees(angle):.0f} deg",
-        _pointing("IMU", axes) if near else "give the IMU's mounting",
-        (lambda recording: _turned(recording, axes, gyro=True)) if near else None,
+        f"by change of speed and speed times yaw rate it is turned by {np.degrees(angle):.0f}{interval} deg",
+        fix,
+        repair,
     )  # fmt: skip
+
+
+def _turned_by(recording: Recording, angle: float) -> Recording:
+    """The recording of an IMU that is turned by `angle` (rad) about z, to the left, in body axes."""
+    imu = recording.imu
+    assert imu is not None
+    turn = np.array(
+        [[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]]
+    )
+    with_z = {"gyro_radps": imu.gyro_radps, "accel_mps2": imu.accel_mps2}
+    turned = {name: values.copy() for name, values in with_z.items()}
+    for name, values in turned.items():
+        values[:, :2] = with_z[name][:, :2] @ turn[:2, :2].T
+    return with_fields(recording, "imu", **turned)
 
 
 def _pointing(sensor: str, axes: Axes) -> str:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.motion import (
     Array,
@@ -36,7 +37,6 @@ WHEEL_UNITS = (5e-4, 50.0)
 """From speeds in mm/s to speeds mistaken for rates; beyond these the positions have another unit."""
 BENDS = 6.0
 """Variance of the second difference of white noise over its own."""
-RESAMPLES, SEED = 400, 20_240_811
 
 
 @dataclass(frozen=True)

@@ -19,8 +19,9 @@ MOST_SLIP_FREE, SURELY_MORE = 1.04, 1.02
 """Driven wheels are never slower than the ground: a ratio above the first whose interval excludes the
 second is no slip, but a wheel larger than stated."""
 LARGEST_RADIUS_ERROR = 2.2
-SMALL = 0.8
-"""Ratio below which wheel and ground speed differ too much for firm ground."""
+SMALL, FIRM_SLIP = 0.8, 0.94
+"""Ratio below which wheel and ground speed differ too much for firm ground, and the same for the end of its
+interval: a Warthog that skids on asphalt has 0.955 (norlab_drive)."""
 SOFT = ("medium_sand", "loose_sand", "ploughed_soil", "mud", "snow", "ice")
 """Grounds on which such slip is usual."""
 UNIT_ERROR = 0.1
@@ -73,12 +74,14 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
         )  # fmt: skip
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
-    elif scale.ratio < SMALL and is_firm(context.recording):
+    elif (scale.ratio < SMALL or scale.high < FIRM_SLIP) and is_firm(context.recording):
+        fitting = f"radius of {radius * scale.ratio:.4f} m" if wheels.unit == "radps" else "speeds"
         yield Finding(
             "wheel-scale", "warning", "wheels",
-            f"ground speed is {scale.ratio:.2f} times the wheel speed",
+            f"the wheels read {1.0 / scale.ratio - 1.0:.1%} too much: ground speed is {scale.ratio:.3f} "
+            "times the wheel speed",
             evidence,
-            "it may be slip; if the ground is firm, check wheel radius and unit",
+            f"it may be slip; if the ground is firm, check wheel {fitting} and unit",
         )  # fmt: skip
 
 

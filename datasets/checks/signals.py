@@ -14,6 +14,7 @@ from terrafusion.datasets.checks.motion import ANY_RADIUS_M, Array, runs, yaw_ra
 from terrafusion.datasets.core.channels import Channel, Imu, Wheels
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
+from terrafusion.datasets.core.paired_sides import sampled_apart
 from terrafusion.datasets.core.recording import Recording
 
 Mask = NDArray[np.bool_]
@@ -26,7 +27,9 @@ CLIPPED_ROWS = 10
 """A value at the end of the range that occurs this often elsewhere is the sensor's limit."""
 LIVELY = 0.1
 """Standard deviation of the other axes over their usual one above which they move."""
-LEAST_TURN_RADPS, LEAST_EXTENT_M = 0.05, 5.0
+LEAST_TURN_RADPS, LEAST_EXTENT_M, STILL_SHARE = 0.05, 5.0, 0.02
+ROLLED_OVER = 2.0
+"""rad; no robot drives on after it has turned so far about x or y."""
 MISSING_SHARE = 0.05
 LONGEST_RUNS = 20
 
@@ -194,8 +197,17 @@ def _spreads(values: Array) -> Array:
 
 
 def _is_stuck_throughout(sensor: SensorAxes, k: int, constant: list[int], moving: list[int]) -> bool:
-    """Whether a constant axis is stuck: one of three, and not one that planar logs leave out."""
-    if sensor.channel == "wheels" or len(sensor.known()) < 3:
+    """Whether a constant axis is stuck: one of three, and not one that planar logs leave out.
+
+    A gyro axis that turns at one rate throughout is stuck, too, where another axis is alive, or where x and y
+    would have rolled the robot over.
+    """
+    if sensor.channel == "wheels":
+        return False
+    if sensor.field == "gyro_radps" and sensor.values[0, k] != 0.0:
+        seconds = float(sensor.t_ns[-1] - sensor.t_ns[0]) * 1e-9
+        return bool(moving) or (k < 2 and abs(float(sensor.values[0, k])) * seconds > ROLLED_OVER)
+    if len(sensor.known()) < 3:
         return False
     return len(constant) == 1 and len(moving) == 2 and not (sensor.field == "accel_mps2" and k == 2)
 
@@ -240,7 +252,7 @@ def check_dead(context: CheckContext) -> Iterator[Finding]:
     constant = [bool((v[1:] == v[:-1]).all()) for v in imu.gyro_radps.T if np.isfinite(v).any()]
     lively = [bool((v[1:] != v[:-1]).mean() > 0.5) for v in imu.accel_mps2.T if np.isfinite(v).any()]
     still = standing and extent_m <= LEAST_EXTENT_M
-    shaking = len(lively) == 3 and all(lively)
+    shaking = (len(lively) == 3 and all(lively)) or _stops_turning(recording)
     if all(constant) and not still and (shaking or _turn_radps(context) > LEAST_TURN_RADPS):
         yield Finding(
             "dead", "error", "imu",
@@ -249,6 +261,14 @@ def check_dead(context: CheckContext) -> Iterator[Finding]:
             "leave the gyro out",
             without_cells([("gyro_radps", np.ones((len(imu), 3), dtype=bool))], "imu"),
         )  # fmt: skip
+
+
+def _stops_turning(recording: Recording) -> bool:
+    """Whether gyro z turns at a constant rate while the wheels stand for a while."""
+    imu, wheels = recording.imu, recording.wheels
+    if imu is None or wheels is None or abs(float(imu.gyro_radps[0, 2])) < LEAST_TURN_RADPS:
+        return False
+    return float((wheels.speed == 0.0).all(axis=1).mean()) > STILL_SHARE
 
 
 def _extent_m(recording: Recording) -> float:
@@ -282,6 +302,8 @@ def check_missing(context: CheckContext) -> Iterator[Finding]:
     for name, channel in context.recording.channels().items():
         if name not in ("command", "wheels", "imu", "motor") or len(channel) < STUCK_ROWS:
             continue
+        if isinstance(channel, Wheels) and sampled_apart(channel):
+            continue  # see sides.check_apart
         columns = {c: np.isnan(v) for c, v in channel.columns().items() if v.dtype.kind == "f"}
         share = {column: float(empty.mean()) for column, empty in columns.items() if not empty.all()}
         if not share or max(share.values()) <= MISSING_SHARE:

@@ -22,6 +22,7 @@ from terrafusion.datasets.core.channels import (
     Wheels,
 )
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
@@ -94,7 +95,13 @@ class ChannelReader:
         if present and missing:
             raise self._error("wheels", f"column '{missing[0]}' is missing beside '{present[0]}'", "add it")
         speed = table.stack([f"{n}_{unit}" for n in names])
-        return Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
+        wheels = Wheels(self._t(table), speed, names, unit, table.stack(columns) if present else None)
+        if self.meta.keep_empty or not sampled_apart(wheels):
+            return wheels
+        self.notes.append(
+            "wheels: left and right are sampled at different times; each is interpolated over its own samples"
+        )
+        return paired_sides(wheels)
 
     def _wheel_layout(self, table: CsvTable) -> tuple[tuple[str, ...], str]:
         speeds = [c for c in table.numbers if not c.endswith("_rad")]

@@ -148,7 +148,7 @@ def parse_meta(content: dict[str, Any], path: Path) -> Meta:
 
 
 def _is_extra(key: str, given: Mapping[str, Any]) -> bool:
-    """Whether a key is neither known, nor the compulsory `start_ns` misspelt, nor a length in another unit."""
+    """Whether a key is neither known, nor `start_ns` misspelt, nor a length in another unit."""
     stem, _, unit = key.rpartition("_")
     if "start_ns" not in given and difflib.get_close_matches(key, ["start_ns"]):
         return False

@@ -1,0 +1,169 @@
+"""Delay of the fixes and scale of the gyro, from the shape of the measured path.
+
+The path by wheels and gyro is laid onto the positions window by window. What shifts, turns or scales a
+window, and a constant bias of the gyro, is free in each; common to all are the delay of the positions, the
+scale of the gyro about z and the lever arm of the antenna. They are found by Gauss-Newton steps with Huber
+weights, their intervals by bootstrap over windows: errors of fixes last for many seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
+from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.checks.motion import Array, Complex, cumulative, gyro_angle, wheel_speed
+from terrafusion.datasets.checks.path import MeasuredPath
+from terrafusion.datasets.core.bootstrap import resampled_rows
+
+LEAST_WINDOWS, LEAST_ROWS, MOST_HZ = 5, 8, 5.0
+"""Windows that are needed, positions in each, and the rate that more would not add to."""
+SIGMAS, WINDOW_S = 30.0, (20.0, 60.0)
+"""A window spans this many sigma of a position, within these limits."""
+STARTS_S = np.arange(-1.0, 5.1, 0.5)
+"""Delays from which the steps start: the best of them."""
+LONGEST_S = 6.0
+PRIOR = np.array([0.2, 3.0, 0.5, 0.5, 0.02])
+"""1 sigma of scale, delay (s) and lever arm (m) before the data: what they do not show stays near zero."""
+STEPS, HUBER = 6, 2.0
+MOST_SCALE, MOST_NOISE = 0.3, 0.1
+"""Beyond this scale, or with this scatter over the size of a window, the paths are unlike."""
+
+
+@dataclass(frozen=True)
+class PathModel:
+    """Scale error of the gyro (0: right), and seconds by which the positions are late."""
+
+    gyro_scale: BootstrapInterval
+    delay_s: BootstrapInterval
+    windows: int
+    source: str
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Dead reckoning (wheels and gyro, on the wheels' times) and the positions, window by window."""
+
+    t: Array
+    v: Array
+    turned: Array
+    t_fix: Array
+    place: Complex
+    rows: list[slice]
+
+    def size_m(self) -> float:
+        """Median over the windows of the scatter of their positions about the mean."""
+        return float(np.median([np.std(self.place[rows]) for rows in self.rows]))
+
+    def steps(self, unknown: Array) -> Iterator[tuple[Array, Array]]:
+        """For each window the normal equations of the common unknowns: columns (2n, 5) and residual (2n,)."""
+        scale, delay_s, forward, left, bias = unknown.tolist()
+        lever = complex(forward, left)
+        ahead = np.exp(1j * ((1.0 + scale) * self.turned + bias * self.t))
+        columns = [self.v * ahead, 1j * self.turned * self.v * ahead, 1j * self.t * self.v * ahead]
+        path, by_scale, by_bias = (cumulative(self.t, column) for column in columns)
+        at = self.t_fix - delay_s
+        P, K, B, V, E = (
+            np.interp(at, self.t, column) for column in (path, by_scale, by_bias, columns[0], ahead)
+        )
+        for rows in self.rows:
+            p, g = P[rows] + lever * E[rows], self.place[rows]
+            p, g = p - p.mean(), g - g.mean()
+            power = float(np.vdot(p, p).real)
+            factor = np.vdot(p, g) / power if power > 0.0 else 0j
+            if abs(factor) < 0.2 or abs(factor) > 5.0:
+                continue
+            free = _real(np.stack([np.ones_like(p), 1j * np.ones_like(p), p, 1j * p], axis=1))
+            Q = np.linalg.qr(free / np.maximum(np.linalg.norm(free, axis=0), 1e-12))[0]
+            common = _real(np.stack([K[rows], -V[rows], E[rows], 1j * E[rows], B[rows]], axis=1))
+            residual = _real(((g / factor) - p)[:, None])[:, 0]
+            yield common - Q @ (Q.T @ common), residual - Q @ (Q.T @ residual)
+
+
+def _real(columns: Complex) -> Array:
+    return np.concatenate([columns.real, columns.imag])
+
+
+def path_model(context: CheckContext, measured: MeasuredPath) -> PathModel | None:
+    """Fit it; None where wheels, gyro or windows are too few, or the paths are unlike."""
+    windows = _windows(context, measured)
+    if windows is None:
+        return None
+    starts = [(_rest(windows, delay), delay) for delay in STARTS_S.tolist()]
+    unknown = np.array([0.0, min(starts)[1], 0.0, 0.0, 0.0])
+    for _ in range(STEPS):
+        H, h, noise = _normal(windows, unknown)
+        if len(H) < LEAST_WINDOWS:
+            return None
+        prior = np.diag(noise**2 / PRIOR**2)
+        unknown = unknown + np.linalg.solve(H.sum(axis=0) + prior, h.sum(axis=0) - prior @ unknown)
+        if abs(unknown[1]) > LONGEST_S or abs(unknown[0]) > MOST_SCALE:
+            return None
+    H, h, noise = _normal(windows, unknown)
+    if len(H) < LEAST_WINDOWS or noise > MOST_NOISE * windows.size_m():
+        return None
+    prior = np.diag(noise**2 / PRIOR**2)
+    draws = resampled_rows(len(H), RESAMPLES, SEED)
+    right = h[draws].sum(axis=1) - prior @ unknown
+    drawn = unknown + np.linalg.solve(H[draws].sum(axis=1) + prior, right[..., None])[..., 0]
+    scale, delay = (interval_of(float(unknown[k]), drawn[:, k], len(H)) for k in range(2))
+    return PathModel(scale, delay, len(H), measured.source)
+
+
+def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
+    driven, yaw = wheel_speed(context), gyro_angle(context.recording)
+    if driven is None or yaw is None:
+        return None
+    t, v = driven
+    within = (t >= yaw.t_s[0]) & (t <= yaw.t_s[-1])
+    t, v = t[within], v[within]
+    if len(t) < 10:
+        return None
+    inside = (measured.t_s >= t[0] + LONGEST_S) & (measured.t_s <= t[-1] - LONGEST_S)
+    t_fix, place = measured.t_s[inside], measured.place[inside]
+    if len(t_fix) < LEAST_WINDOWS * LEAST_ROWS:
+        return None
+    stride = max(1, int(1.0 / (MOST_HZ * max(float(np.median(np.diff(t_fix))), 1e-3))))
+    t_fix, place = t_fix[::stride], place[::stride]
+    length_s = float(np.clip(SIGMAS * measured.sigma_m / max(float(np.abs(v).mean()), 1e-3), *WINDOW_S))
+    length_s = min(length_s, float(t_fix[-1] - t_fix[0]) / (LEAST_WINDOWS + 1))
+    number = ((t_fix - t_fix[0]) / length_s).astype(int)
+    edges = np.flatnonzero(np.diff(number, prepend=-1, append=number[-1] + 1))
+    rows = [slice(a, b) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+    far = max(2.0, 5.0 * measured.sigma_m)
+    rows = [
+        row
+        for row in rows
+        if row.stop - row.start >= LEAST_ROWS and np.ptp(place[row].real) + np.ptp(place[row].imag) > far
+    ]
+    turned = np.interp(t, yaw.t_s, yaw.value)
+    return _Windows(t, v, turned, t_fix, place, rows) if len(rows) >= LEAST_WINDOWS else None
+
+
+def _rest(windows: _Windows, delay_s: float) -> float:
+    """Sum of the residuals' sizes at a delay, after the best scale and lever arm of each window."""
+    total = 0.0
+    for common, residual in windows.steps(np.array([0.0, delay_s, 0.0, 0.0, 0.0])):
+        kept = common[:, [0, 2, 3, 4]]
+        fitted = kept @ np.linalg.lstsq(kept, residual, rcond=1e-6)[0]
+        total += float(np.abs(residual - fitted).sum())
+    return total
+
+
+def _normal(windows: _Windows, unknown: Array) -> tuple[NDArray[np.float64], Array, float]:
+    """Normal equations (W, 5, 5) and (W, 5) of the windows with Huber weights, and the residuals' 1 sigma."""
+    steps = list(windows.steps(unknown))
+    if not steps:
+        return np.zeros((0, 5, 5)), np.zeros((0, 5)), 0.0
+    sizes = np.abs(np.concatenate([residual for _, residual in steps]))
+    noise = max(1.4826 * float(np.median(sizes)), 1e-3)
+    H, h = [], []
+    for common, residual in steps:
+        weight = np.minimum(1.0, HUBER * noise / np.maximum(np.abs(residual), 1e-9))
+        H.append(common.T @ (weight[:, None] * common))
+        h.append(common.T @ (weight * residual))
+    return np.array(H), np.array(h), noise
