@@ -38,7 +38,9 @@ class Study:
         return DATA in self.command or self.name in READS_LOGS
 
 
-READS_LOGS = ("survey", "field_table", "fault_injection", "benchmark", "effective_track")
+READS_LOGS = (
+    "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents", "known_changes",
+)  # fmt: skip
 
 
 def _module(name: str, *arguments: str) -> tuple[str, ...]:
@@ -153,6 +155,27 @@ STUDIES = (
         _module("field_table.table", "--out", OUT, "--starts", "6", "--seeds", "3", "--jobs", "2"),
         240,
         picture="field_table.png",
+    ),
+    Study(
+        "opponents",
+        "Are errors in outages smaller than those of an EKF, a GTSAM smoother and an INS, tuned alike?",
+        _module("opponents.table", "--out", OUT, "--jobs", "2"),
+        240,
+        {
+            f"{mode}_{what}_{seconds}_s": rf"{mode}, {known}, {seconds} s: ([\d.]+)"
+            for mode in ("fixed", "adaptive")
+            for what, known in (("log", "vehicle of the log"), ("unknown", "wheel radius and track alone"))
+            for seconds in (10, 30, 60)
+        },
+        "opponents.png",
+    ),
+    Study(
+        "known_changes",
+        "What do known changes in real logs cost an estimator that is not told, and do ellipses hold?",
+        _module("known_changes.table", "--out", OUT, "--jobs", "2"),
+        240,
+        {"ratio": r"all changes, not told: ([\d.]+)"},
+        "known_changes.png",
     ),
     Study(
         "benchmark",

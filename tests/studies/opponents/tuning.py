@@ -1,7 +1,7 @@
 """Tunes the opponents: one noise for all logs, by a grid over the tuning half of them.
 
     python -m tests.studies.opponents.tuning --split     writes split.json, before anything is fitted
-    python -m tests.studies.opponents.tuning             writes tuned.json
+    python -m tests.studies.opponents.tuning --out DIR   writes tuned.json; goes on where it was stopped
 
 Score of a noise: geometric mean over drives of the median error in outages of 30 s, or 10 s on short drives.
 """
@@ -10,16 +10,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import multiprocessing
-import os
 import sys
 from pathlib import Path
 
 import numpy as np
 
 from tests.studies.opponents.drives import Drive, default_logs, drives_of, longest, vehicle_of
-from tests.studies.opponents.estimators import OPPONENTS, TUNED, grid, noise_of, rows_of
+from tests.studies.opponents.estimators import TUNED, TUNED_OPPONENTS, grid, noise_of, rows_of
 from tests.studies.opponents.inertial import Inertial
+from tests.studies.opponents.parts import Task, code_of, result_of, run_all
 
 SPLIT = Path(__file__).with_name("split.json")
 LENGTHS_S = (30.0, 10.0)
@@ -40,8 +39,9 @@ def split(names: list[str]) -> dict[str, list[str]]:
 _DRIVES: list[tuple[Drive, Inertial]] = []
 
 
-def _score(task: tuple[str, dict[str, float]]) -> tuple[str, dict[str, float], float]:
-    name, values = task
+def score(work: tuple[str, dict[str, float]]) -> float:
+    """Geometric mean over drives of an opponent's median error with one noise, m."""
+    name, values = work
     logs: list[float] = []
     for _, inputs in _DRIVES:
         for seconds in LENGTHS_S:
@@ -49,32 +49,33 @@ def _score(task: tuple[str, dict[str, float]]) -> tuple[str, dict[str, float], f
             if rows:
                 logs.append(float(np.log(max(LEAST_M, np.median([r.error_m for r in rows])))))
                 break
-    return name, values, float(np.exp(np.mean(logs)))
+    return float(np.exp(np.mean(logs)))
 
 
-def tune(jobs: int) -> dict[str, dict[str, object]]:
-    """Best noise of each opponent, and the scores of all."""
-    names = json.loads(SPLIT.read_text(encoding="utf-8"))["tuning"]
-    for name in names:
+def tune(folder: Path, jobs: int) -> dict[str, dict[str, object]]:
+    """Best noise of each opponent, and how it compares with the others; results are kept in a folder."""
+    for name in json.loads(SPLIT.read_text(encoding="utf-8"))["tuning"]:
         for drive in longest(drives_of(name), 1):
             inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
             if inputs is not None:
                 _DRIVES.append((drive, inputs))
-    tasks = [(name, values) for name in OPPONENTS for values in grid(name)]
+    code = code_of(
+        *(SPLIT.with_name(f"{n}.py") for n in ("ekf", "smoother", "ins", "inertial", "drives")), SPLIT
+    )
+    tasks = [
+        Task(f"{name} {values}", code, (name, values)) for name in TUNED_OPPONENTS for values in grid(name)
+    ]
+    run_all(tasks, score, folder, jobs, float("inf"))
     best: dict[str, dict[str, object]] = {}
-    scores: dict[str, list[tuple[float, dict[str, float]]]] = {name: [] for name in OPPONENTS}
-    with multiprocessing.get_context("fork").Pool(jobs) as pool:
-        for k, (name, values, score) in enumerate(pool.imap_unordered(_score, tasks), 1):
-            scores[name].append((score, values))
-            if sys.stderr.isatty() or os.environ.get("PROGRESS"):
-                print(f"{k} of {len(tasks)}: {name} {values} {score:.3f} m", file=sys.stderr, flush=True)
-    for name, found in scores.items():
-        found.sort(key=lambda pair: pair[0])
+    for name in TUNED_OPPONENTS:
+        scores = sorted(
+            (result_of(t, folder), list(grid(name)).index(t.what[1])) for t in tasks if t.what[0] == name
+        )
         best[name] = {
-            "noise": found[0][1],
-            "score_m": round(found[0][0], 4),
-            "worst_m": round(found[-1][0], 4),
-            "tried": len(found),
+            "noise": list(grid(name))[scores[0][1]],
+            "score_m": round(scores[0][0], 3),
+            "worst_m": round(scores[-1][0], 3),
+            "tried": len(scores),
         }
     return best
 
@@ -87,12 +88,13 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--split", action="store_true", help="write the split alone")
+    parser.add_argument("--out", type=Path, default=Path("studies-work/tuning"), help="folder for parts")
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
     if given.split:
         SPLIT.write_text(json.dumps(split(default_logs()), indent=1) + "\n", encoding="utf-8")
         return 0
-    best = tune(given.jobs)
+    best = tune(given.out, given.jobs)
     TUNED.write_text(json.dumps({"opponents": best}, indent=1) + "\n", encoding="utf-8")
     for name, found in best.items():
         print(f"{name}: {found}")
