@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from terrafusion.datasets.checks import run_checks
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import ImuSample, Message
 from terrafusion.datasets.core.recording import Recording
@@ -16,6 +17,10 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import imu_kind, sensor_config_of
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.metrics.baselines import baselines
+from terrafusion.fusion.metrics.scores import score
+from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
 from terrafusion.twin.model.choose import choose_vehicle
 
 
@@ -36,8 +41,10 @@ class Latencies:
                 yield f"{spec.name:9} {quantiles}, {len(values)} calls"
 
 
-def live_estimator(recording: Recording, vehicle: str | None = None) -> Estimator:
-    """An estimator for the robot and the sensors of a recording.
+def live_estimator(
+    recording: Recording, vehicle: str | None = None, history: History | None = None
+) -> Estimator:
+    """An estimator for the robot and the sensors of a recording; `history` collects its states.
 
     Raises:
         DataError: the log has no IMU or no wheels, or nothing tells the robot's geometry.
@@ -49,7 +56,30 @@ def live_estimator(recording: Recording, vehicle: str | None = None) -> Estimato
         )
     robot, _ = choose_vehicle(recording, vehicle)
     inputs = sensor_config_of(recording, recording.gnss)
-    return Estimator(EstimatorConfig(robot.rig(), robot.name, inputs=inputs))
+    config = EstimatorConfig(robot.rig(), robot.name, inputs=inputs)
+    if history is None:
+        return Estimator(config)
+    estimator = Estimator(
+        config,
+        on_state=lambda state: history.add(state, estimator.weights.noise),
+        on_innovation=history.innovations.append,
+    )
+    return estimator
+
+
+def verdict_of(estimator: Estimator, history: History, recording: Recording) -> Verdict:
+    """The verdict on a finished run that got all fixes, against the truth where the recording has one."""
+    history.align(estimator.gnss.alignment, batch=False)
+    rig, local = estimator.config.rig, estimator.gnss.local
+    antenna_m = rig.sensors.gnss.antenna_m
+    estimate = history.estimate(estimator.weights.detector.classes, [], ())
+    scores = score(estimate, recording, antenna_m=antenna_m, aligned=local)
+    rivals = baselines(
+        recording, estimate, scores, recording.gnss, wheel_radius_m=rig.wheel_radius_m, track_m=rig.track_m,
+        antenna_m=antenna_m, aligned=local,
+    )  # fmt: skip
+    found = run_checks(recording, rig)
+    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig.wheel_radius_m))
 
 
 def run(

@@ -7,9 +7,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from terrafusion.datasets.checks import Finding, run_checks
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.config.assumptions import Assumption, assumptions
 from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
 from terrafusion.fusion.config.sensor_config import sensor_config_of
 from terrafusion.fusion.estimate.estimate import Estimate
@@ -18,7 +20,9 @@ from terrafusion.fusion.estimator.feed import feed, never_started, split_fixes, 
 from terrafusion.fusion.estimator.history import History
 from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.metrics.baselines import Baselines, baselines
 from terrafusion.fusion.metrics.scores import Outage, Scores, score
+from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
 from terrafusion.fusion.noise.policy import Policy, load_policy
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import VehicleParams
@@ -34,6 +38,9 @@ class ReplayResult:
         seconds: computing time of the estimation alone.
         latencies_ms: computing time of each keyframe (live mode).
         rejected_gnss, rejected_wheels: measurements refused by a gate.
+        baselines: plain dead reckoning and the receiver alone on the same log, scored alike.
+        verdict: whether the result is good, and why.
+        assumed: numbers that neither log nor vehicle file tells.
     """
 
     recording: Recording
@@ -49,6 +56,9 @@ class ReplayResult:
     latencies_ms: Array
     rejected_gnss: int
     rejected_wheels: int
+    baselines: Baselines
+    verdict: Verdict
+    assumed: tuple[Assumption, ...]
 
     def realtime_factor(self) -> float:
         """Seconds of recording per second of computing."""
@@ -66,6 +76,7 @@ def replay(
     progress: Callable[[float], None] | None = None,
     magnetometer: bool = False,
     settings: EstimatorOptions | None = None,
+    findings: Sequence[Finding] | None = None,
 ) -> ReplayResult:
     """Estimate and score one run.
 
@@ -78,6 +89,7 @@ def replay(
         progress: called with the share done, 0 to 1.
         magnetometer: use the log's magnetometer, too; a barometer is used wherever there is one.
         settings: fields of `EstimatorConfig` that are not its defaults.
+        findings: of the log checks, where they are known already.
 
     Raises:
         TerrafusionError: the recording or the vehicle cannot be used; the message tells why.
@@ -122,7 +134,23 @@ def replay(
         antenna_m=config.rig.sensors.gnss.antenna_m,
         aligned=estimator.gnss.local,
     )
+
+    # Compare it with what the sensors alone give, and judge it.
+    rivals = baselines(
+        recording,
+        estimate,
+        scores,
+        used,
+        outages,
+        wheel_radius_m=config.rig.wheel_radius_m,
+        track_m=config.rig.track_m,
+        antenna_m=config.rig.sensors.gnss.antenna_m,
+        aligned=estimator.gnss.local,
+    )
+    found = run_checks(recording, config.rig) if findings is None else findings
+    verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig.wheel_radius_m))
     return ReplayResult(
         recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), seconds, latencies,
-        estimator.gnss.rejected, estimator.wheels_rejected,
+        estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,
+        assumptions(recording, vehicle or recording.vehicle, params, inputs, used),
     )  # fmt: skip

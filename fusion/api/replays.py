@@ -42,8 +42,9 @@ class Replay(ReplayResult):
     def __repr__(self) -> str:
         scores = self.scores
         lines = [
+            *self.verdict.lines()[:3],
             f"Replay of '{self.recording.name}' ({self.vehicle.name}, {self.mode}), "
-            f"{self.recording.duration_s():.1f} s at {self.realtime_factor():.0f} x real time"
+            f"{self.recording.duration_s():.1f} s at {self.realtime_factor():.0f} x real time",
         ]
         if scores.ate_m is not None:
             lines.append(f"  position error against {scores.against}: {scores.ate_m:.3f} m (RMS)")
@@ -99,7 +100,7 @@ def replay(
     (recording,) = opened(log, None if known is None else known.rig())
     result = run(
         recording,
-        vehicle=known,
+        vehicle=vehicle,
         mode=mode,
         policy=policy,
         outages=[o if isinstance(o, Outage) else Outage(*map(float, o)) for o in outages],

@@ -130,15 +130,17 @@ def clock_accepted(recording: Recording) -> Recording:
     return dataclasses.replace(recording, clock_jumps=()).with_notes(*notes)
 
 
-def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> None:
-    """Refuse a log whose numbers would mislead: what the log checks call an error.
+def refuse_errors(log: str, recording: Recording, rig: Rig | None) -> list[Finding]:
+    """Refuse a log whose numbers would mislead: what the log checks call an error; gives their warnings.
 
     Raises:
         DataError: the first such finding, with its evidence and what to do.
     """
     from terrafusion.datasets.checks import run_checks
 
-    _refuse(log, run_checks(recording, rig_of(recording, rig)))
+    findings = run_checks(recording, rig_of(recording, rig))
+    _refuse(log, findings)
+    return findings
 
 
 def refuse_impossible(log: str, recording: Recording) -> None:

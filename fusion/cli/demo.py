@@ -73,4 +73,5 @@ def _comparison(results: list[ReplayResult]) -> list[str]:
         f"{recording.duration_s():.0f} s over {', '.join(dict.fromkeys(labels))}; "
         f"no GNSS from {OUTAGE_START_S:.0f} to {OUTAGE_START_S + OUTAGE_S:.0f} s",
         *text_table(["", *(r.mode for r in results)], cells, right=(1, 2), gap=4),
+        *(line for r in results for line in [f"{r.mode}, {r.verdict.lines()[0]}", *r.verdict.lines()[1:]]),
     ]

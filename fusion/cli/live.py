@@ -17,14 +17,16 @@ RealtimeOption = Annotated[bool, typer.Option("--realtime", help="At the pace of
 def live(log: LogArgument, vehicle: VehicleOption = None, realtime: RealtimeOption = False) -> None:
     """Run the estimator as on a robot: message by message, odometry after every IMU sample.
 
-    Prints how long updates and odometry take, and the last state. docs/how-to/integration.md has the same
+    Prints how long updates and odometry take, the last state, and the verdict on the run.
+    docs/how-to/integration.md has the same
     loop as a ROS 2 node.
 
     Example: terrafusion live drive.bag --vehicle husky --realtime
     """
     from terrafusion.datasets.core.errors import DataError, errors_of
     from terrafusion.datasets.readers import open_recording
-    from terrafusion.fusion.live import live_estimator, run
+    from terrafusion.fusion.estimator.history import History
+    from terrafusion.fusion.live import live_estimator, run, verdict_of
 
     recording = open_recording(log)
     newest: list[State] = []
@@ -33,10 +35,14 @@ def live(log: LogArgument, vehicle: VehicleOption = None, realtime: RealtimeOpti
         newest[:] = [state]
 
     with errors_of(log):
-        taken = run(live_estimator(recording, vehicle), recording.messages(), publish, realtime)
-        for line in taken.lines():
-            print(line)
+        history = History()
+        estimator = live_estimator(recording, vehicle, history)
+        taken = run(estimator, recording.messages(), publish, realtime)
         if not newest:
             raise DataError("the estimator never started", remedy="see `terrafusion inspect`")
+        for line in taken.lines():
+            print(line)
     state = newest[0]
     print(f"{state.status}: {state.position_m.round(2).tolist()} m, slip {state.slip:.2f}")
+    for line in verdict_of(estimator, history, recording).lines():
+        print(line)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -24,6 +25,7 @@ from terrafusion.fusion.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from terrafusion.fusion.metrics.baselines import Baselines
     from terrafusion.fusion.replay import ReplayResult
 
 OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results and report.html.")]
@@ -124,7 +126,7 @@ def replay(
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
     if repair_clock:
         recording = clock_accepted(recording)
-    refuse_errors(log, recording, rig)
+    findings = refuse_errors(log, recording, rig)
     check_folder(out)
     with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
@@ -137,13 +139,15 @@ def replay(
             progress=progress,
             magnetometer=magnetometer or declination is not None,
             settings={"calibrate": calibrate, "declination_rad": turned},
+            findings=findings,
         )
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     if mcap:
         _write_bag(result, out / "estimate.mcap")
     if rerun is not None:
         write_rerun(result, rerun)
-    for line in summary(result):
+    warnings = [f"log check, {f.channel}: {f.what} ({f.evidence}); {f.fix}" for f in findings]
+    for line in [*summary(result), *assumed_and_noted(result, warnings)]:
         print(line)
     print(f"written to {out}")
 
@@ -158,14 +162,23 @@ def _write_bag(result: ReplayResult, path: Path) -> None:
         print(f"not in standard messages: {part}")
 
 
+def assumed_and_noted(result: ReplayResult, warnings: Sequence[str]) -> list[str]:
+    """What the run assumed and noted, and the warnings of the log checks that the verdict does not name."""
+    notes = dict.fromkeys((*result.estimate.notes, *result.scores.notes))
+    told = " ".join(result.verdict.reasons).lower()
+    warned = [warning for warning in warnings if warning.lower() not in told]
+    return [*(f"assumed: {one}" for one in result.assumed), *warned, *(f"note: {note}" for note in notes)]
+
+
 def summary(result: ReplayResult) -> list[str]:
-    """The result as lines of text."""
+    """The result as lines of text, the verdict first."""
     from terrafusion.fusion.outputs.linear_states import calibration, cells
     from terrafusion.fusion.outputs.replay_files import final_status
 
     scores = result.scores
     status = final_status(result.estimate)
     lines = [
+        *result.verdict.lines(),
         f"{result.recording.name}: {result.recording.duration_s():.1f} s, {result.mode}, "
         f"{result.realtime_factor():.0f} x real time",
         f"status: {status['value']} ({status['message']})",
@@ -177,6 +190,7 @@ def summary(result: ReplayResult) -> list[str]:
         )
     if scores.against == "truth" and scores.ate_m is not None:
         lines.append(f"against truth: position error {scores.ate_m:.3f} m (root mean square)")
+    lines += _rivals(result.baselines)
     for outage in scores.outages:
         if outage.end_error_m is None or outage.median_m is None:
             lines.append(f"outage at {outage.start_s:g} s: nothing to score against")
@@ -188,3 +202,10 @@ def summary(result: ReplayResult) -> list[str]:
     for what, value, sigma, _, verdict in map(cells, calibration(result.estimate)):
         lines.append(f"{what}: {value} +- {sigma} ({verdict})")
     return lines
+
+
+def _rivals(baselines: Baselines) -> list[str]:
+    """The errors of the baselines, where they are scored."""
+    named = (("dead reckoning", baselines.dead_reckoning_m), ("the receiver alone", baselines.gnss_m))
+    shown = [f"{name} {error_m:.3f} m" for name, error_m in named if error_m is not None]
+    return [f"for comparison, scored alike: {', '.join(shown)}"] if shown else []

@@ -25,9 +25,12 @@ from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.json_text import finite, to_json
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.writers.tum import write_tum
+from terrafusion.fusion.config.assumptions import Assumption
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, WeightChange
 from terrafusion.fusion.graph.key_state import LINEAR
+from terrafusion.fusion.metrics.baselines import Baselines
 from terrafusion.fusion.metrics.scores import Scores
+from terrafusion.fusion.metrics.verdict import Verdict
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
 from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.replay import ReplayResult
@@ -53,6 +56,9 @@ def build_metrics(
     status: Mapping[str, str],
     notes: Sequence[str] = (),
     calibration: Sequence[Mapping[str, Any]] = (),
+    verdict: Verdict | None = None,
+    assumed: Sequence[Assumption] = (),
+    baselines: Baselines | None = None,
 ) -> dict[str, Any]:
     """The content of `metrics.json`.
 
@@ -67,12 +73,19 @@ def build_metrics(
         status: `value` and `message` (see `final_status`).
         notes: what was assumed; notes on the scoring are added.
         calibration: rows of `linear_states.calibration`; empty where none was asked for.
+        verdict, assumed, baselines: see `ReplayResult`; without them their keys are absent.
     """
     if mode not in MODES:
         raise ValueError(f"mode is '{mode}', not one of {', '.join(MODES)}")
     latencies = np.asarray(latencies_ms, dtype=float).ravel()
     latencies = latencies[np.isfinite(latencies)]
     p50, p99 = np.percentile(latencies, [50.0, 99.0]) if len(latencies) else (0.0, 0.0)
+    judged: dict[str, Any] = {}
+    if verdict is not None:
+        judged["verdict"] = {"value": verdict.value, "reasons": list(verdict.reasons)}
+        judged["assumed"] = [finite(dataclasses.asdict(one)) for one in assumed]
+    if baselines is not None:
+        judged["baselines"] = finite(baselines.record())
     return {
         "schema": SCHEMA,
         "log": log,
@@ -100,7 +113,7 @@ def build_metrics(
         "calibration": [finite(row) for row in calibration],
         "status": {"value": status["value"], "message": status["message"]},
         "notes": [*notes, *(note for note in scores.notes if note not in notes)],
-    }
+    } | judged
 
 
 def terrain_shares(estimate: Estimate) -> dict[str, float]:
@@ -159,6 +172,9 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
         status=final_status(estimate),
         notes=estimate.notes,
         calibration=calibration_of(estimate),
+        verdict=result.verdict,
+        assumed=result.assumed,
+        baselines=result.baselines,
     )
 
 

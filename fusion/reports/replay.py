@@ -102,6 +102,7 @@ def write_report(
         lead = replay_text.summary_of_one(metrics[0])
     apart_s = max(2.0, recording.duration_s() / MOST_MARKS)
     marked = plots.important_changes(shown.estimate.changes, MOST_CHANGES, apart_s)
+    rows = replay_text.score_rows(metrics)
     figures = _figures(shown, recording, held_out, outages, wheel_radius_m, marked)
     figures |= _comparison(runs, recording, held_out, outages) if compared else {"error_runs": None}
     labelled = recording.terrain is not None
@@ -109,7 +110,8 @@ def write_report(
     return write_page(
         path, "replay.html.j2", title, lead=" ".join(lead), provenance=_provenance(recording, provenance),
         runs=runs, shown=shown, other=runs[pair[1]], pair=pair, compared=compared,
-        scores=replay_text.score_rows(metrics), figures=figures,
+        scores=rows, rivals=replay_text.shown_rivals(rows), figures=figures,
+        verdicts=replay_text.verdicts([run.name for run in runs], metrics), assumed=_assumed(runs),
         reference=replay_text.REFERENCE[shown.scores.against or "truth"],
         label_strip=" The strip on top is the log's own label." if labelled else "",
         calibrations={name: rows for name, rows in calibrations.items() if rows},
@@ -175,6 +177,20 @@ def _change_rows(estimate: Estimate, start_ns: int, marked: Sequence[WeightChang
         before, after = number(float(change.before)), number(float(change.after))
         rows.append([*when, name, f"{before} → {after} {change.unit}".rstrip(), reason])
     return rows
+
+
+def _assumed(runs: Sequence[ReportRun]) -> list[list[str]]:
+    """Name, value, sigma and unit of each number that was assumed; the runs of one report share them."""
+    return [
+        [one["name"], _short(one["value"]), "" if one["sigma"] is None else _short(one["sigma"]), one["unit"]]
+        for one in runs[0].metrics.get("assumed", ())
+    ]
+
+
+def _short(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_short, value))
+    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _notes(runs: Sequence[ReportRun]) -> list[str]:

@@ -14,6 +14,8 @@ from terrafusion.datasets.core.tables import number
 
 Metrics = Mapping[str, Any]
 
+RIVALS = {"dead_reckoning_m": "dead reckoning", "gnss_m": "receiver alone"}
+"""Baselines by their key in `metrics.json`."""
 REFERENCE = {"truth": "the ground truth", "gnss_held_out": "held-out GNSS fixes"}
 
 
@@ -21,7 +23,8 @@ REFERENCE = {"truth": "the ground truth", "gnss_held_out": "held-out GNSS fixes"
 class ScoreRow:
     """One score of each run, None where it was not scored.
 
-    `goal` is "low" (less is better), "one" (nearer to 1 is better) or "" (neither is better).
+    `goal` is "low" (less is better), "one" (nearer to 1 is better) or "" (neither is better). `rivals` are
+    the same score of the baselines of `RIVALS`.
     """
 
     label: str
@@ -29,6 +32,7 @@ class ScoreRow:
     digits: int = 3
     goal: str = ""
     about: str = ""
+    rivals: tuple[float | None, ...] = (None, None)
 
     def best(self) -> int | None:
         """Which run is best, or None where fewer than two are scored or the best are equal as shown."""
@@ -62,6 +66,10 @@ class ScoreRow:
         """The number of run `i` as shown."""
         return number(self.values[i], self.digits)
 
+    def rival_text(self, k: int) -> str:
+        """The number of a baseline as shown."""
+        return number(self.rivals[k], self.digits)
+
     def _cost(self, value: float | None) -> float | None:
         if value is None or self.goal != "one":
             return value
@@ -82,7 +90,9 @@ def score_rows(runs: Sequence[Metrics]) -> list[ScoreRow]:
 
     reference = next((REFERENCE[r["against"]] for r in runs if r["against"]), "")
     ate = f"ATE: horizontal, against {reference}; aligned only at the start of a drive without GNSS"
-    rows = [row("Position error, RMS, m", lambda m: m["ate_m"], "low", ate if reference else "")]
+    ates = tuple(run["ate_m"] for run in runs)
+    rivals = _rivals(runs[0].get("baselines"))
+    rows = [ScoreRow("Position error, RMS, m", ates, 3, "low", ate if reference else "", rivals)]
     for i, length in enumerate(runs[0]["rpe_percent"]):
         values = tuple(run["rpe_percent"].get(length) for run in runs)
         about = "RPE: mean over all segments of that length" if i == 0 else ""
@@ -116,8 +126,37 @@ def _outage_rows(runs: Sequence[Metrics]) -> list[ScoreRow]:
             ("percent", "end error, % of the distance"),
         ):
             values = tuple(run["outages"][i][key] if i < len(run["outages"]) else None for run in runs)
-            rows.append(ScoreRow(f"{_outage_name(outage)}: {what}", values, goal="low"))
+            ends = runs[0].get("baselines", {}).get("outages", ())[i : i + 1] if key == "end_error_m" else ()
+            rivals = _rivals(ends[0] if ends else None)
+            rows.append(ScoreRow(f"{_outage_name(outage)}: {what}", values, goal="low", rivals=rivals))
     return rows
+
+
+def _rivals(errors: Mapping[str, Any] | None) -> tuple[float | None, ...]:
+    return tuple(None if errors is None else errors.get(key) for key in RIVALS)
+
+
+def shown_rivals(rows: Sequence[ScoreRow]) -> list[tuple[int, str]]:
+    """The baselines that are scored in any row: number and name."""
+    names = enumerate(RIVALS.values())
+    return [(k, name) for k, name in names if any(row.rivals[k] is not None for row in rows)]
+
+
+def verdicts(names: Sequence[str], runs: Sequence[Metrics]) -> list[dict[str, Any]]:
+    """The verdict of each run that has one: `value`, `title`, `reasons` and what was `assumed`."""
+    out = []
+    for name, metrics in zip(names, runs, strict=True):
+        found = metrics.get("verdict")
+        if found is not None:
+            run = f" ({name})" if len(runs) > 1 else ""
+            out.append(
+                {
+                    "value": found["value"],
+                    "title": f"Verdict{run}: {found['value'].replace('_', ' ')}",
+                    "reasons": found["reasons"],
+                }
+            )
+    return out
 
 
 def summary_of_one(metrics: Metrics) -> list[str]:

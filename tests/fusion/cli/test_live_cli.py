@@ -17,6 +17,7 @@ def test_a_log_gives_times_and_the_last_state(good_log: Path) -> None:
     lines = done.output.splitlines()
     assert [line.split()[0] for line in lines[:3]] == ["keyframe", "sample", "odometry"]
     assert lines[3].startswith("running: [")
+    assert lines[4] == "verdict: good", lines
 
 
 def test_a_log_that_is_not_there_is_a_known_error() -> None:

@@ -113,6 +113,7 @@ def test_a_comparison_has_all_sections_and_nothing_outside(drive, tmp_path):
         "Terrain and slip",
         "Sensor weights",
         "Sensors",
+        "Assumed",
         "Notes",
         "Provenance",
     ]

@@ -1,0 +1,399 @@
+"""The verdict on a run: good, doubtful or not to be used, with its reasons and what to do about each.
+
+Tests of what the run itself shows, most of them chi-square tests of its errors or innovations against its
+own covariance. The limits are constants below; docs/reference/verdict.md lists the rules.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import binom
+
+from terrafusion.datasets.checks import Finding
+from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimate.estimate import STATUS, Estimate, Innovation
+from terrafusion.fusion.metrics.baselines import Baselines
+from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
+from terrafusion.fusion.metrics.error_series import known_keyframes
+from terrafusion.fusion.metrics.health import examine_estimate
+from terrafusion.fusion.metrics.scores import Scores
+
+Array = NDArray[np.float64]
+
+GOOD, DOUBTFUL, UNUSABLE = "good", "doubtful", "not_to_be_used"
+WORDS = {GOOD: "good", DOUBTFUL: "doubtful", UNUSABLE: "not to be used"}
+
+FAR_M, FAR_SHARE = 10.0, 0.05
+"""An error of more than 10 m is never good; if it is also more than this share of the distance, plain dead
+reckoning is usually no worse."""
+FIVE_SIGMA = 25.0
+"""e' P^-1 e of an error of five sigma; for a right covariance its chance is exp(-12.5), 4e-6."""
+STRAY_SHARE = 0.01
+"""Share of single samples beyond five sigma that is put down to the reference (its jumps, its stamps)."""
+SIGMA_RATIO = 2.0
+"""A sigma is called too small if the errors, after allowing for chance, still show it this many times too
+small: a factor that matters to whoever uses it."""
+NIS_95 = 5.991
+"""Chi-square quantile of 95 % for 2 degrees of freedom."""
+SIGNIFICANT_Z = 3.0
+"""Standard errors by which a share must exceed its expectation."""
+IN_A_ROW = 5
+"""Fixes rejected one after the other from which on they are no outliers but a contradiction: the chance of
+it, at a gate of 99.9 %, is 1e-15 for independent errors."""
+REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
+"""Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
+CLEARLY_WORSE, FAR_WORSE, MATTERS_M = 1.5, 2.0, 0.5
+"""Ratio of errors from which on an estimate is called worse than a baseline: the first where its covariance
+does not allow the errors, the second where it does, for differences of more than so many metres (slow errors
+of a receiver can favour dead reckoning by chance on a short drive)."""
+LEAST_OUTAGES = 5
+"""So many outages, all worse than dead reckoning, are no chance (1 in 32)."""
+MOST_PATH_RATIO = 2.0
+"""Estimated over rolled path that no wrong radius explains (assumed): fixes have moved the estimate about."""
+SIGMA_KNOWN_M, YAW_SIGMA_KNOWN_RAD = 10.0, 0.5
+"""Position and heading are unknown for navigation beyond these 1 sigmas."""
+REPORTED = (
+    "wheel-radius", "wheel-scale", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored",
+    "gnss-frozen", "sigma-too-small", "clock-offset",
+)  # fmt: skip
+"""Warnings of the log checks that make a result doubtful; errors always do."""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`value` is "good", "doubtful" or "not_to_be_used"; `reasons` are sentences, the gravest first."""
+
+    value: str
+    reasons: tuple[str, ...]
+
+    def words(self) -> str:
+        """The value as people write it."""
+        return WORDS[self.value]
+
+    def lines(self) -> list[str]:
+        """The verdict as lines of text."""
+        return [f"verdict: {self.words()}", *(f"  {reason}" for reason in self.reasons)]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What a verdict is passed on."""
+
+    recording: Recording
+    estimate: Estimate
+    scores: Scores
+    baselines: Baselines
+    used: Gnss | None
+    findings: Sequence[Finding]
+    wheel_radius_m: float
+
+
+Reason = tuple[str, str]
+"""A value and a sentence."""
+
+
+def judge(run: Run) -> Verdict:
+    """The verdict on a run: the gravest of its reasons; if there are none, on what `good` rests."""
+    reasons = [reason for test in TESTS for reason in test(run)]
+    for value in (UNUSABLE, DOUBTFUL):
+        if any(reason[0] == value for reason in reasons):
+            ordered = sorted(reasons, key=lambda reason: reason[0] != UNUSABLE)
+            return Verdict(value, tuple(_sentence(text) for _, text in ordered))
+    return Verdict(GOOD, tuple(map(_sentence, _supports(run))))
+
+
+def _sound(run: Run) -> Iterator[Reason]:
+    wheels = run.recording.wheels
+    if wheels is None or not len(run.estimate.trajectory):
+        return
+    health = examine_estimate(run.estimate, wheels, run.wheel_radius_m)
+    if not health.why:
+        return
+    ratio = health.path_ratio()
+    # A path a little too long for the wheels may still be right: then it is the radius that is not.
+    mild = ratio is not None and ratio < MOST_PATH_RATIO and "path" in health.why
+    yield (
+        DOUBTFUL if mild else UNUSABLE,
+        f"the estimate is not plausible: {health.why}; check wheel radius, fixes and stamps with "
+        "`terrafusion inspect`",
+    )
+
+
+def _started(run: Run) -> Iterator[Reason]:
+    status = run.estimate.status.astype(str)
+    if not len(status):
+        return
+    if status[-1] in ("waiting", "aligning"):
+        yield UNUSABLE, f"the estimator never started: {STATUS[status[-1]]}; use a longer drive"
+    elif run.used is not None and len(run.used) and (status == "no_gnss").all():
+        yield (
+            UNUSABLE,
+            "the fixes never placed the path: its start and heading are arbitrary; use a longer drive, or "
+            "look at the fixes with `terrafusion inspect`",
+        )
+
+
+def _error(run: Run) -> Iterator[Reason]:
+    ate, travelled = _error_m(run), run.estimate.trajectory.path_length_m()
+    if ate is None or ate <= FAR_M:
+        return
+    share = 100.0 * ate / max(travelled, 1e-9)
+    value = UNUSABLE if ate > FAR_SHARE * travelled else DOUBTFUL
+    yield (
+        value,
+        f"the position error is {ate:.1f} m RMS against {_reference(run)}, {share:.0f} % of the distance; "
+        "check vehicle file and log with `terrafusion inspect`",
+    )
+
+
+def _outages(run: Run) -> Iterator[Reason]:
+    for outage in run.scores.outages:
+        end = outage.end_error_m
+        if end is not None and end > FAR_M:
+            share = f", {outage.percent:.0f} % of the distance" if outage.percent is not None else ""
+            yield (
+                DOUBTFUL,
+                f"{outage.seconds:g} s without GNSS from {outage.start_s:g} s on end {end:.1f} m off{share}; "
+                "expect as much wherever fixes are missing for so long",
+            )
+
+
+def _five_sigma(run: Run) -> Iterator[Reason]:
+    errors = run.scores.errors
+    if errors is None:
+        return
+    square = 2.0 * errors.nees()
+    known = np.isfinite(square)
+    beyond = known & (square > FIVE_SIGMA)
+    share = beyond.sum() / max(known.sum(), 1)
+    if share <= STRAY_SHARE:
+        return
+    worst = int(np.argmax(np.where(beyond, errors.distance_m(), -1.0)))
+    off_m = float(errors.distance_m()[worst])
+    travelled = run.estimate.trajectory.path_length_m()
+    value = UNUSABLE if share > 0.5 and off_m > min(FAR_M, FAR_SHARE * travelled) else DOUBTFUL
+    yield (
+        value,
+        f"the error exceeds five times its own sigma {100.0 * share:.0f} % of the time, up to {off_m:.1f} m "
+        f"at {_since(run, int(errors.t_ns[worst])):.0f} s: sigma is wrong there; compare vehicle file, IMU "
+        "mounting and stamps with the log (`terrafusion inspect`)",
+    )
+
+
+def _nees(run: Run) -> Iterator[Reason]:
+    row = _row(run, "position")
+    if row is not None and row.mean > SIGMA_RATIO**2 * row.high:
+        yield (
+            DOUBTFUL,
+            f"position errors are {row.mean**0.5:.1f} times their sigma (NEES {row.mean:.1f} per dimension, "
+            f"at most {row.high:.1f} expected): do not rely on sigma",
+        )
+
+
+def _worse_than_a_baseline(run: Run) -> Iterator[Reason]:
+    ours, row = run.scores.ate_m, _row(run, "position")
+    rivals = [("plain dead reckoning", run.baselines.dead_reckoning_m)]
+    if run.scores.against == "truth":  # held-out fixes are the receiver itself
+        rivals.append(("the receiver alone", run.baselines.gnss_m))
+    for name, theirs in rivals:
+        if ours is None or theirs is None:
+            continue
+        promised = row is None or row.mean <= row.high
+        far = ours > FAR_WORSE * theirs and ours - theirs > MATTERS_M
+        if far or (not promised and ours > CLEARLY_WORSE * theirs):
+            yield (
+                DOUBTFUL,
+                f"{name} has an error of {theirs:.2f} m, the estimate {ours:.2f} m: a sensor or a number of "
+                "the vehicle file misleads it; see `terrafusion inspect`",
+            )
+    yield from _worse_in_outages(run)
+
+
+def _worse_in_outages(run: Run) -> Iterator[Reason]:
+    ends = [
+        (outage.end_error_m, rival.dead_reckoning_m)
+        for outage, rival in zip(run.scores.outages, run.baselines.outages, strict=False)
+        if outage.end_error_m is not None and rival.dead_reckoning_m is not None
+    ]
+    if len(ends) < LEAST_OUTAGES:
+        return
+    ours, theirs = np.array(ends).T
+    # One-sided sign test: of n outages, k or more lost by chance.
+    lost = int((ours > theirs).sum())
+    chance = float(binom.sf(lost - 1, len(ends), 0.5))
+    if chance < 1.0 - CONFIDENCE and np.median(ours) > CLEARLY_WORSE * np.median(theirs):
+        yield (
+            DOUBTFUL,
+            f"plain dead reckoning is nearer at the end of {lost} of {len(ends)} outages, "
+            f"{np.median(theirs):.2f} m for {np.median(ours):.2f} m: "
+            "wheels or gyro are weighted wrongly; see `terrafusion calibrate`",
+        )
+
+
+def _certain(run: Run) -> Iterator[Reason]:
+    known, _ = known_keyframes(run.estimate)
+    path = known.trajectory
+    if path.covariance is None or not len(path):
+        return
+    sigma = np.sqrt(np.maximum(path.covariance[:, 0, 0], path.covariance[:, 1, 1]))
+    k = int(np.nanargmax(sigma)) if np.isfinite(sigma).any() else 0
+    limit_m = max(SIGMA_KNOWN_M, 3.0 * _fix_sigma_m(run.used))
+    if sigma[k] > limit_m:
+        yield (
+            DOUBTFUL,
+            f"the position is known to {sigma[k]:.0f} m only (1 sigma) at "
+            f"{_since(run, int(path.t_ns[k])):.0f} s: without fixes the uncertainty grows",
+        )
+    yaw_sigma = float(np.sqrt(path.covariance[-1, 5, 5]))
+    if yaw_sigma > YAW_SIGMA_KNOWN_RAD:
+        yield (
+            DOUBTFUL,
+            f"the heading is unknown at the end: {np.degrees(yaw_sigma):.0f} deg (1 sigma); drive on",
+        )
+
+
+def _innovations(run: Run) -> Iterator[Reason]:
+    row, fixes = _row(run, "nis gnss"), _gnss(run)
+    if row is None or not fixes:
+        return
+    share = float(np.mean([i.nis > NIS_95 for i in fixes]))
+    expected = 1.0 - CONFIDENCE
+    spread = np.sqrt(expected * CONFIDENCE / max(row.effective, 1.0))
+    if share > 2.0 * expected and share > expected + SIGNIFICANT_Z * spread and row.mean > row.high:
+        yield (
+            DOUBTFUL,
+            f"GNSS innovations are {row.mean**0.5:.1f} times what their sigmas allow, {100.0 * share:.0f} % "
+            "of them beyond the 95 % bound: sigmas too small, a late receiver, or wrong wheels or IMU; "
+            "try `terrafusion inspect`",
+        )
+
+
+def _rejections(run: Run) -> Iterator[Reason]:
+    fixes = _gnss(run)
+    if not fixes:
+        return
+    rejected = [not i.accepted for i in fixes]
+    share = sum(rejected) / len(fixes)
+    if share > REJECTED_SHARE:
+        yield (
+            UNUSABLE if share > MOST_REJECTED and run.scores.against != "truth" else DOUBTFUL,
+            f"{100.0 * share:.0f} % of the fixes were rejected: they contradict wheels and IMU; check "
+            "sigmas, stamps and axes with `terrafusion inspect`",
+        )
+    longest = _longest(rejected)
+    if longest is not None and longest[1] - longest[0] >= IN_A_ROW:
+        first, end = longest
+        size = float(np.median([np.hypot(*i.value[:2]) for i in fixes[first:end]]))
+        at = _since(run, fixes[first].t_ns)
+        moved = end < len(fixes) and fixes[end].nis > FIVE_SIGMA
+        yield (
+            DOUBTFUL,
+            f"{end - first} fixes in a row from {at:.0f} s on lie {size:.1f} m off the estimate"
+            + (", which then moved to them" if moved else "")
+            + ": either they or the estimate are wrong there",
+        )
+
+
+def _log(run: Run) -> Iterator[Reason]:
+    for finding in run.findings:
+        if finding.severity == "error" or finding.code in REPORTED:
+            yield (
+                DOUBTFUL,
+                f"log check, {finding.channel}: {finding.what} ({finding.evidence}); {finding.fix}",
+            )
+
+
+def _unchecked(run: Run) -> Iterator[Reason]:
+    if run.scores.against is not None or _gnss(run):
+        return
+    missing = _disagreement(run)
+    if missing:
+        yield (
+            DOUBTFUL,
+            f"nothing to check the path against: no GNSS, no truth, and {missing}; record one of them",
+        )
+
+
+def _disagreement(run: Run) -> str:
+    """Why wheels, gyro and accelerometer cannot vouch for each other; "" where they do."""
+    imu, wheels = run.recording.imu, run.recording.wheels
+    if imu is None or wheels is None or not imu.has_accel() or not np.isfinite(imu.gyro_radps[:, 2]).any():
+        return "no complete IMU"
+    if not wheels.has_sides():
+        return "wheels that do not show turns"
+    rows = [i for i in run.estimate.innovations if i.sensor == "wheels"]
+    if not rows or np.mean([not i.accepted for i in rows]) > REJECTED_SHARE:
+        return "wheels and IMU disagree"
+    return ""
+
+
+TESTS = (
+    _sound, _started, _error, _outages, _five_sigma, _nees, _worse_than_a_baseline, _certain, _innovations,
+    _rejections, _log, _unchecked,
+)  # fmt: skip
+
+
+def _supports(run: Run) -> Iterator[str]:
+    """On what a good verdict rests."""
+    scores = run.scores
+    row = _row(run, "position")
+    if scores.ate_m is not None:
+        covered = "" if row is None else f", {row.mean**0.5:.1f} times sigma"
+        yield f"the position error is {scores.ate_m:.2f} m RMS against {_reference(run)}{covered}"
+    elif not _gnss(run):
+        yield "nothing to check against but the agreement of wheels, gyro and accelerometer"
+    gnss = _row(run, "nis gnss")
+    if gnss is not None:
+        yield f"fixes agree with wheels and IMU: innovations are {gnss.mean**0.5:.1f} times their sigma"
+
+
+def _error_m(run: Run) -> float | None:
+    """RMS against truth; of held-out fixes, some of which may be wild, the RMS that their median implies."""
+    held = run.scores.held_out
+    if run.scores.against == "gnss_held_out" and held is not None:
+        return held.median_m / float(np.sqrt(np.log(2.0)))  # of two equal Gaussian errors
+    return run.scores.ate_m
+
+
+def _reference(run: Run) -> str:
+    return "the ground truth" if run.scores.against == "truth" else "the held-out fixes"
+
+
+def _row(run: Run, quantity: str) -> Consistency | None:
+    rows = (row for row in run.scores.consistency if row.quantity == quantity and row.terrain == ALL)
+    return next(rows, None)
+
+
+def _gnss(run: Run) -> list[Innovation]:
+    return [i for i in run.estimate.innovations if i.sensor == "gnss"]
+
+
+def _fix_sigma_m(used: Gnss | None) -> float:
+    sigma = np.zeros(0) if used is None else used.sigma_enu_m[:, :2].max(axis=1)
+    sigma = sigma[np.isfinite(sigma)]
+    return float(np.median(sigma)) if len(sigma) else 0.0
+
+
+def _longest(flags: Sequence[bool]) -> tuple[int, int] | None:
+    """First index of the longest run of True, and the one after its last."""
+    best, at = None, 0
+    for flag, group in itertools.groupby(flags):
+        end = at + len(list(group))
+        if flag and (best is None or end - at > best[1] - best[0]):
+            best = at, end
+        at = end
+    return best
+
+
+def _since(run: Run, t_ns: int) -> float:
+    return (t_ns - run.recording.start_ns) * 1e-9
+
+
+def _sentence(text: str) -> str:
+    return f"{text[0].upper()}{text[1:]}{'' if text[-1] in '.?!' else '.'}"

@@ -1,0 +1,198 @@
+"""Verdicts: good if nothing speaks against the run, not good where the error is far or far beyond sigma."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.checks import Finding
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimate.estimate import Innovation
+from terrafusion.fusion.metrics.baselines import Baselines, OutageBaseline
+from terrafusion.fusion.metrics.scores import Outage, OutageScore, score
+from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
+from tests.studies.verdicts import FAULTS, is_wrong, short_drive
+
+
+def verdict(
+    d, *, truth=True, estimate=None, baselines=None, findings=(), outages=(), held_out=None
+) -> Verdict:
+    estimate = estimate or d.estimate
+    recording = d.recording if truth else dataclasses.replace(d.recording, truth=None)
+    scores = score(estimate, recording, held_out=held_out, outages=outages)
+    return judge(Run(recording, estimate, scores, baselines or Baselines(), d.fixes, findings, 0.2))
+
+
+def with_innovations(d, nis, accepted=True):
+    """The estimate with one GNSS innovation a second."""
+    t_ns = d.fixes.t_ns[: len(nis)]
+    accepted = np.broadcast_to(accepted, len(nis))
+    rows = zip(t_ns.tolist(), np.asarray(nis).tolist(), accepted.tolist(), strict=True)
+    # A direction of its own each time, so that innovations are independent.
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (len(nis), 2))
+    found = [Innovation(t, "gnss", 12.0 * signs[i], n, 2, ok) for i, (t, n, ok) in enumerate(rows)]
+    return dataclasses.replace(d.estimate, innovations=tuple(found))
+
+
+def consistent(d, **changed):
+    return with_innovations(d, np.random.default_rng(3).chisquare(2, 100), **changed)
+
+
+def test_a_run_within_its_sigma_is_good_and_says_on_what_that_rests(drive):
+    d = drive(offset_m=(0.1, 0.1), sigma_m=0.2)
+    found = verdict(d, estimate=consistent(d))
+    assert found.value == "good", found
+    assert found.reasons[0].startswith("The position error is 0.1")
+    assert "against the ground truth" in found.reasons[0]
+    assert found.lines()[0] == "verdict: good"
+
+
+def test_far_from_the_truth_is_not_to_be_used(drive):
+    found = verdict(drive(offset_m=(15.0, 5.0)))
+    assert found.value == "not_to_be_used"
+    assert found.words() == "not to be used"
+    assert "15.8 m RMS against the ground truth" in found.reasons[0]
+
+
+def test_far_on_a_long_way_is_doubtful(drive):
+    d = drive(seconds=300.0, offset_m=(11.0, 0.0), sigma_m=9.0)
+    assert verdict(d, estimate=consistent(d)).value == "doubtful"
+
+
+@pytest.mark.parametrize(("offset_m", "value"), [(0.2, "good"), (0.6, "doubtful")])
+def test_an_error_beyond_five_sigma_is_not_good(drive, offset_m, value):
+    d = drive(offset_m=(offset_m, 0.0), sigma_m=0.1)
+    found = verdict(d, estimate=consistent(d))
+    assert found.value == value
+    assert ("five times its own sigma" in " ".join(found.reasons)) == (value == "doubtful")
+
+
+def test_a_sigma_too_small_is_named(drive):
+    d = drive(noise_m=0.35, sigma_m=0.1)
+    assert "NEES" in " ".join(verdict(d, estimate=consistent(d)).reasons)
+
+
+def test_innovations_beyond_their_bound_are_doubtful_without_any_reference(drive):
+    d = drive()
+    chi = np.random.default_rng(5).chisquare(2, 100)
+    assert verdict(d, truth=False, estimate=with_innovations(d, chi)).value == "good"
+    found = verdict(d, truth=False, estimate=with_innovations(d, 4.0**2 * chi))
+    assert found.value == "doubtful"
+    assert "GNSS innovations are 4" in found.reasons[0]
+    assert "`terrafusion inspect`" in found.reasons[0]
+
+
+def test_a_single_wild_fix_is_none_of_its_business(drive):
+    d = drive()
+    chi = np.random.default_rng(5).chisquare(2, 100)
+    chi[40] = 900.0
+    assert verdict(d, truth=False, estimate=with_innovations(d, chi, chi < 900.0)).value == "good"
+
+
+def test_fixes_rejected_in_a_row_are_named_with_time_and_size(drive):
+    d = drive()
+    chi = np.random.default_rng(5).chisquare(2, 100)
+    chi[40:48] = 900.0
+    found = verdict(d, truth=False, estimate=with_innovations(d, chi, np.r_[chi[:47] < 900.0, [True] * 53]))
+    assert found.value == "doubtful"
+    assert "7 fixes in a row from 40 s on lie 17.0 m off the estimate, which then moved to them" in " ".join(
+        found.reasons
+    )
+
+
+def test_most_fixes_rejected_is_not_to_be_used(drive):
+    d = drive()
+    estimate = with_innovations(d, np.full(100, 50.0), np.arange(100) % 5 == 0)
+    assert verdict(d, truth=False, estimate=estimate).value == "not_to_be_used"
+
+
+def test_a_baseline_that_does_better_is_named(drive):
+    d = drive(offset_m=(2.8, 0.0), sigma_m=2.0)
+    assert verdict(d, estimate=consistent(d), baselines=Baselines(2.0, 2.5)).value == "good"
+    found = verdict(d, estimate=consistent(d), baselines=Baselines(1.0, 2.5))
+    assert found.value == "doubtful"
+    assert "lain dead reckoning has an error of 1.00 m" in found.reasons[0]
+
+
+def test_many_outages_lost_to_dead_reckoning_are_no_chance(drive):
+    d = drive()
+    lost = tuple(OutageScore(i, 30.0, 30.0, 4.0, 2.0, 13.0) for i in range(6))
+    rivals = Baselines(outages=tuple(OutageBaseline(i, 1.0, None) for i in range(6)))
+    scores = dataclasses.replace(score(consistent(d), d.recording), outages=lost)
+    run = Run(d.recording, consistent(d), scores, rivals, d.fixes, (), 0.2)
+    assert "6 of 6 outages" in judge(run).reasons[0]
+    few = dataclasses.replace(run, scores=dataclasses.replace(scores, outages=lost[:4]))
+    few = dataclasses.replace(few, baselines=Baselines(outages=rivals.outages[:4]))
+    assert judge(few).value == "good"
+
+
+def test_an_outage_that_ends_far_off_is_doubtful(drive):
+    d = drive(drift_mps=0.6, drift_from_s=60.0, sigma_m=8.0)
+    found = verdict(d, estimate=consistent(d), outages=[Outage(40.0, 40.0)])
+    assert found.value != "good"
+    assert any("40 s without GNSS from 40 s on end 1" in reason for reason in found.reasons)
+
+
+def test_what_is_not_known_is_doubtful(drive):
+    d = drive(sigma_m=40.0)
+    assert "known to 40 m only" in verdict(d, estimate=consistent(d)).reasons[0]
+
+
+def test_a_path_that_fixes_never_placed_is_not_to_be_used(drive):
+    d = drive()
+    local = dataclasses.replace(d.estimate, status=np.full(len(d.estimate.status), "no_gnss", dtype=object))
+    assert verdict(d, truth=False, estimate=local).value == "not_to_be_used"
+
+
+def test_nothing_to_check_against_is_doubtful_without_sensors_that_vouch(drive):
+    d = drive()
+    alone = dataclasses.replace(d.estimate, innovations=())
+    run = Run(
+        dataclasses.replace(d.recording, truth=None),
+        alone,
+        score(alone, Recording("r", 0)),
+        Baselines(),
+        None,
+        (),
+        0.2,
+    )
+    assert judge(run).value == "doubtful"
+    assert "nothing to check the path against" in judge(run).reasons[0].lower()
+
+
+def test_findings_of_the_log_checks_count_by_their_kind(drive):
+    d = drive()
+
+    def of(code: str, severity: str) -> str:
+        finding = Finding(code, severity, "wheels", "what", "evidence", "fix")
+        return verdict(d, estimate=consistent(d), findings=[finding]).value
+
+    assert of("uneven-sampling", "warning") == "good"
+    assert of("wheel-radius", "warning") == "doubtful"
+    assert of("yaw-sign", "error") == "doubtful"
+
+
+@pytest.mark.parametrize("seed", [400, 403, 410, 415])
+def test_a_clean_drive_of_the_twin_is_good(seed):
+    from terrafusion.fusion.replay import replay
+
+    log = short_drive(seed)
+    for known in (log, dataclasses.replace(log, truth=None)):
+        run = replay(known)
+        assert run.verdict.value == "good", run.verdict
+
+
+@pytest.mark.parametrize("fault", ["fixes 50 m off, 10 s", "gyro sign", "IMU turned, 90 deg about z"])
+def test_a_fault_that_leads_far_astray_is_not_good(fault):
+    from terrafusion.fusion.replay import replay
+
+    log = FAULTS[fault](short_drive(402))
+    far = False
+    for known in (log, dataclasses.replace(log, truth=None)):
+        run = replay(known)
+        wrong = is_wrong(score(run.estimate, log, antenna_m=run.vehicle.sensors.gnss.antenna_m))
+        far |= wrong
+        assert run.verdict.value != "good", run.verdict
+    assert far or "IMU" in fault
