@@ -25,7 +25,7 @@ from tests.studies.opponents.inertial import Inertial
 from tests.studies.opponents.page import Cell, markdown, picture
 from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
 
-LENGTHS_S = (10.0, 30.0, 60.0)
+LENGTHS_S = (30.0, 60.0, 10.0)
 ENVIRONMENT = "TERRAFUSION_LOGS"
 DESCRIBED, UNKNOWN = "vehicle of the log", "wheel radius and track alone"
 HERE = Path(__file__).parent
@@ -71,7 +71,7 @@ def load(names: Sequence[str], runs: int) -> None:
 
 
 def tasks_of(lengths: Sequence[float]) -> list[Task]:
-    """All tasks, the quick opponents first, then one mode after another over all logs."""
+    """All tasks, length after length; the opponents first, then one mode after another over all logs."""
     opponents = code_of(
         *(HERE / f"{n}.py" for n in ("ekf", "smoother", "ins", "inertial", "protocol", "drives"))
     )
@@ -80,11 +80,11 @@ def tasks_of(lengths: Sequence[float]) -> list[Task]:
     wanted = [(name, DESCRIBED) for name in estimators.OPPONENTS]
     wanted += [(mode, known) for known in (DESCRIBED, UNKNOWN) for mode in estimators.MODES]
     tasks = []
-    for estimator, known in wanted:
-        for i, (drive, inputs) in enumerate(_DRIVES):
-            for seconds in lengths:
+    for seconds in lengths:
+        for estimator, known in wanted:
+            code = opponents if estimator in estimators.OPPONENTS else library
+            for i, (drive, inputs) in enumerate(_DRIVES):
                 if inputs.streams.passes(seconds):
-                    code = opponents if estimator in estimators.OPPONENTS else library
                     name = f"{drive.name} {drive.recording.name} {seconds:g} s {estimator} {known}"
                     tasks.append(Task(name, code, Work(i, seconds, estimator, known)))
     return tasks
