@@ -131,7 +131,7 @@ def replay(
         recording,
         held_out=held_out,
         outages=outages,
-        antenna_m=config.rig.sensors.gnss.antenna_m,
+        antenna_m=tuple(estimator.gnss.antenna_m.tolist()),
         aligned=estimator.gnss.local,
     )
 

@@ -28,6 +28,7 @@ class EstimatorOptions(TypedDict, total=False):
     yaw_sigma_start_rad: float
     start_without_gnss_s: float
     calibrate: bool
+    self_calibrate: bool
     declination_rad: float | None
     labels: GroundLabels | None
 
@@ -56,6 +57,8 @@ class EstimatorConfig:
             `inputs` has none).
         inputs: sensors that the estimator will be given; without all six IMU axes the graph is planar.
         calibrate: also estimate `key_state.CALIBRATION`: wheel radius, antenna, IMU rotation, delays.
+        self_calibrate: learn antenna, delay of GNSS, gyro scale and wheel scale while driving
+            (`calibration.online`); not together with `calibrate`.
         declination_rad: magnetic north, east of true north; with it a magnetometer measures the
             heading, without it it holds that of GNSS or the start.
         labels: the ground over time, in place of the detector; None: it detects.
@@ -77,6 +80,7 @@ class EstimatorConfig:
     start_without_gnss_s: float = 30.0
     inputs: SensorConfig = field(default_factory=SensorConfig)
     calibrate: bool = False
+    self_calibrate: bool = True
     declination_rad: float | None = None
     labels: GroundLabels | None = None
 

@@ -76,7 +76,7 @@ class DeadReckoning:
     """The dead-reckoned path of the antenna and the fixes along it, for the last `KEPT_S`."""
 
     def __init__(self, antenna_m: Array) -> None:
-        self._lever = complex(antenna_m[0], antenna_m[1])
+        self.lever = complex(antenna_m[0], antenna_m[1])
         self._t_ns: list[int] = []
         self._z: list[complex] = []
         self._yaw: list[float] = []
@@ -124,7 +124,7 @@ class DeadReckoning:
         share = min((fix.t_ns - begin) / (end - begin), 1.0)
         z = self._z[i - 1] + share * (self._z[i] - self._z[i - 1])
         yaw = self._yaw[i - 1] + share * (self._yaw[i] - self._yaw[i - 1])
-        at = z + self._lever * complex(np.cos(yaw), np.sin(yaw))
+        at = z + self.lever * complex(np.cos(yaw), np.sin(yaw))
         pair = FixPair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
         bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
 
@@ -220,7 +220,7 @@ class DeadReckoning:
 
     def antenna(self) -> complex:
         """The dead-reckoned antenna at the newest keyframe, m."""
-        return self._z[-1] + self._lever * cmath.exp(1j * self._yaw[-1])
+        return self._z[-1] + self.lever * cmath.exp(1j * self._yaw[-1])
 
     def fit(self, scale: float, yaw_sigma_rad: float) -> PathFit | None:
         """The path aligned with the fixes, their sigmas times `scale`; None until its turn is known to

@@ -22,6 +22,7 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
+from terrafusion.fusion.calibration import for_estimator
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
@@ -44,6 +45,7 @@ from terrafusion.fusion.estimator.stationarity import (
     StationarityDetector,
     add_zero_velocity,
 )
+from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
@@ -52,11 +54,20 @@ from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
-from terrafusion.fusion.inputs.streams import LONGEST_PAUSE_NS, ImuSegment, ImuStream, WheelStream
+from terrafusion.fusion.inputs.streams import (
+    LONGEST_PAUSE_NS,
+    ImuSegment,
+    ImuStream,
+    WheelStream,
+    longest_gap_s,
+    usual_interval_s,
+)
+from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
-LONGEST_IMU_GAP_S, OUTAGE_S = 0.5, 2.0
+OUTAGE_S = 2.0
+LONGEST_STEP_S = 1.0
 SMOOTH_EVERY, SMOOTH_WINDOW = 5, 50
 LAG_MARGIN = 5
 """Keyframes held beyond the lag: a fix that is exactly so late belongs to a keyframe still there."""
@@ -95,9 +106,9 @@ class Estimator:
         self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
         self._wheel_gate = WheelGate(config.wheel_gate_sigma)
-        self._step_ns = round(config.keyframe_s * 1e9)
-        self._keep = round(config.lag_s / config.keyframe_s) + LAG_MARGIN
+        self._jitter = WheelJitter()
         self._search = StartSearch(config, self.aids, self.gnss)
+        self._set_step(config.keyframe_s)
         self._state: State | None = None
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
@@ -105,6 +116,7 @@ class Estimator:
         self._stationarity = StationarityDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
         self._propagator = Propagator(self._preintegrator)
+        self.learned = for_estimator.self_calibration(config)
 
     @classmethod
     def for_vehicle(cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive") -> Estimator:
@@ -158,6 +170,8 @@ class Estimator:
         taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
         if taken is not None and self.newest.admitted(taken.t_ns, "gnss") is not None:
             self.gnss.queue(taken)
+            if self.learned is not None:
+                self.learned.fix(taken.t_ns, taken.enu_m, float(np.max(taken.sigma_m[:2])))
 
     def set_start(
         self,
@@ -245,10 +259,13 @@ class Estimator:
         """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
         if not self.imu.covers(t_ns):
             return False
-        waited = t_ns + round(self.config.wheel_wait_s * 1e9)
+        wait_s = max(self.config.wheel_wait_s, 1.5 * usual_interval_s(self.wheels.t_ns))
+        waited = t_ns + round(wait_s * 1e9)
         return last or self.wheels.covers(t_ns) or self.imu.covers(waited)
 
     def _begin(self, start: Start) -> None:
+        slowest_s = max(usual_interval_s(self.imu.t_ns), usual_interval_s(self.wheels.t_ns))
+        self._set_step(max(self.config.keyframe_s, min(slowest_s, LONGEST_STEP_S)))
         # The fixes that gave the heading enter the graph again: the prior must not count them twice.
         from_fixes = not self.gnss.local and self._search.known is None
         spec, drift_m = self.config.rig.sensors.imu, self.gnss.drift_sigma_m
@@ -267,6 +284,11 @@ class Estimator:
         self._silent = False
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
+    def _set_step(self, step_s: float) -> None:
+        """Time between keyframes: that of the slower of IMU and wheels, as between samples little is known."""
+        self._step_ns = round(step_s * 1e9)
+        self._keep = round(self.config.lag_s / step_s) + LAG_MARGIN
+
     def _keyframe(self, t_ns: int) -> None:
         self._upkeep()
         switch = self.weights.take_switch()
@@ -280,13 +302,15 @@ class Estimator:
         if self.config.inputs.planar:
             segments = with_centripetal_force(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
+        noise = self._with_turn_doubt(noise, segments)
         segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
+        gap = self.imu.largest_gap_s(before_ns, t_ns) > longest_gap_s(self.imu.t_ns)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if dt > LONGEST_PAUSE_NS * 1e-9:
             point, link, wheels = *pause(k, before, dt), None
-        elif self.imu.largest_gap_s(before_ns, t_ns) > LONGEST_IMU_GAP_S:
+        elif gap:
             point = carried(before, wheels, dt)
             link = bridge(k, before, point, dt)
         else:
@@ -305,7 +329,11 @@ class Estimator:
         if self.config.inputs.planar:
             self.chain.add(k, level_factor(k), "X")
         self._zero_velocity(k, t_ns, before, link)
-        self._finish_keyframe(t_ns, gyro, rolled.distance_m if rolled else None)
+        rolled_m = rolled.distance_m if rolled else None
+        self._finish_keyframe(t_ns, gyro, rolled_m)
+        if self.learned is not None:
+            turn_rad = float(gyro[2]) * dt / (1.0 + self.imu.turn_scale)
+            self._learn(t_ns, None if gap else rolled_m, turn_rad)
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
         chain, before = self.chain, self._solve()
@@ -318,6 +346,22 @@ class Estimator:
         self.wheels.forget(t_ns - KEPT_NS)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         self._fresh = self._emitted(t_ns, gyro)
+
+    def _learn(self, t_ns: int, rolled_m: float | None, turn_rad: float) -> None:
+        """Self-calibration with the motion of a keyframe, and its corrections where they are new."""
+        learned, pose = self.learned, self.chain.state(self.chain.last).pose
+        assert learned is not None
+        if self.gnss.local:
+            learned.restart()
+            return
+        learned.drive(t_ns, rolled_m, turn_rad, np.asarray(pose.translation()), pose.rotation().yaw())
+        if learned.step():
+            for_estimator.apply(learned.known, self.imu, self.gnss, self.weights, t_ns)
+
+    def _with_turn_doubt(self, noise: SensorNoise, segments: list[ImuSegment]) -> SensorNoise:
+        if self.learned is None:
+            return noise
+        return for_estimator.with_turn_doubt(noise, self.learned.known, segments, self.config.rig.sensors.imu)
 
     def _solve(self) -> Array:
         self.chain.solve(SMOOTH_WINDOW)
@@ -334,6 +378,8 @@ class Estimator:
         if state is None:
             return
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)
+        if turned and self.learned is not None:
+            self.learned.restart(forget=True)
         if turned or self.chain.last % SMOOTH_EVERY == 0:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()
@@ -353,6 +399,7 @@ class Estimator:
         increment = wheel_increment(
             travelled, segments, bias_z, rig.track_m, quantum_m, noise, change, surging
         )
+        increment = self._jitter.applied(increment)
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 

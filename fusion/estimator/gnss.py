@@ -73,6 +73,8 @@ class GnssUpdater:
     ) -> None:
         self.weighting = weighting or Weighting()
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
+        self.nominal_antenna_m = self.antenna_m.copy()
+        self.delay_s = 0.0
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
         spec = config.rig.sensors.gnss
@@ -105,9 +107,17 @@ class GnssUpdater:
 
     def queue(self, fix: GnssFix) -> None:
         """Take a fix in, in any order of time."""
+        if self.delay_s:
+            fix = dataclasses.replace(fix, t_ns=fix.t_ns - round(self.delay_s * 1e9))
         self.waiting.append(fix)
         if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
             self.waiting.sort(key=lambda f: f.t_ns)
+
+    def correct(self, antenna_m: Array, delay_s: float) -> None:
+        """Take over a correction (2,) of the lever arm and the lateness of the stamps."""
+        self.antenna_m = self.nominal_antenna_m + np.append(antenna_m, 0.0)
+        self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
+        self.delay_s = delay_s
 
     def have_new(self) -> bool:
         """Whether fixes came since the last call."""

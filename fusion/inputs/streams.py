@@ -58,6 +58,24 @@ MOST_LATE_S = 5.0
 LONGEST_WAIT_S = 0.5
 LONGEST_PAUSE_NS = 20_000_000_000
 """A longer pause of the IMU has no keyframes: what a call computes is bounded."""
+USUAL_GAP_S = 0.5
+"""Time between samples up to which a stream of any rate has no gap (assumed: lost messages of a 10 Hz
+sensor)."""
+GAP_INTERVALS, SLOWEST_INTERVAL_S = 2.5, 2.0
+"""A slow stream has a gap where samples are missing by its own interval, of at most 2 s."""
+INTERVALS_SEEN = 21
+
+
+def usual_interval_s(times: list[int]) -> float:
+    """Median interval of the newest samples of a stream, s; 0 with fewer than three."""
+    newest = times[-INTERVALS_SEEN:]
+    intervals = sorted(b - a for a, b in itertools.pairwise(newest))
+    return intervals[len(intervals) // 2] * 1e-9 if len(intervals) > 1 else 0.0
+
+
+def longest_gap_s(times: list[int]) -> float:
+    """Longest time between two samples of a stream over which it still tells the motion, s."""
+    return max(USUAL_GAP_S, GAP_INTERVALS * min(usual_interval_s(times), SLOWEST_INTERVAL_S))
 
 
 class Lateness:
@@ -118,12 +136,15 @@ class ImuStream:
     Without `six_axis` only the yaw rate is used: any other axis may be NaN, and `segments` has in their
     place the readings of a robot that drives straight on level ground.
 
+    `turn_scale` is the true over the measured yaw rate, less one; `segments` and `levelled` correct it.
+
     A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
     before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
     """
 
     def __init__(self, six_axis: bool = True, newest: Newest | None = None) -> None:
         self.six_axis = six_axis
+        self.turn_scale = 0.0
         self.spikes = self.impossible = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
@@ -209,9 +230,12 @@ class ImuStream:
         return segments
 
     def _for_graph(self, gyro: Array, accel: Array) -> tuple[Array, Array]:
-        if self.six_axis:
+        scale = 1.0 + self.turn_scale
+        if not self.six_axis:
+            return np.array([0.0, 0.0, scale * gyro[2]]), np.array([0.0, 0.0, GRAVITY_MPS2])
+        if scale == 1.0:
             return gyro, accel
-        return np.array([0.0, 0.0, gyro[2]]), np.array([0.0, 0.0, GRAVITY_MPS2])
+        return np.array([gyro[0], gyro[1], scale * gyro[2]]), accel
 
     def levelled(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """Rates (n, 3) and forces (n, 3) of a window, as `segments` has them."""
@@ -308,21 +332,22 @@ class WheelStream:
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
 
-    def travelled(self, start_ns: int, end_ns: int, longest_gap_s: float = 1.0) -> tuple[float, float] | None:
+    def travelled(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Distance of the left and right side between two times, m; None where samples are missing."""
-        a, b = self._at(start_ns, longest_gap_s), self._at(end_ns, longest_gap_s)
+        gap_s = max(1.0, longest_gap_s(self.t_ns))
+        a, b = self._at(start_ns, gap_s), self._at(end_ns, gap_s)
         if a is None or b is None:
             return None
         return b[0] - a[0], b[1] - a[1]
 
-    def _at(self, t_ns: int, longest_gap_s: float) -> tuple[float, float] | None:
+    def _at(self, t_ns: int, gap_s: float) -> tuple[float, float] | None:
         j = bisect.bisect_left(self.t_ns, t_ns)
         if j == len(self.t_ns) or (j == 0 and self.t_ns[0] != t_ns):
             return None
         if self.t_ns[j] == t_ns:
             return self.left_m[j], self.right_m[j]
         span = self.t_ns[j] - self.t_ns[j - 1]
-        if span * 1e-9 > longest_gap_s:
+        if span * 1e-9 > gap_s:
             return None
         w = (t_ns - self.t_ns[j - 1]) / span
         left = self.left_m[j - 1] + w * (self.left_m[j] - self.left_m[j - 1])

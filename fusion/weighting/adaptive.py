@@ -59,6 +59,7 @@ class TerrainNoise:
         self._labels = config.labels
         self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
+        self._pooled = fixed
         self._starts_pooled = model.slip_only
         if self._starts_pooled:
             # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
@@ -76,6 +77,16 @@ class TerrainNoise:
         self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
+
+    def learn_slip(self, mean: float, sigma: float, t_ns: int) -> None:
+        """Take over the slip that the robot itself shows, for the ground that no class describes."""
+        learned = dataclasses.replace(self._pooled, slip_mean=mean, slip_sigma=sigma)
+        if not self.adaptive:
+            self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma)
+        elif self._starts_pooled:
+            classes = {**self.policy.classes, UNKNOWN: learned}
+            self.policy = dataclasses.replace(self.policy, classes=classes)
+            self._reweight(t_ns)
 
     def record(self, change: WeightChange) -> None:
         """Record a change that another part made."""

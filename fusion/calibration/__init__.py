@@ -1,0 +1,1 @@
+"""Self-calibration of a robot's sensors while it drives, and from several logs."""

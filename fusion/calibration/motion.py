@@ -1,0 +1,101 @@
+"""Wheels, turns and fixes of a stretch of driving, and the path that the numbers of a robot make of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.calibration.numbers import GYRO_BIAS, NUMBERS, TURN_SCALE, WHEEL_DELAY
+
+Complex = NDArray[np.complex128]
+
+LEAST_NODE_S, LONGEST_NODE_S = 2.0, 30.0
+NODE_M, NODE_SIGMAS, LONGEST_NODE_M = 4.0, 20.0, 40.0
+"""A new node after 2 s and a distance that the fixes show to 5 %, from 4 to 40 m; or after 30 s."""
+
+
+@dataclass(frozen=True, eq=False)
+class Drive:
+    """One uninterrupted stretch of a drive.
+
+    Attributes:
+        t_s: (N + 1,) times; sample 0 is the start.
+        distance_m: (N,) mean distance of the wheels since the sample before.
+        turn_rad: (N,) turn by its source since the sample before, as measured.
+        fix_t_s: (F,) stamps of the fixes.
+        fix: (F,) positions, east + i north, m.
+        fix_sigma_m: (F,) 1 sigma of each axis.
+        antenna_m: nominal lever arm, forward + i left, m.
+        first: (M,) samples at which a node begins, from 0 on.
+    """
+
+    t_s: Array
+    distance_m: Array
+    turn_rad: Array
+    fix_t_s: Array
+    fix: Complex
+    fix_sigma_m: Array
+    antenna_m: complex
+    first: NDArray[np.intp]
+
+
+def node_due(apart_s: float, rolled_m: float, fix_sigma_m: float) -> bool:
+    """Whether a new node is due this long and far after the last one."""
+    long_m = min(max(NODE_SIGMAS * fix_sigma_m, NODE_M), LONGEST_NODE_M)
+    return (apart_s >= LEAST_NODE_S and rolled_m >= long_m) or apart_s >= LONGEST_NODE_S
+
+
+def node_starts(t_s: Array, distance_m: Array, fix_sigma_m: float) -> NDArray[np.intp]:
+    """Samples at which a node begins, from times (N + 1,) and distances (N,)."""
+    rolled = np.concatenate([[0.0], np.cumsum(np.abs(distance_m))])
+    found = [0]
+    for i in range(1, len(t_s) - 1):
+        last = found[-1]
+        if node_due(float(t_s[i] - t_s[last]), float(rolled[i] - rolled[last]), fix_sigma_m):
+            found.append(i)
+    return np.array(found)
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Dead reckoning of a drive with given numbers, and its derivatives by them.
+
+    Attributes:
+        yaw_rad: (N + 1,) from 0.
+        z: (N + 1,) position without slip, east + i north for yaw 0 at the start, m.
+        yaw_by: (N + 1, 7) derivatives of the yaw by `NUMBERS`; zero where there is none.
+        z_by: (N + 1, 7) of the position.
+    """
+
+    yaw_rad: Array
+    z: Complex
+    yaw_by: Array
+    z_by: Complex
+
+
+def dead_reckoned(drive: Drive, numbers: Array) -> Path:
+    """The path of `drive` by wheels and turns with `numbers` (7,)."""
+    dt = np.diff(drive.t_s)
+    rate_scale = 1.0 + numbers[TURN_SCALE]
+    turn = rate_scale * (drive.turn_rad - numbers[GYRO_BIAS] * dt)
+    yaw = _summed(turn)
+    speed = drive.distance_m / dt
+    gained = np.gradient(speed) if len(speed) > 1 else np.zeros(1)
+    step = drive.distance_m + numbers[WHEEL_DELAY] * gained
+    middle = np.exp(1j * 0.5 * (yaw[1:] + yaw[:-1]))
+    yaw_by = np.zeros((len(yaw), len(NUMBERS)))
+    yaw_by[:, TURN_SCALE] = yaw / rate_scale
+    yaw_by[:, GYRO_BIAS] = -rate_scale * (drive.t_s - drive.t_s[0])
+    z_by = np.zeros((len(yaw), len(NUMBERS)), dtype=complex)
+    for number in (TURN_SCALE, GYRO_BIAS):
+        by = 0.5 * (yaw_by[1:, number] + yaw_by[:-1, number])
+        z_by[:, number] = _summed(1j * by * step * middle)
+    z_by[:, WHEEL_DELAY] = _summed(gained * middle)
+    return Path(yaw, _summed(step * middle), yaw_by, z_by)
+
+
+def _summed(steps: Array) -> Array:
+    return np.concatenate([np.zeros(1, dtype=steps.dtype), np.cumsum(steps)])

@@ -1,0 +1,75 @@
+"""The numbers of a robot that its own fixes can tell, and how well they are known beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+
+NUMBERS = (
+    "turn_scale",
+    "gyro_bias_radps",
+    "wheel_scale",
+    "antenna_x_m",
+    "antenna_y_m",
+    "gnss_delay_s",
+    "wheel_delay_s",
+)
+"""In the order of every vector of numbers:
+
+- turn_scale: true turn over that of its source (gyro z, or the wheels over the track), less one.
+- gyro_bias: mean reading of the source of yaw without any turn.
+- wheel_scale: true distance over that of the wheels, less one; slip of the usual ground included.
+- antenna: correction of the lever arm, body x and y.
+- gnss_delay, wheel_delay: lateness of the stamps against those of the source of yaw."""
+TURN_SCALE, GYRO_BIAS, WHEEL_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY, WHEEL_DELAY = range(len(NUMBERS))
+
+GYRO_SCALE_SIGMA, WHEEL_TURN_SIGMA = 0.015, 0.35
+"""Prior of the turn scale: a gyro's scale factor (MEMS data sheets: 0.5 to 2 %, with a tilted mounting), and
+the wheels' of a skid-steered robot about its usual value (0.44 to 0.71 measured)."""
+BIAS_SIGMA_RADPS = 0.005
+"""Least prior of the gyro's bias: data sheets give it at one temperature."""
+WHEEL_SCALE_SIGMA = 0.05
+"""Tyre pressure, wear, a nominal radius, and the mean slip of the ground (assumed)."""
+ANTENNA_SIGMA_M = 0.25
+"""An antenna somewhere on a robot (assumed)."""
+GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
+"""Receivers without a common clock report up to seconds late; wheel odometry by its driver's queue (assumed)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Knowledge:
+    """Mean and covariance of `NUMBERS`, and the spread of slip between stretches of ground.
+
+    Attributes:
+        mean: (7,).
+        covariance: (7, 7).
+        slip_spread: standard deviation of the distance ratio about `wheel_scale`.
+    """
+
+    mean: Array
+    covariance: Array
+    slip_spread: float
+
+    @property
+    def sigma(self) -> Array:
+        """1 sigma (7,)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+
+def assumed(bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float) -> Knowledge:
+    """What is known of a robot before it drives."""
+    sigma = np.array(
+        [
+            WHEEL_TURN_SIGMA if yaw_of_wheels else GYRO_SCALE_SIGMA,
+            max(bias_sigma_radps, BIAS_SIGMA_RADPS),
+            WHEEL_SCALE_SIGMA,
+            ANTENNA_SIGMA_M,
+            ANTENNA_SIGMA_M,
+            GNSS_DELAY_SIGMA_S,
+            WHEEL_DELAY_SIGMA_S,
+        ]
+    )
+    return Knowledge(np.zeros(len(sigma)), np.diag(sigma**2), slip_spread)
