@@ -197,9 +197,7 @@ def _legs(path: Path, start: NDArray[np.intp], z: Complex, yaw: Array, z_by: Com
     return _Legs(along, yaw - path.yaw_rad[start], by, yaw_by - own_by)
 
 
-def _fix_rows(
-    part: Nodes, path: Path, numbers: Array, noise: Noise
-) -> tuple[Array, Array, NDArray[np.intp]]:
+def _fix_rows(part: Nodes, path: Path, numbers: Array, noise: Noise) -> tuple[Array, Array, NDArray[np.intp]]:
     drive, state = part.drive, part.state
     first = drive.first
     at_s = drive.fix_t_s - numbers[GNSS_DELAY]
@@ -267,7 +265,9 @@ def _link_rows(
     for row, place in enumerate((DRIFT_E, DRIFT_N)):
         by_drift[:, row, place], by_drift[:, row, NODE + place] = -decay * wander, wander
     drifted = (then[:, DRIFT_E:] - decay[:, None] * now[:, DRIFT_E:]) * wander[:, None]
-    rows = np.stack([by.real * position[:, None], by.imag * position[:, None], by_yaw * angle[:, None]], axis=1)
+    rows = np.stack(
+        [by.real * position[:, None], by.imag * position[:, None], by_yaw * angle[:, None]], axis=1
+    )
     left = np.stack([error.real * position, error.imag * position, turned * angle], axis=1)
     columns = _columns(here, count, 2)
     alone = np.zeros((count, 1, NODE + SHARED))

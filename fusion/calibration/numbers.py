@@ -36,7 +36,7 @@ WHEEL_SCALE_SIGMA = 0.05
 ANTENNA_SIGMA_M = 0.25
 """An antenna somewhere on a robot (assumed)."""
 GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
-"""Receivers without a common clock report up to seconds late; wheel odometry by its driver's queue (assumed)."""
+"""Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
 
 
 @dataclass(frozen=True, eq=False)

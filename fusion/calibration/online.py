@@ -114,7 +114,7 @@ class SelfCalibration:
         return True
 
     def _nodes(self) -> Nodes:
-        """The stretch with the nodes of the last step, and new ones by dead reckoning from the last of them."""
+        """The stretch with the nodes of the last step, and dead-reckoned new ones."""
         drive = Drive(
             np.array(self._t_s),
             np.array(self._distance_m),

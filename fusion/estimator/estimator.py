@@ -22,7 +22,6 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
-from terrafusion.fusion.calibration import for_estimator
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
@@ -36,6 +35,7 @@ from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater
 from terrafusion.fusion.estimator.key_states import state_fields
+from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.skid import SkidDetector
@@ -62,7 +62,6 @@ from terrafusion.fusion.inputs.streams import (
     longest_gap_s,
     usual_interval_s,
 )
-from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
@@ -116,7 +115,7 @@ class Estimator:
         self._stationarity = StationarityDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
         self._propagator = Propagator(self._preintegrator)
-        self.learned = for_estimator.self_calibration(config)
+        self.learned = LearnedNumbers(config, self.imu, self.gnss, self.weights)
 
     @classmethod
     def for_vehicle(cls, vehicle: str | Path | VehicleParams, mode: str = "adaptive") -> Estimator:
@@ -170,8 +169,7 @@ class Estimator:
         taken = checked_fix(t_ns, enu_m, sigma_m, velocity_mps, sigma_v_mps, fix)
         if taken is not None and self.newest.admitted(taken.t_ns, "gnss") is not None:
             self.gnss.queue(taken)
-            if self.learned is not None:
-                self.learned.fix(taken.t_ns, taken.enu_m, float(np.max(taken.sigma_m[:2])))
+            self.learned.fix(taken)
 
     def set_start(
         self,
@@ -285,7 +283,7 @@ class Estimator:
         self.chain.smooth(len(self.chain.nodes), iterations=5)
 
     def _set_step(self, step_s: float) -> None:
-        """Time between keyframes: that of the slower of IMU and wheels, as between samples little is known."""
+        """Time between keyframes: at least that between samples of the slower stream."""
         self._step_ns = round(step_s * 1e9)
         self._keep = round(self.config.lag_s / step_s) + LAG_MARGIN
 
@@ -302,7 +300,7 @@ class Estimator:
         if self.config.inputs.planar:
             segments = with_centripetal_force(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
-        noise = self._with_turn_doubt(noise, segments)
+        noise = self.learned.with_doubt(noise, segments)
         segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
@@ -331,9 +329,8 @@ class Estimator:
         self._zero_velocity(k, t_ns, before, link)
         rolled_m = rolled.distance_m if rolled else None
         self._finish_keyframe(t_ns, gyro, rolled_m)
-        if self.learned is not None:
-            turn_rad = float(gyro[2]) * dt / (1.0 + self.imu.turn_scale)
-            self._learn(t_ns, None if gap else rolled_m, turn_rad)
+        pose = self.chain.state(self.chain.last).pose
+        self.learned.keyframe(t_ns, None if gap else rolled_m, float(gyro[2]) * dt, pose)
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
         chain, before = self.chain, self._solve()
@@ -346,22 +343,6 @@ class Estimator:
         self.wheels.forget(t_ns - KEPT_NS)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         self._fresh = self._emitted(t_ns, gyro)
-
-    def _learn(self, t_ns: int, rolled_m: float | None, turn_rad: float) -> None:
-        """Self-calibration with the motion of a keyframe, and its corrections where they are new."""
-        learned, pose = self.learned, self.chain.state(self.chain.last).pose
-        assert learned is not None
-        if self.gnss.local:
-            learned.restart()
-            return
-        learned.drive(t_ns, rolled_m, turn_rad, np.asarray(pose.translation()), pose.rotation().yaw())
-        if learned.step():
-            for_estimator.apply(learned.known, self.imu, self.gnss, self.weights, t_ns)
-
-    def _with_turn_doubt(self, noise: SensorNoise, segments: list[ImuSegment]) -> SensorNoise:
-        if self.learned is None:
-            return noise
-        return for_estimator.with_turn_doubt(noise, self.learned.known, segments, self.config.rig.sensors.imu)
 
     def _solve(self) -> Array:
         self.chain.solve(SMOOTH_WINDOW)
@@ -378,8 +359,8 @@ class Estimator:
         if state is None:
             return
         turned = self.gnss.correct_heading(self.chain, self.weights.noise)
-        if turned and self.learned is not None:
-            self.learned.restart(forget=True)
+        if turned:
+            self.learned.heading_turned()
         if turned or self.chain.last % SMOOTH_EVERY == 0:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()

@@ -1,0 +1,119 @@
+"""Self-calibration as the estimator uses it: which numbers it learns, and where they go."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import gtsam
+import numpy as np
+
+from terrafusion.datasets.core.sensors import ImuSpec
+from terrafusion.fusion.calibration.fit import Noise
+from terrafusion.fusion.calibration.numbers import (
+    ANTENNA_X,
+    ANTENNA_Y,
+    GNSS_DELAY,
+    TURN_SCALE,
+    WHEEL_SCALE,
+    Knowledge,
+    assumed,
+)
+from terrafusion.fusion.calibration.online import SelfCalibration
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
+from terrafusion.fusion.noise.policy import SensorNoise
+from terrafusion.fusion.weighting.adaptive import TerrainNoise
+
+SLIP_SPREAD = 0.05
+"""Spread of slip between stretches of some tens of metres before any is driven (assumed)."""
+LEAST_SLIP_SIGMA = 0.02
+"""Least sigma of learned slip: the next ground may be another one (assumed)."""
+GYRO_DENSITY_RADPS, WHEEL_TURN_SHARE = 3e-3, 0.1
+"""Noise of the turn over seconds, beyond what a bias explains (assumed)."""
+TURN_TIME_S = 10.0
+"""Duration of a turn in one direction, over which a wrong scale adds up (assumed)."""
+
+
+class LearnedNumbers:
+    """The numbers that an estimator learns, and the sensors that they correct.
+
+    Attributes:
+        calibration: None where it is switched off, or there is nothing to learn from.
+    """
+
+    def __init__(
+        self, config: EstimatorConfig, imu: ImuStream, gnss: GnssUpdater, weights: TerrainNoise
+    ) -> None:
+        self.calibration = _calibration(config)
+        self._imu, self._gnss, self._weights = imu, gnss, weights
+        self._spec = config.rig.sensors.imu
+
+    def fix(self, fix: GnssFix) -> None:
+        """A fix as it came."""
+        if self.calibration is not None:
+            self.calibration.fix(fix.t_ns, fix.enu_m, float(np.max(fix.sigma_m[:2])))
+
+    def keyframe(self, t_ns: int, rolled_m: float | None, turn_rad: float, pose: gtsam.Pose3) -> None:
+        """Learn from the motion since the last keyframe, and correct the sensors where that is due.
+
+        Args:
+            rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
+            turn_rad: by the corrected source of yaw.
+            pose: of the keyframe.
+        """
+        learning = self.calibration
+        if learning is None:
+            return
+        if self._gnss.local:
+            learning.restart()
+            return
+        measured = turn_rad / (1.0 + self._imu.turn_scale)
+        learning.drive(t_ns, rolled_m, measured, np.asarray(pose.translation()), pose.rotation().yaw())
+        if learning.step():
+            self._apply(learning.known, t_ns)
+
+    def heading_turned(self) -> None:
+        """The heading was wrong, and what was learned with it may be, too."""
+        if self.calibration is not None:
+            self.calibration.restart(forget=True)
+
+    def with_doubt(self, noise: SensorNoise, segments: list[ImuSegment]) -> SensorNoise:
+        """Noise of a keyframe's yaw rate with the uncertainty of its scale."""
+        if self.calibration is None:
+            return noise
+        return with_turn_doubt(noise, self.calibration.known, segments, self._spec)
+
+    def _apply(self, known: Knowledge, t_ns: int) -> None:
+        self._imu.turn_scale = float(known.mean[TURN_SCALE])
+        self._gnss.correct(known.mean[[ANTENNA_X, ANTENNA_Y]], float(known.mean[GNSS_DELAY]))
+        doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))
+        self._weights.learn_slip(-float(known.mean[WHEEL_SCALE]), max(doubt, LEAST_SLIP_SIGMA), t_ns)
+
+
+def _calibration(config: EstimatorConfig) -> SelfCalibration | None:
+    inputs, sensors = config.inputs, config.rig.sensors
+    if not config.self_calibrate or config.calibrate or not inputs.gnss or inputs.yaw == "nobody":
+        return None
+    wheels = inputs.yaw == "wheels"
+    noise = Noise(
+        GYRO_DENSITY_RADPS,
+        WHEEL_TURN_SHARE if wheels else 0.0,
+        1.0 - WHITE_SHARE,
+        max(sensors.gnss.correlation_time_s, 1.0),
+    )
+    prior = assumed(sensors.imu.gyro_bias_sigma_radps, wheels, SLIP_SPREAD)
+    return SelfCalibration(prior, noise, complex(*sensors.gnss.antenna_m[:2]))
+
+
+def with_turn_doubt(
+    noise: SensorNoise, known: Knowledge, segments: list[ImuSegment], imu: ImuSpec
+) -> SensorNoise:
+    """Noise of a keyframe's yaw rate with the uncertainty of its scale."""
+    total = sum(s.dt_s for s in segments)
+    rate = abs(sum(float(s.gyro_radps[2]) * s.dt_s for s in segments)) / total if total > 0.0 else 0.0
+    more = float(known.sigma[TURN_SCALE]) * rate * math.sqrt(TURN_TIME_S) / imu.gyro_noise_radps_sqrthz
+    if more < 0.1 * noise.gyro_yaw_inflation:
+        return noise
+    return dataclasses.replace(noise, gyro_yaw_inflation=math.hypot(noise.gyro_yaw_inflation, more))
