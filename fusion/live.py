@@ -79,7 +79,7 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
         antenna_m=antenna_m, aligned=local,
     )  # fmt: skip
     found = run_checks(recording, rig)
-    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig.wheel_radius_m))
+    return judge(Run(recording, estimate, scores, rivals, recording.gnss, found, rig))
 
 
 def run(

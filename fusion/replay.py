@@ -148,7 +148,7 @@ def replay(
         aligned=estimator.gnss.local,
     )
     found = run_checks(recording, config.rig) if findings is None else findings
-    verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig.wheel_radius_m))
+    verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig))
     return ReplayResult(
         recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), seconds, latencies,
         estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,

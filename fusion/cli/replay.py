@@ -167,7 +167,9 @@ def assumed_and_noted(result: ReplayResult, warnings: Sequence[str]) -> list[str
     notes = dict.fromkeys((*result.estimate.notes, *result.scores.notes))
     told = " ".join(result.verdict.reasons).lower()
     warned = [warning for warning in warnings if warning.lower() not in told]
-    return [*(f"assumed: {one}" for one in result.assumed), *warned, *(f"note: {note}" for note in notes)]
+    assumed = [str(one) for one in result.assumed]
+    others = [f"note: {note}" for note in notes if note not in assumed]
+    return [*(f"assumed: {one}" for one in assumed), *warned, *others]
 
 
 def summary(result: ReplayResult) -> list[str]:

@@ -43,6 +43,8 @@ OWN_PLACES = ("antenna_m", "imu_m")
 """Where these sit is each robot's own: in a file that comes with the library they are those of one robot."""
 YAW_FACTOR_SIGMA = 0.15
 """Half the range of the factors measured (docs/explanation/planar.md)."""
+TAKEN = ("assumed", "taken as", "taken for", "taken from", "brought to", "rotated from", "nominal")
+"""Words by which readers note what they took for granted."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,9 @@ class Assumption:
     unit: str
 
     def __str__(self) -> str:
-        value = self.value if isinstance(self.value, str) else np.round(self.value, 6).tolist()
+        if isinstance(self.value, str):
+            return f"{self.name}: {self.value}"
+        value = np.round(self.value, 6).tolist()
         shown = f"{value:g}" if isinstance(value, float) else str(value)
         spread = "" if self.sigma is None else f" +- {self.sigma:g}"
         return f"{self.name} = {shown}{spread} {self.unit}".rstrip()
@@ -74,7 +78,7 @@ def assumptions(
         rig = vehicle.rig()
         factor = rig.track_m / inputs.rig(rig).track_m
         found.append(Assumption("yaw_factor", factor, YAW_FACTOR_SIGMA, ""))
-    found += _of_the_fixes(recording, used)
+    found += [*_of_the_fixes(recording, used), *_of_the_reader(recording)]
     return tuple(found)
 
 
@@ -125,9 +129,14 @@ def _of_the_fixes(recording: Recording, used: Gnss | None) -> Iterator[Assumptio
     for fix in np.unique(gnss.fix[unknown]).tolist():
         sigma = ASSUMED_SIGMA_M[Fix(fix)]
         yield Assumption(f"gnss_sigma_m ({Fix(fix).name.lower()})", sigma, sigma, "m")
+
+
+def _of_the_reader(recording: Recording) -> Iterator[Assumption]:
+    """What a reader took for granted, in its own words, by channel: axes, stamps, classes, sigmas."""
     for note in recording.notes:
-        if note.startswith("gnss:") and ("no sigma" in note or "without GST" in note):
-            yield Assumption("gnss_sigma_m", note.removeprefix("gnss: "), None, "m")
+        channel, colon, what = note.partition(": ")
+        if colon and channel in (*Recording.CHANNELS, "truth") and any(word in what for word in TAKEN):
+            yield Assumption(channel, what, None, "")
 
 
 def _sources(asked: object, vehicle: str) -> tuple[dict[str, Any], bool]:

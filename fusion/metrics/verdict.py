@@ -14,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import binom
 
-from terrafusion.datasets.checks import Finding
+from terrafusion.datasets.checks import CheckContext, Finding
+from terrafusion.datasets.checks.path import scales
+from terrafusion.datasets.checks.scale import SMALL, is_firm
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate, Innovation
 from terrafusion.fusion.metrics.baselines import Baselines
 from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
@@ -59,10 +62,11 @@ MOST_PATH_RATIO = 2.0
 SIGMA_KNOWN_M, YAW_SIGMA_KNOWN_RAD = 10.0, 0.5
 """Position and heading are unknown for navigation beyond these 1 sigmas."""
 REPORTED = (
-    "wheel-radius", "wheel-scale", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored",
-    "gnss-frozen", "sigma-too-small", "clock-offset",
+    "wheel-radius", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored", "gnss-frozen",
+    "sigma-too-small", "standing",
 )  # fmt: skip
-"""Warnings of the log checks that make a result doubtful; errors always do."""
+"""Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that the
+estimator estimates itself, such as small scale errors and delays, or cost accuracy only."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +95,7 @@ class Run:
     baselines: Baselines
     used: Gnss | None
     findings: Sequence[Finding]
-    wheel_radius_m: float
+    rig: Rig
 
 
 Reason = tuple[str, str]
@@ -112,7 +116,7 @@ def _sound(run: Run) -> Iterator[Reason]:
     wheels = run.recording.wheels
     if wheels is None or not len(run.estimate.trajectory):
         return
-    health = examine_estimate(run.estimate, wheels, run.wheel_radius_m)
+    health = examine_estimate(run.estimate, wheels, run.rig.wheel_radius_m)
     if not health.why:
         return
     ratio = health.path_ratio()
@@ -309,6 +313,19 @@ def _log(run: Run) -> Iterator[Reason]:
             )
 
 
+def _path_ratio(run: Run) -> Iterator[Reason]:
+    found = scales(CheckContext(run.recording, run.rig))
+    if not found or not is_firm(run.recording):
+        return
+    scale, _ = min(found, key=lambda both: both[0].high - both[0].low)
+    if scale.high < SMALL:
+        yield (
+            DOUBTFUL,
+            f"the robot moved {scale.ratio:.2f} of the path of its wheels by the {scale.source}, on ground that is "
+            "not known to be soft: check wheel radius and unit, unless it slipped",
+        )
+
+
 def _unchecked(run: Run) -> Iterator[Reason]:
     if run.scores.against is not None or _gnss(run):
         return
@@ -330,12 +347,15 @@ def _disagreement(run: Run) -> str:
     rows = [i for i in run.estimate.innovations if i.sensor == "wheels"]
     if not rows or np.mean([not i.accepted for i in rows]) > REJECTED_SHARE:
         return "wheels and IMU disagree"
+    slipping = run.estimate.slipping
+    if slipping is not None and slipping.mean() > REJECTED_SHARE:
+        return f"the wheels slipped {100.0 * slipping.mean():.0f} % of the time"
     return ""
 
 
 TESTS = (
     _sound, _started, _error, _outages, _five_sigma, _nees, _worse_than_a_baseline, _certain, _innovations,
-    _rejections, _log, _unchecked,
+    _rejections, _path_ratio, _log, _unchecked,
 )  # fmt: skip
 
 

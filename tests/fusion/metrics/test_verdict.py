@@ -13,7 +13,10 @@ from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.metrics.baselines import Baselines, OutageBaseline
 from terrafusion.fusion.metrics.scores import Outage, OutageScore, score
 from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
+from terrafusion.twin.model.vehicle import load_vehicle
 from tests.studies.verdicts import FAULTS, is_wrong, short_drive
+
+RIG = load_vehicle("elevate").rig()
 
 
 def verdict(
@@ -22,7 +25,7 @@ def verdict(
     estimate = estimate or d.estimate
     recording = d.recording if truth else dataclasses.replace(d.recording, truth=None)
     scores = score(estimate, recording, held_out=held_out, outages=outages)
-    return judge(Run(recording, estimate, scores, baselines or Baselines(), d.fixes, findings, 0.2))
+    return judge(Run(recording, estimate, scores, baselines or Baselines(), d.fixes, findings, RIG))
 
 
 def with_innovations(d, nis, accepted=True):
@@ -121,7 +124,7 @@ def test_many_outages_lost_to_dead_reckoning_are_no_chance(drive):
     lost = tuple(OutageScore(i, 30.0, 30.0, 4.0, 2.0, 13.0) for i in range(6))
     rivals = Baselines(outages=tuple(OutageBaseline(i, 1.0, None) for i in range(6)))
     scores = dataclasses.replace(score(consistent(d), d.recording), outages=lost)
-    run = Run(d.recording, consistent(d), scores, rivals, d.fixes, (), 0.2)
+    run = Run(d.recording, consistent(d), scores, rivals, d.fixes, (), RIG)
     assert "6 of 6 outages" in judge(run).reasons[0]
     few = dataclasses.replace(run, scores=dataclasses.replace(scores, outages=lost[:4]))
     few = dataclasses.replace(few, baselines=Baselines(outages=rivals.outages[:4]))
@@ -156,7 +159,7 @@ def test_nothing_to_check_against_is_doubtful_without_sensors_that_vouch(drive):
         Baselines(),
         None,
         (),
-        0.2,
+        RIG,
     )
     assert judge(run).value == "doubtful"
     assert "nothing to check the path against" in judge(run).reasons[0].lower()
@@ -171,6 +174,7 @@ def test_findings_of_the_log_checks_count_by_their_kind(drive):
 
     assert of("uneven-sampling", "warning") == "good"
     assert of("wheel-radius", "warning") == "doubtful"
+    assert of("gyro-scale", "warning") == "good"
     assert of("yaw-sign", "error") == "doubtful"
 
 
