@@ -30,6 +30,8 @@ LONGEST_S = 6.0
 PRIOR = np.array([0.2, 3.0, 0.5, 0.5, 0.02])
 """1 sigma of scale, delay (s) and lever arm (m) before the data: what they do not show stays near zero."""
 STEPS, HUBER = 6, 2.0
+SPIKES_S = 0.2
+"""Speeds sampled faster than this lose spikes of one sample."""
 MOST_SCALE, MOST_NOISE = 0.3, 0.1
 """Beyond this scale, or with this scatter over the size of a window, the paths are unlike."""
 
@@ -115,6 +117,8 @@ def path_model(context: CheckContext, measured: MeasuredPath) -> PathModel | Non
 
 
 def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
+    from scipy.ndimage import median_filter
+
     driven, yaw = wheel_speed(context), gyro_angle(context.recording)
     if driven is None or yaw is None:
         return None
@@ -140,6 +144,8 @@ def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
         for row in rows
         if row.stop - row.start >= LEAST_ROWS and np.ptp(place[row].real) + np.ptp(place[row].imag) > far
     ]
+    if np.median(np.diff(t)) < SPIKES_S:
+        v = median_filter(v, 3)
     turned = np.interp(t, yaw.t_s, yaw.value)
     return _Windows(t, v, turned, t_fix, place, rows) if len(rows) >= LEAST_WINDOWS else None
 

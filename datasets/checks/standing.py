@@ -44,7 +44,7 @@ def check_standing(context: CheckContext) -> Iterator[Finding]:
             "standing", "warning", "wheels",
             "the wheels roll while the robot stands",
             f"by the {measured.source} it keeps within {spread[begin:end].max():.2f} m in each "
-            f"{window_s:.0f} s from t = {grid[begin]:.0f} to {grid[end]:.0f} s, in which wheels and gyro move "
+            f"{window_s:.0f} s from t = {grid[begin]:.0f} to {grid[end]:.0f} s; wheels and gyro move "
             f"by {far[begin:end].min():.1f} m and more",
             "leave these stretches out, or say that the ground is soft: nothing else tells how it slipped",
         )  # fmt: skip

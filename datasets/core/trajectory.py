@@ -19,17 +19,6 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 
 
-def _level(quaternion: Array) -> Array:
-    """Quaternions (N, 4) of the same yaw, without roll and pitch; the same array where there are none."""
-    if not np.nan_to_num(quaternion[:, :2]).any():
-        return quaternion
-    half = 0.5 * yaw_of(quaternion)
-    level = np.zeros_like(quaternion)
-    level[:, 2], level[:, 3] = np.sin(half), np.cos(half)
-    level[~np.isfinite(quaternion).all(axis=1)] = np.nan
-    return level
-
-
 @dataclass(frozen=True, eq=False)
 class Trajectory:
     """Poses of the body (or antenna) in the world frame.
@@ -77,14 +66,14 @@ class Trajectory:
     def limited_to(self, channels: Collection[str]) -> Trajectory:
         """The same trajectory without what is not in `channels`, of position, yaw, orientation and velocity.
 
-        Positions that are not known become NaN; an orientation of which only the yaw is known becomes level.
+        Positions that are not known become NaN; an orientation of which only the yaw is known stays.
         """
         q, P = self.quaternion, self.covariance
         position, twist = self.position_m, self.twist_body
         if "position" not in channels and not np.isnan(position).all():
             position = np.full_like(position, np.nan)
-        if "orientation" not in channels and q is not None:
-            q = _level(q) if "yaw" in channels else None
+        if not {"yaw", "orientation"} & set(channels):
+            q = None
         if "velocity" not in channels:
             twist = None
         if "position" not in channels or q is None:
@@ -92,6 +81,16 @@ class Trajectory:
         if position is self.position_m and q is self.quaternion and twist is self.twist_body:
             return self
         return dataclasses.replace(self, position_m=position, quaternion=q, twist_body=twist, covariance=P)
+
+    def level(self) -> Trajectory:
+        """The same trajectory without roll and pitch."""
+        if self.quaternion is None:
+            return self
+        half = 0.5 * self.yaw_rad()
+        zero = np.zeros_like(half)
+        quaternion = np.stack([zero, zero, np.sin(half), np.cos(half)], axis=1)
+        quaternion[~np.isfinite(self.quaternion).all(axis=1)] = np.nan
+        return dataclasses.replace(self, quaternion=quaternion)
 
     def yaw_rad(self) -> Array:
         """Yaw angles (N,), rad, in [-pi, pi]."""

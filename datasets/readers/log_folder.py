@@ -98,6 +98,9 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         name: of the recording where `meta` gives none.
         notes: of the reader; those that the log already has are not repeated.
     """
+    truth, listed = channels["truth"], meta.truth_channels or ()
+    if truth is not None and "yaw" in listed and "orientation" not in listed and _is_tilted(truth):
+        channels = {**channels, "truth": truth.level()}
     return Recording(
         name=meta.texts.get("name", name),
         start_ns=meta.start_ns,
@@ -172,13 +175,16 @@ def _truth_channels(meta: Meta, truth: Trajectory | None) -> tuple[str, ...]:
     return () if truth is None else truth_contents(truth)
 
 
+def _is_tilted(truth: Trajectory) -> bool:
+    q = truth.quaternion
+    return q is not None and bool(np.nanmax(np.abs(q[:, :2]), initial=0.0) > 0.0)
+
+
 def truth_contents(truth: Trajectory) -> tuple[str, ...]:
     """Names of what a trajectory holds: position, yaw, orientation (more than yaw), velocity."""
     found = ["position"]
     if truth.quaternion is not None:
-        found.append("yaw")
-        if np.nanmax(np.abs(truth.quaternion[:, :2]), initial=0.0) > 0.0:
-            found.append("orientation")
+        found += ["yaw", "orientation"] if _is_tilted(truth) else ["yaw"]
     if truth.twist_body is not None and not np.isnan(truth.twist_body[:, :2]).all():
         found.append("velocity")
     return tuple(found)
