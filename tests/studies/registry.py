@@ -38,9 +38,13 @@ class Study:
         return DATA in self.command or self.name in READS_LOGS
 
 
+<<<<<<< HEAD
 READS_LOGS = (
     "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents", "known_changes",
 )  # fmt: skip
+=======
+READS_LOGS = ("good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track")
+>>>>>>> bd74cd0 (Log checks: tests and a study that repairs leave good logs alone, and undo what was put into them)
 
 
 def _module(name: str, *arguments: str) -> tuple[str, ...]:
@@ -48,6 +52,16 @@ def _module(name: str, *arguments: str) -> tuple[str, ...]:
 
 
 STUDIES = (
+    Study(
+        "good_logs",
+        "Do the log checks offer repairs for logs in which nothing is wrong?",
+        _module("good_logs"),
+        5,
+        {
+            "field_logs_changed": r"field logs \d+, of which a repair would change (\d+)",
+            "runs_changed": r"simulated runs \d+, of which a repair would change (\d+)",
+        },
+    ),
     Study(
         "demo_seeds",
         "What do adaptive weights gain over fixed ones on drives of the twin, over ten seeds?",

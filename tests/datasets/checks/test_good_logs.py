@@ -1,0 +1,256 @@
+"""A good log, recorded or simulated, is not changed by a repair; a fault put into it is named and undone.
+
+All public logs and 50 simulated runs are in `tests.studies.good_logs`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+import terrafusion as tf
+from terrafusion.datasets.catalog.catalog import locate
+from terrafusion.datasets.checks import repair, run_checks
+from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.datasets.readers import open_recording
+from terrafusion.fusion.cli.common import rig_of
+from tests.studies.good_logs import repairs_offered, simulated
+
+FIELD = (
+    "husky_parkinglot/test1",
+    "wvu_pathfinder/test17run",
+    "norlab_drive/grass_2024_8_8_15h56s39/raw",
+    "umich_husky/mair_mocap/trial7",
+    "borealtc/SNOW/10",
+)
+
+
+def rig(recording: Recording) -> Rig | None:
+    return rig_of(recording, None)
+
+
+def field(name: str) -> Recording:
+    if locate(name) is None:
+        pytest.skip(f"{name} is not on this machine")
+    return open_recording(name)
+
+
+@pytest.mark.parametrize("name", FIELD)
+def test_no_repair_changes_a_good_field_log(name: str) -> None:
+    log = field(name)
+    repaired, done = repair(log, rig(log))
+    assert [finding.code for finding in done] == []
+    assert repaired is log
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_repair_changes_a_good_simulated_log(seed: int) -> None:
+    assert repairs_offered(simulated(seed)) == set()
+
+
+def fixes_of_truth(log: Recording) -> Recording:
+    """The log with fixes made of its truth, 5 a second, 1 sigma 5 cm, and without the truth."""
+    assert log.truth is not None
+    every = max(round(0.2 / float(np.median(np.diff(log.truth.t_ns)) * 1e-9)), 1)
+    place = log.truth.position_m[::every].copy()
+    place += np.random.default_rng(1).normal(0.0, 0.05, place.shape)
+    sigma, single = np.full(place.shape, 0.05), np.ones(len(place), dtype=np.uint8)
+    gnss = Gnss(log.truth.t_ns[::every], place, sigma, single)
+    return dataclasses.replace(log, gnss=gnss, truth=None, truth_channels=())
+
+
+def imu_with(
+    log: Recording, change: Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+) -> Recording:
+    assert log.imu is not None
+    gyro, accel = change(log.imu.gyro_radps.copy(), log.imu.accel_mps2.copy())
+    return dataclasses.replace(log, imu=dataclasses.replace(log.imu, gyro_radps=gyro, accel_mps2=accel))
+
+
+def about_z(degrees: float) -> Callable[[Recording], Recording]:
+    """The IMU mounted so that it is turned by an angle to the left."""
+    a = np.radians(degrees)
+    R = np.array([[np.cos(a), np.sin(a), 0.0], [-np.sin(a), np.cos(a), 0.0], [0.0, 0.0, 1.0]])
+    return lambda log: imu_with(log, lambda gyro, accel: (gyro @ R.T, accel @ R.T))
+
+
+def late(seconds: float) -> Callable[[Recording], Recording]:
+    def fault(log: Recording) -> Recording:
+        assert log.gnss is not None
+        moved = dataclasses.replace(log.gnss, t_ns=log.gnss.t_ns + round(seconds * 1e9))
+        return dataclasses.replace(log, gnss=moved)
+
+    return fault
+
+
+def left_side(factor: float) -> Callable[[Recording], Recording]:
+    def fault(log: Recording) -> Recording:
+        assert log.wheels is not None
+        factors = [factor if "left" in name else 1.0 for name in log.wheels.names]
+        return dataclasses.replace(
+            log, wheels=dataclasses.replace(log.wheels, speed=log.wheels.speed * factors)
+        )
+
+    return fault
+
+
+def sampled_in_turn(log: Recording) -> Recording:
+    assert log.wheels is not None
+    speed, even = log.wheels.speed.copy(), np.arange(len(log.wheels)) % 2 == 0
+    left = np.array(["left" in name for name in log.wheels.names])
+    speed[np.ix_(even, left)] = np.nan
+    speed[np.ix_(~even, ~left)] = np.nan
+    return dataclasses.replace(log, wheels=dataclasses.replace(log.wheels, speed=speed))
+
+
+def stuck(axis: int) -> Callable[[Recording], Recording]:
+    def change(gyro: np.ndarray, accel: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gyro[:, axis] = 0.54
+        return gyro, accel
+
+    return lambda log: imu_with(log, change)
+
+
+def lateness_s(log: Recording, good: Recording) -> float:
+    assert log.gnss is not None
+    assert good.gnss is not None
+    return abs(float(log.gnss.t_ns[0] - good.gnss.t_ns[0])) * 1e-9
+
+
+def gyro_scale_off(log: Recording, good: Recording) -> float:
+    assert log.imu is not None
+    assert good.imu is not None
+    return abs(float(np.vdot(log.imu.gyro_radps[:, 2], good.imu.gyro_radps[:, 2])) /
+               float(np.vdot(good.imu.gyro_radps[:, 2], good.imu.gyro_radps[:, 2])) - 1.0)  # fmt: skip
+
+
+def turned_by_deg(log: Recording, good: Recording) -> float:
+    assert log.imu is not None
+    assert good.imu is not None
+    a, b = (one.imu.accel_mps2[:, 0] + 1j * one.imu.accel_mps2[:, 1] for one in (log, good) if one.imu)
+    return abs(float(np.degrees(np.angle(np.vdot(b - b.mean(), a - a.mean())))))
+
+
+def sides_off(log: Recording, good: Recording) -> float:
+    """Change of left over right, against the good log."""
+    ratios = []
+    for one in (log, good):
+        assert one.wheels is not None
+        left, right = np.abs(one.wheels.side_speeds_mps(1.0)).sum(axis=0)
+        ratios.append(left / right)
+    return abs(ratios[0] / ratios[1] - 1.0)
+
+
+def distance_off(log: Recording, good: Recording) -> float:
+    """Error of the distance rolled, over itself."""
+    rolled = []
+    for one in (log, good):
+        assert one.wheels is not None
+        speed, t = one.wheels.side_speeds_mps(1.0).mean(axis=1), one.wheels.t_ns * 1e-9
+        rolled.append(float(np.sum(0.5 * np.abs(speed[1:] + speed[:-1]) * np.diff(t))))
+    return abs(rolled[0] / rolled[1] - 1.0)
+
+
+@dataclass(frozen=True)
+class Injected:
+    """A fault, the code it is named by, and how much of it at most is left after the repair."""
+
+    fault: Callable[[Recording], Recording]
+    code: str
+    left: Callable[[Recording, Recording], float]
+    most: float
+
+
+INJECTED = {
+    "fixes 1.5 s late": Injected(late(1.5), "clock-offset", lateness_s, 0.25),
+    "fixes 3 s late": Injected(late(3.0), "clock-offset", lateness_s, 0.25),
+    "gyro 3 % too much": Injected(
+        lambda log: imu_with(log, lambda g, a: (g * [1.0, 1.0, 1.03], a)), "gyro-scale", gyro_scale_off, 0.01
+    ),
+    "gyro x stuck": Injected(stuck(0), "stuck", gyro_scale_off, 1e-9),
+    "imu turned by 25 deg": Injected(about_z(25.0), "imu-forward", turned_by_deg, 10.0),
+    "imu turned by -60 deg": Injected(about_z(-60.0), "imu-forward", turned_by_deg, 10.0),
+    "imu backwards": Injected(about_z(180.0), "imu-forward", turned_by_deg, 1e-6),
+    "left tyre deflated": Injected(left_side(1.05), "wheel-sides", sides_off, 0.02),
+    "left wheel large": Injected(left_side(0.94), "wheel-sides", sides_off, 0.02),
+    "sides in turn": Injected(sampled_in_turn, "sides-apart", distance_off, 0.02),
+}
+LOGS = {
+    "simulated": lambda: tf.simulate("figure_eight", terrain="asphalt", seed=0),
+    "husky": lambda: field("husky_parkinglot/test1"),
+    "warthog": lambda: fixes_of_truth(field("norlab_drive/grass_2024_8_8_15h56s39/raw")),
+}
+NOT_SHOWN = {("husky", "gyro-scale"), ("warthog", "gyro-scale"), ("warthog", "sides-apart")}
+"""Fixes too noisy or a drive too short for it; wheels at 5 Hz are too slow to be halved."""
+
+
+@pytest.fixture(scope="module", params=LOGS)
+def good(request: pytest.FixtureRequest) -> tuple[str, Recording]:
+    return request.param, LOGS[request.param]()
+
+
+@pytest.mark.parametrize("name", INJECTED)
+def test_a_fault_in_a_good_log_is_named_and_undone(good: tuple[str, Recording], name: str) -> None:
+    (log_name, log), case = good, INJECTED[name]
+    faulty = case.fault(log)
+    named = {finding.code for finding in run_checks(faulty, rig(log))}
+    if (log_name, case.code) in NOT_SHOWN:
+        pytest.skip("the log does not show it")
+    assert case.code in named
+    repaired, done = repair(faulty, rig(log))
+    assert [finding.code for finding in done] == [case.code]
+    assert case.left(repaired, log) < case.most
+
+
+def test_wheels_that_read_8_percent_too_much_are_named_but_may_be_slip() -> None:
+    log = LOGS["simulated"]()
+    assert log.wheels is not None
+    faster = dataclasses.replace(log, wheels=dataclasses.replace(log.wheels, speed=log.wheels.speed * 1.08))
+    [found] = run_checks(faster, rig(log))
+    assert (found.code, found.repair) == ("wheel-scale", None)
+
+
+def test_rtk_steps_that_the_wheels_explain_are_no_jumps() -> None:
+    """1 Hz fixes of 2 cm on tight turns: each step turns far from the one before."""
+    log = tf.simulate("waypoints", terrain="asphalt", seed=2)
+    assert log.gnss is not None
+    assert log.truth is not None
+    t_ns = np.arange(log.start_ns + 10**9, int(log.truth.t_ns[-1]), 2 * 10**9)
+    place = log.truth.points_at(t_ns, tf.Vehicle.load("elevate").sensors.gnss.antenna_m)
+    fixes = Gnss(t_ns, place, np.full(place.shape, 0.02), np.full(len(place), 4, dtype=np.uint8))
+    sparse = dataclasses.replace(log, gnss=fixes, truth=None, truth_channels=())
+    assert "gnss-jumps" not in {finding.code for finding in run_checks(sparse, rig(log))}
+    place = place.copy()
+    place[20:24, 0] += 4.0
+    jumped = dataclasses.replace(sparse, gnss=dataclasses.replace(fixes, enu_m=place))
+    assert "gnss-jumps" in {finding.code for finding in run_checks(jumped, rig(log))}
+
+
+def test_wheels_that_roll_under_a_standing_robot_are_named() -> None:
+    log = LOGS["simulated"]()
+    assert log.gnss is not None
+    assert log.imu is not None
+    rng = np.random.default_rng(3)
+    place = log.gnss.enu_m[:1] + rng.normal(0.0, 0.02, log.gnss.enu_m.shape)
+    gnss = dataclasses.replace(log.gnss, enu_m=place, velocity_enu_mps=None, sigma_v_mps=None)
+    imu = dataclasses.replace(log.imu, gyro_radps=rng.normal(0.0, 0.002, log.imu.gyro_radps.shape))
+    standing = dataclasses.replace(log, gnss=gnss, imu=imu, truth=None, truth_channels=(), command=None)
+    assert "standing" in {finding.code for finding in run_checks(standing, rig(log))}
+
+
+def test_a_truth_of_positions_alone_turns_no_wheels() -> None:
+    """The yaw of a truth that lists its position alone is not true, and used by no check."""
+    log = LOGS["simulated"]()
+    assert log.truth is not None
+    assert log.truth.quaternion is not None
+    backwards = log.truth.quaternion[:, [1, 0, 3, 2]] * [1.0, -1.0, 1.0, -1.0]  # half a turn about z
+    truth = dataclasses.replace(log.truth, quaternion=backwards, twist_body=None)
+    claimed = dataclasses.replace(log, truth=truth, truth_channels=("position", "yaw"), command=None)
+    assert "truth-yaw" in {f.code for f in run_checks(claimed, rig(log))} or run_checks(claimed, rig(log))
+    assert run_checks(dataclasses.replace(claimed, truth_channels=("position",)), rig(log)) == []
