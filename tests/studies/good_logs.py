@@ -9,12 +9,14 @@ logs, which are listed apart.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 
 import terrafusion as tf
 from terrafusion.datasets.catalog.catalog import load_catalog, locate
 from terrafusion.datasets.checks import run_checks
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.cli.common import rig_of
@@ -46,13 +48,15 @@ def known_faults(name: str) -> set[str]:
     return {code for log, codes in KNOWN.items() if name.startswith(log) for code in codes}
 
 
-def field_names() -> list[str]:
+def field_names() -> Iterator[str]:
     """Names of the drives of the catalogue that are on this machine."""
-    names = load_catalog().recordings()
-    return [name for name in names if locate(name) is not None and not name.startswith("cmu_single_wheel")]
+    for name in load_catalog().recordings():
+        with contextlib.suppress(DataError):
+            if not name.startswith("cmu_single_wheel") and locate(name) is not None:
+                yield name
 
 
-def _field(names: Sequence[str]) -> Iterator[tuple[str, Recording]]:
+def _field(names: Iterable[str]) -> Iterator[tuple[str, Recording]]:
     for name in names:
         yield from ((name, recording) for recording in open_recordings(name))
 

@@ -38,13 +38,10 @@ class Study:
         return DATA in self.command or self.name in READS_LOGS
 
 
-<<<<<<< HEAD
 READS_LOGS = (
-    "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents", "known_changes",
+    "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
+    "known_changes",
 )  # fmt: skip
-=======
-READS_LOGS = ("good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track")
->>>>>>> bd74cd0 (Log checks: tests and a study that repairs leave good logs alone, and undo what was put into them)
 
 
 def _module(name: str, *arguments: str) -> tuple[str, ...]:

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 import terrafusion as tf
-from terrafusion.datasets.catalog.catalog import locate
 from terrafusion.datasets.checks import repair, run_checks
 from terrafusion.datasets.core.channels import Gnss
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
@@ -36,9 +36,10 @@ def rig(recording: Recording) -> Rig | None:
 
 
 def field(name: str) -> Recording:
-    if locate(name) is None:
-        pytest.skip(f"{name} is not on this machine")
-    return open_recording(name)
+    try:
+        return open_recording(name)
+    except DataError as error:
+        pytest.skip(f"not on this machine: {error}")
 
 
 @pytest.mark.parametrize("name", FIELD)
