@@ -25,6 +25,7 @@ from terrafusion.twin.sensors.environment import barometer_channel, magnetometer
 from terrafusion.twin.sensors.gnss import gnss_channel
 from terrafusion.twin.sensors.imu import imu_channel
 from terrafusion.twin.sensors.noise import NoiseStreams, rows_at_rate
+from terrafusion.twin.sensors.steering import steering_channel
 
 START_NS = 1_704_067_200 * 10**9
 """Simulated drives start on 2024-01-01 00:00 UTC."""
@@ -60,6 +61,7 @@ def record(setup: RunSetup, driven: DrivenStates, motion: BodyMotion, noise: Noi
         terrain=Terrain(t_ns[terrain], route.labels(along[terrain], patch[terrain]), source="simulation"),
         barometer=barometer_channel(t_ns, motion, DATUM[2], vehicle, noise),
         magnetometer=magnetometer_channel(t_ns, motion, vehicle, noise),
+        steering=steering_channel(t_ns, motion, driven.inputs, vehicle, noise),
         truth=_truth(t_ns, motion),
         datum=DATUM,
         truth_channels=("position", "yaw", "orientation", "velocity"),

@@ -14,6 +14,7 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.twin.analysis.summary import RunSummary, slip_ratios, summarise
 from terrafusion.twin.effects.catalogue import checked
+from terrafusion.twin.effects.steered import drive_terms
 from terrafusion.twin.model.motion import BodyMotion, motion_of, wheel_shares
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.soil import SoilParams
@@ -65,7 +66,7 @@ class RunSetup:
         Raises:
             ConfigError: slip outside the range for which a soil was measured.
         """
-        slip = slip_ratios(driven.states, motion, self.vehicle)
+        slip = slip_ratios(driven, motion, self.vehicle)
         check_slip(self.route, self.plant.route.field, self.t_s, driven.states, slip)
         return slip, summarise(driven, motion, self.vehicle, slip)
 
@@ -100,7 +101,7 @@ def set_up(
     slope, aspect = scenario.plane()
     parameters = vehicle_vector(vehicle, slope_rad=slope, aspect_rad=aspect)
     known = checked({**vehicle.effects, **(effects or {})})
-    plant = with_effects(Plant(parameters, route.table(seed)), known)
+    plant = with_effects(Plant(parameters, route.table(seed)), known, drive_terms(vehicle.drive.type))
     rate = vehicle.sensors.imu.rate_hz
     count = max(2, round(scenario.duration_s * rate) + 1)
     return RunSetup(scenario, vehicle, route, plant, np.arange(count) / rate, known)

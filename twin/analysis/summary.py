@@ -8,11 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.sensors import STEERED_DRIVES
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import INDEX, SIDES, VEHICLE_PARAMETERS, state_slice
+from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import gear_loss, motor_current, motor_voltage, winding_loss
-from terrafusion.twin.scenario.commands import DrivenStates
+from terrafusion.twin.scenario.commands import DrivenStates, wheel_angles
 
 Array = NDArray[np.float64]
 
@@ -94,11 +95,16 @@ class Energy:
         return self.battery_j - lost - self.slip_j - self.resistance_j - self.potential_j - self.kinetic_j
 
 
-def slip_ratios(states: Array, motion: BodyMotion, vehicle: VehicleParams) -> Array:
-    """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest."""
-    rim = states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
+def slip_ratios(driven: DrivenStates, motion: BodyMotion, vehicle: VehicleParams) -> Array:
+    """Slip ratio (N, 4) of each wheel, (w R - u) / max(|w R|, |u|), 0 at rest; u is along the wheel."""
+    rim = driven.states[:, state_slice("wheel_speed")] * vehicle.wheel.radius_m
     half = 0.5 * vehicle.body.track_m * np.array(SIDES)
     hub = motion.velocity_body_mps[:, :1] - motion.yaw_rate_radps[:, None] * half
+    if vehicle.drive.type in STEERED_DRIVES:
+        ahead = 0.5 * vehicle.body.wheelbase_m * np.array(ENDS)
+        across = motion.velocity_body_mps[:, 1:2] + motion.yaw_rate_radps[:, None] * ahead
+        angle = wheel_angles(driven.inputs, vehicle)
+        hub = np.cos(angle) * hub + np.sin(angle) * across
     larger = np.maximum(np.abs(rim), np.abs(hub))
     return np.where(larger > 1e-3, (rim - hub) / np.maximum(larger, 1e-3), 0.0)
 

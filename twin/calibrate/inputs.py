@@ -62,8 +62,14 @@ def twin_input(recording: Recording, vehicle: VehicleParams, source: str) -> Twi
     """The input from one of `SOURCES`.
 
     Raises:
-        DataError: the log does not have it.
+        DataError: the log does not have it, or its vehicle steers.
     """
+    if vehicle.steered() is not None:
+        raise DataError(
+            f"drive type {vehicle.drive.type}: the twin is held against logs of robots without steering only",
+            file=recording.name,
+            remedy="give a log of a differential, skid_steer or tracked robot",
+        )
     command, wheels = recording.command, recording.wheels
     if source != "wheels" and command is not None and len(command) > 1:
         return _commands(recording, vehicle)

@@ -28,6 +28,14 @@ def catalogue() -> dict[str, Form]:
     return {**built_in(), **_OWN}
 
 
+@functools.cache
+def of_drives() -> dict[str, Form]:
+    """Terms by key that a vehicle's drive brings; they are no effects."""
+    from terrafusion.twin.effects.steered import STEERED
+
+    return {STEERED.key: STEERED}
+
+
 def register(form: Form) -> Form:
     """Adds a form of the user's own; it takes part in everything that goes by names. Returns the form.
 
@@ -109,10 +117,12 @@ class Terms:
 
     def __init__(self, keys: Iterable[str], symbols: Any) -> None:
         given = {key: symbols[i] for i, key in enumerate(keys)}
-        forms = {lookup(key)[0].key: lookup(key)[0] for key in given}
+        forms = {form.key: form for form in (of_drives().get(key) or lookup(key)[0] for key in given)}
         self._active = [
             (form, tuple(given.get(form.parameter_key(p), 0.0) for p in form.parameters))
-            for form in (catalogue()[key] for key in catalogue() if key in forms)
+            for form in (
+                {**of_drives(), **catalogue()}[key] for key in (*of_drives(), *catalogue()) if key in forms
+            )
         ]
 
     def at(self, stage: str) -> bool:

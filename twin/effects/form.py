@@ -29,6 +29,7 @@ STAGES: dict[str, tuple[str, ...]] = {
     "supply": ("voltage_share",),
     "corner": (
         "radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m", "grouser_height_m", "grouser_count",
+        "heading_cos", "heading_sin", "path_share",
     ),
     "ground": (*SOIL_PARAMETERS, "shear_x_m", "shear_y_m", "following"),
     "motor": (
@@ -45,7 +46,8 @@ STAGES: dict[str, tuple[str, ...]] = {
 """Stages in the order in which they are built, and the quantities a term may set there.
 
 `corner`, `ground`, `motor` and `wheel` are built once a wheel. In the stage `stamp` the time
-derivative of an output is known as `d_<output>`.
+derivative of an output is known as `d_<output>`. `heading_cos` and `heading_sin` turn the wheel about z; without
+them it points along body x.
 """
 
 PLANE = frozenset(

@@ -6,7 +6,7 @@ from collections.abc import Collection, Mapping
 from importlib import metadata, resources
 from typing import Any, NamedTuple
 
-from terrafusion.twin.effects.catalogue import built_in
+from terrafusion.twin.effects.catalogue import built_in, of_drives
 from terrafusion.twin.engine.emit import Emitter
 from terrafusion.twin.engine.graph import (
     CALLS,
@@ -83,7 +83,9 @@ class Variant(NamedTuple):
 def follows_from(kind: object, effects: Collection[str]) -> str | None:
     """What the source of a graph with these effects follows from; None with effects of the user's own, whose
     names do not tell their laws."""
-    known = {form.parameter_key(p) for form in built_in().values() for p in form.parameters}
+    known = {
+        form.parameter_key(p) for form in built_in().values() for p in form.parameters
+    } | of_drives().keys()
     if not known.issuperset(effects):
         return None
     return repr((model_sha256(), metadata.version("casadi"), kind, sorted(effects)))

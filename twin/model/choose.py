@@ -75,7 +75,7 @@ def _drive_of(steering: Steering) -> str:
 
 
 def _missing_geometry(recording: Recording, overrides: Overrides) -> list[str]:
-    """What a generic vehicle cannot replace: a radius for rad/s; track or wheelbase where no gyro shows yaw."""
+    """What a generic vehicle cannot replace: a radius for rad/s; without a gyro track or wheelbase."""
     wheels, imu = recording.wheels, recording.imu
     missing = []
     if wheels is not None and wheels.unit == "radps" and overrides.wheel_radius_m is None:

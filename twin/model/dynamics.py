@@ -170,6 +170,10 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
     w = terms.apply("corner", w)
 
     w["hub_x_mps"], w["hub_y_mps"] = q["u"] - q["r"] * w["hub_left_m"], q["v"] + q["r"] * w["hub_forward_m"]
+    if "heading_cos" in w:  # from here on in axes of the wheel
+        w["hub_x_mps"], w["hub_y_mps"] = _turned(
+            w["heading_cos"], -w["heading_sin"], w["hub_x_mps"], w["hub_y_mps"]
+        )
     w["rim_mps"] = w["wheel_speed"] * w["radius_m"]
     ahead, aside = w["hub_forward_m"] + q["cg_forward_m"], w["hub_left_m"] + q["cg_left_m"]
     w["wheel_x_m"] = q["x"] + q["cos_yaw"] * ahead - q["sin_yaw"] * aside
@@ -200,15 +204,26 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
     w["current_a"] = motor_current(w, w["torque"], w["wheel_speed"])
 
     w["drive_torque_nm"] = w["torque"]
-    return terms.apply("wheel", w)
+    w = terms.apply("wheel", w)
+    w["push_x_n"], w["push_y_n"] = w["force_x_n"], w["force_y_n"]
+    if "heading_cos" in w:
+        w["push_x_n"], w["push_y_n"] = _turned(
+            w["heading_cos"], w["heading_sin"], w["force_x_n"], w["force_y_n"]
+        )
+    return w
+
+
+def _turned(cos: Any, sin: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """A vector turned about z."""
+    return cos * x - sin * y, sin * x + cos * y
 
 
 def _forces(wheels: list[dict[str, Any]]) -> dict[str, Any]:
     """Sum of the wheels' forces on the body, N and N m about the centre of gravity."""
     force_x, force_y, moment = 0.0, 0.0, 0.0
     for w in wheels:
-        force_x, force_y = force_x + w["force_x_n"], force_y + w["force_y_n"]
-        moment = moment + w["hub_forward_m"] * w["force_y_n"] - w["hub_left_m"] * w["force_x_n"]
+        force_x, force_y = force_x + w["push_x_n"], force_y + w["push_y_n"]
+        moment = moment + w["hub_forward_m"] * w["push_y_n"] - w["hub_left_m"] * w["push_x_n"]
     return {"body_force_x_n": force_x, "body_force_y_n": force_y, "body_moment_nm": moment}
 
 

@@ -247,7 +247,7 @@ def _rates(g: ModelGraph, q: Mapping[str, Any]) -> dict[str, Any]:
     import casadi as ca
 
     x, u = g.arguments[:2]
-    speeds = len(INPUTS) // 2  # the inputs are speeds, then their rates, which are taken as constant
-    direction = ca.vertcat(g.derivative, u[speeds:], ca.SX.zeros(speeds))
+    speeds = 2  # the inputs are speeds, then their rates, which are taken as constant as steering angles are
+    direction = ca.vertcat(g.derivative, u[speeds : 2 * speeds], ca.SX.zeros(len(INPUTS) - speeds))
     rates = ca.jtimes(ca.vertcat(*(q[name] for name in OUTPUTS)), ca.vertcat(x, u), direction)
     return {f"d_{name}": rates[i] for i, name in enumerate(OUTPUTS)}

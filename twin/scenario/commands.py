@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.twin.effects.steered import wheel_path
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.plant import Plant
 from terrafusion.twin.model.vehicle import VehicleParams
-from terrafusion.twin.physics.layout import ENERGIES, INDEX, INPUTS, STATES, state_slice
+from terrafusion.twin.physics.layout import ENDS, ENERGIES, INDEX, INPUTS, SIDES, STATES, state_slice
 from terrafusion.twin.scenario.scenario import Scenario
 
 Array = NDArray[np.float64]
@@ -23,6 +24,11 @@ WAYPOINT_REACHED_M = 0.5
 LOOK_AHEAD_M = 1.5
 STEERING_GAIN_PER_S = 1.5
 MAX_STEERING_RADPS = 0.8
+SLOWEST_TURN = 0.3
+"""Share of the speed at which a vehicle that cannot turn on the spot turns to a waypoint behind it."""
+STANDING_MPS = 0.02
+MOST_TURN = 1.6
+"""Most of curvature times track: the wheels inside of a curve stay ahead of its centre."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,25 +72,72 @@ def follow(goal: Array, step: float, start: float) -> Array:
 
 
 def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
-    """Wheel speeds (N, 2) of left and right, rad/s, by the robot's own odometry geometry."""
+    """Wheel speeds (N, 2) of left and right, rad/s, by the robot's own odometry geometry.
+
+    Of a steered vehicle both are that of the body origin: the model tells each wheel's own from the angles.
+    """
     half = 0.5 * vehicle.odometry.track_m * twist[:, 1]
+    if vehicle.steered() is not None:
+        half = np.zeros_like(half)
     return np.stack([twist[:, 0] - half, twist[:, 0] + half], axis=1) / vehicle.odometry.wheel_radius_m
 
 
-def delayed_inputs(sides: Array, dt_s: float, dead_time_s: float = 0.0) -> Array:
-    """Inputs (N, 4), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, after a dead time.
+def steering_angles(twist: Array, dt_s: float, vehicle: VehicleParams, start: float = 0.0) -> Array:
+    """Angle (N,) of the front wheels, rad (bicycle model), by which a steered vehicle follows twists (N, 2).
+
+    The curvature is yaw rate over speed, within the limits of the angle and of its rate, from the angle
+    `start`; below `STANDING_MPS` the angle stays.
+    """
+    steering = vehicle.steered()
+    if steering is None:
+        return np.zeros(len(twist))
+    share = 0.5 if vehicle.drive.type == "four_wheel_steer" else 1.0
+    most = min(
+        math.tan(steering.max_angle_rad) / share / vehicle.body.wheelbase_m, MOST_TURN / vehicle.body.track_m
+    )
+    moving = np.abs(twist[:, 0]) >= STANDING_MPS
+    curvature = np.divide(twist[:, 1], twist[:, 0], out=np.zeros(len(twist)), where=moving)
+    goal = np.arctan(np.clip(curvature, -most, most) * vehicle.body.wheelbase_m * share)
+    last = np.maximum.accumulate(np.where(moving, np.arange(len(twist)), -1))
+    goal = np.where(last >= 0, goal[last], start)
+    return follow(goal, steering.max_rate_radps * dt_s, start)
+
+
+def axle_angles(front_rad: Array, vehicle: VehicleParams) -> Array:
+    """Angles (N, 2) of the front and of the rear axle, rad, of the front angles (N,)."""
+    rear = -front_rad if vehicle.drive.type == "four_wheel_steer" else np.zeros_like(front_rad)
+    return np.stack([front_rad, rear], axis=1)
+
+
+def wheel_angles(inputs: Array, vehicle: VehicleParams) -> Array:
+    """Angles (N, 4) of the wheels, rad, under inputs (N, U)."""
+    front, rear = (np.tan(inputs[:, INPUTS.index(f"steer_{end}_rad")])[:, None] for end in ("front", "rear"))
+    body = vehicle.body
+    x, y = 0.5 * body.wheelbase_m * np.array(ENDS), 0.5 * body.track_m * np.array(SIDES)
+    along, across = wheel_path(front, rear, body.wheelbase_m, x, y)
+    return np.arctan2(across, along)
+
+
+def delayed_inputs(sides: Array, dt_s: float, dead_time_s: float = 0.0, axles: Array | None = None) -> Array:
+    """Inputs (N, U), in the order of `layout.INPUTS`, of side speeds (N, 2), rad/s, after a dead time.
+
+    `axles` (N, 2) are steering angles of front and rear, rad, which are as late; None for none.
 
     Linear between samples; the first sample holds before it. The rates are those of the interval that
     ends at the delayed time: the derivative of the input by the dead time is minus the rate.
     """
     steps = np.diff(sides, axis=0, prepend=sides[:1]) / dt_s
+    axles = np.zeros((len(sides), 2)) if axles is None else axles
     if dead_time_s == 0.0:
-        return np.hstack([sides, steps])
+        return np.hstack([sides, steps, axles])
     count = len(sides)
     at = np.arange(count) - dead_time_s / dt_s
     whole = np.clip(np.ceil(at).astype(int), 0, count - 1)
-    late = np.stack([np.interp(at, np.arange(count), side) for side in sides.T], axis=1)
-    return np.hstack([late, np.where(at[:, None] > 0.0, steps[whole], 0.0)])
+    late, turned = (
+        np.stack([np.interp(at, np.arange(count), column) for column in columns.T], axis=1)
+        for columns in (sides, axles)
+    )
+    return np.hstack([late, np.where(at[:, None] > 0.0, steps[whole], 0.0), turned])
 
 
 def settling(scenario: Scenario, dt_s: float) -> tuple[Array, Array]:
@@ -109,7 +162,8 @@ def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[A
     dt = float(t_s[-1]) / (len(t_s) - 1)
     commanded = scenario.commanded(t_s)
     twist = limit_slew(commanded, dt, vehicle, scenario, np.zeros(2))
-    return commanded, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s)
+    axles = axle_angles(steering_angles(twist, dt, vehicle), vehicle)
+    return commanded, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s, axles)
 
 
 def drive(
@@ -134,30 +188,39 @@ def _steer(
     points = np.array([(0.0, 0.0), *scenario.waypoints])
     states, commanded = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
     states[0], commanded[0] = start, 0.0
-    twists = np.zeros((len(t_s), 2))
+    twists, front = np.zeros((len(t_s), 2)), np.zeros(len(t_s))
     goal, first = 1, 0
     while first < len(t_s) - 1:
         last = min(first + period, len(t_s) - 1)
         pose = states[first, :3]
         while goal < len(points) and np.hypot(*(points[goal] - pose[:2])) < WAYPOINT_REACHED_M:
             goal += 1
-        twist = _towards(points, goal, pose, scenario.waypoint_speed_mps)
+        least = SLOWEST_TURN if vehicle.steered() else 0.0
+        twist = _towards(points, goal, pose, scenario.waypoint_speed_mps, least)
         block = np.tile(twist, (last - first, 1))
-        twists[first + 1 : last + 1] = limit_slew(block, dt, vehicle, scenario, twists[first])
+        rows = slice(first + 1, last + 1)
+        twists[rows] = limit_slew(block, dt, vehicle, scenario, twists[first])
+        front[rows] = steering_angles(twists[rows], dt, vehicle, float(front[first]))
         known = max(0, first - reach)
-        inputs = delayed_inputs(side_speeds(twists[known : last + 1], vehicle), dt, vehicle.drive.dead_time_s)
+        some = slice(known, last + 1)
+        sides, axles = side_speeds(twists[some], vehicle), axle_angles(front[some], vehicle)
+        inputs = delayed_inputs(sides, dt, vehicle.drive.dead_time_s, axles)
         t0_s = float(t_s[first])
         states[first : last + 1] = integrate(
             states[first], inputs[first - known :], dt_s, plant, t0_s=t0_s, backend=backend
         )
         commanded[first + 1 : last + 1] = twist
         first = last
-    inputs = delayed_inputs(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s)
+    axles = axle_angles(front, vehicle)
+    inputs = delayed_inputs(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s, axles)
     return DrivenStates(commanded, inputs, states)
 
 
-def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:
-    """Twist (2,) towards a point ahead on the leg that ends at `points[goal]`; rest after the last one."""
+def _towards(points: Array, goal: int, pose: Array, speed_mps: float, least: float = 0.0) -> Array:
+    """Twist (2,) towards a point ahead on the leg that ends at `points[goal]`; rest after the last one.
+
+    The speed falls with the error of the heading, to the share `least`.
+    """
     if goal >= len(points):
         return np.zeros(2)
     leg = points[goal] - points[goal - 1]
@@ -167,4 +230,4 @@ def _towards(points: Array, goal: int, pose: Array, speed_mps: float) -> Array:
     bearing = math.atan2(*(ahead - pose[:2])[::-1]) - float(pose[2])
     error = math.remainder(bearing, 2.0 * math.pi)
     rate = min(max(STEERING_GAIN_PER_S * error, -MAX_STEERING_RADPS), MAX_STEERING_RADPS)
-    return np.array([speed_mps * max(math.cos(error), 0.0), rate])
+    return np.array([speed_mps * max(math.cos(error), least), rate])

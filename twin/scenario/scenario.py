@@ -44,6 +44,8 @@ PLACE = Quantity("m", -5.0, 5.0, size=3)
 class DriveSegment:
     """Commanded twist over `duration_s`: v + v_amplitude sin(phase), likewise the yaw rate.
 
+    `curvature_per_m` times the speed is added to the yaw rate.
+
     The phase is zero at the segment's start and runs with `period_s`; with
     `end_period_s` the frequency rises (or falls) linearly to 1/end_period_s.
     """
@@ -55,6 +57,7 @@ class DriveSegment:
     yaw_rate_amplitude_radps: YawRate = 0.0
     period_s: Period = 60.0
     end_period_s: Period = 0.0
+    curvature_per_m: Annotated[float, Quantity("1/m", -20.0, 20.0)] = 0.0
 
     def twist(self, t_s: Array) -> Array:
         """Twist (N, 2), m/s and rad/s, at times (N,) from the segment's start."""
@@ -62,7 +65,8 @@ class DriveSegment:
         sweep = (1.0 / self.end_period_s - start) / self.duration_s if self.end_period_s > 0 else 0.0
         wave = np.sin(2.0 * np.pi * (start * t_s + 0.5 * sweep * t_s**2))
         v = self.v_mps + self.v_amplitude_mps * wave
-        return np.stack([v, self.yaw_rate_radps + self.yaw_rate_amplitude_radps * wave], axis=1)
+        rate = self.yaw_rate_radps + self.yaw_rate_amplitude_radps * wave
+        return np.stack([v, rate + self.curvature_per_m * v if self.curvature_per_m else rate], axis=1)
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.effects.catalogue import moves
+from terrafusion.twin.effects.steered import drive_terms
 from terrafusion.twin.model.ground import under_wheels
 from terrafusion.twin.model.measurement import corrections, measured
 from terrafusion.twin.model.motion import BodyMotion
@@ -34,12 +35,17 @@ STAMPED_LATE = {"imu": "imu_time_offset/shift", "gnss": "gnss_latency/both"}
 """Delays of a whole channel."""
 
 
-def with_effects(plant: Plant, effects: Mapping[str, float]) -> Plant:
-    """The plant with the effects that change its motion; the dead time is applied to the inputs."""
+def with_effects(
+    plant: Plant, effects: Mapping[str, float], drive: Mapping[str, float] | None = None
+) -> Plant:
+    """The plant with the effects that change its motion and the terms of its drive (`steered.drive_terms`).
+
+    The dead time is applied to the inputs.
+    """
     vehicle = plant.vehicle.copy()
     vehicle[VEHICLE_PARAMETERS.index("dead_time_applied_s")] += effects.get(DEAD_TIME, 0.0)
     moving = {key: value for key, value in effects.items() if moves(key)}
-    return dataclasses.replace(plant, vehicle=vehicle, effects=moving)
+    return dataclasses.replace(plant, vehicle=vehicle, effects={**moving, **(drive or {})})
 
 
 def as_driven(vehicle: VehicleParams, effects: Mapping[str, float]) -> VehicleParams:
@@ -83,6 +89,7 @@ def with_sensor_effects(
         raise ValueError("a simulated recording has all channels")
     late = {name: effects.get(key, 0.0) for name, key in STAMPED_LATE.items()}
     rest = {key: value for key, value in effects.items() if key not in STAMPED_LATE.values()}
+    rest |= drive_terms(vehicle.drive.type)
     ground = under_wheels(plant.route, plant.vehicle, motion.t_s, driven.states)
     mounting = mounting_vector(vehicle)
     added = corrections(driven.states, driven.inputs, plant.vehicle, ground, mounting, rest)

@@ -15,6 +15,7 @@ from terrafusion.twin.engine.sensitivity import Directions, integrate_with_sensi
 from terrafusion.twin.model.dynamics import rhs
 from terrafusion.twin.physics.layout import (
     INDEX,
+    INPUTS,
     OUTPUTS,
     SOIL_PARAMETERS,
     STATES,
@@ -224,13 +225,13 @@ def test_no_form_leaves_its_law_where_wheels_turn_against_their_way(terrain) -> 
         for end in ("low", "high"):
             values = at(form, end)
             dx = rhs(tuple(values))(
-                against, np.zeros(4), plant().vehicle, soil(terrain), np.array([*values.values()])
+                against, np.zeros(len(INPUTS)), plant().vehicle, soil(terrain), np.array([*values.values()])
             )
             assert np.isfinite(dx.full()).all(), form.key
 
 
 def test_a_false_encoder_leaves_the_motors_limits_at_the_speed_the_wheel_has() -> None:
-    fast, inputs = np.zeros(len(STATES)), np.array([-50.0, -50.0, 0.0, 0.0])
+    fast, inputs = np.zeros(len(STATES)), np.array([-50.0, -50.0, 0.0, 0.0, 0.0, 0.0])
     fast[state_slice("wheel_speed")], ground = 9.0, soil("asphalt")
     rate = [
         rhs(names)(fast, inputs, plant().vehicle, ground, values).full()[state_slice("torque"), 0]
@@ -321,7 +322,10 @@ def test_drag_takes_power_whatever_the_robot_does(key, share, body, wheels, torq
     x[0, state_slice("wheel_speed")], x[0, state_slice("torque")] = wheels, torques
     x[0, state_slice("play")], x[0, INDEX["travel"]] = play, 3.0
     value = share * next(p.high for form in FORMS if form.key == key for p in form.parameters)
-    change = (derivatives({key: value}, x, np.zeros((1, 4))) - derivatives({}, x, np.zeros((1, 4))))[0]
+    change = (
+        derivatives({key: value}, x, np.zeros((1, len(INPUTS))))
+        - derivatives({}, x, np.zeros((1, len(INPUTS))))
+    )[0]
     u, v, r = (change[INDEX[name]] * own for name, own in zip(BODY, body, strict=True))
     power = ELEVATE.body.mass_kg * (u + v) + ELEVATE.body.yaw_inertia_kgm2 * r
     power += ELEVATE.wheel.inertia_kgm2 * (change[state_slice("wheel_speed")] @ np.array(wheels))

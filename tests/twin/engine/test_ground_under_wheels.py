@@ -77,11 +77,11 @@ def test_a_late_command_is_the_same_command_later_and_its_rate_the_derivative() 
     sides = np.stack([np.sin(t), np.cos(2 * t) - 1.0], axis=1)
     np.testing.assert_allclose(delayed_inputs(sides, 0.01, 0.2)[20:, :2], sides[:-20], atol=1e-12)
     np.testing.assert_array_equal(
-        delayed_inputs(sides, 0.01, 0.2)[:20], np.repeat([[*sides[0], 0, 0]], 20, axis=0)
+        delayed_inputs(sides, 0.01, 0.2)[:20], np.repeat([[*sides[0], 0, 0, 0, 0]], 20, axis=0)
     )
     for dead_time in (0.0, 0.113):
         eps = 1e-7
         inputs, later = delayed_inputs(sides, 0.01, dead_time), delayed_inputs(sides, 0.01, dead_time + eps)
         moving = slice(round(dead_time * 100) + 2, None)
         change = (later[moving, :2] - inputs[moving, :2]) / eps
-        np.testing.assert_allclose(change, -inputs[moving, 2:], atol=1e-6)
+        np.testing.assert_allclose(change, -inputs[moving, 2:4], atol=1e-6)

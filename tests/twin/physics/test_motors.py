@@ -24,7 +24,7 @@ from terrafusion.twin.analysis.summary import (
 from terrafusion.twin.engine.integrate import integrate
 from terrafusion.twin.model.vectors import vehicle_vector
 from terrafusion.twin.model.vehicle import Battery, VehicleParams, load_vehicle
-from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
+from terrafusion.twin.physics.layout import INDEX, INPUTS, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import battery, gear_loss, motor_current, motor_torque
 from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import DrivenStates, delayed_inputs
@@ -228,9 +228,9 @@ def test_wheels_that_turn_under_a_standing_robot_have_lost_traction(wheel_radps,
     setup = set_up("straight")
     states = np.zeros((len(setup.t_s), len(STATES)))
     states[:, state_slice("wheel_speed")] = wheel_radps
-    driven = DrivenStates(setup.scenario.commanded(setup.t_s), np.zeros((len(states), 4)), states)
+    driven = DrivenStates(setup.scenario.commanded(setup.t_s), np.zeros((len(states), len(INPUTS))), states)
     motion = setup.motion(driven)
-    summary = summarise(driven, motion, setup.vehicle, slip_ratios(states, motion, setup.vehicle))
+    summary = summarise(driven, motion, setup.vehicle, slip_ratios(driven, motion, setup.vehicle))
     assert summary.immobilised_cause == cause
     assert summary.immobilised_at_s == pytest.approx(3.0)  # from its first command on
 
