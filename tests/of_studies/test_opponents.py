@@ -148,12 +148,15 @@ def test_parts_are_computed_once(tmp_path: Path) -> None:
 
 def test_ratios_are_to_the_best_opponent() -> None:
     cells = [
-        Cell("set/log", 30.0, "EKF", "k", (2.0,), (30.0,)),
-        Cell("set/log", 30.0, "INS", "k", (4.0,), (30.0,)),
+        *(
+            Cell("set/log", 30.0, name, "k", (2.0 + i,), (30.0,))
+            for i, name in enumerate(estimators.OPPONENTS)
+        ),
         Cell("set/log", 30.0, "fixed", "k", (3.0,), (30.0,)),
     ]
     assert [c.ratio for c in compared(cells, "fixed", "k")] == [1.5]
     assert "fixed, k, 30 s: 1.50, lost 1 of 1" in markdown(cells, [], 0, 3)
+    assert not compared(cells[1:], "fixed", "k")  # the best of some would flatter
 
 
 def test_summary() -> None:

@@ -51,49 +51,35 @@ def ratios(found: Sequence[Found], change: str, told: bool) -> dict[str, float]:
 def markdown(found: Sequence[Found], notes: Sequence[str], missing: int, tasks: int) -> str:
     """Over all logs, then by set, then log by log."""
     changes = list(dict.fromkeys(f.change for f in found if f.change != BEFORE))
-    parts = [
-        f"Error in outages, after over before: geometric mean over logs [95 %], aimed at {ALLOWED} or less",
-        "",
-    ]
+    head = f"Error in outages, after over before: geometric mean over logs [95 %], aimed at {ALLOWED} or less"
+    parts = [head, ""]
     parts += ["| change | logs | not told | told | worst log | inside 95 % ellipses: before | after | told |"]
-    parts += ["|" + " --- |" * 8]
-    for change in changes:
-        after, told = ratios(found, change, False), ratios(found, change, True)
-        worst = max(after, key=lambda log: after[log], default="")
-        logs = set(after)
-        shares = [_share(found, c, t, logs) for c, t in ((BEFORE, False), (change, False), (change, True))]
-        cells = [
-            change,
-            str(len(after)),
-            _mean(after),
-            _mean(told),
-            f"{worst} {after[worst]:.2f}" if worst else "",
-            *shares,
-        ]
-        parts.append("| " + " | ".join(cells) + " |")
+    parts += ["|" + " --- |" * 8, *(_line(found, change) for change in changes)]
     every = [r for change in changes for r in ratios(found, change, False).values()]
     if every:
         above = f"above {ALLOWED} in {sum(r > ALLOWED for r in every)} of {len(every)}"
         parts += ["", f"all changes, not told: {geometric_mean(every).text()}, {above}"]
-    parts += [
-        "",
-        "Errors inside 95 % ellipses by set, before and over all changes",
-        "",
-        "| set | before | after |",
-        "| --- | --- | --- |",
-    ]
+    parts += ["", "Errors inside 95 % ellipses by set, before and over all changes", ""]
+    parts += ["| set | before | after |", "| --- | --- | --- |"]
     for name in dict.fromkeys(f.set_name for f in found):
         logs = {f.log for f in found if f.set_name == name}
         parts.append(
             f"| {name} | {_share(found, BEFORE, False, logs)} | {_share(found, None, False, logs)} |"
         )
-    parts += ["", "Median error in m, log by log (told in brackets)", ""]
-    parts += _by_log(found, changes)
+    parts += ["", "Median error in m, log by log (told in brackets)", "", *_by_log(found, changes)]
     if notes:
         parts += ["", "Failed (counted with the whole distance) or not applicable:", *dict.fromkeys(notes)]
     if missing:
         parts += ["", f"{missing} of {tasks} parts not run yet"]
     return "\n".join(parts)
+
+
+def _line(found: Sequence[Found], change: str) -> str:
+    after, told = ratios(found, change, False), ratios(found, change, True)
+    worst = max(after, key=lambda log: after[log], default="")
+    shares = [_share(found, c, t, set(after)) for c, t in ((BEFORE, False), (change, False), (change, True))]
+    where = f"{worst} {after[worst]:.2f}" if worst else ""
+    return "| " + " | ".join([change, str(len(after)), _mean(after), _mean(told), where, *shares]) + " |"
 
 
 def _by_log(found: Sequence[Found], changes: Sequence[str]) -> list[str]:

@@ -53,13 +53,10 @@ def compared(cells: Sequence[Cell], mode: str, known: str, against: str = BEST) 
     for cell in cells:
         if (cell.estimator, cell.known) != (mode, known):
             continue
-        theirs = [
-            c.median_m
-            for c in cells
-            if (c.log, c.seconds) == (cell.log, cell.seconds)
-            and c.estimator in (OPPONENTS if against == BEST else (against,))
-        ]
-        if theirs:
+        wanted = OPPONENTS if against == BEST else (against,)
+        here = [c for c in cells if (c.log, c.seconds) == (cell.log, cell.seconds)]
+        theirs = [c.median_m for c in here if c.estimator in wanted]
+        if len(theirs) == len(wanted):  # the best of some would flatter
             out.append(Compared(cell.log, cell.seconds, ratio(cell.median_m, min(theirs))))
     return out
 
@@ -68,34 +65,30 @@ def markdown(cells: Sequence[Cell], failures: Sequence[str], missing: int, tasks
     """Summary, then a table for each state of knowledge and each length."""
     kinds = list(dict.fromkeys(c.known for c in cells if c.estimator in MODES))
     lengths = sorted({c.seconds for c in cells})
-    parts = [
-        "Ratio of median errors to the best of three opponents, geometric mean over logs with 95 % interval:"
-    ]
-    for known in kinds:
-        for mode in MODES:
-            for seconds in lengths:
-                parts.append(_line(cells, mode, known, seconds))
+    parts = [f"Ratio of median errors to the {BEST}, geometric mean over logs with 95 % interval:"]
+    parts += [_line(cells, mode, known, seconds) for known in kinds for mode in MODES for seconds in lengths]
     parts += ["", "The same, to each opponent, all lengths:"]
-    for known in kinds:
-        for mode in MODES:
-            for name in OPPONENTS:
-                ratios = [c.ratio for c in compared(cells, mode, known, name)]
-                if ratios:
-                    lost = f"lost {losses(ratios)} of {len(ratios)}"
-                    parts.append(f"{mode} / {name}, {known}: {geometric_mean(ratios).text()}, {lost}")
+    parts += [line for known in kinds for mode in MODES for line in _each(cells, mode, known)]
     for known in kinds:
         for seconds in lengths:
-            parts += [
-                "",
-                f"Outages of {seconds:g} s, {known}; median error in m [95 %], per cent of the distance",
-                "",
-            ]
-            parts += _table(cells, known, seconds)
+            head = f"Outages of {seconds:g} s, {known}; median error in m [95 %], per cent of the distance"
+            parts += ["", head, "", *_table(cells, known, seconds)]
     if failures:
         parts += ["", "Failed (counted with the whole distance):", *dict.fromkeys(failures)]
     if missing:
         parts += ["", f"{missing} of {tasks} parts not run yet"]
     return "\n".join(parts)
+
+
+def _each(cells: Sequence[Cell], mode: str, known: str) -> list[str]:
+    """A line an opponent."""
+    lines = []
+    for name in OPPONENTS:
+        ratios = [c.ratio for c in compared(cells, mode, known, name)]
+        if ratios:
+            lost = f"lost {losses(ratios)} of {len(ratios)}"
+            lines.append(f"{mode} / {name}, {known}: {geometric_mean(ratios).text()}, {lost}")
+    return lines
 
 
 def _line(cells: Sequence[Cell], mode: str, known: str, seconds: float) -> str:
