@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
+from terrafusion.fusion.benchmark.outage_plan import until
 from tests.studies.opponents.drives import Drive, default_logs, drives_of, longest, vehicle_of
 from tests.studies.opponents.estimators import TUNED, TUNED_OPPONENTS, grid, noise_of, rows_of
 from tests.studies.opponents.inertial import Inertial
@@ -22,6 +23,8 @@ from tests.studies.opponents.parts import Task, code_of, result_of, run_all
 
 SPLIT = Path(__file__).with_name("split.json")
 LENGTHS_S = (30.0, 10.0)
+MOST_S = 120.0
+"""Of each drive, for the time that a grid takes."""
 LEAST_M = 0.01
 """Smaller medians count as this: no noise is chosen for millimetres."""
 
@@ -56,7 +59,8 @@ def tune(folder: Path, jobs: int) -> dict[str, dict[str, object]]:
     """Best noise of each opponent, and how it compares with the others; results are kept in a folder."""
     for name in json.loads(SPLIT.read_text(encoding="utf-8"))["tuning"]:
         for drive in longest(drives_of(name), 1):
-            inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
+            recording = until(drive.recording, MOST_S)
+            inputs = Inertial.of(recording, vehicle_of(recording, None))
             if inputs is not None:
                 _DRIVES.append((drive, inputs))
     code = code_of(
