@@ -124,7 +124,9 @@ def _matters(pair: Pair, lag: Lag, one: Signal, other: Signal) -> bool:
     """Whether a lag is large, and its interval clear of what half a sample and slip may cause."""
     least = LEAST_LAG_S[pair]
     sample_s = max(period_s(one[0]), period_s(other[0]))
-    return abs(lag.seconds) >= least and _distance_to_zero_s(lag) > 0.5 * max(sample_s, least)
+    ahead = pair[1] == "wheels" and lag.seconds < 0.0  # as where the robot skids after them
+    clear_s = (1.0 if ahead else 0.5) * max(sample_s, least)
+    return abs(lag.seconds) >= least and _distance_to_zero_s(lag) > clear_s
 
 
 def _distance_to_zero_s(lag: Lag) -> float:

@@ -20,8 +20,9 @@ from terrafusion.datasets.checks.motion import Array, Complex, cumulative, gyro_
 from terrafusion.datasets.checks.path import MeasuredPath
 from terrafusion.datasets.core.bootstrap import resampled_rows
 
-LEAST_WINDOWS, LEAST_ROWS, MOST_HZ = 5, 8, 5.0
-"""Windows that are needed, positions in each, and the rate that more would not add to."""
+LEAST_WINDOWS, LEAST_CONTRIBUTING, LEAST_ROWS, MOST_HZ = 5, 2.0, 8, 5.0
+"""Windows that are needed, those of them that show a number, positions in each, and the rate that more would
+not add to."""
 SIGMAS, WINDOW_S = 30.0, (20.0, 60.0)
 """A window spans this many sigma of a position, within these limits."""
 STARTS_S = np.arange(-1.0, 5.1, 0.5)
@@ -112,8 +113,19 @@ def path_model(context: CheckContext, measured: MeasuredPath) -> PathModel | Non
     draws = resampled_rows(len(H), RESAMPLES, SEED)
     right = h[draws].sum(axis=1) - prior @ unknown
     drawn = unknown + np.linalg.solve(H[draws].sum(axis=1) + prior, right[..., None])[..., 0]
-    scale, delay = (interval_of(float(unknown[k]), drawn[:, k], len(H)) for k in range(2))
+    scale, delay = (
+        interval_of(float(unknown[k]), drawn[:, k], len(H))
+        if _contributing(H[:, k, k]) >= LEAST_CONTRIBUTING
+        else BootstrapInterval(float(unknown[k]), -np.inf, np.inf)
+        for k in range(2)
+    )
     return PathModel(scale, delay, len(H), measured.source)
+
+
+def _contributing(information: Array) -> float:
+    """How many windows share the information (W,) on a number, if they did so equally."""
+    total = float(information.sum())
+    return total**2 / float(np.sum(information**2)) if total > 0.0 else 0.0
 
 
 def _windows(context: CheckContext, measured: MeasuredPath) -> _Windows | None:
