@@ -21,6 +21,7 @@ STATUS = {
     "aligning": "heading is unknown until the robot has moved far enough for GNSS to show it",
     "running": "position, heading and slip are estimated",
     "outage": "no GNSS fix for more than two seconds; wheels and IMU carry the position",
+    "doubtful": "fixes contradict what wheels and gyro allow; its sigma spans what is possible, the notes tell why",
     "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
 }
 """Values of a status and the sentence that explains each."""
@@ -84,7 +85,10 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Innovation:
-    """A measurement against its prediction: `value` (m or m/s), normalised square `nis` with `dof`."""
+    """A measurement against its prediction: `value` (m or m/s), normalised square `nis` with `dof`.
+
+    `reason`: why it was not used, where more than its gate speaks against it.
+    """
 
     t_ns: int
     sensor: str
@@ -92,6 +96,7 @@ class Innovation:
     nis: float
     dof: int
     accepted: bool
+    reason: str = ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)

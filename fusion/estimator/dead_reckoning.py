@@ -28,6 +28,9 @@ LEAST_DIFFERENCES, MOST_DIFFERENCES = 8.0, 300.0
 """Second differences from which the white share is known, and how many are remembered (assumed)."""
 CENSORED = 3.0
 """Squared second differences over their expectation are censored here (assumed)."""
+MARGIN, TOP_MPS = 1.2, 2.0
+"""Driven over wheel distance, at most (tyre radius, a skid), and least top speed of a robot whose wheels are
+unknown for a time (assumed)."""
 SLIP_CHANGE = 0.1
 """Change of slip from fix to fix, which bends the dead-reckoned path (assumed)."""
 LEAST_RATIO, MOST_RATIO = 0.3, 1.7
@@ -62,14 +65,19 @@ class PathFit:
         return self.fix_middle + self.turn * (z - self.middle)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class FixPair:
-    """A fix (east + i north, m) its reported sigma, and the dead-reckoned antenna `z` (m) then."""
+    """A fix (east + i north, m) its reported sigma, and the dead-reckoned antenna `z` (m) then.
+
+    `reach_m`: how far the robot can have driven in all by then; `usable`: the fix may show the heading.
+    """
 
     t_ns: int
     z: complex
     fix: complex
     sigma_m: float
+    reach_m: float = 0.0
+    usable: bool = True
 
 
 class DeadReckoning:
@@ -80,35 +88,56 @@ class DeadReckoning:
         self._t_ns: list[int] = []
         self._z: list[complex] = []
         self._yaw: list[float] = []
+        self._reach_m: list[float] = []
+        self._top_mps = TOP_MPS
         self.pairs: list[FixPair] = []
         self._yaw_chain = 0.0
         self._confirmed = 0
         self._forgotten = np.zeros(2)
 
-    def step(self, chain: Chain) -> None:
+    @property
+    def reach_m(self) -> float:
+        """How far the robot can have driven in all, m."""
+        return self._reach_m[-1] if self._reach_m else 0.0
+
+    @property
+    def heading(self) -> complex:
+        """Turn from the dead-reckoned path to the map by the filter's heading."""
+        return cmath.exp(1j * (self._yaw_chain - self._yaw[-1]))
+
+    def step(self, chain: Chain, skids: bool = False) -> None:
         """Extend the path to the newest keyframe by its wheels, or its velocity where they are rejected."""
         node, state = chain.nodes[-1], chain.state(chain.last)
         R = state.pose.rotation().matrix()
         self._yaw_chain = float(np.arctan2(R[1, 0], R[0, 0]))
         if not self._t_ns or len(chain.nodes) < 2:
-            self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0)
+            self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0, 0.0)
             return
         dt = (node.t_ns - self._t_ns[-1]) * 1e-9
-        moved = R.T @ state.velocity * dt
+        moved, known = R.T @ state.velocity * dt, False
+        speed_mps = float(np.linalg.norm(state.velocity))
         if node.wheels is not None and np.isfinite(node.wheels.sigma[0]):
-            moved = node.wheels.displacement_m
+            moved, known = node.wheels.displacement_m, not skids
+            speed_mps = max(speed_mps, abs(node.wheels.distance_m) / dt)
+            self._top_mps = max(self._top_mps, speed_mps)
         east, north, _ = R @ moved
         turn = float((R @ state.rate(node.gyro_radps))[2]) * dt
         level = complex(east, north) * np.exp(-1j * self._yaw_chain)
-        self._append(node.t_ns, self._z[-1] + level * np.exp(1j * self._yaw[-1]), self._yaw[-1] + turn)
+        self._append(
+            node.t_ns,
+            self._z[-1] + level * np.exp(1j * self._yaw[-1]),
+            self._yaw[-1] + turn,
+            MARGIN * (speed_mps if known else max(speed_mps, self._top_mps)) * dt,
+        )
 
-    def _append(self, t_ns: int, z: complex, yaw: float) -> None:
+    def _append(self, t_ns: int, z: complex, yaw: float, further_m: float) -> None:
         self._t_ns.append(t_ns)
         self._z.append(z)
         self._yaw.append(yaw)
+        self._reach_m.append(self.reach_m + further_m)
         old = bisect.bisect_left(self._t_ns, t_ns - round(KEPT_S * 1e9))
         if old > 50:
-            del self._t_ns[:old], self._z[:old], self._yaw[:old]
+            del self._t_ns[:old], self._z[:old], self._yaw[:old], self._reach_m[:old]
             kept = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
             # The differences that go with them, which their two neighbours complete.
             self._forgotten += self._difference_sums(self.pairs[: len(self.pairs) - len(kept) + 2])
@@ -116,17 +145,28 @@ class DeadReckoning:
             self.pairs = kept
 
     def add(self, fix: GnssFix) -> None:
-        """Pair a fix with the path at its time."""
+        """Keep a fix with the path at its time."""
+        pair = self.pair(fix)
+        if pair is not None:
+            self.keep(pair)
+
+    def keep(self, pair: FixPair) -> None:
+        """Keep a pair, in order of time."""
+        bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
+
+    def pair(self, fix: GnssFix) -> FixPair | None:
+        """A fix with the path at its time; None where that is not known."""
         if len(self._t_ns) < 2 or fix.t_ns < self._t_ns[0]:
-            return
+            return None
         i = min(bisect.bisect_left(self._t_ns, fix.t_ns, 1), len(self._t_ns) - 1)
         begin, end = self._t_ns[i - 1], self._t_ns[i]
         share = min((fix.t_ns - begin) / (end - begin), 1.0)
         z = self._z[i - 1] + share * (self._z[i] - self._z[i - 1])
         yaw = self._yaw[i - 1] + share * (self._yaw[i] - self._yaw[i - 1])
         at = z + self.lever * complex(np.cos(yaw), np.sin(yaw))
-        pair = FixPair(fix.t_ns, at, complex(fix.enu_m[0], fix.enu_m[1]), float(np.max(fix.sigma_m[:2])))
-        bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
+        reach_m = self._reach_m[i - 1] + share * (self._reach_m[i] - self._reach_m[i - 1])
+        there = complex(fix.enu_m[0], fix.enu_m[1])
+        return FixPair(fix.t_ns, at, there, float(np.max(fix.sigma_m[:2])), reach_m)
 
     def scatter(self) -> float:
         """Scatter of the last fixes about the path over their reported sigma; NaN with too few.
@@ -173,6 +213,11 @@ class DeadReckoning:
         bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
         reported = 6.0 * np.array([p.sigma_m for p in pairs])[1:-1] ** 2
         return squares[even], bend[even], reported[even]
+
+    def extent_m(self) -> float:
+        """Distance between the first and the last of the fixes over which the scatter is taken."""
+        recent = self.pairs[-SCATTER_FIXES:]
+        return abs(recent[-1].z - recent[0].z) if recent else 0.0
 
     def smooth_at(self, t_ns: int) -> bool:
         """Whether the fix at `t_ns` continues the parabola through the three before it, within reported
@@ -226,10 +271,11 @@ class DeadReckoning:
         """The path aligned with the fixes, their sigmas times `scale`; None until its turn is known to
         `yaw_sigma_rad`.
         """
-        if len(self.pairs) < 5:
+        pairs = [p for p in self.pairs if p.usable]
+        if len(pairs) < 5:
             return None
-        z, fix = np.array([p.z for p in self.pairs]), np.array([p.fix for p in self.pairs])
-        weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in self.pairs])
+        z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
+        weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in pairs])
         inlier = np.ones(len(z), dtype=bool)
         for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
             turn, information = planar_rotation(z[inlier], fix[inlier], weight[inlier])

@@ -23,6 +23,7 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import YAW_RATIO
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
@@ -53,7 +54,7 @@ from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_r
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
-from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
+from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix, checked_time
 from terrafusion.fusion.inputs.streams import (
     LONGEST_PAUSE_NS,
     ImuSegment,
@@ -62,6 +63,7 @@ from terrafusion.fusion.inputs.streams import (
     longest_gap_s,
     usual_interval_s,
 )
+from terrafusion.fusion.inputs.stuck_gyro import StuckGyro
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 
@@ -97,6 +99,8 @@ class Estimator:
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
         self.wheels = WheelStream(self.newest)
+        track_m, imu = config.rig.track_m / YAW_RATIO, config.rig.sensors.imu
+        self.gyro = StuckGyro(track_m, imu.gyro_noise_radps_sqrthz)
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
@@ -136,6 +140,9 @@ class Estimator:
             raise DataError(
                 "the estimator is configured without an IMU", channel="imu", remedy="mend `inputs`"
             )
+        t_ns = checked_time(t_ns, "imu")
+        if self.config.inputs.sides:
+            gyro_radps = self.gyro.checked(t_ns, gyro_radps, self.wheels)
         self.imu.add(t_ns, gyro_radps, accel_mps2)
         self._advance()
 
@@ -289,6 +296,8 @@ class Estimator:
 
     def _keyframe(self, t_ns: int) -> None:
         self._upkeep()
+        if doubt_rad := self.gyro.take_doubt_rad():
+            self.chain.restart(doubt_rad**2 * (np.arange(self.chain.dim) == 2))
         switch = self.weights.take_switch()
         before_ns = self.chain.nodes[-1].t_ns
         dt = (t_ns - before_ns) * 1e-9
@@ -312,7 +321,7 @@ class Estimator:
             point = carried(before, wheels, dt)
             link = bridge(k, before, point, dt)
         else:
-            measured = self._preintegrator.integrate(segments, before.bias, noise)
+            measured = self._preintegrator.integrate(segments, before.bias, self.gyro.noise(noise))
             seen = before.bias_seen(gyro, accel) if self.config.calibrate else before.bias
             nav = measured.predict(gtsam.NavState(before.pose, before.velocity), seen)
             point = KeyState(nav.pose(), nav.velocity(), before.bias, before.linear)
@@ -420,7 +429,7 @@ class Estimator:
         )
         outage = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
         gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, noise)
-        state = self._state = State(
+        state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
             terrain=self.weights.posterior(),
@@ -429,6 +438,7 @@ class Estimator:
             immobilised=self.monitor.immobilised,
             **state_fields(key, self._covariance, gyro, gyro_sigma),
         )
+        self._state = state = self.gnss.plausible.widened(state, self.gnss.track.reach_m)
         if self._on_state is not None and not self._silent:
             self._on_state(state)
         return state

@@ -14,9 +14,10 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
-from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning
+from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
+from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
@@ -29,6 +30,9 @@ from terrafusion.fusion.weighting.weighting import InnovationTest, Weighting
 from terrafusion.twin.sensors.gnss import best_fix
 
 LEAST_SIGMA_M = 0.005
+KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
+"""Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
+sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
 LARGE_TURN_RAD = 0.05
 APART_NS = 1_000_000_000
@@ -47,6 +51,10 @@ OPTIMISM = 3.0
 reports even less has fixes of a better class (RTK), which drift in proportion to their sigma."""
 DOUBTFUL_YAW_SIGMA_RAD = 0.2
 """Heading sigma after the heading was corrected from the motion (assumed)."""
+VELOCITY_OFF_MPS, VELOCITY_OFF_SIGMA = 2.0, 6.0
+"""A velocity farther from the estimate's, beyond so many sigmas, is none of the robot (assumed)."""
+VELOCITY_SIGMA_MPS = 0.3
+"""Velocity sigma after the fixes used turned out to be far less accurate than reported (assumed)."""
 
 
 class GnssUpdater:
@@ -57,6 +65,7 @@ class GnssUpdater:
         waiting: fixes not yet used, oldest first.
         local: the graph was started without GNSS and is not yet aligned with the map.
         alignment: with the map, once known; unaligned: how many fixes came until then.
+        velocities_refused: how many velocities were too far from the estimate's.
         rejected, too_late: how many fixes the gate rejected, or came after their keyframe was dropped.
         turned: how often the heading was corrected from the motion.
         scale: scatter of the fixes over their reported sigma, 1 where it is below `OPTIMISTIC_SCATTER`.
@@ -81,7 +90,7 @@ class GnssUpdater:
         self.track = DeadReckoning(self.antenna_m)
         self.turned = 0
         self.skid = skid or SkidDetector()
-        self.scale, self.white = 1.0, WHITE_SHARE
+        self.scale, self.white, self._handled = 1.0, WHITE_SHARE, 1.0
         self.sheet_sigma_m = spec.sigma_horizontal_m
         self._best = best_fix(spec)
         self._class: Fix | None = None
@@ -102,6 +111,9 @@ class GnssUpdater:
         self.last_used_ns: int | None = None
         self._newest_ns = 0
         self._unchecked: GnssFix | None = None
+        self._pair: FixPair | None = None
+        self.velocities_refused = 0
+        self.plausible = FixPlausibility()
         self._report = report
         self._seen = 0
 
@@ -109,6 +121,10 @@ class GnssUpdater:
         """Take a fix in, in any order of time."""
         if self.delay_s:
             fix = dataclasses.replace(fix, t_ns=fix.t_ns - round(self.delay_s * 1e9))
+        least_m = self.sheet_sigma_m if self.sheet_sigma_m <= RTK_SHEET_M else KINEMATIC_M
+        if fix.sigma_m[:2].min() < 0.999 * least_m:
+            sigma = np.append(np.maximum(fix.sigma_m[:2], least_m), fix.sigma_m[2])
+            fix = dataclasses.replace(fix, sigma_m=sigma)
         self.waiting.append(fix)
         if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
             self.waiting.sort(key=lambda f: f.t_ns)
@@ -132,7 +148,8 @@ class GnssUpdater:
         keyframe.
         """
         used = False
-        self.track.step(chain)
+        self.track.step(chain, self.skid.rate_m2ps > 0.0)
+        self.plausible.watch(chain.nodes[-1].t_ns)
         while self.waiting and self.waiting[0].t_ns <= chain.nodes[-1].t_ns:
             fix = self.waiting.pop(0)
             k = keyframe_of(fix, chain)
@@ -142,9 +159,14 @@ class GnssUpdater:
                 self.unaligned += 1
                 self.track.add(fix)
                 used |= self._align(chain, fix)
+            elif self._implausible(chain, k, fix, covariance):
+                self.rejected += 1
             else:
-                self.track.add(fix)
+                if self._pair is not None:
+                    self.track.keep(self._pair)
                 self._update_scale(self.track.scatter(), self.track.white_share())
+                if self.scale > OPTIMISTIC_SCATTER * self._handled:
+                    self._doubt_used(chain, fix)
                 if self.skid.friction is not None:
                     self.skid.friction.score_fix(fix, self.scale)
                 restarted = self._change_class(chain, k, fix)
@@ -152,10 +174,45 @@ class GnssUpdater:
                     chain.smooth(max(chain.last - k + 2, 1))
                     covariance = chain.covariance_at(k)
                 used |= self._add_fix(chain, k, fix, covariance, noise)
-                self._unchecked = fix
+                if self._pair is None or self._pair.usable:
+                    self._unchecked = fix
         if used:
             self.weighting.revisit(chain)
         return used
+
+    def _implausible(self, chain: Chain, k: int, fix: GnssFix, covariance: Array) -> bool:
+        """Whether a fix must not be used whatever the gate says of it."""
+        self._pair, place = self.track.pair(fix), self._antenna(chain, k)
+        if self._pair is None:
+            return False
+        refused = self.plausible.refusal(self._pair, place, self.track)
+        if refused is None:
+            return False
+        if self.plausible.mirrored:
+            self.track.keep(self._pair)
+        off = self._pair.fix - place
+        innovation = np.array([off.real, off.imag])
+        S = covariance[3:5, 3:5] + np.diag(fix.sigma_m[:2] ** 2)
+        nis = float(innovation @ np.linalg.solve(S, innovation))
+        self._report(Innovation(fix.t_ns, "gnss", np.append(innovation, np.nan), nis, 2, False, refused))
+        return True
+
+    def _antenna(self, chain: Chain, k: int) -> complex:
+        """The antenna at keyframe k by the estimate, east + i north, m."""
+        pose = chain.state(k).pose
+        at = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
+        return complex(at[0], at[1])
+
+    def _gated(self, chain: Chain, k: int, innovation_m: Array, S: Array) -> tuple[GateDecision, float]:
+        """Verdict of the gate and of plausibility on the newest fix, and the normalised square."""
+        verdict, nis = self.gate.test(innovation_m, S)
+        if verdict is GateDecision.REJECT and nis <= self.weighting.passed_nis:
+            return GateDecision.ACCEPT, nis
+        if verdict is GateDecision.ACCEPT or self._pair is None:
+            return verdict, nis
+        if self.plausible.rejected(self._pair, self._antenna(chain, k), self.track, self.scale):
+            return GateDecision.REACQUIRE, nis
+        return (verdict if self._pair.usable else GateDecision.REJECT), nis
 
     def _align(self, chain: Chain, fix: GnssFix) -> bool:
         """Align a path that was begun without fixes with the map; True once they determine how."""
@@ -171,6 +228,21 @@ class GnssUpdater:
         self.white = WHITE_SHARE if math.isnan(white) else max(white, WHITE_SHARE)
         if self.white > ALL_NEW:
             self.white = 1.0
+
+    def _doubt_used(self, chain: Chain, fix: GnssFix) -> None:
+        """Doubt what fixes of a far too small sigma have made of the window, once their scatter is known."""
+        ratio, self._handled = self.scale / self._handled, self.scale
+        for k, node in enumerate(chain.nodes, chain.first):
+            for old in node.fixes[:]:
+                wider = old.sigma_m * np.array([ratio, ratio, 1.0])
+                chain.replace_fix(k, old, dataclasses.replace(old, sigma_m=wider))
+        sigma_m = self.scale * float(np.max(fix.sigma_m[:2]))
+        doubt = np.zeros(chain.dim)
+        doubt[2] = min(DOUBTFUL_YAW_SIGMA_RAD, sigma_m / max(self.track.extent_m(), 1e-3)) ** 2
+        doubt[3:5], doubt[VELOCITY] = sigma_m**2, VELOCITY_SIGMA_MPS**2
+        doubt[BIAS], doubt[DRIFT] = self._bias_sigma**2, self.drift_sigma_m**2
+        chain.restart(doubt, chain.first)
+        chain.smooth(len(chain.nodes))
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Restart the drift where the class of fix changes; True when it does.
@@ -245,10 +317,9 @@ class GnssUpdater:
         predicted_m2 = P[[0, 1], [0, 1]].copy()
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
         P[[0, 1], [0, 1]] += np.maximum(sigma[:2], fix.sigma_m[:2] * inflation) ** 2
-        verdict, nis = self.gate.test(innovation[:2], P[:2, :2])
-        if verdict is GateDecision.REJECT and nis <= self.weighting.passed_nis:
-            verdict = GateDecision.ACCEPT
-        if verdict is GateDecision.REJECT and not again and self._test_wheels(chain, k, fix, noise):
+        verdict, nis = self._gated(chain, k, innovation[:2], P[:2, :2])
+        slid = verdict is GateDecision.REJECT and (self._pair is None or self._pair.usable)
+        if slid and not again and self._test_wheels(chain, k, fix, noise):
             return self._add_fix(chain, k, fix, chain.covariance_at(k), noise, again=True)
         scale, weight = 1.0, 1.0
         if verdict is not GateDecision.REACQUIRE:
@@ -264,12 +335,16 @@ class GnssUpdater:
                     self.white,
                 )
             )
-        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, verdict is not GateDecision.REJECT))
+        used = verdict is not GateDecision.REJECT
+        why = "" if self._pair is None or self._pair.usable else BEYOND
+        self._report(Innovation(fix.t_ns, "gnss", innovation, nis, 2, used, "" if used else why))
         if verdict is GateDecision.REJECT:
             if again:
                 self.skid.undo(chain)
             self.rejected += 1
             return False
+        if self._pair is not None:
+            self.plausible.accepted(self._pair, verdict is GateDecision.REACQUIRE)
         self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
         P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
@@ -283,7 +358,7 @@ class GnssUpdater:
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
-        if fix.velocity_mps is not None and np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
+        if self._velocity_usable(fix, velocity, covariance):
             sigma_v = round(max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), 4)
             if chain.dim > GNSS_DELAY:
                 doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
@@ -299,6 +374,16 @@ class GnssUpdater:
         if weight > UNUSED_WEIGHT:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
+
+    def _velocity_usable(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> bool:
+        """Whether a fix has a velocity that the robot can have."""
+        if fix.velocity_mps is None or not np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
+            return False
+        sigma_mps = math.sqrt(fix.sigma_v_mps**2 + float(covariance[VELOCITY, VELOCITY].trace()))
+        off_mps = float(np.linalg.norm(fix.velocity_mps - predicted_mps))
+        usable = off_mps <= VELOCITY_OFF_MPS + VELOCITY_OFF_SIGMA * sigma_mps
+        self.velocities_refused += not usable
+        return usable
 
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""

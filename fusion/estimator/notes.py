@@ -21,6 +21,9 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
         notes.append(f"{gnss.too_late} GNSS fixes came before the start or too late for the lag")
     if gnss.turned:
         notes.append(f"the heading was wrong and was set right from the motion {gnss.turned} times")
+    notes += gnss.plausible.notes()
+    if gnss.velocities_refused:
+        notes.append(f"{gnss.velocities_refused} GNSS velocities were far from what wheels and IMU allow")
     if gnss.skid.refutations:
         notes.append(f"fixes showed {gnss.skid.refutations} times that the robot slid beside its wheels")
     friction = gnss.skid.friction
@@ -37,6 +40,11 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     ):
         if count:
             notes.append(f"{count} samples of {name} beyond {what} were left out: no robot moves so")
+    if estimator.gyro.samples:
+        notes.append(
+            f"the gyro's yaw rate stood still for {estimator.gyro.samples} samples while the wheels turned "
+            "otherwise: the wheels stood in for it"
+        )
     for name, count in estimator.newest.refused.items():
         notes.append(f"{count} samples of {name} lay far ahead of IMU and wheels: they were left out")
     for stream in (estimator.imu.late, estimator.wheels.late):

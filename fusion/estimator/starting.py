@@ -14,6 +14,7 @@ from terrafusion.fusion.estimator.alignment import (
     level_start,
 )
 from terrafusion.fusion.estimator.gnss import GnssUpdater
+from terrafusion.fusion.estimator.plausibility import plausible_fixes
 from terrafusion.fusion.estimator.stationarity import drop_before_start
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 
@@ -50,7 +51,8 @@ class StartSearch:
             return self.known.at(self.level)
         fixes = self._gnss.waiting
         if fixes and self._gnss.have_new():
-            start = heading_from_motion(imu, wheels, fixes, self.level, self._antenna_m)
+            fitting = plausible_fixes(fixes, wheels)
+            start = heading_from_motion(imu, wheels, fitting, self.level, self._antenna_m)
             if start is not None and start.yaw_sigma_rad <= self._config.yaw_sigma_start_rad:
                 return start
             if drop_before_start(imu, wheels, fixes):

@@ -1,0 +1,342 @@
+"""Whether fixes can be those of the robot: by what it can have driven, by its motion and by its turns.
+
+A receiver that is wrong is often wrong for many fixes in a row, which agree with each other (a reflected
+signal, a wrong ambiguity, a position that it repeats). Wheels and gyro bound where the robot can be: a new
+place is believed as soon as it could have been reached since the last fix that was used. A place beyond it is
+believed only once the fixes there have traced, over tens of metres and seconds, the path that wheels and gyro
+describe; until then, and for a while after, the covariance spans both places.
+"""
+
+from __future__ import annotations
+
+import cmath
+import dataclasses
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.dead_reckoning import (
+    LEAST_TURN_RAD,
+    MARGIN,
+    TOP_MPS,
+    DeadReckoning,
+    FixPair,
+)
+from terrafusion.fusion.inputs.door import GnssFix
+from terrafusion.fusion.inputs.streams import WheelStream
+
+SLACK_M, SLACK_SIGMA = 1.0, 4.0
+"""Beyond the reach of the wheels: lever arm and delay (assumed), and sigmas of both fixes."""
+EVIDENCE_FIXES, EVIDENCE_S, EVIDENCE_M = 10, 20.0, 20.0
+"""Fixes, time and path that a place beyond reach must show."""
+SHAPE_RATIO, SHAPE_SHARE, SHAPE_SIGMA = 0.15, 0.03, 3.0
+"""How well their path must match that of wheels and gyro: in scale, and in share of the path plus sigmas."""
+CONTRADICTED = 5
+"""Fixes in a row beyond reach that put the estimate in doubt."""
+BRIEF_S, FORGOTTEN_S = 5.0, 10.0
+"""Fixes that contradict for less than the one are forgotten after the other without any."""
+DOUBT, DOUBT_M = 0.35, 30.0
+"""Sigma over the distance of both places, and the path after a jump over which it decays by e (assumed)."""
+SETTLED = 0.02
+"""Share of the distance below which a jump is no longer in doubt."""
+REPEATED_SIGMA, REPEATED_M = 0.1, 0.005
+"""A position is repeated where it changes by less than this share of sigma, at most by so much."""
+REPEATED_WAY_M = 0.1
+"""Least motion that a repeated position contradicts; one sigma of the fix where that is more."""
+MIRROR_FIXES, MIRROR_GAIN = 10, 5.0
+"""Fixes, and ratio of residuals, from which the path fits its mirror image only."""
+MIRROR_YAW_RAD = 1.8
+"""Sigma of a heading of which nothing is known: pi / sqrt(3)."""
+MIRROR_RATIO = 0.3
+"""Driven over dead-reckoned distance may differ from 1 by so much."""
+MOST_RUNS, MOST_PAIRS = 8, 600
+"""Runs, and fixes of a run, that are remembered."""
+
+REPEATS = "the receiver repeats its position while wheels and gyro show motion"
+MIRRORED = "the path of the fixes is the mirror image of that of wheels and gyro (axes swapped, or a sign)"
+BEYOND = "the place lies beyond what the robot can have driven"
+
+
+@dataclass
+class Run:
+    """Fixes of which each can be reached from the one before; `reachable`: the first one could be, too."""
+
+    reachable: bool
+    pairs: list[FixPair]
+
+    def seconds(self) -> float:
+        """Time from its first to its last fix."""
+        return (self.pairs[-1].t_ns - self.pairs[0].t_ns) * 1e-9
+
+    def is_evidence(self, scale: float, heading: complex) -> bool:
+        """Whether the fixes trace the path of wheels and gyro, long enough; sigmas times `scale`.
+
+        `heading` turns the path as the estimate has it; a straight path must have that heading.
+        """
+        if len(self.pairs) < EVIDENCE_FIXES or self.seconds() < EVIDENCE_S:
+            return False
+        z, fix = (np.array([getattr(p, name) for p in self.pairs]) for name in ("z", "fix"))
+        path_m = float(np.abs(np.diff(z)).sum())
+        if path_m < EVIDENCE_M:
+            return False
+        turn, left_m = similarity(z, fix)
+        sigma_m = scale * max(p.sigma_m for p in self.pairs)
+        allowed_m = SHAPE_SIGMA * sigma_m + SHAPE_SHARE * path_m
+        if abs(abs(turn) - 1.0) > SHAPE_RATIO or left_m > allowed_m:
+            return False
+        other = abs(cmath.phase(turn / heading)) > LEAST_TURN_RAD
+        return not other or similarity(z.conj(), fix)[1] > MIRROR_GAIN * max(left_m, sigma_m)
+
+
+@dataclass
+class RepeatedPosition:
+    """A receiver that repeats a position: the first fix there, and where path and estimate were then."""
+
+    first: complex | None = None
+    z: complex = 0j
+    estimate: complex = 0j
+
+    def moved_m(self, pair: FixPair, estimate: complex) -> float:
+        """Motion since the position was new, by wheels and by the estimate, whichever is less; 0 where it is.
+
+        A robot whose wheels spin on the spot does not move by its estimate.
+        """
+        near_m = min(REPEATED_SIGMA * pair.sigma_m, REPEATED_M)
+        if self.first is None or abs(pair.fix - self.first) > near_m:
+            self.first, self.z, self.estimate = pair.fix, pair.z, estimate
+            return 0.0
+        return min(abs(pair.z - self.z), abs(estimate - self.estimate))
+
+
+@dataclass
+class FixPlausibility:
+    """What fixes must be before the gate's verdict on them counts.
+
+    Attributes:
+        anchors: fixes used last before each change of place; the last is that of now.
+        runs: fixes refused since then.
+        run: that of the newest one.
+        mirrored: east and north are swapped, or one is reversed.
+        jump_m: from the place left to the place believed, and the reach then; None where there is no doubt.
+        repeated, turned, beyond, jumps: fixes not used, by reason, and jumps beyond reach.
+    """
+
+    anchors: list[FixPair] = field(default_factory=list)
+    runs: list[Run] = field(default_factory=list)
+    run: Run | None = None
+    mirrored: bool = False
+    jump_m: complex | None = None
+    jump_at_m: float = 0.0
+    repeated: int = 0
+    turned: int = 0
+    beyond: int = 0
+    jumps: int = 0
+    returns: int = 0
+    _position: RepeatedPosition = field(default_factory=RepeatedPosition)
+    _in_a_row: int = 0
+    _refused_ns: int | None = None
+    _doubt_m: complex = 0j
+    _since: list[FixPair] = field(default_factory=list)
+
+    def refusal(self, pair: FixPair, estimate: complex, track: DeadReckoning) -> str | None:
+        """Why a fix must not be used whatever the gate says; None where it may be.
+
+        `estimate` is the antenna (east + i north, m) by the estimate at the fix.
+        """
+        moved_m = self._position.moved_m(pair, estimate)
+        if moved_m > max(REPEATED_WAY_M, pair.sigma_m):
+            self.repeated += 1
+            return self._refused(pair, REPEATS)
+        if self.mirrored:
+            self._since.append(pair)
+        if self.mirrored and Shape.of(self._since).is_own():
+            self.mirrored = False
+            self._since.clear()
+        if self.mirrored:
+            del self._since[:-MOST_PAIRS]
+            self.turned += 1
+            return self._refused(pair, MIRRORED)
+        return None
+
+    def rejected(self, pair: FixPair, estimate: complex, track: DeadReckoning, scale: float) -> bool:
+        """Take a fix that the gate rejects; True where its place is now believed although beyond reach."""
+        if not self.anchors:
+            self.anchors.append(dataclasses.replace(pair, fix=estimate))
+        self.run = self._continued(pair, scale)
+        pair.usable = self.run.reachable
+        if any(Shape.of(pairs).is_mirrored() for pairs in (track.pairs, self.run.pairs)):
+            self.mirrored, self._since = True, []
+            self.turned += 1
+            self._refused(pair, MIRRORED)
+            return False
+        if self.run.reachable:
+            return False
+        self.beyond += 1
+        self._refused(pair, BEYOND)
+        self._doubt_m = pair.fix - estimate
+        if not self.run.is_evidence(scale, track.heading):
+            return False
+        self.jumps += 1
+        self.jump_m, self.jump_at_m = pair.fix - estimate, pair.reach_m
+        for one in self.run.pairs:
+            one.usable = True
+        return True
+
+    def accepted(self, pair: FixPair, anew: bool) -> None:
+        """A fix is used; `anew`: the estimate was moved there."""
+        if anew and self.jump_m is not None and not within_reach(self.anchors[-1], pair, 1.0):
+            if self.run is not None and self.run.reachable:
+                self.jump_m, self.returns = None, self.returns + 1
+        if self.jump_m is not None and self._share(pair.reach_m) < SETTLED:
+            self.jump_m = None
+        self.anchors = [*self.anchors[-1 if anew else -2 : None if anew else -1], pair]
+        if self.jump_m is None and pair.reach_m - self.anchors[0].reach_m > EVIDENCE_M:
+            self.anchors = [pair]
+        self.runs.clear()
+        self.run, self._in_a_row, self._refused_ns = None, 0, None
+
+    def watch(self, t_ns: int) -> None:
+        """Forget a brief contradiction once no fix has come for a time."""
+        if self._refused_ns is None or (t_ns - self._refused_ns) * 1e-9 < FORGOTTEN_S:
+            return
+        if self.run is None or self.run.seconds() < BRIEF_S:
+            self._in_a_row, self._refused_ns = 0, None
+
+    def widened(self, state: State, reach_m: float) -> State:
+        """A state whose covariance spans both places and whose status says so, where there is doubt."""
+        away_m, share = self._doubt(reach_m)
+        if share == 0.0 and self._in_a_row < CONTRADICTED:
+            return state
+        covariance = state.covariance.copy()
+        d = np.array([away_m.real, away_m.imag])
+        covariance[:2, :2] += share**2 * (np.outer(d, d) + 1e-4 * float(d @ d) * np.eye(2))
+        if self.mirrored:  # place and heading of the start may have come from wrong axes, too
+            covariance[:2, :2] += float(np.sum(state.position_m[:2] ** 2)) * np.eye(2)
+            covariance[5, 5] += MIRROR_YAW_RAD**2
+        return dataclasses.replace(state, covariance=covariance, status="doubtful")
+
+    def notes(self) -> list[str]:
+        """What was made of the fixes, in sentences."""
+        out = []
+        for count, why in ((self.repeated, REPEATS), (self.turned, MIRRORED), (self.beyond, BEYOND)):
+            if count:
+                out.append(f"{count} GNSS fixes were not used: {why}")
+        if self.jumps:
+            out.append(
+                f"{self.jumps} times fixes beyond reach traced the path of wheels and gyro for so long that "
+                "the position was moved to them; its sigma spanned both places for a while"
+            )
+        if self.returns:
+            out.append(f"{self.returns} times the position went back to where it had been before such a move")
+        return out
+
+    def _refused(self, pair: FixPair, why: str) -> str:
+        self._in_a_row += 1
+        self._refused_ns = pair.t_ns
+        return why
+
+    def _continued(self, pair: FixPair, scale: float) -> Run:
+        """The run that a rejected fix continues, or a new one."""
+        for run in reversed(self.runs):
+            if within_reach(run.pairs[-1], pair, scale):
+                run.pairs.append(pair)
+                del run.pairs[:-MOST_PAIRS]
+                self.runs.remove(run)
+                self.runs.append(run)
+                return run
+        reachable = any(within_reach(anchor, pair, scale) for anchor in self.anchors)
+        self.runs.append(Run(reachable, [pair]))
+        if len(self.runs) > MOST_RUNS:
+            self.runs.remove(min(self.runs[:-1], key=lambda run: len(run.pairs)))
+        return self.runs[-1]
+
+    def _share(self, reach_m: float) -> float:
+        """Sigma over the length of the jump."""
+        return DOUBT * math.exp(-(reach_m - self.jump_at_m) / DOUBT_M)
+
+    def _doubt(self, reach_m: float) -> tuple[complex, float]:
+        """Distance between both places, and sigma over its length."""
+        if self.run is not None and not self.run.reachable and len(self.run.pairs) >= CONTRADICTED:
+            return self._doubt_m, DOUBT if self._refused_ns is not None else 0.0
+        if self.jump_m is not None:
+            return self.jump_m, self._share(reach_m)
+        return 0j, 0.0
+
+
+def within_reach(a: FixPair, b: FixPair, scale: float) -> bool:
+    """Whether the robot can have gone from one fix to the other."""
+    reach_m = abs(b.reach_m - a.reach_m) + SLACK_M + SLACK_SIGMA * scale * math.hypot(a.sigma_m, b.sigma_m)
+    return abs(b.fix - a.fix) <= reach_m
+
+
+def similarity(z: Array, fix: Array) -> tuple[complex, float]:
+    """Turn and scale, as a complex number, that bring a path onto fixes, and the median distance left, m."""
+    z, fix = z - z.mean(), fix - fix.mean()
+    turn = complex(np.vdot(z, fix) / max(float(np.vdot(z, z).real), 1e-12))
+    return turn, float(np.median(np.abs(fix - turn * z)))
+
+
+@dataclass(frozen=True)
+class Shape:
+    """How well fixes trace the path of wheels and gyro, and its mirror image.
+
+    Attributes:
+        own_m, mirrored_m: median distances left.
+        own, mirrored: whether the path, or its image, fits: in scale, and within `allowed_m`.
+    """
+
+    count: int
+    own_m: float
+    mirrored_m: float
+    own: bool
+    mirrored: bool
+    sigma_m: float
+
+    @classmethod
+    def of(cls, pairs: list[FixPair]) -> Shape:
+        """The shape of fixes."""
+        if len(pairs) < MIRROR_FIXES:
+            return cls(0, 0.0, 0.0, False, False, 0.0)
+        z, fix = (np.array([getattr(p, name) for p in pairs]) for name in ("z", "fix"))
+        sigma_m = max(p.sigma_m for p in pairs)
+        allowed_m = SHAPE_SIGMA * sigma_m + SHAPE_SHARE * float(np.abs(np.diff(z)).sum())
+        fits = [similarity(path, fix) for path in (z, z.conj())]
+        own, mirrored = (abs(abs(a) - 1.0) <= MIRROR_RATIO and m <= allowed_m for a, m in fits)
+        return cls(len(pairs), fits[0][1], fits[1][1], own, mirrored, sigma_m)
+
+    def is_mirrored(self) -> bool:
+        """Whether only the image fits, clearly."""
+        clearly_m = max(MIRROR_GAIN * self.mirrored_m, 2.0 * SHAPE_SIGMA * self.sigma_m)
+        return self.mirrored and self.own_m > clearly_m
+
+    def is_own(self) -> bool:
+        """Whether only the path itself fits, clearly."""
+        clearly_m = max(MIRROR_GAIN * self.own_m, 2.0 * SHAPE_SIGMA * self.sigma_m)
+        return self.own and self.mirrored_m > clearly_m
+
+
+def plausible_fixes(fixes: list[GnssFix], wheels: WheelStream) -> list[GnssFix]:
+    """The largest set of fixes before the start of which each can be reached from the one before it.
+
+    All of them, where no set has more than half.
+    """
+    runs: list[list[FixPair]] = []
+    of: dict[int, GnssFix] = {}
+    reach_m = 0.0
+    for before, fix in zip([fixes[:1], *([f] for f in fixes)], fixes, strict=False):
+        travelled = wheels.travelled(before[0].t_ns, fix.t_ns)
+        seconds = (fix.t_ns - before[0].t_ns) * 1e-9
+        reach_m += TOP_MPS * seconds if travelled is None else MARGIN * max(map(abs, travelled))
+        place = complex(fix.enu_m[0], fix.enu_m[1])
+        pair = FixPair(fix.t_ns, 0j, place, float(np.max(fix.sigma_m[:2])), reach_m)
+        of[id(pair)] = fix
+        run = next((run for run in reversed(runs) if within_reach(run[-1], pair, 1.0)), None)
+        if run is None:
+            runs.append([pair])
+        else:
+            run.append(pair)
+    largest = max(reversed(runs), key=len, default=[])
+    return [of[id(pair)] for pair in largest] if 2 * len(largest) > len(fixes) else fixes
