@@ -130,7 +130,7 @@ class DeadReckoning:
             MARGIN * (speed_mps if known else max(speed_mps, self._top_mps)) * dt,
         )
 
-    def _append(self, t_ns: int, z: complex, yaw: float, further_m: float) -> None:
+    def _append(self, t_ns: int, z: complex, yaw: float, further_m: float = 0.0) -> None:
         self._t_ns.append(t_ns)
         self._z.append(z)
         self._yaw.append(yaw)
