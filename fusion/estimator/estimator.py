@@ -47,6 +47,7 @@ from terrafusion.fusion.estimator.stationarity import (
     add_zero_velocity,
 )
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
+from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
@@ -63,7 +64,6 @@ from terrafusion.fusion.inputs.streams import (
     longest_gap_s,
     usual_interval_s,
 )
-from terrafusion.fusion.inputs.stuck_gyro import StuckGyro
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
 from terrafusion.twin.model.vehicle import VehicleParams, as_vehicle
 

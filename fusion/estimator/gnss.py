@@ -358,15 +358,16 @@ class GnssUpdater:
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
-        if self._velocity_usable(fix, velocity, covariance):
+        measured_mps = self._usable_velocity(fix, velocity, covariance)
+        if measured_mps is not None:
             sigma_v = round(max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), 4)
             if chain.dim > GNSS_DELAY:
                 doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
-                at_keyframe = fix.velocity_mps - accel_world * offset_s
+                at_keyframe = measured_mps - accel_world * offset_s
                 sigma_v, turned = math.hypot(sigma_v, doubt), lever_arm_velocity(rate, offset_s)
                 chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
             else:
-                body_velocity = fix.velocity_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
+                body_velocity = measured_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
                 chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
         if cut:
             chain.smooth(chain.last - k + 1)
@@ -375,15 +376,15 @@ class GnssUpdater:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
 
-    def _velocity_usable(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> bool:
-        """Whether a fix has a velocity that the robot can have."""
+    def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
+        """The velocity of a fix, where it has one that the robot can have."""
         if fix.velocity_mps is None or not np.isfinite(fix.velocity_mps.sum() + fix.sigma_v_mps):
-            return False
+            return None
         sigma_mps = math.sqrt(fix.sigma_v_mps**2 + float(covariance[VELOCITY, VELOCITY].trace()))
         off_mps = float(np.linalg.norm(fix.velocity_mps - predicted_mps))
         usable = off_mps <= VELOCITY_OFF_MPS + VELOCITY_OFF_SIGMA * sigma_mps
         self.velocities_refused += not usable
-        return usable
+        return fix.velocity_mps if usable else None
 
     def _test_wheels(self, chain: Chain, k: int, fix: GnssFix, noise: SensorNoise) -> bool:
         """Whether the fixes just rejected refute the wheels; see `SkidDetector.test_wheels`."""

@@ -61,7 +61,7 @@ BEYOND = "the place lies beyond what the robot can have driven"
 
 
 @dataclass
-class Run:
+class FixRun:
     """Fixes of which each can be reached from the one before; `reachable`: the first one could be, too."""
 
     reachable: bool
@@ -125,8 +125,8 @@ class FixPlausibility:
     """
 
     anchors: list[FixPair] = field(default_factory=list)
-    runs: list[Run] = field(default_factory=list)
-    run: Run | None = None
+    runs: list[FixRun] = field(default_factory=list)
+    run: FixRun | None = None
     mirrored: bool = False
     jump_m: complex | None = None
     jump_at_m: float = 0.0
@@ -152,7 +152,7 @@ class FixPlausibility:
             return self._refused(pair, REPEATS)
         if self.mirrored:
             self._since.append(pair)
-        if self.mirrored and Shape.of(self._since).is_own():
+        if self.mirrored and PathShape.of(self._since).is_own():
             self.mirrored = False
             self._since.clear()
         if self.mirrored:
@@ -167,7 +167,7 @@ class FixPlausibility:
             self.anchors.append(dataclasses.replace(pair, fix=estimate))
         self.run = self._continued(pair, scale)
         pair.usable = self.run.reachable
-        if any(Shape.of(pairs).is_mirrored() for pairs in (track.pairs, self.run.pairs)):
+        if any(PathShape.of(pairs).is_mirrored() for pairs in (track.pairs, self.run.pairs)):
             self.mirrored, self._since = True, []
             self.turned += 1
             self._refused(pair, MIRRORED)
@@ -238,7 +238,7 @@ class FixPlausibility:
         self._refused_ns = pair.t_ns
         return why
 
-    def _continued(self, pair: FixPair, scale: float) -> Run:
+    def _continued(self, pair: FixPair, scale: float) -> FixRun:
         """The run that a rejected fix continues, or a new one."""
         for run in reversed(self.runs):
             if within_reach(run.pairs[-1], pair, scale):
@@ -248,7 +248,7 @@ class FixPlausibility:
                 self.runs.append(run)
                 return run
         reachable = any(within_reach(anchor, pair, scale) for anchor in self.anchors)
-        self.runs.append(Run(reachable, [pair]))
+        self.runs.append(FixRun(reachable, [pair]))
         if len(self.runs) > MOST_RUNS:
             self.runs.remove(min(self.runs[:-1], key=lambda run: len(run.pairs)))
         return self.runs[-1]
@@ -280,7 +280,7 @@ def similarity(z: Array, fix: Array) -> tuple[complex, float]:
 
 
 @dataclass(frozen=True)
-class Shape:
+class PathShape:
     """How well fixes trace the path of wheels and gyro, and its mirror image.
 
     Attributes:
@@ -296,7 +296,7 @@ class Shape:
     sigma_m: float
 
     @classmethod
-    def of(cls, pairs: list[FixPair]) -> Shape:
+    def of(cls, pairs: list[FixPair]) -> PathShape:
         """The shape of fixes."""
         if len(pairs) < MIRROR_FIXES:
             return cls(0, 0.0, 0.0, False, False, 0.0)
