@@ -46,8 +46,8 @@ from terrafusion.fusion.estimator.stationarity import (
     StationarityDetector,
     add_zero_velocity,
 )
-from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
+from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
