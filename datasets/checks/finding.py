@@ -80,8 +80,13 @@ def without_rows(channel: str, rows: NDArray[np.bool_]) -> Repair:
 
 
 def retimed(recording: Recording, name: str, t_ns: TimesNs) -> Recording:
-    """The recording with other times for one channel (or "truth"); it starts no later than they do."""
-    start_ns = min(recording.start_ns, int(t_ns[0])) if len(t_ns) else recording.start_ns
+    """The recording with other times for one channel (or "truth"); it starts no later than they do.
+
+    A log without a calendar starts at 0, which is its only sign: it stays so.
+    """
+    start_ns = (
+        min(recording.start_ns, int(t_ns[0])) if len(t_ns) and recording.start_ns else recording.start_ns
+    )
     return dataclasses.replace(with_fields(recording, name, t_ns=t_ns), start_ns=start_ns)
 
 

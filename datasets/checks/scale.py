@@ -75,7 +75,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
     elif (scale.ratio < SMALL or scale.high < FIRM_SLIP) and is_firm(context.recording):
-        fitting = f"radius of {radius * scale.ratio:.4f} m" if wheels.unit == "radps" else "speeds"
+        fitting = f"radius ({radius * scale.ratio:.4f} m fits)" if wheels.unit == "radps" else "speeds"
         yield Finding(
             "wheel-scale", "warning", "wheels",
             f"the wheels read {1.0 / scale.ratio - 1.0:.1%} too much: ground speed is {scale.ratio:.3f} "

@@ -28,6 +28,8 @@ CLIPPED_ROWS = 10
 LIVELY = 0.1
 """Standard deviation of the other axes over their usual one above which they move."""
 LEAST_TURN_RADPS, LEAST_EXTENT_M, STILL_SHARE = 0.05, 5.0, 0.02
+LEAST_STUCK_RADPS = 1e-3
+"""A smaller rate that is constant throughout stands for a missing axis."""
 ROLLED_OVER = 2.0
 """rad; no robot drives on after it has turned so far about x or y."""
 MISSING_SHARE = 0.05
@@ -204,9 +206,10 @@ def _is_stuck_throughout(sensor: SensorAxes, k: int, constant: list[int], moving
     """
     if sensor.channel == "wheels":
         return False
-    if sensor.field == "gyro_radps" and sensor.values[0, k] != 0.0:
+    turning = abs(float(sensor.values[0, k])) if sensor.field == "gyro_radps" else 0.0
+    if turning > LEAST_STUCK_RADPS:
         seconds = float(sensor.t_ns[-1] - sensor.t_ns[0]) * 1e-9
-        return bool(moving) or (k < 2 and abs(float(sensor.values[0, k])) * seconds > ROLLED_OVER)
+        return bool(moving) or (k < 2 and turning * seconds > ROLLED_OVER)
     if len(sensor.known()) < 3:
         return False
     return len(constant) == 1 and len(moving) == 2 and not (sensor.field == "accel_mps2" and k == 2)

@@ -21,7 +21,11 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
 from terrafusion.fusion.cli.common import rig_of
 
-KNOWN = {"borealtc": {"clock-offset", "clock-drift"}, "wvu_pathfinder/s5t1": {"uneven-sampling"}}
+KNOWN = {
+    "borealtc": {"clock-offset", "clock-drift"},
+    "wvu_pathfinder/s5t1": {"uneven-sampling"},
+    "comma2k19": {"uneven-sampling"},
+}
 """By beginning of the name: wheels and IMU that did not start together, and times of arrival."""
 VEHICLES = ("elevate", "husky", "warthog")
 SCENARIOS = ("figure_eight", "waypoints", "paper_profile", "circle", "staircase", "chirp", "straight", "spin")

@@ -88,6 +88,17 @@ def test_missing_cells_are_nan_and_empty_rows_are_left_out(tmp_path: Path) -> No
     assert any("1 of 4 rows" in note for note in recording.notes)
 
 
+def test_sides_that_are_sampled_in_turn_are_interpolated(tmp_path: Path) -> None:
+    """Empty cells in turn are no missing values: the robot drives 1 m/s on the left, 2 m/s on the right."""
+    rows = "".join(f"{0.1 * k:.1f},{'1,' if k % 2 else ',2'}\n" for k in range(40))
+    recording = open_recording(folder_with(tmp_path, wheels=f"t_s,left_mps,right_mps\n{rows}"))
+    wheels = recording.wheels
+    assert wheels is not None
+    assert len(wheels) >= 19
+    np.testing.assert_allclose(wheels.speed, np.tile([1.0, 2.0], (len(wheels), 1)))
+    assert any("sampled at different times" in note for note in recording.notes)
+
+
 def test_gnss_without_fix_or_height(tmp_path: Path) -> None:
     recording = open_recording(
         folder_with(tmp_path, gnss="t_s,east_m,north_m,sigma_e_m,sigma_n_m\n0,1,2,0.5,0.5\n")
