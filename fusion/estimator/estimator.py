@@ -53,7 +53,12 @@ from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, pause, wheel_increment
 from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
-from terrafusion.fusion.graph.planar import level_factor, with_centripetal_force, yaw_of_wheels
+from terrafusion.fusion.graph.planar import (
+    level_factor,
+    with_centripetal_force,
+    with_wheel_acceleration,
+    yaw_of_wheels,
+)
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix, checked_time
 from terrafusion.fusion.inputs.streams import (
@@ -310,6 +315,9 @@ class Estimator:
             segments = with_centripetal_force(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
         noise = self.learned.with_doubt(noise, segments)
+        if self.config.inputs.planar and wheels is not None:
+            gained_mps = before.rolling * wheels.speed_change_mps
+            segments = with_wheel_acceleration(segments, gained_mps / dt)
         segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)

@@ -308,7 +308,9 @@ class GnssUpdater:
         velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
         inflation = noise.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
-        sigma = self._white_sigma(fix, inflation, share)
+        # The fix is carried to its keyframe by the speed as it is known now.
+        carried_m = abs(offset_s) * float(np.sqrt(0.5 * np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
+        sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
         position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
         innovation = -residual(position, state.pose, state.linear)
         H_pose, H_linear = jacobians(position, state.pose, state.linear)

@@ -1,0 +1,141 @@
+"""The planar smoother of a robot's numbers: derivatives, recovery, honest sigmas."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.calibration import fit as smoother
+from terrafusion.fusion.calibration.fit import NODE, Nodes, Noise, fit, information_gained, refined, started
+from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_starts
+from terrafusion.fusion.calibration.numbers import (
+    ANTENNA_X,
+    GNSS_DELAY,
+    NUMBERS,
+    TURN_SCALE,
+    WHEEL_SCALE,
+    assumed,
+)
+
+NOISE = Noise(yaw_density_radps=1e-3, turn_share=0.0, drift_share=0.0, drift_time_s=60.0)
+TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0])
+PRIOR = assumed(0.005, yaw_of_wheels=False, slip_spread=0.03)
+STEP_S = 0.1
+
+
+def figure(
+    seconds: float,
+    numbers: Array = TRUE,
+    fix_sigma_m: float = 0.0,
+    slip: float = 0.0,
+    seed: int = 0,
+    straight: bool = False,
+) -> Drive:
+    """Winding at changing speed; what the sensors of a robot with `numbers` measure of it."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, seconds, STEP_S)
+    middle = 0.5 * (t[1:] + t[:-1])
+    speed = 1.0 + 0.4 * np.sin(0.3 * middle)
+    rate = 0.0 * middle if straight else 0.5 * np.sin(0.17 * middle) + 0.2 * np.cos(0.05 * middle)
+    turn = rate * STEP_S
+    ratio = 1.0 + numbers[WHEEL_SCALE] + slip * np.repeat(rng.normal(size=len(middle) // 80 + 1), 80)[: len(middle)]
+    yaw = np.concatenate([[0.0], np.cumsum(turn)])
+    z = np.concatenate([[0j], np.cumsum(speed * STEP_S * np.exp(1j * 0.5 * (yaw[1:] + yaw[:-1])))])
+    measured = turn / (1.0 + numbers[0]) + numbers[1] * STEP_S
+    stamps = np.arange(3.0, seconds - 1.0, 1.0)
+    at = stamps - numbers[GNSS_DELAY]
+    antenna = complex(numbers[3], numbers[4]) * np.exp(1j * np.interp(at, t, yaw))
+    fix = np.interp(at, t, z.real) + 1j * np.interp(at, t, z.imag) + antenna
+    fix = fix + fix_sigma_m * (rng.normal(size=len(at)) + 1j * rng.normal(size=len(at)))
+    sigma = np.full(len(at), max(fix_sigma_m, 0.01))
+    distance = speed * STEP_S / ratio
+    first = node_starts(t, distance, float(sigma[0]))
+    return Drive(t, distance, measured, stamps, fix, sigma, 0j, first)
+
+
+def test_derivatives_of_the_path_are_those_of_finite_differences() -> None:
+    drive, step = figure(60.0), 1e-6
+    path = dead_reckoned(drive, TRUE)
+    for number in range(len(NUMBERS)):
+        more, less = TRUE.copy(), TRUE.copy()
+        more[number] += step
+        less[number] -= step
+        up, down = dead_reckoned(drive, more), dead_reckoned(drive, less)
+        assert np.allclose(path.yaw_by[:, number], (up.yaw_rad - down.yaw_rad) / (2 * step), atol=1e-5)
+        assert np.allclose(path.z_by[:, number], (up.z - down.z) / (2 * step), atol=1e-4)
+
+
+def kinds(nodes: Nodes, numbers: Array) -> list[tuple[Array, Array, Array]]:
+    """Whitened rows, residuals and columns of fixes and of links."""
+    path = dead_reckoned(nodes.drive, numbers)
+    links = smoother._link_rows(nodes, path, 0.03, NOISE, numbers)
+    return [smoother._fix_rows(nodes, path, numbers, NOISE), *links]
+
+
+def test_derivatives_of_all_rows_are_those_of_finite_differences() -> None:
+    # Near the truth, where neither the robust weights nor the sigma of a link change to first order.
+    nodes = started(figure(60.0), 0j, 0.0, TRUE)
+    nodes.state[:, :2] *= 1.0 + TRUE[WHEEL_SCALE]
+    here, count, step = nodes.state.copy(), len(nodes.state), 1e-6
+    unknowns = NODE * count + len(NUMBERS)
+    dense = []
+    for rows, left, columns in kinds(nodes, TRUE):
+        J = np.zeros((*left.shape, unknowns))
+        for m in range(len(rows)):
+            J[m][:, columns[m]] = rows[m]
+        dense.append(J)
+    for column in [*range(2 * NODE), *range(NODE * count, unknowns)]:
+        both = []
+        for sign in (1.0, -1.0):
+            moved = np.zeros(unknowns)
+            moved[column] = sign * step
+            nodes.state = here + moved[: NODE * count].reshape(-1, NODE)
+            both.append([left for _, left, _ in kinds(nodes, TRUE + moved[NODE * count :])])
+        for J, up, down in zip(dense, *both, strict=True):
+            assert np.allclose(J[..., column], (up - down) / (2 * step), atol=1e-2 * np.abs(J).max()), column
+
+
+def test_without_noise_the_numbers_are_found() -> None:
+    found = fit([figure(300.0)], [(0j, 0.0)], PRIOR, NOISE)
+    assert np.allclose(found.mean[:6], TRUE[:6], atol=[2e-3, 2e-4, 5e-3, 0.02, 0.02, 0.02])
+
+
+@pytest.mark.parametrize("sigma_m", [0.02, 0.5])
+def test_errors_are_covered_by_their_sigmas(sigma_m: float) -> None:
+    errors = []
+    for seed in range(12):
+        found = fit([figure(240.0, fix_sigma_m=sigma_m, slip=0.02, seed=seed)], [(0j, 0.0)], PRIOR, NOISE)
+        errors.append((found.mean - TRUE) / found.sigma)
+    square = np.mean(np.square(np.array(errors)[:, :6]))
+    assert square < 2.0, np.array(errors).round(1)
+    assert np.mean(np.abs(np.array(errors)[:, :6]) < 2.0) > 0.85
+
+
+def test_two_drives_tell_more_than_one() -> None:
+    drives = [figure(120.0, fix_sigma_m=0.3, seed=seed) for seed in (1, 2)]
+    one = fit(drives[:1], [(0j, 0.0)], PRIOR, NOISE)
+    both = fit(drives, [(0j, 0.0)] * 2, PRIOR, NOISE)
+    assert (both.sigma <= one.sigma).all()
+    assert both.sigma[ANTENNA_X] < 0.85 * one.sigma[ANTENNA_X]
+
+
+def test_a_straight_drive_tells_nothing_of_antenna_and_turn_scale() -> None:
+    found = fit([figure(200.0, straight=True, fix_sigma_m=0.3)], [(0j, 0.0)], PRIOR, NOISE)
+    gained = information_gained(PRIOR, found)
+    assert gained[TURN_SCALE] < 0.1
+    assert gained[WHEEL_SCALE] > 1.0
+
+
+def test_wild_fixes_do_not_move_the_numbers() -> None:
+    drive = figure(300.0, fix_sigma_m=0.05, seed=4)
+    drive.fix[::9] += 40.0
+    found = fit([drive], [(0j, 0.0)], PRIOR, NOISE)
+    assert np.abs(found.mean[ANTENNA_X] - TRUE[ANTENNA_X]) < 0.1
+    assert np.abs(found.mean[GNSS_DELAY] - TRUE[GNSS_DELAY]) < 0.1
+
+
+def test_a_step_never_loses_information() -> None:
+    nodes = started(figure(120.0, fix_sigma_m=0.3), 0j, 0.0, PRIOR.mean)
+    after = refined([nodes], PRIOR, PRIOR, NOISE)
+    assert (after.sigma <= PRIOR.sigma * (1 + 1e-9)).all()

@@ -1,0 +1,72 @@
+"""Self-calibration while driving."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.calibration.motion import Drive
+from terrafusion.fusion.calibration.numbers import NUMBERS, Knowledge
+from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
+from tests.fusion.calibration.test_fit import NOISE, PRIOR, TRUE, figure
+
+
+def driven(drive: Drive, learning: SelfCalibration, begin_ns: int = 0) -> list[Knowledge]:
+    """Gives a drive sample by sample; what was known after each step."""
+    known, j, z, yaw = [], 0, 0j, 0.0
+    for i, t_s in enumerate(drive.t_s):
+        t_ns = begin_ns + round(t_s * 1e9)
+        distance = float(drive.distance_m[i - 1]) if i else 0.0
+        turn = float(drive.turn_rad[i - 1]) if i else 0.0
+        yaw += turn
+        z += distance * np.exp(1j * yaw)
+        learning.drive(t_ns, distance, turn, np.array([z.real, z.imag]), yaw)
+        while j < len(drive.fix) and drive.fix_t_s[j] <= t_s:
+            fix = np.array([drive.fix[j].real, drive.fix[j].imag, 0.0])
+            learning.fix(begin_ns + round(drive.fix_t_s[j] * 1e9), fix, float(drive.fix_sigma_m[j]))
+            j += 1
+        if learning.step():
+            known.append(learning.known)
+    return known
+
+
+def test_numbers_are_found_while_driving_and_their_sigmas_shrink() -> None:
+    known = driven(figure(240.0, fix_sigma_m=0.05, slip=0.01), SelfCalibration(PRIOR, NOISE, 0j))
+    error = np.abs(known[-1].mean - TRUE)[:6]
+    assert (error < 4.0 * known[-1].sigma[:6] + [2e-3, 2e-4, 3e-3, 0.02, 0.02, 0.02]).all()
+    assert (known[-1].sigma[:6] < 0.4 * known[0].sigma[:6]).all()
+
+
+def test_a_long_drive_is_cut_into_stretches_and_keeps_what_it_learned() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    known = driven(figure(600.0, fix_sigma_m=0.05), learning)
+    assert len(learning._first) < MOST_NODES
+    assert np.allclose(known[-1].mean[:6], TRUE[:6], atol=[3e-3, 3e-4, 6e-3, 0.03, 0.03, 0.03])
+
+
+def test_missing_samples_end_a_stretch_but_not_what_was_learned() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    driven(figure(200.0, fix_sigma_m=0.05), learning)
+    before = learning.known
+    learning.drive(10**12, None, 0.0, np.zeros(2), 0.0)
+    assert learning.known is before
+    again = driven(figure(120.0, fix_sigma_m=0.05, seed=1), learning, 2 * 10**12)
+    assert (again[-1].sigma < PRIOR.sigma).all()
+
+
+def test_a_wrong_heading_takes_back_its_stretch() -> None:
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    driven(figure(60.0, fix_sigma_m=0.05), learning)
+    assert not same(learning.known.mean, PRIOR.mean)
+    learning.restart(forget=True)
+    assert same(learning.known.mean, PRIOR.mean)
+
+
+def test_equal_input_gives_equal_bits() -> None:
+    runs = [driven(figure(120.0, 0.0 * TRUE, 0.3), SelfCalibration(PRIOR, NOISE, 0j)) for _ in range(2)]
+    assert all(same(a.mean, b.mean) for a, b in zip(*runs, strict=True))
+
+
+def same(a: Array, b: Array) -> bool:
+    """Whether two vectors of numbers have the same bits."""
+    return len(a) == len(NUMBERS) and a.tobytes() == b.tobytes()
