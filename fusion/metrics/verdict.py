@@ -51,10 +51,10 @@ IN_A_ROW = 5
 it, at a gate of 99.9 %, is 1e-15 for independent errors."""
 REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
 """Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
-CLEARLY_WORSE, FAR_WORSE, MATTERS_M = 1.5, 2.0, 0.5
-"""Ratio of errors from which on an estimate is called worse than a baseline: the first where its covariance
-does not allow the errors, the second where it does, for differences of more than so many metres (slow errors
-of a receiver can favour dead reckoning by chance on a short drive)."""
+CLEARLY_WORSE, CLEARLY_M, FAR_WORSE, FAR_WORSE_M = 1.5, 0.1, 2.0, 0.5
+"""Ratio and difference of errors from which on an estimate is called worse than a baseline: the first pair where
+its covariance does not allow the errors, the second where it does (slow errors of a receiver can favour dead
+reckoning by chance on a short drive)."""
 LEAST_OUTAGES = 5
 """So many outages, all worse than dead reckoning, are no chance (1 in 32)."""
 MOST_PATH_RATIO = 2.0
@@ -209,8 +209,8 @@ def _worse_than_a_baseline(run: Run) -> Iterator[Reason]:
         if ours is None or theirs is None:
             continue
         promised = row is None or row.mean <= row.high
-        far = ours > FAR_WORSE * theirs and ours - theirs > MATTERS_M
-        if far or (not promised and ours > CLEARLY_WORSE * theirs):
+        ratio, more_m = (FAR_WORSE, FAR_WORSE_M) if promised else (CLEARLY_WORSE, CLEARLY_M)
+        if ours > ratio * theirs and ours - theirs > more_m:
             yield (
                 DOUBTFUL,
                 f"{name} has an error of {theirs:.2f} m, the estimate {ours:.2f} m: a sensor or a number of "

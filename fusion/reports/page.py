@@ -21,6 +21,7 @@ from terrafusion.datasets.core.tables import number
 
 if TYPE_CHECKING:
     from jinja2 import Environment
+    from markupsafe import Markup
     from matplotlib.figure import Figure
 
 LIBRARIES = ("gtsam", "numpy", "scipy")
@@ -92,8 +93,17 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"svg": _svg, "number": number}
+    environment.filters |= {"svg": _svg, "number": number, "code": _code}
     return environment
+
+
+def _code(text: str) -> Markup:
+    """A sentence whose commands stand in back quotes, as HTML."""
+    from markupsafe import Markup, escape
+
+    parts = [escape(part) for part in text.split("`")]
+    marked = (Markup("<code>{}</code>").format(part) if i % 2 else part for i, part in enumerate(parts))
+    return Markup("").join(marked)
 
 
 def _svg(fig: Figure) -> str:

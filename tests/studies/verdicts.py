@@ -16,6 +16,7 @@ import numpy as np
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.config.estimator_config import EstimatorOptions
 from terrafusion.fusion.metrics.scores import Scores, score
 from terrafusion.fusion.metrics.verdict import DOUBTFUL, FAR_M, FIVE_SIGMA, GOOD, STRAY_SHARE, UNUSABLE
 from terrafusion.fusion.replay import replay
@@ -105,10 +106,10 @@ def is_wrong(scores: Scores) -> bool:
     return bool(errors.distance_m().max() > FAR_M or beyond.mean() > STRAY_SHARE)
 
 
-def judged(log: Recording, with_truth: bool) -> tuple[str, bool, tuple[str, ...]]:
+def judged(log: Recording, with_truth: bool, settings: EstimatorOptions) -> tuple[str, bool, tuple[str, ...]]:
     """Value of the verdict, whether the estimate was wrong, the reasons; a refused log is not to be used."""
     try:
-        run = replay(log if with_truth else dataclasses.replace(log, truth=None))
+        run = replay(log if with_truth else dataclasses.replace(log, truth=None), settings=settings)
     except TerrafusionError as error:
         return UNUSABLE, False, (str(error),)
     antenna_m = run.vehicle.sensors.gnss.antenna_m
@@ -121,11 +122,14 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=36)
     parser.add_argument("--faults", nargs="*", default=list(FAULTS))
     parser.add_argument("--reasons", action="store_true", help="Also print why drives are not good.")
+    parser.add_argument("--plain", action="store_true", help="Without self-calibration.")
     given = parser.parse_args()
+    settings: EstimatorOptions = {"self_calibrate": False} if given.plain else {}
     print(f"{'fault':28s} judged with  good  doubtful  not to be used  wrong  wrong and good")
     for name in given.faults:
         for with_truth in (True, False):
-            rows = [judged(FAULTS[name](short_drive(FIRST_SEED + i)), with_truth) for i in range(given.seeds)]
+            logs = (FAULTS[name](short_drive(FIRST_SEED + i)) for i in range(given.seeds))
+            rows = [judged(log, with_truth, settings) for log in logs]
             values = Counter(value for value, _, _ in rows)
             wrong = [value for value, bad, _ in rows if bad]
             counts = f"{values[GOOD]:5d} {values[DOUBTFUL]:9d} {values[UNUSABLE]:15d}"

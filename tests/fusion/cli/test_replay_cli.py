@@ -94,6 +94,24 @@ def check_agreement(results: Results, start_ns: int) -> None:
     assert 'src="http' not in results.report, "the report must be self-contained"
 
 
+def check_verdict(results: Results, screen: str) -> None:
+    """The verdict comes first, on the screen and in the report; assumptions and notes follow."""
+    metrics, lines = results.metrics, screen.splitlines()
+    words = metrics["verdict"]["value"].replace("_", " ")
+    assert lines[0] == f"verdict: {words}"
+    assert [line.strip() for line in lines[1:]][: len(metrics["verdict"]["reasons"])] == metrics["verdict"][
+        "reasons"
+    ]
+    assert results.report.index(f"Verdict: {words}") < results.report.index("lasts")
+    assert metrics["baselines"]["dead_reckoning_m"] > metrics["ate_m"]
+    assert f"dead reckoning {metrics['baselines']['dead_reckoning_m']:.3f} m" in screen
+    assert metrics["baselines"]["outages"][0]["gnss_m"] > 1.0
+    assumed = [line for line in lines if line.startswith("assumed: ")]
+    assert len(assumed) == len(metrics["assumed"]) > 0
+    for note in metrics["notes"]:
+        assert note in screen
+
+
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from terrafusion.datasets.writers import write_log_folder
@@ -112,6 +130,7 @@ def test_files_agree(options: tuple[str, ...], drive: Path, tmp_path: Path, terr
     recording = open_recording(drive)
     check_agreement(results, recording.start_ns)
     metrics = results.metrics
+    check_verdict(results, outcome.out)
     assert metrics["against"] == "truth"
     assert metrics["duration_s"] == pytest.approx(35.0, abs=0.1)
     assert [outage["start_s"] for outage in metrics["outages"]] == [20.0]
