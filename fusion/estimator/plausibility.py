@@ -52,6 +52,9 @@ MIRROR_YAW_RAD = 1.8
 """Sigma of a heading of which nothing is known: pi / sqrt(3)."""
 MIRROR_RATIO = 0.3
 """Driven over dead-reckoned distance may differ from 1 by so much."""
+START_FIXES, START_SHARE, START_MOST = 5, 0.35, 20
+"""Fixes, and share of all, of one place from which a robot is started among wild ones; with so many fixes and
+no such place it is started from all (assumed)."""
 MOST_RUNS, MOST_PAIRS = 8, 600
 """Runs, and fixes of a run, that are remembered."""
 
@@ -321,7 +324,7 @@ class PathShape:
 def plausible_fixes(fixes: list[GnssFix], wheels: WheelStream) -> list[GnssFix]:
     """The largest set of fixes before the start of which each can be reached from the one before it.
 
-    All of them, where no set has more than half.
+    None yet where no set is large, and all of them where none has been among many.
     """
     runs: list[list[FixPair]] = []
     of: dict[int, GnssFix] = {}
@@ -339,4 +342,6 @@ def plausible_fixes(fixes: list[GnssFix], wheels: WheelStream) -> list[GnssFix]:
         else:
             run.append(pair)
     largest = max(reversed(runs), key=len, default=[])
-    return [of[id(pair)] for pair in largest] if 2 * len(largest) > len(fixes) else fixes
+    if 2 * len(largest) > len(fixes) or len(largest) >= max(START_FIXES, START_SHARE * len(fixes)):
+        return [of[id(pair)] for pair in largest]
+    return fixes if len(fixes) >= START_MOST else []

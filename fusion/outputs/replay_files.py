@@ -211,7 +211,7 @@ def estimate_columns(estimate: Estimate, start_ns: int) -> dict[str, list[str]]:
     sigma_yaw_rad                1 sigma of the heading
     gyro_bias_*, accel_bias_*    body axes
     w_<name>                     the weights in force, named and measured as in the policy file
-    status                       waiting, aligning, running, outage or no_gnss
+    status                       waiting, aligning, running, outage, doubtful or no_gnss
     slipping, immobilised        1 or 0, see docs/explanation/monitor.md
     sigma_gyro_bias_*, sigma_accel_bias_*   1 sigma of the biases
     <state>, sigma_<state>       the linear states but slip, as far as they are estimated; see
