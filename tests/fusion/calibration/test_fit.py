@@ -39,7 +39,11 @@ def figure(
     speed = 1.0 + 0.4 * np.sin(0.3 * middle)
     rate = 0.0 * middle if straight else 0.5 * np.sin(0.17 * middle) + 0.2 * np.cos(0.05 * middle)
     turn = rate * STEP_S
-    ratio = 1.0 + numbers[WHEEL_SCALE] + slip * np.repeat(rng.normal(size=len(middle) // 80 + 1), 80)[: len(middle)]
+    ratio = (
+        1.0
+        + numbers[WHEEL_SCALE]
+        + slip * np.repeat(rng.normal(size=len(middle) // 80 + 1), 80)[: len(middle)]
+    )
     yaw = np.concatenate([[0.0], np.cumsum(turn)])
     z = np.concatenate([[0j], np.cumsum(speed * STEP_S * np.exp(1j * 0.5 * (yaw[1:] + yaw[:-1])))])
     measured = turn / (1.0 + numbers[0]) + numbers[1] * STEP_S

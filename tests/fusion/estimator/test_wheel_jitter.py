@@ -15,7 +15,9 @@ from terrafusion.twin.simulate import simulate
 
 
 def increment(distance_m: float) -> WheelIncrement:
-    return WheelIncrement(np.array([distance_m, 0.0, 0.0]), np.array([1e-3, 1e-2, 1e-2, 0.1]), distance_m, 0.0)
+    return WheelIncrement(
+        np.array([distance_m, 0.0, 0.0]), np.array([1e-3, 1e-2, 1e-2, 0.1]), distance_m, 0.0
+    )
 
 
 @pytest.mark.parametrize("position_sigma_m", [0.004, 0.02])
