@@ -23,7 +23,6 @@ from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import Message
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.config.sensor_config import YAW_RATIO
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
@@ -60,7 +59,7 @@ from terrafusion.fusion.graph.planar import (
     yaw_of_wheels,
 )
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
-from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix, checked_time
+from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
 from terrafusion.fusion.inputs.streams import (
     LONGEST_PAUSE_NS,
     ImuSegment,
@@ -104,8 +103,7 @@ class Estimator:
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
         self.wheels = WheelStream(self.newest)
-        track_m, imu = config.rig.track_m / YAW_RATIO, config.rig.sensors.imu
-        self.gyro = StuckGyro(track_m, imu.gyro_noise_radps_sqrthz)
+        self.gyro = StuckGyro(config.rig, config.inputs)
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
@@ -145,10 +143,7 @@ class Estimator:
             raise DataError(
                 "the estimator is configured without an IMU", channel="imu", remedy="mend `inputs`"
             )
-        t_ns = checked_time(t_ns, "imu")
-        if self.config.inputs.sides:
-            gyro_radps = self.gyro.checked(t_ns, gyro_radps, self.wheels)
-        self.imu.add(t_ns, gyro_radps, accel_mps2)
+        self.imu.add(t_ns, self.gyro.checked(t_ns, gyro_radps, self.wheels), accel_mps2)
         self._advance()
 
     def add_wheels(
@@ -254,16 +249,10 @@ class Estimator:
                 return
             self._begin(start)
         newest = self.chain.last
-        while self._ready(t := self._next_ns(), last):
+        while self._ready(t := self.imu.next_ns(self.chain.nodes[-1].t_ns, self._step_ns), last):
             self._keyframe(t)
         if self.chain.last == newest or last:
             self._upkeep()
-
-    def _next_ns(self) -> int:
-        """Time of the next keyframe: a step on, or at the end of a pause in the samples of the IMU."""
-        now_ns = self.chain.nodes[-1].t_ns
-        pause_ns = self.imu.pause_ns(now_ns)
-        return now_ns + max(pause_ns // self._step_ns, 1) * self._step_ns
 
     def _ready(self, t_ns: int, last: bool) -> bool:
         """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
@@ -301,8 +290,7 @@ class Estimator:
 
     def _keyframe(self, t_ns: int) -> None:
         self._upkeep()
-        if doubt_rad := self.gyro.take_doubt_rad():
-            self.chain.restart(doubt_rad**2 * (np.arange(self.chain.dim) == 2))
+        self.gyro.doubt_heading(self.chain)
         switch = self.weights.take_switch()
         before_ns = self.chain.nodes[-1].t_ns
         dt = (t_ns - before_ns) * 1e-9

@@ -8,7 +8,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.inputs.door import as_numbers
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.config.sensor_config import YAW_RATIO, SensorConfig
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.inputs.door import as_numbers, checked_time
 from terrafusion.fusion.inputs.streams import WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -30,11 +33,12 @@ class StuckGyro:
         doubt_rad: heading error since the reading was last right, to be taken into account.
     """
 
-    def __init__(self, track_m: float, density: float) -> None:
+    def __init__(self, rig: Rig, inputs: SensorConfig) -> None:
         self.stuck = False
         self.samples = 0
         self.doubt_rad = 0.0
-        self._track_m, self._density = track_m, density
+        self._track_m, self._density = rig.track_m / YAW_RATIO, rig.sensors.imu.gyro_noise_radps_sqrthz
+        self._sides = inputs.sides
         self._reading = float("nan")
         self._since_ns = 0
         self._count = 0
@@ -42,8 +46,9 @@ class StuckGyro:
     def checked(self, t_ns: int, gyro_radps: ArrayLike, wheels: WheelStream) -> Array:
         """A reading (3,), its yaw rate that of the wheels where the gyro is stuck."""
         gyro = as_numbers(gyro_radps, "gyro", "imu")
-        if gyro.shape != (3,):
-            return gyro  # refused by the stream
+        t_ns = checked_time(t_ns, "imu")
+        if gyro.shape != (3,) or not self._sides:  # the stream refuses the first
+            return gyro
         reading = float(gyro[2])
         if reading != self._reading:
             self._reading, self._since_ns, self._count, self.stuck = reading, t_ns, 0, False
@@ -67,10 +72,11 @@ class StuckGyro:
         self.samples += 1
         return np.array([gyro[0], gyro[1], turning])
 
-    def take_doubt_rad(self) -> float:
-        """The heading error not yet taken into account."""
-        doubt, self.doubt_rad = self.doubt_rad, 0.0
-        return doubt
+    def doubt_heading(self, chain: Chain) -> None:
+        """Take the heading error into account that a stuck reading has made before it was found."""
+        if self.doubt_rad:
+            chain.restart(self.doubt_rad**2 * (np.arange(chain.dim) == 2))
+            self.doubt_rad = 0.0
 
     def noise(self, noise: SensorNoise) -> SensorNoise:
         """Noise of the IMU, that of wheels about yaw while they stand in."""

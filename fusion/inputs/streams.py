@@ -208,12 +208,12 @@ class ImuStream:
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
 
-    def pause_ns(self, t_ns: int) -> int:
-        """Time from `t_ns` to the next sample where that is longer than `LONGEST_PAUSE_NS`, else 0."""
-        if not self.t_ns or self.t_ns[-1] - t_ns <= LONGEST_PAUSE_NS:
-            return 0
-        ahead_ns = self.t_ns[bisect.bisect_right(self.t_ns, t_ns)] - t_ns
-        return ahead_ns if ahead_ns > LONGEST_PAUSE_NS else 0
+    def next_ns(self, now_ns: int, step_ns: int) -> int:
+        """Time of the keyframe after one at `now_ns`: a step on, or at the end of a pause in the samples."""
+        if not self.t_ns or self.t_ns[-1] - now_ns <= LONGEST_PAUSE_NS:
+            return now_ns + step_ns
+        ahead_ns = self.t_ns[bisect.bisect_right(self.t_ns, now_ns)] - now_ns
+        return now_ns + (ahead_ns // step_ns if ahead_ns > LONGEST_PAUSE_NS else 1) * step_ns
 
     def segments(self, start_ns: int, end_ns: int) -> list[ImuSegment]:
         """The samples between two times, the last one cut at `end_ns`; the stream must cover it."""

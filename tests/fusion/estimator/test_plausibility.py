@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator.dead_reckoning import FixPair
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -261,9 +262,9 @@ def test_fixes_before_the_start_are_those_of_one_place() -> None:
 
 
 def test_a_gyro_at_rest_or_in_order_is_not_stuck() -> None:
-    wheels, check = WheelStream(), StuckGyro(0.5, 1e-3)
+    wheels, check = WheelStream(), StuckGyro(load_vehicle("elevate").rig(), SensorConfig())
     for i in range(300):
-        wheels.add(i * 10**7, -0.1, 0.1)
+        wheels.add(i * 10**7, -0.17, 0.17)
         check.checked(i * 10**7, [0.0, 0.0, 0.4], wheels)
     assert not check.stuck, "it agrees with the wheels"
     rng = np.random.default_rng(0)
