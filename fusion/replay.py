@@ -120,7 +120,7 @@ def replay(
         raise never_started(used)
 
     # Score it.
-    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording), *alignment_notes)
+    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig), *alignment_notes)
     notes += notes_of(estimator)
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.quantity import Position, Sourced
+from terrafusion.datasets.core.robot import DRIVES as DRIVES
+from terrafusion.datasets.core.robot import SensorNumbers
 
 AXES = {
     "+x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0),
@@ -22,9 +24,6 @@ AXES = {
     "+z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0),
 }  # fmt: skip
 
-DRIVES = ("differential", "skid_steer", "tracked", "ackermann", "four_wheel_steer")
-"""How a robot turns: two driven wheels and casters, wheels or tracks that skid, steered front wheels,
-steered front and rear wheels."""
 STEERED_DRIVES = DRIVES[3:]
 
 ASSUMED_SIGMA_M = {Fix.NONE: 3.0, Fix.SINGLE: 3.0, Fix.DGPS: 1.0, Fix.FLOAT: 0.5, Fix.FIXED: 0.02}
@@ -154,7 +153,8 @@ class Rig:
 
     `track_m` is the track of the log's wheel odometry: a body twist (v, yaw rate) has the side speeds
     v -+ yaw rate * track / 2. `drive` is one of `DRIVES`; `steering` is None where no wheel is steered, else
-    its curvature is (tan front - tan rear) / `wheelbase_m`.
+    its curvature is (tan front - tan rear) / `wheelbase_m`. `known` is what is known of its sensors beside
+    their data sheets.
     """
 
     wheel_radius_m: float
@@ -164,3 +164,4 @@ class Rig:
     drive: str = "skid_steer"
     wheelbase_m: float = 0.5
     steering: SteeringSpec | None = None
+    known: SensorNumbers = field(default_factory=SensorNumbers)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from terrafusion.datasets.readers import open_recording as open
     from terrafusion.fusion.api.diagnoses import Diagnosis as Diagnosis
     from terrafusion.fusion.api.diagnoses import diagnose as diagnose
+    from terrafusion.fusion.api.calibrations import calibrate_sensors as calibrate_sensors
     from terrafusion.fusion.api.replays import Replay as Replay
     from terrafusion.fusion.api.replays import replay as replay
     from terrafusion.fusion.api.studies import benchmark as benchmark
@@ -50,6 +51,7 @@ _HOMES = {
     "Vehicle": "twin.model.vehicle:VehicleParams",
     "benchmark": "fusion.api.studies:benchmark",
     "calibrate": "twin.calibrate.calibrate:calibrate",
+    "calibrate_sensors": "fusion.api.calibrations:calibrate_sensors",
     "diagnose": "fusion.api.diagnoses:diagnose",
     "open": "datasets.readers:open_recording",
     "policy": "policy:",
@@ -60,8 +62,8 @@ _HOMES = {
 
 __all__ = [
     "ConfigError", "DataError", "Diagnosis", "Estimate", "Estimator", "EstimatorConfig", "Recording",
-    "Replay", "TerrafusionError", "Vehicle", "__version__", "benchmark", "calibrate", "diagnose", "open",
-    "policy", "replay", "simulate", "sweep",
+    "Replay", "TerrafusionError", "Vehicle", "__version__", "benchmark", "calibrate", "calibrate_sensors", "diagnose",
+    "open", "policy", "replay", "simulate", "sweep",
 ]  # fmt: skip
 
 

@@ -12,6 +12,7 @@ from typing import Any
 
 from terrafusion.datasets.catalog.catalog import SetFile
 from terrafusion.datasets.core.config import schema
+from terrafusion.datasets.core.robot import RobotFile
 from terrafusion.datasets.readers.log_meta import MetaFile
 from terrafusion.datasets.readers.text.column_map import ColumnMapFile
 from terrafusion.fusion.noise.modes import ModesFile
@@ -41,8 +42,19 @@ def file_schema(kind: str) -> dict[str, Any]:
     Raises:
         KeyError: unknown kind.
     """
-    found = schema(KINDS[kind], f"terrafusion {kind.replace('_', ' ')} file")
+    title = f"terrafusion {kind.replace('_', ' ')} file"
+    found = schema(KINDS[kind], title)
+    if kind == "vehicle":
+        found = _either(schema(RobotFile, title), found)
     return found | {"additionalProperties": True} if kind == "meta" else found  # unknown keys are kept
+
+
+def _either(short: dict[str, Any], full: dict[str, Any]) -> dict[str, Any]:
+    """Schema of files of one form or the other."""
+    common = {"$defs": {**short.pop("$defs"), **full.pop("$defs")}}
+    common |= {key: full[key] for key in ("$schema", "title")}
+    forms = [{k: v for k, v in form.items() if k not in common} for form in (short, full)]
+    return {**common, "anyOf": forms}
 
 
 def write_schemas(folder: Path) -> None:

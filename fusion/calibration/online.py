@@ -35,6 +35,10 @@ class SelfCalibration:
         self._noise, self._antenna_m = noise, antenna_m
         self._begin()
 
+    def start_from(self, prior: Knowledge) -> None:
+        """Begin with what is known of the robot from earlier runs."""
+        self.prior = self.known = self._before = prior
+
     def _begin(self) -> None:
         self._start_ns = 0
         self._t_s: list[float] = []

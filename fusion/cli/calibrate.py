@@ -1,10 +1,10 @@
-"""`terrafusion calibrate`: soil and vehicle parameters fitted to logs, with sigma and identifiability."""
+"""`terrafusion calibrate`: soil and vehicle parameters, or sensor numbers, from logs, with their sigma."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -17,6 +17,7 @@ from terrafusion.fusion.cli.common import (
     opened,
     progress_bar,
     reading,
+    refuse_impossible,
 )
 
 if TYPE_CHECKING:
@@ -32,7 +33,10 @@ LogsArgument = Annotated[
     ),
 ]
 OutOption = Annotated[
-    Path, typer.Option("--out", help="Folder for calibration.json, YAML files, report.html.")
+    Path,
+    typer.Option(
+        "--out", help="Folder for calibration.json, YAML files, report.html; with --sensors a YAML file."
+    ),
 ]
 TerrainOption = Annotated[
     list[str] | None,
@@ -50,7 +54,20 @@ PriorOption = Annotated[
 def calibrate(
     logs: LogsArgument,
     out: OutOption,
-    vehicle: Annotated[str, typer.Option(help="Vehicle to start from, by name or YAML file.")] = "elevate",
+    vehicle: Annotated[
+        str | None,
+        typer.Option(
+            help="Vehicle to start from, by name or YAML file. Default: elevate; with --sensors the logs' own."
+        ),
+    ] = None,
+    sensors: Annotated[
+        bool,
+        typer.Option(
+            "--sensors",
+            help="Learn antenna, gyro, wheel scale and delays from fixes, without any twin; writes a vehicle "
+            "file. Takes --vehicle and how logs are read, no other option.",
+        ),
+    ] = False,
     terrain: TerrainOption = None,
     parameters: Annotated[
         str | None, typer.Option(help="Dotted names with commas, such as soil.shear.friction_cap.")
@@ -80,7 +97,14 @@ def calibrate(
     Writes calibration.json, vehicle.yaml and soil.yaml with the new numbers, and report.html.
 
     Example: terrafusion calibrate drive --terrain loose_sand --parameters soil.shear.friction_cap --out fit
+
+    Example: terrafusion calibrate monday tuesday --sensors --out my_robot.yaml
     """
+    if sensors:
+        if terrain or parameters or prior or suggest or truth or channels or robust:
+            raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
+        options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
+        return _sensors(logs, vehicle, options, out, repair_clock)
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
@@ -90,6 +114,7 @@ def calibrate(
         raise typer.BadParameter(f"{slope_deg:g} is not in 0 to {MAX_SLOPE_DEG:g}", param_hint="--slope-deg")
     priors = dict(parse_prior(text) for text in prior or [])
     soils = parse_terrain(terrain)
+    vehicle = vehicle or "elevate"
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
     recordings = opened(logs, options, repair_clock)
     with progress_bar("calibrating") as progress:
@@ -107,6 +132,27 @@ def calibrate(
 
         for suggestion in suggestions(found):
             print(suggestion.sentence())
+    print(f"written to {out}")
+
+
+def _sensors(
+    logs: list[str], vehicle: str | None, options: dict[str, Any], out: Path, repair_clock: bool
+) -> None:
+    """Learn the sensor numbers of a robot, and write its file."""
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.fusion.outputs.robot_file import write_robot
+    from terrafusion.fusion.sensor_calibration import calibrate_sensors
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
+    recordings = opened(logs, options, repair_clock)
+    for recording in recordings:
+        refuse_impossible(recording.name, recording)
+    with progress_bar("calibrating") as progress:
+        found = calibrate_sensors(recordings, vehicle, progress=progress)
+    write_robot(out, found)
+    for line in repr(found).splitlines():
+        print(line)
     print(f"written to {out}")
 
 

@@ -15,8 +15,8 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.fusion.config.sensor_config import SensorConfig
-from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams, vehicle_names
+from terrafusion.twin.model.vehicle_file import read_vehicle
 
 
 @dataclass(frozen=True)
@@ -144,7 +144,7 @@ def _sources(asked: object, vehicle: str) -> tuple[dict[str, Any], bool]:
     for name in (asked, vehicle):
         if isinstance(name, str | Path) and str(name):
             try:
-                raw, _ = read_named("vehicles", name, kind="vehicle")
+                raw, _ = read_vehicle(name)
             except ConfigError:
                 continue
             return raw, str(name) in vehicle_names()

@@ -71,15 +71,15 @@ class SensorConfig:
         if not self.planar:
             return rig
         imu = planar_spec(rig.sensors.imu, self.yaw)
-        track = rig.track_m / YAW_RATIO if self.yaw == "wheels" else rig.track_m
+        track = rig.track_m / yaw_factor(rig) if self.yaw == "wheels" else rig.track_m
         return dataclasses.replace(rig, track_m=track, sensors=dataclasses.replace(rig.sensors, imu=imu))
 
     def preintegrator(self, spec: ImuSpec) -> Preintegrator:
         """Maker of the link between keyframes."""
         return PlanarPreintegrator(spec, self.yaw) if self.planar else Preintegrator(spec)
 
-    def notes(self, recording: Recording) -> tuple[str, ...]:
-        """What was assumed, in sentences."""
+    def notes(self, recording: Recording, rig: Rig) -> tuple[str, ...]:
+        """What was assumed of a log of the robot `rig`, in sentences."""
         notes = []
         if self.planar:
             notes.append(
@@ -88,14 +88,20 @@ class SensorConfig:
             )
         if self.yaw == "wheels":
             notes.append(
-                f"yaw is taken from the wheels: {YAW_RATIO:g} of what their difference over the track says "
-                "(assumed for skid steer)"
+                f"yaw is taken from the wheels: {yaw_factor(rig):g} of what their difference over the track "
+                f"says ({'assumed for skid steer' if rig.known.yaw_factor is None else 'by the vehicle file'})"
             )
         elif self.yaw == "nobody":
             notes.append("the log has body speed only and no gyro: the heading comes from GNSS alone")
         if not self.sides and self.yaw == "gyro":
             notes.append("the log has body speed only: the wheels tell nothing of yaw")
         return tuple(notes)
+
+
+def yaw_factor(rig: Rig) -> float:
+    """True over geometric yaw rate of the wheels."""
+    known = rig.known.yaw_factor
+    return YAW_RATIO if known is None else known.number
 
 
 def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:

@@ -269,6 +269,7 @@ class Estimator:
         from_fixes = not self.gnss.local and self._search.known is None
         spec, drift_m = self.config.rig.sensors.imu, self.gnss.drift_sigma_m
         point, sigmas = initial_state(start, self.weights.noise, spec, drift_m, from_fixes)
+        point = self.learned.with_known_bias(point, start)
         self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))
         self.chain.set_prior(sigmas[: self.chain.dim])
         if self.chain.archive is not None:

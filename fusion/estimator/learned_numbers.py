@@ -8,20 +8,25 @@ import math
 import gtsam
 import numpy as np
 
+from terrafusion.datasets.core.robot import SensorNumbers
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.calibration.fit import Noise
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
     GNSS_DELAY,
+    GYRO_BIAS,
     TURN_SCALE,
     WHEEL_SCALE,
     Knowledge,
     assumed,
+    known_before,
 )
 from terrafusion.fusion.calibration.online import SelfCalibration
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -46,9 +51,27 @@ class LearnedNumbers:
     def __init__(
         self, config: EstimatorConfig, imu: ImuStream, gnss: GnssUpdater, weights: TerrainNoise
     ) -> None:
-        self.calibration = _calibration(config)
+        known, prior = config.rig.known, _prior(config)
+        self.calibration = _calibration(config, prior)
         self._imu, self._gnss, self._weights = imu, gnss, weights
         self._spec = config.rig.sensors.imu
+        self._bias_radps = float(prior.mean[GYRO_BIAS])
+        if known != SensorNumbers():
+            self._apply(prior, 0, known.wheel_scale is not None)
+
+    def start_from(self, prior: Knowledge) -> None:
+        """Begin with what earlier runs of the robot gave."""
+        if self.calibration is not None:
+            self.calibration.start_from(prior)
+            self._bias_radps = float(prior.mean[GYRO_BIAS])
+            self._apply(prior, 0)
+
+    def with_known_bias(self, point: KeyState, start: Start) -> KeyState:
+        """The first state, with the gyro's bias of earlier runs where the robot did not stand to show it."""
+        if start.gyro_bias_radps is not None or self._bias_radps == 0.0:
+            return point
+        gyro = np.array([0.0, 0.0, self._bias_radps])
+        return dataclasses.replace(point, bias=gtsam.imuBias.ConstantBias(np.zeros(3), gyro))
 
     def fix(self, fix: GnssFix) -> None:
         """A fix as it came."""
@@ -85,14 +108,23 @@ class LearnedNumbers:
             return noise
         return with_turn_doubt(noise, self.calibration.known, segments, self._spec)
 
-    def _apply(self, known: Knowledge, t_ns: int) -> None:
+    def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
         self._imu.turn_scale = float(known.mean[TURN_SCALE])
         self._gnss.correct(known.mean[[ANTENNA_X, ANTENNA_Y]], float(known.mean[GNSS_DELAY]))
+        if not slip:
+            return
         doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))
         self._weights.learn_slip(-float(known.mean[WHEEL_SCALE]), max(doubt, LEAST_SLIP_SIGMA), t_ns)
 
 
-def _calibration(config: EstimatorConfig) -> SelfCalibration | None:
+def _prior(config: EstimatorConfig) -> Knowledge:
+    """What is known of the robot before it drives."""
+    wheels = config.inputs.yaw == "wheels"
+    wide = assumed(config.rig.sensors.imu.gyro_bias_sigma_radps, wheels, SLIP_SPREAD)
+    return known_before(config.rig.known, wide, wheels)
+
+
+def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration | None:
     inputs, sensors = config.inputs, config.rig.sensors
     if not config.self_calibrate or config.calibrate or not inputs.gnss or inputs.yaw == "nobody":
         return None
@@ -103,7 +135,6 @@ def _calibration(config: EstimatorConfig) -> SelfCalibration | None:
         1.0 - WHITE_SHARE,
         max(sensors.gnss.correlation_time_s, 1.0),
     )
-    prior = assumed(sensors.imu.gyro_bias_sigma_radps, wheels, SLIP_SPREAD)
     return SelfCalibration(prior, noise, complex(*sensors.gnss.antenna_m[:2]))
 
 

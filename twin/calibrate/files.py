@@ -12,6 +12,7 @@ from terrafusion.twin.calibrate.identifiability import IDENTIFIED
 from terrafusion.twin.calibrate.result import Calibration, FittedParameter
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.soil_table import is_published, published_soil
+from terrafusion.twin.model.vehicle_file import read_vehicle
 
 
 def write_files(
@@ -34,7 +35,7 @@ def write_files(
     model, logs = calibration.model, ", ".join(calibration.sensor_errors)
     if not calibration.converged():
         logs += " by a search that did not converge"
-    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    raw, _ = read_vehicle(vehicle)
     own = ("vehicle.", "effects.")
     mine = {f.name.removeprefix("vehicle."): f for f in calibration.fitted if f.name.startswith(own)}
     updated = _updated(raw, model.vehicle, mine, logs)

@@ -1,7 +1,8 @@
 """Vehicle parameters: what the twin drives and what the estimator knows of a robot.
 
 A vehicle is a YAML file in `twin/params/vehicles` (or the user's own): every
-number stands as `{value, source}` under a key that carries its unit.
+number stands as `{value, source}` under a key that carries its unit. A file may
+also give only what differs from another one (`vehicle_file`).
 Body frame: x forward, y left, z up; its origin lies in the ground plane,
 midway between the four contact points.
 """
@@ -19,9 +20,11 @@ from terrafusion.datasets.core.display import text_html
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.quantity import Sourced, Word
 from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.core.robot import SensorNumbers
 from terrafusion.datasets.core.sensors import DRIVES, STEERED_DRIVES, Rig, SensorSuite, SteeringSpec
-from terrafusion.twin.model.library import known_names, read_named
+from terrafusion.twin.model.library import known_names
 from terrafusion.twin.model.sensor_realism import SensorRealism
+from terrafusion.twin.model.vehicle_file import read_vehicle
 
 GEOMETRY = {
     "wheel_radius_m": "wheel.radius_m",
@@ -119,6 +122,7 @@ class VehicleParams:
     effects by key (docs/reference/effects.md) that this robot, or what it drives on, is known to have, as
     `terrafusion gap` finds them: the twin has them in every run. `measured` are numbers, by dotted name,
     that were found for the body of this very robot: the geometry that a log assumes does not replace them.
+    `robot` is what is known of its sensors, as `terrafusion calibrate --sensors` finds it.
     """
 
     name: str
@@ -134,6 +138,7 @@ class VehicleParams:
     effects: dict[str, Annotated[float, Sourced("")]] = field(default_factory=dict)
     measured: tuple[str, ...] = ()
     steering: SteeringSpec | None = None
+    robot: SensorNumbers = field(default_factory=SensorNumbers)
 
     @classmethod
     def load(cls, name_or_path: str | Path) -> VehicleParams:
@@ -168,6 +173,7 @@ class VehicleParams:
             drive=self.drive.type,
             wheelbase_m=self.body.wheelbase_m,
             steering=self.steered(),
+            known=self.robot,
         )
 
     def steered(self) -> SteeringSpec | None:
@@ -187,7 +193,7 @@ def load_vehicle(name_or_path: str | Path) -> VehicleParams:
         ConfigError: unknown name (the known ones are listed), or a file that
             does not keep to the parameters' names, units and ranges.
     """
-    raw, file = read_named("vehicles", name_or_path, kind="vehicle")
+    raw, file = read_vehicle(name_or_path)
     found = structure(VehicleParams, raw, file=file)
     refuse(_problems(found), file)
     return found
@@ -264,15 +270,23 @@ def with_overrides(vehicle: VehicleParams, overrides: Overrides) -> VehicleParam
         steering = steering if overrides.drive in STEERED_DRIVES else None
     if overrides.steering_ratio is not None and drive.type in STEERED_DRIVES:
         steering = dataclasses.replace(steering or SteeringSpec(), ratio=overrides.steering_ratio)
-    if overrides.antenna_m is not None:
+    robot = vehicle.robot
+    if overrides.antenna_m is not None and not _antenna_calibrated(vehicle):
+        robot = dataclasses.replace(robot, antenna_m=None)
         gnss = dataclasses.replace(sensors.gnss, antenna_m=overrides.antenna_m)
         sensors = dataclasses.replace(sensors, gnss=gnss)
     if overrides.imu_m is not None:
         imu = dataclasses.replace(sensors.imu, position_m=overrides.imu_m)
         sensors = dataclasses.replace(sensors, imu=imu)
     return dataclasses.replace(
-        vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors, drive=drive, steering=steering
-    )
+        vehicle, body=body, wheel=wheel, odometry=odometry, sensors=sensors, drive=drive, steering=steering,
+        robot=robot,
+    )  # fmt: skip
+
+
+def _antenna_calibrated(vehicle: VehicleParams) -> bool:
+    """Whether logs of this robot gave the place of its antenna: what a log assumes does not replace it."""
+    return vehicle.robot.antenna_m is not None and vehicle.robot.antenna_m.known == "calibrated"
 
 
 def reported_geometry(recordings: Sequence[Recording]) -> Overrides:
@@ -308,4 +322,6 @@ def geometry_notes(vehicle: VehicleParams, overrides: Overrides) -> tuple[str, .
     retained = [number for number in reported if number in vehicle.measured]
     if retained:
         note += f"; measured on this robot before, and retained for its body: {', '.join(retained)}"
+    if overrides.antenna_m is not None and _antenna_calibrated(vehicle):
+        note += "; the antenna is where calibration found it"
     return (note,)

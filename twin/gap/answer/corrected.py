@@ -10,8 +10,8 @@ from typing import Any
 from terrafusion.twin.calibrate.files import mark_measured, write_yaml
 from terrafusion.twin.effects.catalogue import lookup
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import VehicleParams
+from terrafusion.twin.model.vehicle_file import read_vehicle
 
 FIELDS = {
     "mass/at_cg": (("body.mass_kg", "times"), ("body.yaw_inertia_kgm2", "times")),
@@ -52,7 +52,7 @@ def write_corrected(diagnosis: GapDiagnosis, vehicle: str | Path, target: Path) 
         ConfigError: the vehicle file cannot be read.
         TerrafusionError: the file cannot be written.
     """
-    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    raw, _ = read_vehicle(vehicle)
     out, changes, params = copy.deepcopy(raw), list[str](), diagnosis.evidence.model.vehicle
     for key, value in values_of(diagnosis).items():
         if key in FIELDS:

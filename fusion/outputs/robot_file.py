@@ -1,0 +1,90 @@
+"""Writes a vehicle file of the short form with the numbers that `sensor_calibration` found."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.config import structure
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.robot import KnownNumber, RobotFile
+from terrafusion.fusion.sensor_calibration import SensorCalibration
+from terrafusion.twin.model.library import read_named
+from terrafusion.twin.model.vehicle import vehicle_names
+from terrafusion.twin.model.vehicle_file import is_short
+
+GEOMETRY = ("wheel_radius_m", "track_m", "wheelbase_m", "imu_m")
+"""Geometry that logs report, by its name in both `Overrides` and the file."""
+
+
+def write_robot(path: Path, found: SensorCalibration) -> Path:
+    """Write the file; it loads as it is, wherever a vehicle is asked for.
+
+    A file of the short form that the calibration started from is taken over with the new numbers in place,
+    another one is extended.
+
+    Raises:
+        ConfigError: the file would overwrite the one it extends, or a number is out of range.
+        TerrafusionError: it cannot be written.
+    """
+    robot = _before(path, found.extends)
+    if found.overrides.drive is not None:
+        robot.setdefault("drive", found.overrides.drive)
+    for name in GEOMETRY:
+        value = getattr(found.overrides, name)
+        if value is not None and name not in robot:
+            robot[name] = _entry(KnownNumber(value, "assumed"))
+    for name, number in vars(found.known()).items():
+        if number is not None:
+            robot[name] = _entry(number)
+    structure(RobotFile, {"robot": robot}, file=path)
+    return _write(path, robot)
+
+
+def _before(path: Path, vehicle: str) -> dict[str, Any]:
+    """What the file is made from: another one of the short form, or the name or path of a complete one."""
+    if vehicle in vehicle_names():
+        return {"extends": vehicle}
+    old = Path(vehicle).expanduser()
+    raw, _ = read_named("vehicles", vehicle, kind="vehicle")
+    if is_short(raw):
+        robot = dict(raw["robot"])
+        under = robot.get("extends", "generic")
+        return robot | {"extends": under if under in vehicle_names() else _seen_from(path, old.parent / under)}
+    if path.resolve() == old.resolve():
+        raise ConfigError(
+            "the calibrated file would overwrite the one it extends", file=path, remedy="give another --out"
+        )
+    return {"extends": _seen_from(path, old)}
+
+
+def _seen_from(path: Path, other: Path) -> str:
+    return Path(os.path.relpath(other.resolve(), path.resolve().parent)).as_posix()
+
+
+def _entry(number: KnownNumber) -> dict[str, Any]:
+    """A number as it stands in the file."""
+    entry = {key: value for key, value in dataclasses.asdict(number).items() if value not in (None, ())}
+    return {key: list(value) if isinstance(value, tuple) else value for key, value in entry.items()}
+
+
+def _write(path: Path, robot: dict[str, Any]) -> Path:
+    from ruamel.yaml import YAML
+    from ruamel.yaml.comments import CommentedMap
+
+    yaml: Any = YAML()
+    yaml.width = 1000
+    section = CommentedMap(robot)
+    for name, entry in robot.items():
+        if isinstance(entry, dict):  # a number a line
+            section[name] = CommentedMap(entry)
+            section[name].fa.set_flow_style()
+
+    def dump(part: Path) -> None:
+        with part.open("w", encoding="utf-8") as file:
+            yaml.dump({"robot": section}, file)
+
+    return write_atomically(path, dump)

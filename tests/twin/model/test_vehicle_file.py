@@ -1,0 +1,137 @@
+"""The short form of a vehicle file: ten lines that stand for a complete one."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.recording import Overrides
+from terrafusion.twin.model.vehicle import geometry_notes, load_vehicle, with_overrides
+from terrafusion.twin.model.vehicle_file import read_vehicle
+from terrafusion.twin.simulate import simulate
+
+SHORT = """\
+robot:
+  extends: husky
+  name: my_robot
+  drive: differential
+  wheel_radius_m: {value: 0.12, known: measured}
+  track_m: {value: 0.4, known: data_sheet}
+  antenna_m: {value: [0.1, 0.02, 0.6], known: measured}
+  gyro_scale: {value: 0.01, known: calibrated, sigma: 0.002, logs: [monday], gained_nats: 2.0}
+  topics: {gnss: /ublox/fix}
+"""
+
+
+def written(path: Path, text: str) -> Path:
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_short_file_replaces_only_what_it_gives(tmp_path: Path) -> None:
+    own, husky = load_vehicle(written(tmp_path / "own.yaml", SHORT)), load_vehicle("husky")
+    assert (own.name, own.drive.type) == ("my_robot", "differential")
+    assert own.wheel.radius_m == own.odometry.wheel_radius_m == 0.12
+    assert own.body.track_m == own.odometry.track_m == 0.4
+    assert own.measured == ("wheel.radius_m",)  # a data sheet is no measurement
+    assert own.sensors.gnss.antenna_m == (0.1, 0.02, 0.6)
+    assert own.sensors.imu == husky.sensors.imu
+    assert own.body.mass_kg == husky.body.mass_kg
+    assert own.topics == {**husky.topics, "gnss": "/ublox/fix"}
+    scale = own.rig().known.gyro_scale
+    assert scale is not None
+    assert (scale.value, scale.sigma, scale.logs) == (0.01, 0.002, ("monday",))
+
+
+def test_a_file_extends_one_beside_it_and_keeps_what_that_one_knows(tmp_path: Path) -> None:
+    (tmp_path / "base").mkdir()
+    written(tmp_path / "base" / "own.yaml", SHORT)
+    text = "robot:\n  extends: base/own.yaml\n  gnss_delay_s: {value: 0.3, known: calibrated, sigma: 0.01}\n"
+    second = load_vehicle(written(tmp_path / "second.yaml", text))
+    assert second.wheel.radius_m == 0.12
+    assert second.robot.gyro_scale is not None
+    assert second.robot.gnss_delay_s is not None
+
+
+def test_a_file_of_one_line_is_the_generic_vehicle(tmp_path: Path) -> None:
+    own = load_vehicle(written(tmp_path / "own.yaml", "robot: {drive: tracked}\n"))
+    generic = load_vehicle("generic")
+    assert own.drive.type == "tracked"
+    assert (own.body, own.sensors, own.name) == (generic.body, generic.sensors, generic.name)
+
+
+def test_the_twin_drives_a_short_file(tmp_path: Path) -> None:
+    log = simulate("straight", vehicle=written(tmp_path / "own.yaml", SHORT), seed=1)
+    assert log.duration_s() > 5.0
+
+
+def test_all_errors_of_a_file_are_reported_at_once(tmp_path: Path) -> None:
+    wrong = """\
+robot:
+  colour: red
+  wheel_radius_m: 0.2
+  track_m: {value: 12.0, known: measured}
+  antenna_m: {value: [0.1, 0.0], known: measured}
+  gyro_scale: {value: 0.01, known: calibrated}
+  wheel_scale: {value: 0.01, known: guessed}
+  gnss_delay: {value: 0.2, known: assumed}
+"""
+    with pytest.raises(ConfigError) as raised:
+        load_vehicle(written(tmp_path / "own.yaml", wrong))
+    lines = str(raised.value).splitlines()
+    assert len(lines) == 7
+    for key, words in (
+        ("robot.colour", "unknown key"),
+        ("robot.wheel_radius_m", "how is it known"),
+        ("robot.track_m.value", "out of range"),
+        ("robot.antenna_m.value", "3 numbers"),
+        ("robot.gyro_scale", "has no sigma"),
+        ("robot.wheel_scale.known", "measured, data_sheet, calibrated, assumed"),
+        ("robot.gnss_delay", "write 'gnss_delay_s'"),
+    ):
+        assert any(key in line and words in line for line in lines), (key, lines)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("robot: {extends: own.yaml}\n", "comes back to this file"),
+        ("robot: {extends: nobody}\n", "neither a known vehicle nor a file"),
+        ("robot: {drive: tracked}\ncolour: red\n", "unknown key 'colour'"),
+        ("robot: 5\n", "not a section"),
+    ],
+)
+def test_a_file_that_leads_nowhere_is_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+    with pytest.raises(ConfigError, match=words) as raised:
+        load_vehicle(written(tmp_path / "own.yaml", text))
+    assert "\n" not in str(raised.value)
+    assert "own.yaml" in str(raised.value)
+
+
+def test_what_a_log_assumes_replaces_a_measured_antenna_but_no_calibrated_one(tmp_path: Path) -> None:
+    log = Overrides(antenna_m=(0.5, 0.0, 1.0))
+    measured = load_vehicle(written(tmp_path / "own.yaml", SHORT))
+    changed = with_overrides(measured, log)
+    assert changed.sensors.gnss.antenna_m == (0.5, 0.0, 1.0)
+    assert changed.robot.antenna_m is None
+    text = SHORT.replace("0.6], known: measured", "0.6], known: calibrated, sigma: [0.01, 0.02]")
+    calibrated = load_vehicle(written(tmp_path / "own.yaml", text))
+    assert with_overrides(calibrated, log).sensors.gnss.antenna_m == (0.1, 0.02, 0.6)
+    assert "where calibration found it" in geometry_notes(calibrated, log)[0]
+
+
+def test_a_complete_file_says_in_its_source_that_the_antenna_is_measured(tmp_path: Path) -> None:
+    for name, source, known in (
+        ("warthog", "measured with a tape", "measured"),
+        ("warthog", "assumed: on the top plate", None),
+    ):
+        raw, _ = read_vehicle(name)
+        text = (Path(__file__).parents[3] / "twin/params/vehicles" / f"{name}.yaml").read_text("utf-8")
+        assert raw["sensors"]["gnss"]["antenna_m"]["source"] in text
+        own = text.replace("assumed: on the top plate", source)
+        number = load_vehicle(written(tmp_path / "own.yaml", own)).robot.antenna_m
+        assert (number and number.known) == known
+    # A shipped file is for any robot of its make, wherever that has its antenna.
+    assert load_vehicle("husky").robot.antenna_m is None

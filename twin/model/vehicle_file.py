@@ -1,0 +1,116 @@
+"""Vehicle files in their two forms: complete, or only what differs from another one (`robot`)."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+from typing import Any
+
+from terrafusion.datasets.core.config import structure
+from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.robot import KnownNumber, Robot, RobotFile, SensorNumbers
+from terrafusion.datasets.core.sensors import STEERED_DRIVES
+from terrafusion.twin.model.library import known_names, read_named
+
+ANTENNA, IMU = ("sensors", "gnss", "antenna_m"), ("sensors", "imu", "position_m")
+PLACES = {
+    "wheel_radius_m": (("odometry", "wheel_radius_m"), ("wheel", "radius_m")),
+    "track_m": (("odometry", "track_m"), ("body", "track_m")),
+    "wheelbase_m": (("body", "wheelbase_m"),),
+    "antenna_m": (ANTENNA,),
+    "imu_m": (IMU,),
+}
+"""Numbers of the short form and their places in a complete file; the last one is the body's own."""
+MEASURED = ("measured", "field log")
+"""Beginnings of sources of numbers that were measured on the robot of the file."""
+
+
+def read_vehicle(name_or_path: str | Path) -> tuple[dict[str, Any], str]:
+    """Content of a vehicle file, complete, and what to call it in messages.
+
+    Raises:
+        ConfigError: neither a known name nor a file, or one of the short form with errors; all of them.
+    """
+    return _read(name_or_path, ())
+
+
+def is_short(raw: dict[str, Any]) -> bool:
+    """Whether the content of a file is of the short form: a complete one has a name."""
+    return "robot" in raw and "name" not in raw
+
+
+def _read(name_or_path: str | Path, above: tuple[str, ...]) -> tuple[dict[str, Any], str]:
+    raw, file = read_named("vehicles", name_or_path, kind="vehicle")
+    if is_short(raw):
+        robot = structure(RobotFile, raw, file=file).robot
+        return _completed(robot, raw["robot"], file, above), file
+    return (raw if _shipped(name_or_path) else _with_measured_antenna(raw)), file
+
+
+def _shipped(name_or_path: str | Path) -> bool:
+    return str(name_or_path) in known_names("vehicles")
+
+
+def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, ...]) -> dict[str, Any]:
+    """The content of the file that it extends, with the numbers of `robot` in place."""
+    here = str(Path(file).expanduser().resolve())
+    if here in above:
+        raise ConfigError(f"'extends: {robot.extends}' comes back to this file", file=file)
+    under = robot.extends
+    if not _shipped(under):
+        path = Path(file).expanduser().parent / Path(under).expanduser()
+        if not path.is_file():
+            raise ConfigError(
+                f"'robot.extends' is '{under}', neither a known vehicle nor a file beside this one",
+                file=file,
+                remedy=f"known are {', '.join(known_names('vehicles'))}",
+            )
+        under = str(path)
+    base, _ = _read(under, (*above, here))
+    out = copy.deepcopy(base)
+    for place in (ANTENNA, IMU) if _shipped(under) else ():  # these are each robot's own
+        entry = _at(out, place[:-1])[place[-1]]
+        entry["source"] = f"assumed: as of '{robot.extends}', {entry['source']}"
+    for name in ("name", "description"):
+        out[name] = getattr(robot, name) or out[name]
+    if robot.drive is not None:
+        out["drive"]["type"] = robot.drive
+        if robot.drive not in STEERED_DRIVES:
+            out.pop("steering", None)
+    out["topics"] = {**out.get("topics", {}), **robot.topics}
+    for name, places in PLACES.items():
+        number = getattr(robot, name)
+        if number is not None:
+            _place(out, number, places)
+    numbers = {name: raw[name] for name in SensorNumbers.__dataclass_fields__ if name in raw}
+    if numbers or "robot" in out:
+        out["robot"] = {**out.get("robot", {}), **numbers}
+    return out
+
+
+def _place(out: dict[str, Any], number: KnownNumber, places: tuple[tuple[str, ...], ...]) -> None:
+    value = list(number.value) if isinstance(number.value, tuple) else number.value
+    for place in places:
+        _at(out, place[:-1])[place[-1]] = {"value": value, "source": number.source}
+    body = ".".join(places[-1])
+    if number.known in ("measured", "calibrated") and places[-1] not in (ANTENNA, IMU):
+        out["measured"] = sorted({*out.get("measured", ()), body})
+
+
+def _at(raw: dict[str, Any], place: tuple[str, ...]) -> dict[str, Any]:
+    for part in place:
+        raw = raw[part]
+    return raw
+
+
+def _with_measured_antenna(raw: dict[str, Any]) -> dict[str, Any]:
+    """A complete file of one robot: says how its antenna is known where the source does."""
+    entry: Any = raw
+    for part in ANTENNA:
+        entry = entry.get(part) if isinstance(entry, dict) else None
+    robot = raw.get("robot", {})
+    if not isinstance(entry, dict) or not str(entry.get("source", "")).lower().startswith(MEASURED):
+        return raw
+    if not isinstance(robot, dict) or "antenna_m" in robot:
+        return raw
+    return {**raw, "robot": {**robot, "antenna_m": {"value": entry.get("value"), "known": "measured"}}}
