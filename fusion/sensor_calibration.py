@@ -251,7 +251,9 @@ def _part_of(progress: Callable[[float], None], i: int, count: int) -> Callable[
     return lambda share: progress((i + share) / count)
 
 
-def _numbers(before: Knowledge, after: Knowledge, params: VehicleParams, yaw: str) -> dict[str, LearnedNumber]:
+def _numbers(
+    before: Knowledge, after: Knowledge, params: VehicleParams, yaw: str
+) -> dict[str, LearnedNumber]:
     gained = information_gained(before, after)
     left_out = OF_WHEELS if yaw == "gyro" else OF_GYRO
     antenna, factor = params.sensors.gnss.antenna_m, yaw_factor(params.rig())

@@ -1,11 +1,11 @@
 """The short form of a vehicle file: a robot's numbers, each with how it is known.
 
-    robot:
-      extends: generic
-      drive: skid_steer
-      wheel_radius_m: {value: 0.165, known: measured}
-      antenna_m: {value: [0.1, 0.0, 0.6], known: measured}
-      gnss_delay_s: {value: 0.21, known: calibrated, sigma: 0.01, logs: [monday, tuesday]}
+robot:
+  extends: generic
+  drive: skid_steer
+  wheel_radius_m: {value: 0.165, known: measured}
+  antenna_m: {value: [0.1, 0.0, 0.6], known: measured}
+  gnss_delay_s: {value: 0.21, known: calibrated, sigma: 0.01, logs: [monday, tuesday]}
 """
 
 from __future__ import annotations

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from terrafusion.datasets.core.errors import TerrafusionError as TerrafusionError
     from terrafusion.datasets.core.recording import Recording as Recording
     from terrafusion.datasets.readers import open_recording as open
+    from terrafusion.fusion.api.calibrations import calibrate_sensors as calibrate_sensors
     from terrafusion.fusion.api.diagnoses import Diagnosis as Diagnosis
     from terrafusion.fusion.api.diagnoses import diagnose as diagnose
-    from terrafusion.fusion.api.calibrations import calibrate_sensors as calibrate_sensors
     from terrafusion.fusion.api.replays import Replay as Replay
     from terrafusion.fusion.api.replays import replay as replay
     from terrafusion.fusion.api.studies import benchmark as benchmark

@@ -39,8 +39,8 @@ ANTENNA_SIGMA_M = 0.25
 GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
 """Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
 CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01]), 0.05
-"""Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of the
-turn scale where it is the wheels'."""
+"""Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of
+the turn scale where it is the wheels'."""
 
 
 @dataclass(frozen=True, eq=False)

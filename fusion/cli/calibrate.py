@@ -57,7 +57,7 @@ def calibrate(
     vehicle: Annotated[
         str | None,
         typer.Option(
-            help="Vehicle to start from, by name or YAML file. Default: elevate; with --sensors the logs' own."
+            help="Vehicle to start from, by name or YAML file. Default: elevate; with --sensors the logs'."
         ),
     ] = None,
     sensors: Annotated[

@@ -87,9 +87,10 @@ class SensorConfig:
                 "(taken as level), height only from GNSS"
             )
         if self.yaw == "wheels":
+            source = "assumed for skid steer" if rig.known.yaw_factor is None else "by the vehicle file"
             notes.append(
                 f"yaw is taken from the wheels: {yaw_factor(rig):g} of what their difference over the track "
-                f"says ({'assumed for skid steer' if rig.known.yaw_factor is None else 'by the vehicle file'})"
+                f"says ({source})"
             )
         elif self.yaw == "nobody":
             notes.append("the log has body speed only and no gyro: the heading comes from GNSS alone")

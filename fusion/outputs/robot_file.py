@@ -53,7 +53,9 @@ def _before(path: Path, vehicle: str) -> dict[str, Any]:
     if is_short(raw):
         robot = dict(raw["robot"])
         under = robot.get("extends", "generic")
-        return robot | {"extends": under if under in vehicle_names() else _seen_from(path, old.parent / under)}
+        return robot | {
+            "extends": under if under in vehicle_names() else _seen_from(path, old.parent / under)
+        }
     if path.resolve() == old.resolve():
         raise ConfigError(
             "the calibrated file would overwrite the one it extends", file=path, remedy="give another --out"
