@@ -34,6 +34,8 @@ class SensorConfig:
         imu: "six_axis", "gyro_z" (other axes may be NaN, the accelerometer too) or "none".
         sides: left and right wheels are distinguished; else body speed alone.
         gnss: fixes will come. Without them the graph starts at once, in a local frame.
+        steered: steering angles will come, of a robot that has steered wheels.
+        steering_wheel: they are those of a steering wheel.
 
     Raises:
         ConfigError: an unknown kind of IMU.
@@ -43,6 +45,8 @@ class SensorConfig:
     imu: str = "six_axis"
     sides: bool = True
     gnss: bool = True
+    steered: bool = False
+    steering_wheel: bool = False
 
     def __post_init__(self) -> None:
         if self.imu not in IMU_KINDS:
@@ -61,9 +65,11 @@ class SensorConfig:
 
     @property
     def yaw(self) -> str:
-        """Source of the yaw rate: "gyro", "wheels" or "nobody"."""
+        """Source of the yaw rate: "gyro", "steering", "wheels" or "nobody"."""
         if self.imu != "none":
             return "gyro"
+        if self.steered:
+            return "steering"
         return "wheels" if self.sides else "nobody"
 
     def rig(self, rig: Rig) -> Rig:
@@ -92,9 +98,11 @@ class SensorConfig:
                 f"yaw is taken from the wheels: {yaw_factor(rig):g} of what their difference over the track "
                 f"says ({source})"
             )
+        elif self.yaw == "steering":
+            notes.append("yaw is taken from the steering angles and the wheelbase; their zero is estimated")
         elif self.yaw == "nobody":
             notes.append("the log has body speed only and no gyro: the heading comes from GNSS alone")
-        if not self.sides and self.yaw == "gyro":
+        if not self.sides and not self.steered and self.yaw == "gyro":
             notes.append("the log has body speed only: the wheels tell nothing of yaw")
         return tuple(notes)
 
@@ -113,7 +121,11 @@ def sensor_config_of(recording: Recording, gnss: Gnss | None) -> SensorConfig:
     """
     wheels = recording.wheels
     fixes = gnss is not None and bool(((gnss.fix > 0) & np.isfinite(gnss.enu_m[:, :2].sum(axis=1))).any())
-    return SensorConfig(imu_kind(recording.imu), wheels is None or wheels.has_sides(), fixes)
+    steering = recording.steering
+    steered = steering is not None and bool(np.isfinite(steering.angle_rad).all(axis=1).any())
+    of_wheel = steered and steering is not None and steering.names == ("steering_wheel",)
+    sides = wheels is None or wheels.has_sides()
+    return SensorConfig(imu_kind(recording.imu), sides, fixes, steered, of_wheel)
 
 
 def complete_samples(imu: Imu, kind: str) -> np.ndarray:

@@ -10,6 +10,7 @@ state = est.latest()
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -45,13 +46,14 @@ from terrafusion.fusion.estimator.stationarity import (
     StationarityDetector,
     add_zero_velocity,
 )
+from terrafusion.fusion.estimator.steering import SteeredTurn, policy_of
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, pause, wheel_increment
-from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
+from terrafusion.fusion.graph.key_state import BIAS, VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import (
     level_factor,
     with_centripetal_force,
@@ -60,6 +62,7 @@ from terrafusion.fusion.graph.planar import (
 )
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement, slip_of
 from terrafusion.fusion.inputs.door import as_number, as_numbers, checked_fix
+from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import (
     LONGEST_PAUSE_NS,
     ImuSegment,
@@ -98,12 +101,17 @@ class Estimator:
         on_innovation: Callable[[Innovation], None] | None = None,
         archive: Chain | None = None,
     ) -> None:
-        self.config = config = dataclasses.replace(config, rig=config.inputs.rig(config.rig))
+        rig, policy = config.inputs.rig(config.rig), policy_of(config.rig, config.policy)
+        self.config = config = dataclasses.replace(config, rig=rig, policy=policy)
         self.chain = Chain(archive, config.calibrate)
         self.imu = ImuStream(six_axis=not config.inputs.planar)
         self.newest = self.imu.late.leap.newest
         self.wheels = WheelStream(self.newest)
         self.gyro = StuckGyro(config.rig, config.inputs)
+        self.steering = SteeringStream(rig, self.newest)
+        self._turn = (
+            SteeredTurn(rig, rig.steering, config.inputs.steering_wheel) if rig.steering is not None else None
+        )
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
@@ -157,8 +165,13 @@ class Estimator:
         """Circumferential speed of each side, m/s, and its travelled distance, m, where encoders count it."""
         self.wheels.add(t_ns, left_mps, right_mps, left_m, right_m)
         if self.config.inputs.imu == "none":  # the wheels are the clock, and their difference the yaw rate
-            self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m), UNKNOWN)
+            steering = self.steering if self.config.inputs.yaw == "steering" else None
+            self.imu.add(t_ns, yaw_of_wheels(self.wheels, self.config.rig.track_m, steering), UNKNOWN)
             self._advance()
+
+    def add_steering(self, t_ns: int, front_rad: float, rear_rad: float = 0.0) -> None:
+        """Mean angle of the front and of the rear wheels, rad, positive to the left; of a steered robot."""
+        self.steering.add(t_ns, front_rad, rear_rad)
 
     def add_gnss(
         self,
@@ -347,6 +360,7 @@ class Estimator:
         chain.forget(self._keep)
         self.imu.forget(t_ns - KEPT_NS)
         self.wheels.forget(t_ns - KEPT_NS)
+        self.steering.forget(t_ns - KEPT_NS)
         self.monitor.watch(t_ns, chain.state(chain.last), self._covariance[VELOCITY, VELOCITY], rolled_m)
         self._fresh = self._emitted(t_ns, gyro)
 
@@ -388,6 +402,10 @@ class Estimator:
         )
         increment = self._jitter.applied(increment)
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
+        if self._turn is not None:
+            rate_sigma = math.sqrt(self._covariance[BIAS, BIAS][5, 5]) if inputs.yaw == "gyro" else 1.0
+            curvature = self.steering.curvature_per_m(before_ns, t_ns) if inputs.yaw == "gyro" else None
+            return self._turn.applied(increment, curvature, (t_ns - before_ns) * 1e-9, rate_sigma)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(

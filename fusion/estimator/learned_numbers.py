@@ -128,7 +128,7 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
     inputs, sensors = config.inputs, config.rig.sensors
     if not config.self_calibrate or config.calibrate or not inputs.gnss or inputs.yaw == "nobody":
         return None
-    wheels = inputs.yaw == "wheels"
+    wheels = inputs.yaw in ("wheels", "steering")
     noise = Noise(
         GYRO_DENSITY_RADPS,
         WHEEL_TURN_SHARE if wheels else 0.0,

@@ -16,10 +16,13 @@ from terrafusion.datasets.core.messages import (
     GnssSample,
     ImuSample,
     Message,
+    SteeringSample,
     TerrainSample,
     WheelSample,
+    axles,
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.steering import front_ratio
 from terrafusion.fusion.terrain.external import TRUE_SOURCES, known_probabilities
 
 
@@ -43,6 +46,7 @@ class Inlets(Protocol):
     ) -> None: ...
     def add_terrain(self, t_ns: int, probabilities: dict[str, float]) -> None: ...
     def add_command(self, t_ns: int, v_mps: float) -> None: ...
+    def add_steering(self, t_ns: int, front_rad: float, rear_rad: float) -> None: ...
     def add_pressure(self, t_ns: int, pressure_pa: float) -> None: ...
 
 
@@ -66,6 +70,8 @@ def add_message(estimator: Inlets, message: Message) -> None:
     elif isinstance(message, CommandSample):
         if np.isfinite(message.v_mps):
             estimator.add_command(message.t_ns, message.v_mps)
+    elif isinstance(message, SteeringSample):
+        _steering(estimator, message)
     elif isinstance(message, BarometerSample):
         estimator.add_pressure(message.t_ns, message.pressure_pa)
     elif isinstance(message, TerrainSample):
@@ -87,6 +93,13 @@ def _imu(estimator: Inlets, message: ImuSample) -> None:
         needed = message.gyro_radps.sum() + message.accel_mps2.sum()
     if kind != "none" and math.isfinite(needed):
         estimator.add_imu(*message)
+
+
+def _steering(estimator: Inlets, message: SteeringSample) -> None:
+    rig = estimator.config.rig
+    if rig.steering is not None and np.isfinite(message.angle_rad).all():
+        front, rear = axles(message.angle_rad[None], message.names, front_ratio(rig))[0].tolist()
+        estimator.add_steering(message.t_ns, front, rear)
 
 
 def _wheels(estimator: Inlets, message: WheelSample) -> None:

@@ -21,6 +21,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.graph.preintegration import INTEGRATION_SIGMA_M, Preintegrator
+from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.inputs.streams import ImuSegment, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -40,6 +41,13 @@ TURN_TIME_S = 10.0
 """Correlation time of that error, s (assumed): a long turn."""
 WHEEL_YAW_DENSITY_RADPS = 0.02
 """Yaw noise of the wheels on a straight, rad/s/sqrt(Hz) (assumed)."""
+STEERED_TURN_SHARE, STEERED_YAW_DENSITY_RADPS = 0.1, 0.005
+"""The same of steered wheels (assumed)."""
+STEERED_BIAS_SIGMA_RADPS, STEERED_BIAS_WALK = 0.05, 1e-3
+"""Yaw rate of a robot that steers straight ahead, 1 sigma (0.02 rad off at a wheelbase in 0.4 s), and its
+walk, rad/s/sqrt(s), by changes of speed (assumed)."""
+BIASED = ("gyro", "steering")
+"""Sources of yaw whose bias is estimated."""
 UNKNOWN_YAW_DENSITY_RADPS = 0.5
 """Yaw noise without any yaw source, rad/s/sqrt(Hz) (assumed): half a rad/s for a second."""
 
@@ -79,13 +87,19 @@ def with_wheel_acceleration(segments: list[ImuSegment], accel_mps2: float) -> li
     ]
 
 
-def yaw_of_wheels(wheels: WheelStream, track_m: float) -> Array:
-    """Angular rate (3,) between the wheels' last two samples, rad/s; x and y are NaN."""
+def yaw_of_wheels(wheels: WheelStream, track_m: float, steering: SteeringStream | None = None) -> Array:
+    """Angular rate (3,) between the wheels' last two samples, rad/s; x and y are NaN.
+
+    It is their difference over the track or, with `steering`, their mean times the path's curvature.
+    """
     rate = 0.0
     if len(wheels.t_ns) > 1 and wheels.t_ns[-1] > wheels.t_ns[-2]:
         dt = (wheels.t_ns[-1] - wheels.t_ns[-2]) * 1e-9
         left, right = wheels.left_m[-1] - wheels.left_m[-2], wheels.right_m[-1] - wheels.right_m[-2]
-        rate = (right - left) / track_m / dt
+        if steering is None:
+            rate = (right - left) / track_m / dt
+        else:
+            rate = 0.5 * (left + right) * (steering.curvature_per_m(*wheels.t_ns[-2:]) or 0.0) / dt
     return np.array([np.nan, np.nan, rate])
 
 
@@ -94,7 +108,7 @@ class PlanarPreintegrator(Preintegrator):
 
     Args:
         spec: noise of the gyro, where yaw is the gyro's.
-        yaw: source of the yaw rate: "gyro", "wheels" or "nobody".
+        yaw: source of the yaw rate: "gyro", "steering", "wheels" or "nobody".
     """
 
     def __init__(self, spec: ImuSpec, yaw: str) -> None:
@@ -124,14 +138,20 @@ class PlanarPreintegrator(Preintegrator):
             return self.spec.gyro_noise_radps_sqrthz * inflation
         if self.yaw == "nobody":
             return UNKNOWN_YAW_DENSITY_RADPS
-        return float(np.hypot(TURN_SHARE * rate_radps * np.sqrt(TURN_TIME_S), WHEEL_YAW_DENSITY_RADPS))
+        steered = self.yaw == "steering"
+        share, floor = (
+            (STEERED_TURN_SHARE, STEERED_YAW_DENSITY_RADPS)
+            if steered
+            else (TURN_SHARE, WHEEL_YAW_DENSITY_RADPS)
+        )
+        return float(np.hypot(share * rate_radps * np.sqrt(TURN_TIME_S), floor))
 
     def _planar(self, yaw_density: float, accel: tuple[float, float]) -> gtsam.PreintegrationCombinedParams:
         eye = np.eye(3)
         params = gtsam.PreintegrationCombinedParams.MakeSharedU(GRAVITY_MPS2)
         params.setGyroscopeCovariance(np.diag([TILT_DENSITY_RADPS**2, TILT_DENSITY_RADPS**2, yaw_density**2]))
         params.setAccelerometerCovariance(np.diag([accel[0] ** 2, accel[1] ** 2, ACCEL_DENSITY_MPS2**2]))
-        walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw == "gyro" else _BIAS_WALK
+        walk = self.spec.gyro_bias_walk_radps2_sqrthz if self.yaw in BIASED else _BIAS_WALK
         params.setBiasOmegaCovariance(np.diag([_BIAS_WALK**2, _BIAS_WALK**2, walk**2]))
         params.setBiasAccCovariance(eye * _BIAS_WALK**2)
         params.setIntegrationCovariance(eye * INTEGRATION_SIGMA_M**2)
@@ -141,7 +161,13 @@ class PlanarPreintegrator(Preintegrator):
 
 def planar_spec(spec: ImuSpec, yaw: str) -> ImuSpec:
     """The IMU's specification for the planar graph: no unobservable biases, no lever arm."""
-    seen = yaw == "gyro"
+    seen = yaw in BIASED
+    if yaw == "steering":  # its zero is off: at a steady speed a rate that is off
+        spec = dataclasses.replace(
+            spec,
+            gyro_bias_sigma_radps=STEERED_BIAS_SIGMA_RADPS,
+            gyro_bias_walk_radps2_sqrthz=STEERED_BIAS_WALK,
+        )
     return dataclasses.replace(
         spec,
         accel_bias_sigma_mps2=0.0,

@@ -42,7 +42,7 @@ def _motor(w: Mapping[str, Any], share: Any) -> Mapping[str, Any]:
 
 STEERED = Form(
     "drive", "steered", one("", 1.0, 0.0, 1.0), {"corner": _corner, "motor": _motor},
-    "wheel at (x, y) rolls along (1 - k y, s + k x), k = (tan f - tan r) / wheelbase, s = (tan f + tan r) / 2",
+    "a wheel at (x, y) rolls along (1 - k y, s + k x), k = (tan f - tan r) / L, s = (tan f + tan r) / 2",
     "Ackermann geometry", candidate=False,
 )  # fmt: skip
 """Share 1 of the angles among the inputs: part of a steered vehicle's plant, no effect of the catalogue."""

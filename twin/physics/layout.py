@@ -44,8 +44,8 @@ backlash (-1 to 1).
 INPUTS = (
     "left_radps", "right_radps", "left_rate_radps2", "right_rate_radps2", "steer_front_rad", "steer_rear_rad",
 )  # fmt: skip
-"""Commanded wheel speeds of the sides, rad/s, their derivatives (see `commands.delayed_inputs`), and angles of the
-front and the rear axle (bicycle model, positive to the left), which only steered vehicles have."""
+"""Commanded wheel speeds of the sides, rad/s, their derivatives (see `commands.delayed_inputs`), and angles
+of the axles (bicycle model, positive to the left), which only steered vehicles have."""
 
 VEHICLE_PARAMETERS = (
     "mass_kg", "yaw_inertia_kgm2", "wheelbase_m", "track_m", "cg_forward_m", "cg_left_m", "cg_height_m",

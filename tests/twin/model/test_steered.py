@@ -45,6 +45,8 @@ def test_the_kinematic_limit_on_firm_ground(drive: str, angle_rad: float, v: flo
     length = vehicle.body.wheelbase_m
     curvature = ends * np.tan(angle_rad) / length
     run = simulate_run(bend(v, curvature), vehicle=vehicle, noiseless=True)
+    assert run.recording.truth is not None
+    assert run.recording.truth.twist_body is not None
     u, side, rate = run.recording.truth.twist_body[-200:, [0, 1, 5]].mean(axis=0)
     assert u == pytest.approx(v, rel=0.02)
     assert rate == pytest.approx(u * curvature, rel=0.02)
@@ -154,6 +156,7 @@ def test_the_log_of_a_steered_drive(tmp_path: Path) -> None:
     folder = write_log_folder(noisy, tmp_path / "log")
     assert (folder / "steering.csv").is_file()
     back = open_recording(folder)
+    assert back.steering is not None
     np.testing.assert_array_equal(back.steering.angle_rad, noisy.steering.angle_rad)
     both = simulate(bend(0.8, 0.3, 2.0), vehicle=steered("four_wheel_steer"), noiseless=True).steering
     assert both is not None

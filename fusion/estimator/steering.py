@@ -1,0 +1,104 @@
+"""The turn of steered wheels: curvature of their angles times the distance, with scale and zero learned.
+
+The path has the curvature (1 + scale) m + zero, where m is that of the measured angles. Scale (ratio of the
+steering and wheelbase) and zero are estimated from the gyro's turns by a Kalman filter beside the graph; what is
+left of them makes the sigma of the turn, correlated over `CORRELATED_S`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.sensors import Rig, SteeringSpec
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.noise.policy import Policy, SensorNoise
+
+WHEEL_RATIO, WHEEL_RATIO_SIGMA = 16.0, 0.3
+"""Angle of a steering wheel over that of the front wheels, of cars (assumed), and its relative sigma."""
+CORRELATED_S = 30.0
+"""Time for which an error of the curvature lasts: tyres, camber of the ground, play (assumed)."""
+CURVATURE_SHARE, CURVATURE_FLOOR = 0.03, 0.002
+"""Error of the curvature by slip angles: share of it, and of one over the wheelbase (assumed)."""
+WANDER_SHARE = 0.1
+"""How far scale and zero wander in `CORRELATED_S`, in their first sigmas (assumed)."""
+LEAST_M = 0.02
+"""Distance a keyframe below which nothing is learned."""
+
+
+def front_ratio(rig: Rig) -> float:
+    """Angle of the steering wheel over that of the front wheels."""
+    known = rig.steering.ratio if rig.steering is not None else None
+    return known if known is not None else WHEEL_RATIO
+
+
+def policy_of(rig: Rig, policy: Policy) -> Policy:
+    """The policy for a robot that does not skid to turn: its wheels' yaw needs no scale."""
+    if rig.steering is None:
+        return policy
+
+    def steered(noise: SensorNoise) -> SensorNoise:
+        return dataclasses.replace(noise, yaw_scale_mean=0.0, yaw_scale_sigma=0.02)
+
+    classes = {name: steered(noise) for name, noise in policy.classes.items()}
+    return dataclasses.replace(policy, classes=classes, fixed=steered(policy.fixed))
+
+
+class SteeredTurn:
+    """Turns by steering angles.
+
+    Attributes:
+        mean: (2,) scale and zero (1/m). covariance: (2, 2) of them.
+    """
+
+    def __init__(self, rig: Rig, spec: SteeringSpec, of_steering_wheel: bool = False) -> None:
+        scale = WHEEL_RATIO_SIGMA if of_steering_wheel and spec.ratio is None else max(spec.scale_sigma, 0.02)
+        self._first = np.array([scale, max(spec.offset_sigma_rad, 1e-3) / rig.wheelbase_m])
+        self._floor_per_m = CURVATURE_FLOOR / rig.wheelbase_m
+        self._ahead_m = 0.5 * rig.wheelbase_m if rig.drive == "ackermann" else 0.0
+        self.mean: Array = np.zeros(2)
+        self.covariance: Array = np.diag(self._first**2)
+
+    def applied(
+        self, increment: WheelIncrement, curvature_per_m: float | None, dt_s: float, rate_sigma_radps: float
+    ) -> WheelIncrement:
+        """The increment with the turn of the steered wheels; scale and zero learn from its gyro's.
+
+        Args:
+            increment: with the turn by the gyro, bias removed, as `yaw_rad`.
+            curvature_per_m: of the measured angles; None where there is none.
+            dt_s: its time.
+            rate_sigma_radps: 1 sigma of the gyro's bias.
+        """
+        moved = increment.displacement_m.copy()
+        moved[1] += self._ahead_m * increment.yaw_rad  # the middle of the rear axle does not go sideways
+        increment = dataclasses.replace(increment, displacement_m=moved)
+        if curvature_per_m is None:
+            return increment.without_turn()
+        distance = increment.distance_m
+        H = np.array([curvature_per_m, 1.0])
+        turn = distance * float(curvature_per_m + H @ self.mean)
+        own = self._slipping(curvature_per_m) ** 2
+        spread = math.sqrt(float(H @ self.covariance @ H) + own)
+        lasting = math.sqrt(2.0 * CORRELATED_S / dt_s)
+        sigma = abs(distance) * spread * lasting + 1e-4
+        if abs(distance) > LEAST_M:
+            self._learn(increment.yaw_rad - turn, distance * H, dt_s, rate_sigma_radps, own, lasting)
+        return dataclasses.replace(increment, turn_rad=turn, sigma=np.append(increment.sigma[:3], sigma))
+
+    def _slipping(self, curvature_per_m: float) -> float:
+        return CURVATURE_SHARE * abs(curvature_per_m) + self._floor_per_m
+
+    def _learn(
+        self, innovation_rad: float, H: Array, dt_s: float, rate_sigma: float, own: float, lasting: float
+    ) -> None:
+        P = self.covariance + np.diag((WANDER_SHARE * self._first) ** 2) * dt_s / CORRELATED_S
+        noise = lasting**2 * ((rate_sigma * dt_s) ** 2 + own * float(H[1]) ** 2)
+        variance = float(H @ P @ H) + noise
+        gain = P @ H / variance
+        self.mean = self.mean + gain * innovation_rad
+        P = P - np.outer(gain, H @ P)
+        self.covariance = 0.5 * (P + P.T)
