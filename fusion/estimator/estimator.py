@@ -10,7 +10,6 @@ state = est.latest()
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -46,14 +45,14 @@ from terrafusion.fusion.estimator.stationarity import (
     StationarityDetector,
     add_zero_velocity,
 )
-from terrafusion.fusion.estimator.steering import SteeredTurn, policy_of
+from terrafusion.fusion.estimator.steering import policy_of, steered_turn
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.body_twist import gyro_sigma_radps
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import bridge, carried, imu_factor, mean_rates, pause, wheel_increment
-from terrafusion.fusion.graph.key_state import BIAS, VELOCITY, KeyState
+from terrafusion.fusion.graph.key_state import VELOCITY, KeyState
 from terrafusion.fusion.graph.planar import (
     level_factor,
     with_centripetal_force,
@@ -109,9 +108,7 @@ class Estimator:
         self.wheels = WheelStream(self.newest)
         self.gyro = StuckGyro(config.rig, config.inputs)
         self.steering = SteeringStream(rig, self.newest)
-        self._turn = (
-            SteeredTurn(rig, rig.steering, config.inputs.steering_wheel) if rig.steering is not None else None
-        )
+        self._turn = steered_turn(rig, config.inputs)
         self.weights = TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
@@ -403,9 +400,7 @@ class Estimator:
         increment = self._jitter.applied(increment)
         increment = self._skid.with_extra_variance(increment, before, (t_ns - before_ns) * 1e-9)
         if self._turn is not None:
-            rate_sigma = math.sqrt(self._covariance[BIAS, BIAS][5, 5]) if inputs.yaw == "gyro" else 1.0
-            curvature = self.steering.curvature_per_m(before_ns, t_ns) if inputs.yaw == "gyro" else None
-            return self._turn.applied(increment, curvature, (t_ns - before_ns) * 1e-9, rate_sigma)
+            return self._turn.between(before_ns, t_ns, increment, self.steering, self._covariance)
         return increment if inputs.sides and inputs.yaw == "gyro" else increment.without_turn()
 
     def _gated(

@@ -1,8 +1,8 @@
 """The turn of steered wheels: curvature of their angles times the distance, with scale and zero learned.
 
 The path has the curvature (1 + scale) m + zero, where m is that of the measured angles. Scale (ratio of the
-steering and wheelbase) and zero are estimated from the gyro's turns by a Kalman filter beside the graph; what is
-left of them makes the sigma of the turn, correlated over `CORRELATED_S`.
+steering and wheelbase) and zero are estimated from the gyro's turns by a Kalman filter beside the graph; what
+is left of them makes the sigma of the turn, correlated over `CORRELATED_S`.
 """
 
 from __future__ import annotations
@@ -14,7 +14,10 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import Rig, SteeringSpec
+from terrafusion.fusion.config.sensor_config import SensorConfig
+from terrafusion.fusion.graph.key_state import BIAS
 from terrafusion.fusion.graph.wheel_factor import WheelIncrement
+from terrafusion.fusion.inputs.steering import SteeringStream
 from terrafusion.fusion.noise.policy import Policy, SensorNoise
 
 WHEEL_RATIO, WHEEL_RATIO_SIGMA = 16.0, 0.3
@@ -47,6 +50,13 @@ def policy_of(rig: Rig, policy: Policy) -> Policy:
     return dataclasses.replace(policy, classes=classes, fixed=steered(policy.fixed))
 
 
+def steered_turn(rig: Rig, inputs: SensorConfig) -> SteeredTurn | None:
+    """The turn of a robot by its steering angles; None for one that does not steer."""
+    if rig.steering is None:
+        return None
+    return SteeredTurn(rig, rig.steering, inputs.steering_wheel, by_gyro=inputs.yaw == "gyro")
+
+
 class SteeredTurn:
     """Turns by steering angles.
 
@@ -54,13 +64,34 @@ class SteeredTurn:
         mean: (2,) scale and zero (1/m). covariance: (2, 2) of them.
     """
 
-    def __init__(self, rig: Rig, spec: SteeringSpec, of_steering_wheel: bool = False) -> None:
+    def __init__(
+        self, rig: Rig, spec: SteeringSpec, of_steering_wheel: bool = False, by_gyro: bool = True
+    ) -> None:
+        self._by_gyro = by_gyro
         scale = WHEEL_RATIO_SIGMA if of_steering_wheel and spec.ratio is None else max(spec.scale_sigma, 0.02)
         self._first = np.array([scale, max(spec.offset_sigma_rad, 1e-3) / rig.wheelbase_m])
         self._floor_per_m = CURVATURE_FLOOR / rig.wheelbase_m
         self._ahead_m = 0.5 * rig.wheelbase_m if rig.drive == "ackermann" else 0.0
         self.mean: Array = np.zeros(2)
         self.covariance: Array = np.diag(self._first**2)
+
+    def between(
+        self,
+        start_ns: int,
+        end_ns: int,
+        increment: WheelIncrement,
+        steering: SteeringStream,
+        covariance: Array,
+    ) -> WheelIncrement:
+        """The increment between two keyframes, under the covariance of the states at the first.
+
+        Where the angles are the only source of yaw, they are in the link of the keyframes, and not here.
+        """
+        dt_s = (end_ns - start_ns) * 1e-9
+        if not self._by_gyro:
+            return self.applied(increment, None, dt_s, 0.0)
+        rate_sigma = math.sqrt(covariance[BIAS, BIAS][5, 5])
+        return self.applied(increment, steering.curvature_per_m(start_ns, end_ns), dt_s, rate_sigma)
 
     def applied(
         self, increment: WheelIncrement, curvature_per_m: float | None, dt_s: float, rate_sigma_radps: float

@@ -46,8 +46,8 @@ STAGES: dict[str, tuple[str, ...]] = {
 """Stages in the order in which they are built, and the quantities a term may set there.
 
 `corner`, `ground`, `motor` and `wheel` are built once a wheel. In the stage `stamp` the time
-derivative of an output is known as `d_<output>`. `heading_cos` and `heading_sin` turn the wheel about z; without
-them it points along body x.
+derivative of an output is known as `d_<output>`. `heading_cos` and `heading_sin` turn the wheel about z;
+without them it points along body x.
 """
 
 PLANE = frozenset(

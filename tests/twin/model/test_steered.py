@@ -39,8 +39,7 @@ def bend(v: float, curvature: float, seconds: float = 10.0, terrain: str = "asph
 @pytest.mark.parametrize("angle_rad", [0.1, -0.4])
 @pytest.mark.parametrize("v", [0.3, -0.3])
 def test_the_kinematic_limit_on_firm_ground(drive: str, angle_rad: float, v: float) -> None:
-    """Yaw rate = v (tan front - tan rear) / wheelbase; the centre of the circle is on the line of the rear axle,
-    or abreast of the middle where both axles steer."""
+    """Yaw rate = v (tan front - tan rear) / wheelbase; rear axle, or the middle, has no side-slip."""
     vehicle, ends = steered(drive), 2 if drive == "four_wheel_steer" else 1
     length = vehicle.body.wheelbase_m
     curvature = ends * np.tan(angle_rad) / length
@@ -74,7 +73,7 @@ def test_mirrored_commands_mirror_the_drive(drive: str, terrain: str) -> None:
 @pytest.mark.parametrize("drive", STEERED)
 @pytest.mark.parametrize("terrain", ["asphalt", "loose_sand", "grass"])
 def test_energy_is_never_created(drive: str, terrain: str) -> None:
-    """What the motors gave is in speed, slip and resistance; neither of the latter gives back over a second."""
+    """The motors' work is in speed, slip and resistance; neither of the latter gives back over a second."""
     wave = DriveSegment(12.0, v_mps=0.7, yaw_rate_amplitude_radps=0.8, period_s=3.0)
     scenario = Scenario("wave", 11.9, drive=(wave,), route=(RouteLeg(terrain),))
     setup = set_up(scenario, vehicle=steered(drive))
@@ -141,7 +140,7 @@ def test_the_angle_follows_within_its_limits() -> None:
 
 
 def test_the_log_of_a_steered_drive(tmp_path: Path) -> None:
-    """steering.csv holds the angle; noise, scale and zero are those of the vehicle; a skid-steered robot has none."""
+    """steering.csv holds the angle, with noise, scale and zero of the vehicle; other drives have none."""
     assert simulate(bend(0.8, 0.3, 3.0)).steering is None
     exact, noisy = (
         simulate(bend(0.8, 0.3, 5.0), vehicle=steered("ackermann"), noiseless=exact, seed=4)
