@@ -26,11 +26,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
-from terrafusion.fusion.estimator.alignment import (
-    Start,
-    checked_start,
-    initial_state,
-)
+from terrafusion.fusion.estimator.alignment import Start, checked_start, initial_state
 from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater
@@ -41,10 +37,7 @@ from terrafusion.fusion.estimator.odometry import Propagator
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.starting import StartSearch
-from terrafusion.fusion.estimator.stationarity import (
-    StationarityDetector,
-    add_zero_velocity,
-)
+from terrafusion.fusion.estimator.stationarity import StationarityDetector, add_zero_velocity
 from terrafusion.fusion.estimator.steering import policy_of, steered_turn
 from terrafusion.fusion.estimator.stuck_gyro import StuckGyro
 from terrafusion.fusion.estimator.wheel_jitter import WheelJitter
