@@ -211,7 +211,7 @@ class _Learner:
         """What is known after the log, with what earlier logs gave."""
         if earlier is not None:
             wide = self.calibration.prior
-            self.estimator.learned.start_from(for_the_next_run(earlier, wide, self.yaw == "wheels"))
+            self.estimator.learned.start_from(for_the_next_run(earlier, wide, self.yaw))
         feed(self.estimator, self.given, progress)
         return self.known
 
@@ -255,7 +255,7 @@ def _numbers(
     before: Knowledge, after: Knowledge, params: VehicleParams, yaw: str
 ) -> dict[str, LearnedNumber]:
     gained = information_gained(before, after)
-    left_out = OF_WHEELS if yaw == "gyro" else OF_GYRO
+    left_out = {"gyro": OF_WHEELS, "wheels": OF_GYRO}.get(yaw, OF_GYRO + OF_WHEELS)
     antenna, factor = params.sensors.gnss.antenna_m, yaw_factor(params.rig())
     found = {}
     for name, row in ROWS.items():

@@ -40,7 +40,7 @@ GNSS_DELAY_SIGMA_S, WHEEL_DELAY_SIGMA_S = 0.5, 0.05
 """Receivers without a common clock report up to seconds late; wheels by a queue (assumed)."""
 CHANGE_SIGMA, WHEEL_TURN_CHANGE = np.array([1e-3, 1e-3, 0.01, 0.0, 0.0, 0.02, 0.01]), 0.05
 """Changes from one run of a robot to the next: temperature, tyres and ground, receiver (assumed); and that of
-the turn scale where it is the wheels'."""
+the turn scale where there is no gyro."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,10 +79,13 @@ def assumed(bias_sigma_radps: float, yaw_of_wheels: bool, slip_spread: float) ->
     return Knowledge(np.zeros(len(sigma)), np.diag(sigma**2), slip_spread)
 
 
-def known_before(known: SensorNumbers, wide: Knowledge, yaw_of_wheels: bool) -> Knowledge:
-    """What is known of a robot that has some of its numbers; of the others, what is known `wide`."""
-    mean, sigma, change = wide.mean.copy(), wide.sigma, _change_sigma(yaw_of_wheels)
-    for row, number in _rows(known, yaw_of_wheels).items():
+def known_before(known: SensorNumbers, wide: Knowledge, yaw: str) -> Knowledge:
+    """What is known of a robot that has some of its numbers; of the others, what is known `wide`.
+
+    `yaw` is the source of the yaw rate, as of `SensorConfig`.
+    """
+    mean, sigma, change = wide.mean.copy(), wide.sigma, _change_sigma(yaw)
+    for row, number in _rows(known, yaw).items():
         in_geometry = row in (ANTENNA_X, ANTENNA_Y) or number is known.yaw_factor  # which holds their values
         mean[row] = 0.0 if in_geometry else number.number
         if number.sigma is not None:
@@ -96,18 +99,18 @@ def known_before(known: SensorNumbers, wide: Knowledge, yaw_of_wheels: bool) -> 
     return Knowledge(mean, np.diag(sigma**2), wide.slip_spread)
 
 
-def _change_sigma(yaw_of_wheels: bool) -> Array:
+def _change_sigma(yaw: str) -> Array:
     change = CHANGE_SIGMA.copy()
-    if yaw_of_wheels:
+    if yaw != "gyro":
         change[TURN_SCALE] = WHEEL_TURN_CHANGE
     return change
 
 
-def _rows(known: SensorNumbers, yaw_of_wheels: bool) -> dict[int, KnownNumber]:
+def _rows(known: SensorNumbers, yaw: str) -> dict[int, KnownNumber]:
     """The numbers that a robot has, by their row in `NUMBERS`."""
     rows = {
-        TURN_SCALE: known.yaw_factor if yaw_of_wheels else known.gyro_scale,
-        GYRO_BIAS: None if yaw_of_wheels else known.gyro_bias_radps,
+        TURN_SCALE: {"gyro": known.gyro_scale, "wheels": known.yaw_factor}.get(yaw),
+        GYRO_BIAS: known.gyro_bias_radps if yaw == "gyro" else None,
         WHEEL_SCALE: known.wheel_scale,
         ANTENNA_X: known.antenna_m,
         ANTENNA_Y: known.antenna_m,
@@ -117,9 +120,9 @@ def _rows(known: SensorNumbers, yaw_of_wheels: bool) -> dict[int, KnownNumber]:
     return {row: number for row, number in rows.items() if number is not None}
 
 
-def for_the_next_run(known: Knowledge, wide: Knowledge, yaw_of_wheels: bool) -> Knowledge:
+def for_the_next_run(known: Knowledge, wide: Knowledge, yaw: str) -> Knowledge:
     """What one run gave, as it is known of the next one; no number is known less well than in `wide`."""
-    covariance = known.covariance + np.diag(_change_sigma(yaw_of_wheels) ** 2)
+    covariance = known.covariance + np.diag(_change_sigma(yaw) ** 2)
     limit = np.minimum(np.diag(covariance), np.diag(wide.covariance))
     shrink = np.sqrt(limit / np.diag(covariance))
     return Knowledge(known.mean, covariance * np.outer(shrink, shrink), known.slip_spread)

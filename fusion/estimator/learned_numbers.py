@@ -119,9 +119,9 @@ class LearnedNumbers:
 
 def _prior(config: EstimatorConfig) -> Knowledge:
     """What is known of the robot before it drives."""
-    wheels = config.inputs.yaw == "wheels"
-    wide = assumed(config.rig.sensors.imu.gyro_bias_sigma_radps, wheels, SLIP_SPREAD)
-    return known_before(config.rig.known, wide, wheels)
+    yaw, bias_sigma = config.inputs.yaw, config.rig.sensors.imu.gyro_bias_sigma_radps
+    wide = assumed(bias_sigma, yaw in ("wheels", "steering"), SLIP_SPREAD)
+    return known_before(config.rig.known, wide, yaw)
 
 
 def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration | None:

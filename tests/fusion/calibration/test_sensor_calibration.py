@@ -128,10 +128,10 @@ def test_the_file_carries_the_numbers_to_the_next_replay(
 def test_a_log_gives_no_more_than_changes_between_runs_allow() -> None:
     wide = assumed(1e-3, False, 0.05)
     sure = dataclasses.replace(wide, covariance=1e-6 * wide.covariance)
-    after = for_the_next_run(sure, wide, False)
+    after = for_the_next_run(sure, wide, "gyro")
     assert after.sigma[ANTENNA_X] == pytest.approx(sure.sigma[ANTENNA_X])
     assert sure.sigma[WHEEL_SCALE] < after.sigma[WHEEL_SCALE] < wide.sigma[WHEEL_SCALE]
-    assert (for_the_next_run(wide, wide, False).sigma <= wide.sigma * (1.0 + 1e-9)).all()
+    assert (for_the_next_run(wide, wide, "gyro").sigma <= wide.sigma * (1.0 + 1e-9)).all()
 
 
 def test_the_prior_follows_how_a_number_is_known() -> None:
@@ -144,7 +144,7 @@ def test_the_prior_follows_how_a_number_is_known() -> None:
         ("calibrated", (0.03, 0.01), 0.03),
     ):
         antenna = KnownNumber((0.4, 0.0, 0.5), known, sigma)
-        prior = known_before(SensorNumbers(antenna_m=antenna), wide, False)
+        prior = known_before(SensorNumbers(antenna_m=antenna), wide, "gyro")
         assert prior.mean[ANTENNA_X] == 0.0  # the lever arm itself has it
         assert prior.sigma[ANTENNA_X] == pytest.approx(expected)
     assert prior.sigma[ANTENNA_Y] == pytest.approx(0.01)
@@ -153,12 +153,14 @@ def test_the_prior_follows_how_a_number_is_known() -> None:
         yaw_factor=KnownNumber(0.5, "calibrated", 0.05),
         gnss_delay_s=KnownNumber(0.4, "assumed"),
     )
-    prior = known_before(numbers, wide, False)
+    prior = known_before(numbers, wide, "gyro")
     assert prior.mean[TURN_SCALE] == 0.03
     assert 0.002 <= prior.sigma[TURN_SCALE] < 0.004
     assert (prior.mean[GNSS_DELAY], prior.sigma[GNSS_DELAY]) == (0.4, wide.sigma[GNSS_DELAY])
-    by_wheels = known_before(numbers, assumed(1e-3, True, 0.05), True)
+    by_wheels = known_before(numbers, assumed(1e-3, True, 0.05), "wheels")
     assert by_wheels.mean[TURN_SCALE] == 0.0
+    by_steering = known_before(numbers, assumed(1e-3, True, 0.05), "steering")
+    assert by_steering.sigma[TURN_SCALE] == assumed(1e-3, True, 0.05).sigma[TURN_SCALE]  # neither is its own
     assert by_wheels.sigma[TURN_SCALE] == pytest.approx(np.hypot(0.1, 0.05))  # grounds differ
 
 
@@ -167,7 +169,7 @@ def test_without_any_number_nothing_changes() -> None:
         rig = load_vehicle(name).rig()
         assert rig.known == SensorNumbers()
         wide = assumed(rig.sensors.imu.gyro_bias_sigma_radps, False, 0.05)
-        assert np.array_equal(known_before(rig.known, wide, False).covariance, wide.covariance)
+        assert np.array_equal(known_before(rig.known, wide, "gyro").covariance, wide.covariance)
 
 
 def test_logs_that_tell_nothing_or_do_not_fit_are_refused(logs: list[Recording], tmp_path: Path) -> None:
