@@ -274,9 +274,8 @@ class Estimator:
         point, sigmas = initial_state(start, self.weights.noise, spec, drift_m, from_fixes)
         point = self.learned.with_known_bias(point, start)
         self.chain.append(start.t_ns, point, gyro_radps=np.asarray(point.bias.gyroscope()))
-        self.chain.set_prior(sigmas[: self.chain.dim])
-        if self.chain.archive is not None:
-            self.chain.archive.set_prior(sigmas[: self.chain.dim])
+        for chain in filter(None, (self.chain, self.chain.archive)):
+            chain.set_prior(sigmas[: chain.dim])
         self._solve()
         self.weights.begin(start.t_ns)
         newest = min(s.t_ns[-1] - s.late.wait_ns for s in (self.imu, self.wheels))
