@@ -8,6 +8,7 @@ import math
 import gtsam
 import numpy as np
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.robot import SensorNumbers
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.calibration.fit import Noise
@@ -41,6 +42,16 @@ TURN_TIME_S = 10.0
 """Duration of a turn in one direction, over which a wrong scale adds up (assumed)."""
 
 
+CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
+"""Numbers that correct a sensor; the others only describe its noise or belong to another state."""
+LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
+"""Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
+rotation look alike (assumed)."""
+CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 3.0]), 0.5
+"""A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
+the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
+
+
 class LearnedNumbers:
     """The numbers that an estimator learns, and the sensors that they correct.
 
@@ -56,6 +67,7 @@ class LearnedNumbers:
         self._imu, self._gnss, self._weights = imu, gnss, weights
         self._spec = config.rig.sensors.imu
         self._bias_radps = float(prior.mean[GYRO_BIAS])
+        self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
         if known != SensorNumbers():
             self._apply(prior, 0, known.wheel_scale is not None)
 
@@ -63,6 +75,7 @@ class LearnedNumbers:
         """Begin with what earlier runs of the robot gave."""
         if self.calibration is not None:
             self.calibration.start_from(prior)
+            self._before = prior
             self._bias_radps = float(prior.mean[GYRO_BIAS])
             self._apply(prior, 0)
 
@@ -109,12 +122,30 @@ class LearnedNumbers:
         return with_turn_doubt(noise, self.calibration.known, segments, self._spec)
 
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
-        self._imu.turn_scale = float(known.mean[TURN_SCALE])
-        self._gnss.correct(known.mean[[ANTENNA_X, ANTENNA_Y]], float(known.mean[GNSS_DELAY]))
+        turn_scale, x_m, y_m, delay_s = self._corrections(known).tolist()
+        self._imu.turn_scale = turn_scale
+        self._gnss.correct(np.array([x_m, y_m]), delay_s)
         if not slip:
             return
         doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))
         self._weights.learn_slip(-float(known.mean[WHEEL_SCALE]), max(doubt, LEAST_SLIP_SIGMA), t_ns)
+
+    def _corrections(self, known: Knowledge) -> Array:
+        """The numbers (4,) of `CORRECTED`: as known before, but where the drive clearly shows others.
+
+        Those are conditional on the rest being as before: at one speed an antenna further ahead and fixes
+        that come earlier cannot be told apart.
+        """
+        mean, before = known.mean[CORRECTED], self._before.mean[CORRECTED]
+        covariance = known.covariance[np.ix_(CORRECTED, CORRECTED)]
+        off, sigma = np.abs(mean - before), np.sqrt(np.diag(covariance))
+        limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
+        self._clear = clear = (off > limit * sigma) & (off > LEAST_CORRECTION)
+        out = before.copy()
+        if clear.any():
+            gain = covariance[np.ix_(clear, ~clear)] @ np.linalg.pinv(covariance[np.ix_(~clear, ~clear)])
+            out[clear] = mean[clear] + gain @ (before - mean)[~clear]
+        return out
 
 
 def _prior(config: EstimatorConfig) -> Knowledge:
