@@ -231,11 +231,13 @@ class GnssUpdater:
 
     def _doubt_used(self, chain: Chain, fix: GnssFix) -> None:
         """Doubt what fixes of a far too small sigma have made of the window, once their scatter is known."""
-        ratio, self._handled = self.scale / self._handled, self.scale
+        first, ratio, self._handled = self._handled == 1.0, self.scale / self._handled, self.scale
         for k, node in enumerate(chain.nodes, chain.first):
             for old in node.fixes[:]:
                 wider = old.sigma_m * np.array([ratio, ratio, 1.0])
                 chain.replace_fix(k, old, dataclasses.replace(old, sigma_m=wider))
+        if not first:  # the fixes since were weighted by their scatter, if by too little of it
+            return chain.smooth(len(chain.nodes))
         sigma_m = self.scale * float(np.max(fix.sigma_m[:2]))
         doubt = np.zeros(chain.dim)
         doubt[2] = min(DOUBTFUL_YAW_SIGMA_RAD, sigma_m / max(self.track.extent_m(), 1e-3)) ** 2
