@@ -62,8 +62,8 @@ _HOMES = {
 
 __all__ = [
     "ConfigError", "DataError", "Diagnosis", "Estimate", "Estimator", "EstimatorConfig", "Recording",
-    "Replay", "TerrafusionError", "Vehicle", "__version__", "benchmark", "calibrate", "calibrate_sensors", "diagnose",
-    "open", "policy", "replay", "simulate", "sweep",
+    "Replay", "TerrafusionError", "Vehicle", "__version__", "benchmark", "calibrate", "calibrate_sensors",
+    "diagnose", "open", "policy", "replay", "simulate", "sweep",
 ]  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -97,5 +98,5 @@ def dead_reckoned(drive: Drive, numbers: Array) -> Path:
     return Path(yaw, _summed(step * middle), yaw_by, z_by)
 
 
-def _summed(steps: Array) -> Array:
+def _summed(steps: Any) -> Any:
     return np.concatenate([np.zeros(1, dtype=steps.dtype), np.cumsum(steps)])

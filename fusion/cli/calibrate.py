@@ -104,7 +104,8 @@ def calibrate(
         if terrain or parameters or prior or suggest or truth or channels or robust:
             raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
         options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-        return _sensors(logs, vehicle, options, out, repair_clock)
+        _sensors(logs, vehicle, options, out, repair_clock)
+        return
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit

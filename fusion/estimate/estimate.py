@@ -21,7 +21,7 @@ STATUS = {
     "aligning": "heading is unknown until the robot has moved far enough for GNSS to show it",
     "running": "position, heading and slip are estimated",
     "outage": "no GNSS fix for more than two seconds; wheels and IMU carry the position",
-    "doubtful": "fixes contradict what wheels and gyro allow; its sigma spans what is possible, the notes tell why",
+    "doubtful": "fixes contradict wheels and gyro; sigma spans what is possible, the notes tell why",
     "no_gnss": "no usable GNSS fix has placed the path; it is local, its start and heading are arbitrary",
 }
 """Values of a status and the sentence that explains each."""

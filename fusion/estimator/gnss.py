@@ -236,15 +236,17 @@ class GnssUpdater:
             for old in node.fixes[:]:
                 wider = old.sigma_m * np.array([ratio, ratio, 1.0])
                 chain.replace_fix(k, old, dataclasses.replace(old, sigma_m=wider))
-        if not first:  # the fixes since were weighted by their scatter, if by too little of it
-            return chain.smooth(len(chain.nodes))
+        if first:  # later fixes were weighted by their scatter, if by too little of it
+            self._doubt_window(chain, fix)
+        chain.smooth(len(chain.nodes))
+
+    def _doubt_window(self, chain: Chain, fix: GnssFix) -> None:
         sigma_m = self.scale * float(np.max(fix.sigma_m[:2]))
         doubt = np.zeros(chain.dim)
         doubt[2] = min(DOUBTFUL_YAW_SIGMA_RAD, sigma_m / max(self.track.extent_m(), 1e-3)) ** 2
         doubt[3:5], doubt[VELOCITY] = sigma_m**2, VELOCITY_SIGMA_MPS**2
         doubt[BIAS], doubt[DRIFT] = self._bias_sigma**2, self.drift_sigma_m**2
         chain.restart(doubt, chain.first)
-        chain.smooth(len(chain.nodes))
 
     def _change_class(self, chain: Chain, k: int, fix: GnssFix) -> bool:
         """Restart the drift where the class of fix changes; True when it does.
@@ -311,7 +313,7 @@ class GnssUpdater:
         inflation = noise.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
         # The fix is carried to its keyframe by the speed as it is known now.
-        carried_m = abs(offset_s) * float(np.sqrt(0.5 * np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
+        carried_m = offset_s * math.sqrt(0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
         sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
         position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
         innovation = -residual(position, state.pose, state.linear)

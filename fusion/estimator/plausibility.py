@@ -190,9 +190,9 @@ class FixPlausibility:
 
     def accepted(self, pair: FixPair, anew: bool) -> None:
         """A fix is used; `anew`: the estimate was moved there."""
-        if anew and self.jump_m is not None and not within_reach(self.anchors[-1], pair, 1.0):
-            if self.run is not None and self.run.reachable:
-                self.jump_m, self.returns = None, self.returns + 1
+        known = self.run is not None and self.run.reachable
+        if anew and known and self.jump_m is not None and not within_reach(self.anchors[-1], pair, 1.0):
+            self.jump_m, self.returns = None, self.returns + 1
         if self.jump_m is not None and self._share(pair.reach_m) < SETTLED:
             self.jump_m = None
         self.anchors = [*self.anchors[-1 if anew else -2 : None if anew else -1], pair]

@@ -52,9 +52,9 @@ it, at a gate of 99.9 %, is 1e-15 for independent errors."""
 REJECTED_SHARE, MOST_REJECTED = 0.1, 0.5
 """Shares of fixes rejected beyond which the estimate rests on few of them, and on the minority."""
 CLEARLY_WORSE, CLEARLY_M, FAR_WORSE, FAR_WORSE_M = 1.5, 0.1, 2.0, 0.5
-"""Ratio and difference of errors from which on an estimate is called worse than a baseline: the first pair where
-its covariance does not allow the errors, the second where it does (slow errors of a receiver can favour dead
-reckoning by chance on a short drive)."""
+"""Ratio and difference of errors from which on an estimate is called worse than a baseline: the first pair
+where its covariance does not allow the errors, the second where it does (slow errors of a receiver can favour
+dead reckoning by chance on a short drive)."""
 LEAST_OUTAGES = 5
 """So many outages, all worse than dead reckoning, are no chance (1 in 32)."""
 MOST_PATH_RATIO = 2.0
@@ -65,8 +65,8 @@ REPORTED = (
     "wheel-radius", "yaw-unrelated", "yaw-contradiction", "imu-forward", "accel-mirrored", "gnss-frozen",
     "sigma-too-small", "standing",
 )  # fmt: skip
-"""Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that the
-estimator estimates itself, such as small scale errors and delays, or cost accuracy only."""
+"""Warnings of the log checks that make a result doubtful; errors always do. The others are of quantities that
+the estimator estimates itself, such as small scale errors and delays, or cost accuracy only."""
 
 
 @dataclass(frozen=True)
@@ -321,8 +321,8 @@ def _path_ratio(run: Run) -> Iterator[Reason]:
     if scale.high < SMALL:
         yield (
             DOUBTFUL,
-            f"the robot moved {scale.ratio:.2f} of the path of its wheels by the {scale.source}, on ground that is "
-            "not known to be soft: check wheel radius and unit, unless it slipped",
+            f"the robot moved {scale.ratio:.2f} of the path of its wheels by the {scale.source}, on ground "
+            "that is not known to be soft: check wheel radius and unit, unless it slipped",
         )
 
 

@@ -73,7 +73,7 @@ def test_opponents_bridge_a_drive_without_noise(drive: Recording) -> None:
 
 def test_a_biased_gyro_is_learned_before_the_outage(drive: Recording) -> None:
     assert drive.imu is not None
-    biased = dataclasses.replace(drive.imu, gyro_radps=drive.imu.gyro_radps + [0.0, 0.0, 0.01])
+    biased = dataclasses.replace(drive.imu, gyro_radps=drive.imu.gyro_radps + np.array([0.0, 0.0, 0.01]))
     inputs = Inertial.of(dataclasses.replace(drive, imu=biased), vehicle_of(drive, None))
     assert inputs is not None
     untouched = 0.5 * 0.01 * 30.0**2 * SPEED_MPS  # way to the side of a heading that drifts unseen
