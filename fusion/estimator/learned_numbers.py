@@ -47,6 +47,8 @@ CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
 LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 """Corrections below these (turn share, m, m, s) are left to the noise: side-slip and a wandering centre of
 rotation look alike (assumed)."""
+MOST_SPREAD = 0.1
+"""Spread of slip beyond which the wheels do not roll, and a slide looks like a delay (assumed)."""
 CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 3.0]), 0.5
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
@@ -105,10 +107,18 @@ class LearnedNumbers:
         if self._gnss.local:
             learning.restart()
             return
+        if self._slides():
+            learning.restart(forget=True)
+            return
         measured = turn_rad / (1.0 + self._imu.turn_scale)
         learning.drive(t_ns, rolled_m, measured, np.asarray(pose.translation()), pose.rotation().yaw())
         if learning.step():
             self._apply(learning.known, t_ns)
+
+    def _slides(self) -> bool:
+        """Whether the robot slides beside its wheels, of which nothing can be learned."""
+        skid = self._gnss.skid
+        return skid.rate_m2ps > 0.0 or (skid.friction is not None and skid.friction.leads)
 
     def heading_turned(self) -> None:
         """The heading was wrong, and what was learned with it may be, too."""
@@ -140,7 +150,8 @@ class LearnedNumbers:
         covariance = known.covariance[np.ix_(CORRECTED, CORRECTED)]
         off, sigma = np.abs(mean - before), np.sqrt(np.diag(covariance))
         limit = np.where(self._clear, STILL_CLEAR, 1.0) * CLEAR_SIGMA
-        self._clear = clear = (off > limit * sigma) & (off > LEAST_CORRECTION)
+        rolling = known.slip_spread < MOST_SPREAD
+        self._clear = clear = (off > limit * sigma) & (off > LEAST_CORRECTION) & rolling
         out = before.copy()
         if clear.any():
             gain = covariance[np.ix_(clear, ~clear)] @ np.linalg.pinv(covariance[np.ix_(~clear, ~clear)])

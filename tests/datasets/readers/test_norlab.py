@@ -163,7 +163,8 @@ def test_yaw_of_the_truth_is_not_scored_on_sand(published: Path) -> None:
     for name in ("sand_2024_9_25_14h13s47", "sand_2024_9_25_14h32s32"):
         windows = open_recordings(window_file(published, name))
         assert windows[0].truth_channels == ("position",)
-        assert np.mean(yaw_errors(windows) > 0.3) > 0.2
+        assert windows[0].truth is not None
+        assert windows[0].truth.quaternion is None
     for name in ("ice_2024_7_30_16h30s21", "gravel_2024_8_6_11h37s32"):
         windows = open_recordings(window_file(published, name))
         assert "yaw" in windows[0].truth_channels

@@ -151,13 +151,13 @@ def test_same_input_gives_the_same_bits(exact: Recording, what: str) -> None:
 )
 def test_what_is_assumed_is_said(exact: Recording, what: str, said: tuple[str, ...]) -> None:
     log = reduced(exact, what)
-    notes = "; ".join(sensor_config_of(log, log.gnss).notes(log))
+    notes = "; ".join(sensor_config_of(log, log.gnss).notes(log, load_vehicle("elevate").rig()))
     assert all(words in notes for words in said), notes
 
 
 def test_a_full_log_has_nothing_to_say(exact: Recording) -> None:
     assert sensor_config_of(exact, exact.gnss) == SensorConfig()
-    assert sensor_config_of(exact, exact.gnss).notes(exact) == ()
+    assert sensor_config_of(exact, exact.gnss).notes(exact, load_vehicle("elevate").rig()) == ()
 
 
 def test_roll_pitch_and_height_stay_level_without_gnss(noisy: Recording) -> None:

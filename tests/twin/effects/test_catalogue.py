@@ -272,7 +272,12 @@ def test_exchanging_left_and_right_gives_the_mirrored_motion(form) -> None:
     plain = np.array([values[n] for n in names])
     turned = plain * [-1.0 if n in ODD else 1.0 for n in names]
     here = (states.T, inputs.T, vehicle, ground)
-    there = ((states[:, rows] * signs).T, inputs[:, [1, 0, 3, 2]].T, vehicle * vehicle_signs, ground)
+    there = (
+        (states[:, rows] * signs).T,
+        (inputs[:, [1, 0, 3, 2, 4, 5]] * [1.0, 1.0, 1.0, 1.0, -1.0, -1.0]).T,
+        vehicle * vehicle_signs,
+        ground,
+    )
     moving = rhs(names)(*here, plain).full().T[:, rows] * signs
     mirrored = rhs(names)(*there, turned).full().T
     reading = measurement(names)(*here, plain, MOUNTING).full().T[:, seen] * seen_signs
