@@ -130,7 +130,6 @@ class GnssUpdater:
             self.waiting.sort(key=lambda f: f.t_ns)
 
     def correct(self, antenna_m: Array, delay_s: float) -> None:
-        """Take over a correction (2,) of the lever arm and the lateness of the stamps."""
         self.antenna_m = self.nominal_antenna_m + np.append(antenna_m, 0.0)
         self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
         self.delay_s = delay_s
@@ -312,7 +311,6 @@ class GnssUpdater:
         velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
         inflation = noise.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
-        # The fix is carried to its keyframe by the speed as it is known now.
         carried_m = offset_s * math.sqrt(0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
         sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
         position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
