@@ -66,7 +66,7 @@ class Trajectory:
     def limited_to(self, channels: Collection[str]) -> Trajectory:
         """The same trajectory without what is not in `channels`, of position, yaw, orientation and velocity.
 
-        Positions that are not known become NaN; an orientation of which only the yaw is known stays.
+        Positions that are not known become NaN; an orientation of which only the yaw is known is level.
         """
         q, P = self.quaternion, self.covariance
         position, twist = self.position_m, self.twist_body
@@ -74,6 +74,8 @@ class Trajectory:
             position = np.full_like(position, np.nan)
         if not {"yaw", "orientation"} & set(channels):
             q = None
+        elif "orientation" not in channels:
+            q = self.level().quaternion
         if "velocity" not in channels:
             twist = None
         if "position" not in channels or q is None:
@@ -83,8 +85,8 @@ class Trajectory:
         return dataclasses.replace(self, position_m=position, quaternion=q, twist_body=twist, covariance=P)
 
     def level(self) -> Trajectory:
-        """The same trajectory without roll and pitch."""
-        if self.quaternion is None:
+        """The same trajectory without roll and pitch; what is level already stays to the bit."""
+        if self.quaternion is None or not np.nan_to_num(self.quaternion[:, :2]).any():
             return self
         half = 0.5 * self.yaw_rad()
         zero = np.zeros_like(half)

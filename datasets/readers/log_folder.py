@@ -98,9 +98,6 @@ def recording_of(channels: Mapping[str, Any], meta: Meta, name: str, notes: Sequ
         name: of the recording where `meta` gives none.
         notes: of the reader; those that the log already has are not repeated.
     """
-    truth, listed = channels["truth"], meta.truth_channels or ()
-    if truth is not None and "yaw" in listed and "orientation" not in listed and _is_tilted(truth):
-        channels = {**channels, "truth": truth.level()}
     return Recording(
         name=meta.texts.get("name", name),
         start_ns=meta.start_ns,
