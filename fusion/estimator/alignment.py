@@ -188,15 +188,26 @@ def heading_from_motion(
         return None
     yaw = float(np.angle(turn))
     origin = np.average(g, weights=weight) - np.exp(1j * yaw) * np.average(z, weights=weight)
+    off = _excess(g - origin - np.exp(1j * yaw) * z, z, weight)
     heights = np.array([f.enu_m[2] for f in inside])
     height = float(np.nanmean(heights)) - antenna_m[2] if np.isfinite(heights).any() else 0.0
     return dataclasses.replace(
         level,
         position_m=np.array([origin.real, origin.imag, height]),
-        position_sigma_m=float(5.0 / np.sqrt(weight.max())) + 0.05,
+        position_sigma_m=float(5.0 * off / np.sqrt(weight.max())) + 0.05,
         yaw_rad=yaw,
-        yaw_sigma_rad=information**0.5 / abs(turn),
+        yaw_sigma_rad=off * information**0.5 / abs(turn),
     )
+
+
+def _excess(left_m: NDArray[np.complex128], z: NDArray[np.complex128], weight: Array) -> float:
+    """Root mean square of what the fixes leave over their sigma and slip, at least 1.
+
+    Sigmas are scaled by it where fixes disagree (Birge ratio; Birge 1932, Phys. Rev. 40, 207).
+    """
+    slip_m = SLIP_SIGMA * np.abs(z - np.average(z, weights=weight))
+    squares = np.abs(left_m) ** 2 / (2.0 * (1.0 / weight + slip_m**2))
+    return max(1.0, float(np.sqrt(squares.sum() / (len(z) - 2))))
 
 
 def _dead_reckon(imu: ImuStream, wheels: WheelStream, level: Start):  # type: ignore[no-untyped-def]

@@ -69,7 +69,8 @@ class PathFit:
 class FixPair:
     """A fix (east + i north, m) its reported sigma, and the dead-reckoned antenna `z` (m) then.
 
-    `reach_m`: how far the robot can have driven in all by then; `usable`: the fix may show the heading.
+    `reach_m`: how far the robot can have driven in all by then; `usable`: the fix may show the heading;
+    `alone`: it lies beyond reach, of the path and of the fixes refused before.
     """
 
     t_ns: int
@@ -78,6 +79,7 @@ class FixPair:
     sigma_m: float
     reach_m: float = 0.0
     usable: bool = True
+    alone: bool = False
 
 
 class DeadReckoning:
@@ -172,9 +174,13 @@ class DeadReckoning:
         """Scatter of the last fixes about the path over their reported sigma; NaN with too few.
 
         From second differences of fix minus path: an offset, a slow drift, a heading error or steady slip
-        do not show in them, white noise of variance s^2 does with 6 s^2.
+        do not show in them, white noise of variance s^2 does with 6 s^2. Fixes that no other supports
+        are left out where they are the fewer: each spoils three differences, a fifth of them the median.
         """
         recent = self.pairs[-SCATTER_FIXES:]
+        supported = [pair for pair in recent if not pair.alone]
+        if 2 * len(supported) > len(recent):
+            recent = supported
         if len(recent) < 8:
             return math.nan
         squares, bend, reported = self._second_differences(recent)

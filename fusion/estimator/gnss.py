@@ -134,6 +134,13 @@ class GnssUpdater:
         self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
         self.delay_s = delay_s
 
+    def refuse_waiting(self, fitting: list[GnssFix]) -> None:
+        """Drop waiting fixes that do not fit those that have given the start."""
+        kept = {id(fix) for fix in fitting}
+        before = len(self.waiting)
+        self.waiting = [fix for fix in self.waiting if id(fix) in kept]
+        self.rejected += before - len(self.waiting)
+
     def have_new(self) -> bool:
         """Whether fixes came since the last call."""
         changed = len(self.waiting) != self._seen

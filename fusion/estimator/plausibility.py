@@ -170,6 +170,9 @@ class FixPlausibility:
             self.anchors.append(dataclasses.replace(pair, fix=estimate))
         self.run = self._continued(pair, scale)
         pair.usable = self.run.reachable
+        pair.alone = not pair.usable and len(self.run.pairs) == 1
+        if len(self.run.pairs) == 2:
+            self.run.pairs[0].alone = False
         if any(PathShape.of(pairs).is_mirrored() for pairs in (track.pairs, self.run.pairs)):
             self.mirrored, self._since = True, []
             self.turned += 1

@@ -54,6 +54,7 @@ class StartSearch:
             fitting = plausible_fixes(fixes, wheels)
             start = heading_from_motion(imu, wheels, fitting, self.level, self._antenna_m)
             if start is not None and start.yaw_sigma_rad <= self._config.yaw_sigma_start_rad:
+                self._gnss.refuse_waiting(fitting)
                 return start
             if drop_before_start(imu, wheels, fixes):
                 self.level = None
