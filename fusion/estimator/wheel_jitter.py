@@ -18,8 +18,8 @@ from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 
 MEMORY = 30.0
 """Increments over which the noise is averaged."""
-MOST_M = 0.05
-"""A larger second difference is a jump, for the gate to judge (assumed)."""
+MOST_M, MOST_SIGMA = 0.05, 4.0
+"""A second difference beyond both, the latter in its own sigmas, is a jump, for the gate to judge (assumed)."""
 SHARE = math.sqrt(2.0 / 20.0)
 """Sigma of an increment over the root mean square of the second differences."""
 
@@ -36,7 +36,8 @@ class WheelJitter:
         self._last = [*self._last[-2:], wheels.distance_m]
         if len(self._last) == 3:
             a, b, c = self._last
-            bend_m = min(abs(a - 2.0 * b + c), MOST_M)
+            most_m = max(MOST_M, MOST_SIGMA * math.sqrt(self._square_m2))
+            bend_m = min(abs(a - 2.0 * b + c), most_m)
             self._square_m2 += (bend_m**2 - self._square_m2) / MEMORY
         shown_m = SHARE * math.sqrt(self._square_m2)
         if shown_m <= wheels.sigma[0]:

@@ -257,8 +257,8 @@ def test_a_receiver_that_lies_is_weighted_by_its_scatter(claimed_m: float, true_
     claims = np.where(t > 15.0, claimed_m, 0.02)[:, None]
     recording = with_fixes(honest, gnss.enu_m + lie, claims)
     fed = feed(recording, messages(recording))
-    floor_m = 0.02  # what the receiver's data sheet promises: a smaller claim is taken for it
-    assert fed.estimator.gnss.scale == pytest.approx(true_m / max(claimed_m, floor_m), rel=0.5)
+    taken_m = max(claimed_m, fed.estimator.gnss.sheet_sigma_m)  # no receiver is better than its data sheet
+    assert taken_m * fed.estimator.gnss.scale == pytest.approx(true_m, rel=0.5)
     late = nis_after(fed, honest.start_ns, 25.0)
     assert 0.3 < late.mean() / 2.0 < 2.0
     assert errors_m(honest, fed.states).max() < 2.0
