@@ -305,7 +305,7 @@ class Estimator:
         if self.config.inputs.planar:
             segments = with_centripetal_force(segments, before)
         rolled = wheels = self._wheel_increment(before_ns, t_ns, segments, before)
-        noise = self.learned.with_doubt(noise, segments)
+        noise = self.learned.with_doubt(noise, t_ns, segments)
         if self.config.inputs.planar and wheels is not None:
             gained_mps = before.rolling * wheels.speed_change_mps
             segments = with_wheel_acceleration(segments, gained_mps / dt)

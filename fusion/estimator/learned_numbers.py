@@ -39,7 +39,7 @@ LEAST_SLIP_SIGMA = 0.02
 GYRO_DENSITY_RADPS, WHEEL_TURN_SHARE = 3e-3, 0.1
 """Noise of the turn over seconds, beyond what a bias explains (assumed)."""
 TURN_TIME_S = 10.0
-"""Duration of a turn in one direction, over which a wrong scale adds up (assumed)."""
+"""Duration of a turn in one direction, over which a wrong scale adds up without fixes (assumed)."""
 
 
 CORRECTED = [TURN_SCALE, ANTENNA_X, ANTENNA_Y, GNSS_DELAY]
@@ -125,11 +125,13 @@ class LearnedNumbers:
         if self.calibration is not None:
             self.calibration.restart(forget=True)
 
-    def with_doubt(self, noise: SensorNoise, segments: list[ImuSegment]) -> SensorNoise:
-        """Noise of a keyframe's yaw rate with the uncertainty of its scale."""
-        if self.calibration is None:
+    def with_doubt(self, noise: SensorNoise, t_ns: int, segments: list[ImuSegment]) -> SensorNoise:
+        """Noise of the yaw rate, up to a keyframe at `t_ns`, with the uncertainty of its scale."""
+        last_ns = self._gnss.last_used_ns
+        if self.calibration is None or last_ns is None:
             return noise
-        return with_turn_doubt(noise, self.calibration.known, segments, self._spec)
+        unaided_s = max(t_ns - last_ns, 0) * 1e-9
+        return with_turn_doubt(noise, self.calibration.known, segments, self._spec, unaided_s)
 
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
         turn_scale, x_m, y_m, delay_s = self._corrections(known).tolist()
@@ -181,12 +183,17 @@ def _calibration(config: EstimatorConfig, prior: Knowledge) -> SelfCalibration |
 
 
 def with_turn_doubt(
-    noise: SensorNoise, known: Knowledge, segments: list[ImuSegment], imu: ImuSpec
+    noise: SensorNoise, known: Knowledge, segments: list[ImuSegment], imu: ImuSpec, unaided_s: float
 ) -> SensorNoise:
-    """Noise of a keyframe's yaw rate with the uncertainty of its scale."""
+    """Noise of a keyframe's yaw rate with the uncertainty of its scale, `unaided_s` after the last fix.
+
+    In a steady turn at rate w an error s of the scale turns the heading by s w t; white noise of density
+    sqrt(2 t) s w gives the same variance at every t.
+    """
     total = sum(s.dt_s for s in segments)
     rate = abs(sum(float(s.gyro_radps[2]) * s.dt_s for s in segments)) / total if total > 0.0 else 0.0
-    more = float(known.sigma[TURN_SCALE]) * rate * math.sqrt(TURN_TIME_S) / imu.gyro_noise_radps_sqrthz
+    grown = math.sqrt(min(2.0 * unaided_s, TURN_TIME_S))
+    more = float(known.sigma[TURN_SCALE]) * rate * grown / imu.gyro_noise_radps_sqrthz
     if more < 0.1 * noise.gyro_yaw_inflation:
         return noise
     return dataclasses.replace(noise, gyro_yaw_inflation=math.hypot(noise.gyro_yaw_inflation, more))
