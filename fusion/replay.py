@@ -103,29 +103,14 @@ def replay(
     config = EstimatorConfig(params.rig(), params.name, mode, noise, inputs=inputs, **(settings or {}))
 
     # Feed it as live; for a batch, then smooth the whole run.
-    archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
-    estimator = Estimator(
-        config,
-        on_state=lambda state: history.add(state, estimator.weights.noise, estimator.weights.take_changes()),
-        on_innovation=history.innovations.append,
-        archive=archive,
-    )
-    started = time.perf_counter()
-    latencies = feed(estimator, given, progress)
-    alignment_notes = history.align(estimator.gnss.alignment, batch)
-    if archive is not None and history.states:
-        history.smooth(archive, estimator.config, estimator.gnss.alignment is not None)
-    seconds = time.perf_counter() - started
-    if not history.states:
-        raise never_started(used)
+    run = _run_estimator(config, given, used, batch, progress)
+    estimator = run.estimator
 
     # Score it.
-    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig), *alignment_notes)
-    notes += notes_of(estimator)
+    notes = (*recording.notes, *vehicle_notes, *inputs.notes(recording, config.rig), *run.notes())
     if recording.magnetometer is not None and not magnetometer:
         notes += ("the log has a magnetometer; it is not used unless asked for (--magnetometer)",)
-    changes = [*history.changes, *estimator.weights.take_changes()]
-    estimate = history.estimate(estimator.weights.detector.classes, changes, notes)
+    estimate = run.estimate(notes)
     scores = score(
         estimate,
         recording,
@@ -150,7 +135,54 @@ def replay(
     found = run_checks(recording, config.rig) if findings is None else findings
     verdict = judge(Run(recording, estimate, scores, rivals, used, found, config.rig))
     return ReplayResult(
-        recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), seconds, latencies,
-        estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,
+        recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), run.seconds,
+        run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,
         assumptions(recording, vehicle or recording.vehicle, params, inputs, used),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class _FinishedRun:
+    """An estimator after the whole run, the states it made, and its computing time in all and by keyframe."""
+
+    estimator: Estimator
+    history: History
+    alignment_notes: tuple[str, ...]
+    seconds: float
+    latencies_ms: Array
+
+    def notes(self) -> tuple[str, ...]:
+        """What the run itself has to report."""
+        return (*self.alignment_notes, *notes_of(self.estimator))
+
+    def estimate(self, notes: tuple[str, ...]) -> Estimate:
+        """The states along time, with `notes`."""
+        weights = self.estimator.weights
+        changes = [*self.history.changes, *weights.take_changes()]
+        return self.history.estimate(weights.detector.classes, changes, notes)
+
+
+def _run_estimator(
+    config: EstimatorConfig,
+    given: Recording,
+    used: Gnss | None,
+    batch: bool,
+    progress: Callable[[float], None] | None,
+) -> _FinishedRun:
+    """Feed the samples `given` as live; for a batch, then smooth the whole run."""
+    archive, history = Chain(calibrate=config.calibrate) if batch else None, History()
+    estimator = Estimator(
+        config,
+        on_state=lambda state: history.add(state, estimator.weights.noise, estimator.weights.take_changes()),
+        on_innovation=history.innovations.append,
+        archive=archive,
+    )
+    started = time.perf_counter()
+    latencies_ms = feed(estimator, given, progress)
+    alignment_notes = history.align(estimator.gnss.alignment, batch)
+    if archive is not None and history.states:
+        history.smooth(archive, estimator.config, estimator.gnss.alignment is not None)
+    seconds = time.perf_counter() - started
+    if not history.states:
+        raise never_started(used)
+    return _FinishedRun(estimator, history, alignment_notes, seconds, latencies_ms)

@@ -126,6 +126,12 @@ def calibrate(
         )  # fmt: skip
     command = " ".join(["terrafusion", *sys.argv[1:]])
     write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command})
+    _print_result(found, suggest)
+    print(f"written to {out}")
+
+
+def _print_result(found: Calibration, suggest: bool) -> None:
+    """Print the fitted numbers, then, where asked for, the manoeuvres that would identify the rest."""
     for line in summary(found):
         print(line)
     if suggest:
@@ -133,7 +139,6 @@ def calibrate(
 
         for suggestion in suggestions(found):
             print(suggestion.sentence())
-    print(f"written to {out}")
 
 
 def _sensors(
