@@ -27,10 +27,10 @@ class Outcome:
     out: str
     err: str
 
-    def refused(self, *words: str) -> None:
+    def refused(self, *words: str) -> str:
         """Assert that the command ended as a known error must: status 1, one line, each word in it.
 
-        A YAML file has one line an error.
+        A YAML file has one line an error. Returns the lines: `assert terrafusion(...).refused(...)`.
         """
         assert self.status == 1, (self.status, self.out, self.err)
         assert self.err.startswith("error: "), self.err
@@ -39,6 +39,7 @@ class Outcome:
         assert max(map(len, self.err.splitlines())) < 1500, self.err
         for word in words:
             assert word in self.err, f"'{word}' is not told in: {self.err}"
+        return self.err
 
 
 Terrafusion = Callable[..., Outcome]

@@ -272,5 +272,7 @@ def test_the_command(server: type[Server], tmp_path: Path, terrafusion: Any) -> 
     assert str(tmp_path / "to" / "toys" / "good.bin") in got.out
     assert "CC0-1.0" in got.out
     assert got.err == ""
-    terrafusion("fetch", "toys/good", "toys/missing", "--to", tmp_path / "to").refused("missing.bin", "404")
-    terrafusion("fetch", "nothing").refused("nothing", "not in the catalogue")
+    assert terrafusion("fetch", "toys/good", "toys/missing", "--to", tmp_path / "to").refused(
+        "missing.bin", "404"
+    )
+    assert terrafusion("fetch", "nothing").refused("nothing", "not in the catalogue")

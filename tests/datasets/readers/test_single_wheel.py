@@ -78,7 +78,7 @@ def test_the_page_of_trials(tmp_path: Path, terrafusion: Any) -> None:
     assert "side_slip_deg" in shown.out
     page = json.loads(terrafusion("inspect", path, "--json").out)
     assert page["trials"] == len(read_wheel_trials(path))
-    terrafusion("convert", path, tmp_path / "out").refused("not a drive", "inspect")
+    assert terrafusion("convert", path, tmp_path / "out").refused("not a drive", "inspect")
 
 
 def axes_checks(t: WheelTrials) -> dict[str, bool]:

@@ -133,10 +133,10 @@ def test_what_cannot_be_written_is_refused_before_anything_is_computed(
     monkeypatch.setattr(run, "run_job", lambda job: pytest.fail("it ran"))
     taken = tmp_path / "file"
     taken.write_text("")
-    terrafusion("benchmark", "--out", taken, "--jobs", 1).refused("cannot be written")
+    assert terrafusion("benchmark", "--out", taken, "--jobs", 1).refused("cannot be written")
     words = ("benchmark", "--out", tmp_path / "out", "--jobs", 1)
-    terrafusion(*words, "--docs", taken).refused("no document with a place")
-    terrafusion(*words, "--only", "field=5").refused("field logs have no seeds")
+    assert terrafusion(*words, "--docs", taken).refused("no document with a place")
+    assert terrafusion(*words, "--only", "field=5").refused("field logs have no seeds")
 
 
 def test_the_commit_is_that_of_this_library_and_of_no_folder_above_it(tmp_path, monkeypatch) -> None:
@@ -240,4 +240,6 @@ def test_the_command(terrafusion, one_job, tmp_path) -> None:
     assert done.status == 0, done.err
     assert "## Errors" in done.out
     assert "outages, twin" in done.out
-    terrafusion("benchmark", "--out", tmp_path, "--only", "nothing").refused("unknown family 'nothing'")
+    assert terrafusion("benchmark", "--out", tmp_path, "--only", "nothing").refused(
+        "unknown family 'nothing'"
+    )

@@ -36,6 +36,6 @@ def test_a_vehicle_has_its_parameters_beside_it() -> None:
 
 
 def test_one_line_errors(terrafusion, tmp_path: Path) -> None:
-    terrafusion("allan", "nope").refused("nope")
+    assert terrafusion("allan", "nope").refused("nope")
     short = parked(tmp_path / "short", 5.0)
-    terrafusion("allan", short).refused("too short for an Allan deviation", "at rest")
+    assert terrafusion("allan", short).refused("too short for an Allan deviation", "at rest")

@@ -77,13 +77,13 @@ def test_unrepaired_findings_are_reported(log: Path, terrafusion) -> None:
         line for line in outcome.out.splitlines() if line.startswith("error: accel-magnitude, imu")
     )
     assert remaining.endswith("[remains: the correct values are unknown]")
-    terrafusion("replay", "out", "--out", "results").refused("gravity has been removed")
+    assert terrafusion("replay", "out", "--out", "results").refused("gravity has been removed")
 
 
 def test_a_refused_replay_names_the_remedy(log: Path, terrafusion) -> None:
     corrupt(log, "imu", ACCEL, 1 / 9.80665)
     refusal = terrafusion("replay", "log", "--out", "results")
-    refusal.refused("imu", "`terrafusion convert log OUT --apply-fixes`")
+    assert refusal.refused("imu", "`terrafusion convert log OUT --apply-fixes`")
     words = refusal.err.split("`terrafusion ")[1].split("`")[0].split()
     assert terrafusion(*(word.replace("OUT", "out") for word in words)).status == 0
     assert terrafusion("replay", "out", "--out", "results").status == 0
@@ -101,8 +101,10 @@ def test_a_clock_set_back(log: Path, terrafusion) -> None:
     """`inspect` shows it, `convert` and `replay` take it out where that is asked for."""
     set_back(log, "imu", after_s=12.0, by_s=3.0)
     assert "[clock-jump]" in terrafusion("inspect", "log").out
-    terrafusion("convert", "log", "copy").refused("imu", "time runs backwards", "--repair-clock")
-    terrafusion("replay", "log", "--out", "results").refused("imu", "time runs backwards", "--repair-clock")
+    assert terrafusion("convert", "log", "copy").refused("imu", "time runs backwards", "--repair-clock")
+    assert terrafusion("replay", "log", "--out", "results").refused(
+        "imu", "time runs backwards", "--repair-clock"
+    )
     for option in ("--repair-clock", "--apply-fixes"):
         outcome = terrafusion("convert", "log", f"with{option}", option)
         assert (outcome.status, outcome.err) == (0, ""), outcome

@@ -231,7 +231,7 @@ def test_bad_log(case: str, good_log: Path, tmp_path: Path, terrafusion) -> None
     spoil, words = BAD_LOGS[case]
     shutil.copytree(good_log, tmp_path / "log")
     spoil(tmp_path / "log")
-    terrafusion("replay", "log", "--out", "results").refused(*words)
+    assert terrafusion("replay", "log", "--out", "results").refused(*words)
     assert not (tmp_path / "results").exists()
 
 
@@ -260,7 +260,7 @@ def test_looking_at_a_bad_log_is_quiet(
 def test_a_bag_gets_no_impossible_numbers(case: str, good_log: Path, tmp_path: Path, terrafusion) -> None:
     shutil.copytree(good_log, tmp_path / "log")
     BAD_LOGS[case][0](tmp_path / "log")
-    terrafusion("convert", "log", "out.mcap").refused("log", "beyond anything possible")
+    assert terrafusion("convert", "log", "out.mcap").refused("log", "beyond anything possible")
     assert not (tmp_path / "out.mcap").exists()
 
 

@@ -94,7 +94,7 @@ BAD_WORDS: dict[str, tuple[str, tuple[str, ...]]] = {
 def test_bad_words(case: str, good_log: Path, terrafusion) -> None:
     line, words = BAD_WORDS[case]
     outcome = terrafusion(*line.replace("LOG", str(good_log)).split())
-    outcome.refused(*words)
+    assert outcome.refused(*words)
     assert "Traceback" not in outcome.out
 
 
@@ -103,7 +103,7 @@ def test_truncated_bag(share: float, husky_bag: Path, tmp_path: Path, terrafusio
     data = husky_bag.read_bytes()
     (tmp_path / "cut.bag").write_bytes(data[: min(int(share * len(data)), len(data) - 10)])
     outcome = terrafusion("replay", "cut.bag", "--vehicle", "husky", "--out", "results")
-    outcome.refused("cut.bag", "copy it again")
+    assert outcome.refused("cut.bag", "copy it again")
     assert not (tmp_path / "results").exists()
 
 
@@ -113,7 +113,7 @@ def test_bag_without_a_channel(channel: str, told: str, good_log: Path, tmp_path
     (tmp_path / "log" / f"{channel}.csv").unlink()
     assert terrafusion("convert", "log", "part.mcap").status == 0
     outcome = terrafusion("replay", "part.mcap", "--vehicle", "elevate", "--out", "results")
-    outcome.refused("part.mcap", channel, told)
+    assert outcome.refused("part.mcap", channel, told)
 
 
 @pytest.mark.parametrize("share", [0.0005, 0.1, 0.5, 0.9, 1.0])
@@ -122,7 +122,7 @@ def test_truncated_mcap(share: float, good_log: Path, tmp_path: Path, terrafusio
     data = (tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: min(int(share * len(data)), len(data) - 10)])
     outcome = terrafusion("replay", "cut.mcap", "--vehicle", "elevate", "--out", "results")
-    outcome.refused("cut.mcap", "copy it again")
+    assert outcome.refused("cut.mcap", "copy it again")
 
 
 @pytest.mark.parametrize("words", [

@@ -91,7 +91,7 @@ def test_bad_meta(case: str, good_log: Path, tmp_path: Path, terrafusion) -> Non
     spoil, words = BAD_META[case]
     shutil.copytree(good_log, tmp_path / "log")
     spoil(tmp_path / "log")
-    terrafusion("replay", "log", "--out", "results").refused(*words)
+    assert terrafusion("replay", "log", "--out", "results").refused(*words)
     assert not (tmp_path / "results").exists()
     assert not (tmp_path / "owned").exists()
 
@@ -148,4 +148,6 @@ def test_bad_vehicle_file(case: str, good_log: Path, tmp_path: Path, terrafusion
     spoilt, count = re.subn(pattern, lambda _: replacement, vehicle_text(), count=1, flags=re.MULTILINE)
     assert count == 1, "the vehicle file has changed: adapt the case"
     (tmp_path / "my.yaml").write_text(spoilt)
-    terrafusion("replay", good_log, "--vehicle", "my.yaml", "--out", "results").refused("my.yaml", *words)
+    assert terrafusion("replay", good_log, "--vehicle", "my.yaml", "--out", "results").refused(
+        "my.yaml", *words
+    )

@@ -80,12 +80,12 @@ def test_pieces_of_a_log(terrafusion, good_log: Path, tmp_path: Path) -> None:
     ],
 )
 def test_one_line_errors(terrafusion, good_log: Path, tmp_path: Path, words: tuple[str, ...], told) -> None:
-    terrafusion("calibrate", good_log, "--out", tmp_path / "fit", *words).refused(*told)
+    assert terrafusion("calibrate", good_log, "--out", tmp_path / "fit", *words).refused(*told)
     assert not (tmp_path / "fit").exists()
 
 
 def test_no_such_log(terrafusion, tmp_path: Path) -> None:
-    terrafusion("calibrate", tmp_path / "none", "--out", tmp_path / "fit").refused("none")
+    assert terrafusion("calibrate", tmp_path / "none", "--out", tmp_path / "fit").refused("none")
     assert not (tmp_path / "fit").exists()
 
 

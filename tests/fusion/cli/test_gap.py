@@ -61,7 +61,7 @@ def test_what_cannot_be_written_is_refused_before_anything_is_computed(
     targets = {"--out": tmp_path / "out", option: taken if option == "--out" else taken / "vehicle.yaml"}
     words = [str(word) for pair in targets.items() for word in pair]
     done = terrafusion("gap", str(logs / "run300"), *words)
-    done.refused("cannot be written", "taken")
+    assert done.refused("cannot be written", "taken")
     assert taken.read_text() == "mine"
     assert not (tmp_path / "out").exists()
 

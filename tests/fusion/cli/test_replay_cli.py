@@ -182,7 +182,7 @@ def test_a_file_for_a_folder_is_refused_before_anything_is_computed(
     taken = tmp_path / "taken"
     taken.write_text("mine")
     monkeypatch.setattr("terrafusion.fusion.replay.replay", lambda *_, **__: pytest.fail("computed"))
-    terrafusion("replay", drive, "--out", taken).refused("cannot be written", "taken")
+    assert terrafusion("replay", drive, "--out", taken).refused("cannot be written", "taken")
     assert taken.read_text() == "mine"
 
 

@@ -139,8 +139,8 @@ def test_the_numbers_of_the_document_still_hold(reproduced: tuple[Path, str]) ->
 
 
 def test_wrong_requests_are_refused_in_one_line(tmp_path: Path, terrafusion) -> None:
-    terrafusion("study", "--out", tmp_path / "out", "--seeds", 0).refused("seeds", "1 to 1000")
+    assert terrafusion("study", "--out", tmp_path / "out", "--seeds", 0).refused("seeds", "1 to 1000")
     (tmp_path / "file").write_text("in the way")
-    terrafusion("study", "--out", tmp_path / "file").refused("file")
+    assert terrafusion("study", "--out", tmp_path / "file").refused("file")
     assert terrafusion("study", "--out", tmp_path, "--jobs", 0).status == 2
     assert os.listdir(tmp_path) == ["file"]

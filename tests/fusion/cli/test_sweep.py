@@ -86,16 +86,16 @@ def test_the_plots_fit_the_axes(terrafusion: Any, file: Path, axes: str, plots: 
 
 
 def test_known_errors_are_one_line(terrafusion: Any, file: Path) -> None:
-    terrafusion("sweep", "climb", "--out", "out").refused("unknown sweep 'climb'", "friction_slope")
-    terrafusion("sweep", file, "--out", "out", "--max-runs", 31).refused("32 runs", "31", "--max-runs")
-    terrafusion("sweep", file, "--out", "out", "--recordings", 32).refused("no run 32", "0 to 31")
+    assert terrafusion("sweep", "climb", "--out", "out").refused("unknown sweep 'climb'", "friction_slope")
+    assert terrafusion("sweep", file, "--out", "out", "--max-runs", 31).refused("32 runs", "31", "--max-runs")
+    assert terrafusion("sweep", file, "--out", "out", "--recordings", 32).refused("no run 32", "0 to 31")
     Path("taken").write_text("")
-    terrafusion("sweep", file, "--out", "taken").refused("taken", "cannot be written")
+    assert terrafusion("sweep", file, "--out", "taken").refused("taken", "cannot be written")
     file.write_text("scenario: drive.yaml\naxes: {slope_deg: [30]}\n")
-    terrafusion("sweep", file, "--out", "out").refused("axes.slope_deg[0]", "30", "[0, 25] deg")
+    assert terrafusion("sweep", file, "--out", "out").refused("axes.slope_deg[0]", "30", "[0, 25] deg")
     address = ("--backend", "dask", "--address", "127.0.0.1")
     file.write_text(SWEEP)
-    terrafusion("sweep", file, "--out", "out", *address).refused("no address of a scheduler", "tcp://")
+    assert terrafusion("sweep", file, "--out", "out", *address).refused("no address of a scheduler", "tcp://")
     assert not list(Path(".").rglob("*.parquet"))
     assert Path("taken").read_text() == ""
 

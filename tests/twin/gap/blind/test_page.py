@@ -59,7 +59,7 @@ def test_the_command_writes_and_continues(
     scores = json.loads((out / "blind.json").read_text())
     assert scores["schema"] == "terrafusion.gap-blind/1"
     assert (scores["trials"], scores["crashes"]) == (1, [])
-    terrafusion("gap-blind", "--quick", "--seed", 9, "--out", out).refused("another seed")
+    assert terrafusion("gap-blind", "--quick", "--seed", 9, "--out", out).refused("another seed")
 
 
 def test_a_share_is_of_the_full_check(
