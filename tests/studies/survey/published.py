@@ -60,6 +60,7 @@ class Fact:
 HUSKY, JACKAL = "husky_parkinglot/test1", "husky_parkinglot/test2"
 ROVER, WARTHOG = "wvu_pathfinder", "norlab_drive"
 MOCAP, FIELD = "umich_husky/mair_mocap", "umich_husky/field"
+CAR = "comma2k19/segment_40"
 FACTS: tuple[Fact, ...] = (
     Fact(HUSKY, "duration, s", (394.5, 395.5), "395 s"),
     Fact(HUSKY, "path by wheels, m", (358, 360), "359 m"),
@@ -119,7 +120,6 @@ FACTS: tuple[Fact, ...] = (
     Fact(f"{WARTHOG}/sand*/windows", "gyro with wheels, r", (0.985, 1.0), "0.99"),
     Fact(f"{WARTHOG}/sand*/windows", "gyro with truth in the log, r", (0.65, 0.84), "poor: 0.67 to 0.82",
          Instead(0.85, 0.88, "over half seconds")),
-    Fact(f"{WARTHOG}/sand*/windows", "gyro with truth, r", (0.93, 0.97), "not told: once its lag is out"),
     Fact(f"{WARTHOG}/asphalt*", "track in yaw, m", (1.65, 1.95), "1.7 to 1.9 m",
          Instead(1.7, 2.0, "to 1.96 m")),
     Fact(f"{WARTHOG}/gr*", "track in yaw, m", (1.65, 1.95), "1.7 to 1.9 m",
@@ -172,4 +172,18 @@ FACTS: tuple[Fact, ...] = (
          Instead(-1, -1, "21 trials with a locked wheel")),
     Fact("cmu_single_wheel/*", "largest slip", (0.85, 0.95), "to 0.9"),
     Fact("cmu_single_wheel/*", "largest side-slip, deg", (89, 91), "to 90 deg"),
+    Fact(CAR, "duration, s", (59.5, 60.5), "one minute"),
+    Fact(CAR, "path by wheels, m", (950, 1050), "1 km"),
+    Fact(CAR, "channels", "wheels imu gnss truth", "wheels, IMU, fixes and pose"),
+    Fact(CAR, "wheels of", "front_left front_right rear_left rear_right mps", "four wheel speeds, m/s"),
+    Fact(CAR, "wheels rows a second", (82.5, 83.5), "83 Hz"),
+    Fact(CAR, "imu rows a second", (103.5, 104.5), "104 Hz"),
+    Fact(CAR, "gnss rows a second", (9.5, 10.5), "10 Hz"),
+    Fact(CAR, "truth rows a second", (19.9, 20.1), "20 Hz"),
+    Fact(CAR, "gravity in the log on", "-z", "forward-right-down"),
+    Fact(CAR, "gravity on body z, m/s2", (9.6, 9.85), "m/s2"),
+    Fact(CAR, "imu x left of forward, deg", (-12, 12), "forward-right-down"),
+    Fact(CAR, "path by gnss over path by wheels", (0.995, 1.015), "not told"),
+    Fact(CAR, "path by truth over path by wheels", (1.0, 1.015), "not told"),
+    Fact(CAR, "wheels behind truth, s", (-0.07, 0.01), "not told"),
 )  # fmt: skip
