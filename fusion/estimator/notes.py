@@ -40,6 +40,11 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
     ):
         if count:
             notes.append(f"{count} samples of {name} beyond {what} were left out: no robot moves so")
+    if estimator.wheels.noise.out_of_step:
+        notes.append(
+            "wheels: the counters are read out of step with their stamps; distances follow the speeds, and the "
+            "counters over ten samples"
+        )
     if estimator.gyro.samples:
         notes.append(
             f"the gyro's yaw rate stood still for {estimator.gyro.samples} samples while the wheels turned "

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import GRAVITY_MPS2
+from terrafusion.fusion.inputs.counter_noise import CounterNoise, drawn
 from terrafusion.fusion.inputs.door import (
     CONFIRMED,
     MOST_MPS,
@@ -277,7 +278,9 @@ class WheelStream:
         self.t_ns: list[int] = []
         self.left_m: list[float] = []
         self.right_m: list[float] = []
+        self.noise = CounterNoise()
         self._speeds: list[tuple[float, float]] = []
+        self._counted: list[tuple[float, float] | None] = []
 
     def add(
         self,
@@ -309,25 +312,43 @@ class WheelStream:
         self, t_ns: int, left_mps: float, right_mps: float, counted: tuple[float, float] | None
     ) -> None:
         for _ in range(self.late.from_future(t_ns, self.t_ns)):
-            for values in (self.t_ns, self.left_m, self.right_m, self._speeds):
+            for values in (self.t_ns, self.left_m, self.right_m, self._speeds, self._counted):
                 values.pop()
         i = self.late.place(t_ns, self.t_ns)
         if i is None:
             return
         self.t_ns.insert(i, t_ns)
         self._speeds.insert(i, (left_mps, right_mps))
+        self._counted.insert(i, counted)
         self.left_m.insert(i, counted[0] if counted else 0.0)
         self.right_m.insert(i, counted[1] if counted else 0.0)
-        if counted is None:
+        if counted is not None and i > 0 and i == len(self.t_ns) - 1:
+            self._watch(i)
+        if counted is None or self.noise.out_of_step:
             self._integrate_from(max(i, 1))
 
+    def _watch(self, i: int) -> None:
+        """Compare the increment of the counters that ends at sample `i` with that of the speeds."""
+        now, before = self._counted[i], self._counted[i - 1]
+        if now is not None and before is not None:
+            counted_m = 0.5 * (now[0] - before[0] + now[1] - before[1])
+            self.noise.add(counted_m, 0.5 * sum(self._by_speeds(i)))
+
+    def _by_speeds(self, j: int) -> tuple[float, float]:
+        """Distances of the sides up to sample `j` from the one before, by the trapezoid rule."""
+        half_s = 0.5e-9 * (self.t_ns[j] - self.t_ns[j - 1])
+        (left, right), (left_now, right_now) = self._speeds[j - 1], self._speeds[j]
+        return half_s * (left + left_now), half_s * (right + right_now)
+
     def _integrate_from(self, first: int) -> None:
-        """Distances by the trapezoid rule, from sample `first` on."""
+        """Distances by the speeds, drawn to the counters where there are any, from sample `first` on."""
         for j in range(first, len(self.t_ns)):
-            half_s = 0.5e-9 * (self.t_ns[j] - self.t_ns[j - 1])
-            (left, right), (left_now, right_now) = self._speeds[j - 1], self._speeds[j]
-            self.left_m[j] = self.left_m[j - 1] + half_s * (left + left_now)
-            self.right_m[j] = self.right_m[j - 1] + half_s * (right + right_now)
+            left_m, right_m = self._by_speeds(j)
+            self.left_m[j], self.right_m[j] = self.left_m[j - 1] + left_m, self.right_m[j - 1] + right_m
+            counted = self._counted[j]
+            if counted is not None:
+                self.left_m[j] = drawn(self.left_m[j], counted[0])
+                self.right_m[j] = drawn(self.right_m[j], counted[1])
 
     def covers(self, t_ns: int) -> bool:
         return bool(self.t_ns) and self.t_ns[-1] >= t_ns + self.late.wait_ns
@@ -374,4 +395,4 @@ class WheelStream:
     def forget(self, before_ns: int) -> None:
         i = bisect.bisect_left(self.t_ns, before_ns) - 1
         if i > 256:
-            del self.t_ns[:i], self.left_m[:i], self.right_m[:i], self._speeds[:i]
+            del self.t_ns[:i], self.left_m[:i], self.right_m[:i], self._speeds[:i], self._counted[:i]
