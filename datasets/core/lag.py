@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.datasets.core.conventions import true_updates
 
 Array = NDArray[np.float64]
@@ -239,5 +240,5 @@ def _spread(lags: NDArray[np.int64], parts: Array) -> float | None:
     found = np.isfinite(vertex)
     if found.mean() < 0.95:
         return None
-    low, high = np.percentile(vertex[found], [2.5, 97.5])
+    low, high = percentile_interval(vertex[found])
     return float(0.5 * (high - low) * stdtrit(blocks - 1, 0.975) / 1.96)

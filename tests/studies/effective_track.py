@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import open_recordings
@@ -75,9 +76,8 @@ def fitted(blocks: Sequence[Array]) -> float:
 
 def effective_track(blocks: Sequence[Array], nominal_m: float, seed: int = 0) -> Track:
     """The effective track of some blocks, checked on those left out of the fit."""
-    rng = np.random.default_rng(seed)
-    drawn = [fitted([blocks[i] for i in rng.integers(0, len(blocks), len(blocks))]) for _ in range(DRAWS)]
-    low, high = np.percentile(drawn, [2.5, 97.5])
+    drawn = [fitted([blocks[i] for i in rows]) for rows in resampled_rows(len(blocks), DRAWS, seed)]
+    low, high = percentile_interval(np.array(drawn))
     effective, nominal, turn = [], [], []
     for parity in (0, 1):
         track = fitted(blocks[parity::2])
@@ -86,7 +86,7 @@ def effective_track(blocks: Sequence[Array], nominal_m: float, seed: int = 0) ->
         nominal.append(rows[:, 0] / nominal_m - rows[:, 1])
         turn.append(rows[:, 1])
     rms = [float(np.sqrt(np.mean(np.concatenate(part) ** 2))) for part in (effective, nominal, turn)]
-    return Track(fitted(blocks), float(low), float(high), len(blocks), rms[0], rms[1], rms[2])
+    return Track(fitted(blocks), low, high, len(blocks), rms[0], rms[1], rms[2])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.fusion.benchmark.compare import known_median
 
 if TYPE_CHECKING:
@@ -83,8 +84,7 @@ def ratio_of(own: Sequence[Run], other: Sequence[Run]) -> tuple[float | None, fl
         chosen = [clusters[j] for j in rng.integers(len(clusters), size=len(clusters))]
         both = np.median(np.vstack([c[rng.integers(len(c), size=len(c))] for c in chosen]), axis=0)
         drawn[i] = both[0] / max(both[1], 1e-9)
-    low, high = np.percentile(drawn, [2.5, 97.5])
-    return ratio, float(low), float(high)
+    return ratio, *percentile_interval(drawn)
 
 
 def verdicts(lines: Sequence[Line]) -> list[dict[str, str | int | float | None]]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.bootstrap import resampled_rows
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 
 Array = NDArray[np.float64]
 
@@ -63,5 +63,4 @@ def _bootstrap(values: Array, statistic: object) -> Interval:
     if len(values) < LEAST_UNITS:
         return Interval(value, None, None)
     draws = [float(statistic(values[rows])) for rows in resampled_rows(len(values), RESAMPLES, SEED)]
-    low, high = np.percentile(draws, [2.5, 97.5])
-    return Interval(value, float(low), float(high))
+    return Interval(value, *percentile_interval(np.array(draws)))

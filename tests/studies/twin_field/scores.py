@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.bootstrap import resampled_groups
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_groups
 from terrafusion.fusion.benchmark.body_velocity import heading
 from terrafusion.fusion.benchmark.field_runs import DT_S
 from tests.studies.twin_field.forks import BIN_S, HORIZON_S, N_PAST, Forks, half_second_means
@@ -73,8 +73,7 @@ def interval(middle: float, draws: Array) -> Interval:
     known = draws[np.isfinite(draws)]
     if not known.size or not np.isfinite(middle):
         return Interval(np.nan, np.nan, np.nan)
-    low, high = np.percentile(known, [2.5, 97.5])
-    return Interval(float(middle), float(low), float(high))
+    return Interval(float(middle), *percentile_interval(known))
 
 
 def _medians(values: Array) -> Array:

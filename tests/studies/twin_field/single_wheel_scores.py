@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.bootstrap import resampled_groups
+from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_groups
 from terrafusion.datasets.readers.sets.single_wheel import WheelTrials
 from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector
@@ -133,8 +133,8 @@ def score(trials: WheelTrials, predicted: Array, rows: Mask, seed: int) -> dict[
         pair = target[:, k], predicted[:, k]
         samples = np.array([_r2_rmse(*pair, at) for at in drawn])
         r2, rmse = _r2_rmse(*pair, whole)
-        low, high = np.percentile(samples, [2.5, 97.5], axis=0)
-        out[name] = {"r2": r2, "r2_ci": [low[0], high[0]], "rmse": rmse, "rmse_ci": [low[1], high[1]]}
+        r2_ci, rmse_ci = (list(percentile_interval(column)) for column in samples.T)
+        out[name] = {"r2": r2, "r2_ci": r2_ci, "rmse": rmse, "rmse_ci": rmse_ci}
     return out
 
 
