@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import multiprocessing
-import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,6 +19,7 @@ import numpy as np
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from tests.studies.opponents import ekf, ours
+from tests.studies.opponents.command import further_logs
 from tests.studies.opponents.drives import Drive, all_drives, as_unknown, vehicle_of
 from tests.studies.opponents.protocol import Row, Streams, scored, streams_of
 
@@ -27,8 +27,6 @@ QUICK = (
     "wvu_pathfinder/s5t1", "husky_parkinglot/test1", "umich_husky/mair_mocap/trial1",
     "norlab_drive/asphalt_2024_9_25_12h8s57/raw", "norlab_drive/grass_2024_8_8_16h11s19/raw",
 )  # fmt: skip
-ENVIRONMENT = "TERRAFUSION_LOGS"
-"""Paths of further logs, separated as in PATH."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +91,8 @@ def main() -> int:
     parser.add_argument("--ekf", action="store_true", help="the EKF alone")
     parser.add_argument("--jobs", type=int, default=2)
     given = parser.parse_args()
-    further = [p for p in os.environ.get(ENVIRONMENT, "").split(os.pathsep) if p]
     try:
-        load(given.logs or [*QUICK, *further], given.vehicle, given.unknown)
+        load(given.logs or [*QUICK, *further_logs()], given.vehicle, given.unknown)
     except TerrafusionError as error:
         parser.exit(1, f"error: {error}\n")
     _run_all(given.seconds, ["EKF", *([] if given.ekf else given.modes)], given.jobs)

@@ -10,9 +10,7 @@ Results are kept one by one: the same command goes on where it was stopped.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -23,10 +21,10 @@ from terrafusion.fusion.benchmark.outage_plan import until
 from tests.studies.known_changes.changes import CHANGES, Change
 from tests.studies.known_changes.page import BEFORE, Found, markdown, picture
 from tests.studies.opponents import ours
-from tests.studies.opponents.drives import Drive, default_logs, drives_of, longest, vehicle_of
+from tests.studies.opponents.command import further_logs, missing, parser_of, prepared, store
+from tests.studies.opponents.drives import Drive, default_logs, vehicle_of
 from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
 from tests.studies.opponents.protocol import Streams, streams_of
-from tests.studies.opponents.table import ENVIRONMENT
 
 HERE = Path(__file__).parent
 MODE = "adaptive"
@@ -65,16 +63,13 @@ def compute(work: Work) -> dict[str, Any]:
 
 def load(names: Sequence[str], runs: int, most_s: float) -> None:
     """Read the logs and cut long ones; those that cannot be read are named and left out."""
-    _DRIVES.clear()
-    for name in names:
-        try:
-            for drive in longest(drives_of(name), runs):
-                cut = dataclasses.replace(drive, recording=until(drive.recording, most_s))
-                streams = streams_of(cut.recording, vehicle_of(cut.recording, None))
-                if streams is not None:
-                    _DRIVES.append((cut, streams))
-        except TerrafusionError as error:
-            print(f"{name}: left out, {error}", file=sys.stderr)
+
+    def prepare(drive: Drive) -> tuple[Drive, Streams] | None:
+        cut = dataclasses.replace(drive, recording=until(drive.recording, most_s))
+        streams = streams_of(cut.recording, vehicle_of(cut.recording, None))
+        return None if streams is None else (cut, streams)
+
+    _DRIVES[:] = prepared(names, runs, prepare)
 
 
 def tasks_of(seconds: float, most_s: float) -> list[Task]:
@@ -115,32 +110,18 @@ def found_in(tasks: Sequence[Task], folder: Path) -> tuple[list[Found], list[str
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.studies.known_changes.table",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder for parts, tables and figure")
-    parser.add_argument("--logs", nargs="+", metavar="LOG", help="by default all at hand")
+    parser = parser_of("known_changes.table", __doc__)
     parser.add_argument("--seconds", type=float, default=30.0, help="length of the outages")
     parser.add_argument("--most-s", type=float, default=3600.0, help="longer logs are cut")
-    parser.add_argument("--runs", type=int, default=1, help="of a file with many runs, the longest")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument(
-        "--minutes", type=float, default=600.0, help="stop after this time, with what there is"
-    )
     given = parser.parse_args()
-    further = [p for p in os.environ.get(ENVIRONMENT, "").split(os.pathsep) if p]
-    load([*(given.logs or default_logs()), *further], given.runs, given.most_s)
+    load([*(given.logs or default_logs()), *further_logs()], given.runs, given.most_s)
     if not _DRIVES:
         parser.exit(1, "error: no log can be scored; set TERRAFUSION_DATA\n")
     tasks, parts = tasks_of(given.seconds, given.most_s), given.out / "parts"
     run_all(tasks, compute, parts, given.jobs, 60.0 * given.minutes)
     found, notes = found_in(tasks, parts)
-    text = markdown(found, notes, sum(result_of(t, parts) is None for t in tasks), len(tasks))
-    (given.out / "known_changes.md").write_text(text + "\n", encoding="utf-8")
-    picture(found).savefig(given.out / "known_changes.png", dpi=110)
-    print(text)
+    text = markdown(found, notes, missing(tasks, parts), len(tasks))
+    store(given.out, "known_changes", text, picture(found))
     return 0
 
 

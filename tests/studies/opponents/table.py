@@ -10,23 +10,20 @@ the catalogue. Results are kept outage by outage: the same command goes on where
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from terrafusion.datasets.core.errors import TerrafusionError
 from tests.studies.opponents import estimators, ours
-from tests.studies.opponents.drives import Drive, as_unknown, default_logs, drives_of, longest, vehicle_of
+from tests.studies.opponents.command import further_logs, missing, parser_of, prepared, store
+from tests.studies.opponents.drives import Drive, as_unknown, default_logs, vehicle_of
 from tests.studies.opponents.inertial import Inertial
 from tests.studies.opponents.page import Cell, markdown, picture
 from tests.studies.opponents.parts import Task, code_of, library_code, result_of, run_all
 
 LENGTHS_S = (30.0, 60.0, 10.0)
-ENVIRONMENT = "TERRAFUSION_LOGS"
 DESCRIBED, UNKNOWN = "vehicle of the log", "wheel radius and track alone"
 HERE = Path(__file__).parent
 
@@ -59,15 +56,12 @@ def compute(work: Work) -> dict[str, Any]:
 
 def load(names: Sequence[str], runs: int) -> None:
     """Read the logs; those that cannot be read are named and left out."""
-    _DRIVES.clear()
-    for name in names:
-        try:
-            for drive in longest(drives_of(name), runs):
-                inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
-                if inputs is not None:
-                    _DRIVES.append((drive, inputs))
-        except TerrafusionError as error:
-            print(f"{name}: left out, {error}", file=sys.stderr)
+
+    def prepare(drive: Drive) -> tuple[Drive, Inertial] | None:
+        inputs = Inertial.of(drive.recording, vehicle_of(drive.recording, None))
+        return None if inputs is None else (drive, inputs)
+
+    _DRIVES[:] = prepared(names, runs, prepare)
 
 
 def tasks_of(lengths: Sequence[float]) -> list[Task]:
@@ -107,23 +101,11 @@ def cells_of(tasks: Sequence[Task], folder: Path) -> tuple[list[Cell], list[str]
 
 def main() -> int:
     """The command line."""
-    parser = argparse.ArgumentParser(
-        prog="python -m tests.studies.opponents.table",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--out", type=Path, required=True, help="folder for parts, tables and figure")
-    parser.add_argument("--logs", nargs="+", metavar="LOG", help="by default all at hand")
+    parser = parser_of("opponents.table", __doc__)
     parser.add_argument("--seconds", nargs="+", type=float, default=LENGTHS_S)
-    parser.add_argument("--runs", type=int, default=1, help="of a file with many runs, the longest")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument(
-        "--minutes", type=float, default=600.0, help="stop after this time, with what there is"
-    )
     parser.add_argument("--only", nargs="+", metavar="ESTIMATOR", help="run these alone")
     given = parser.parse_args()
-    further = [p for p in os.environ.get(ENVIRONMENT, "").split(os.pathsep) if p]
-    load(given.logs or [*default_logs(), *further], given.runs)
+    load(given.logs or [*default_logs(), *further_logs()], given.runs)
     if not _DRIVES:
         parser.exit(1, "error: no log can be scored; set TERRAFUSION_DATA\n")
     tasks, parts = tasks_of(given.seconds), given.out / "parts"
@@ -135,10 +117,8 @@ def main() -> int:
         60.0 * given.minutes,
     )
     cells, failures = cells_of(tasks, parts)
-    text = markdown(cells, failures, sum(result_of(t, parts) is None for t in tasks), len(tasks))
-    (given.out / "opponents.md").write_text(text + "\n", encoding="utf-8")
-    picture(cells).savefig(given.out / "opponents.png", dpi=110)
-    print(text)
+    text = markdown(cells, failures, missing(tasks, parts), len(tasks))
+    store(given.out, "opponents", text, picture(cells))
     return 0
 
 
