@@ -77,25 +77,35 @@ class Path:
     z_by: Complex
 
 
-def dead_reckoned(drive: Drive, numbers: Array) -> Path:
-    """The path of `drive` by wheels and turns with `numbers` (7,)."""
-    dt = np.diff(drive.t_s)
+def dead_reckoned(drive: Drive, numbers: Array, begin: int = 0, end: int | None = None) -> Path:
+    """The path of `drive` by wheels and turns with `numbers` (7,), from sample `begin` to `end`."""
+    end = len(drive.t_s) - 1 if end is None else end
+    t_s = drive.t_s[begin : end + 1]
+    dt, distance_m = np.diff(t_s), drive.distance_m[begin:end]
     rate_scale = 1.0 + numbers[TURN_SCALE]
-    turn = rate_scale * (drive.turn_rad - numbers[GYRO_BIAS] * dt)
+    turn = rate_scale * (drive.turn_rad[begin:end] - numbers[GYRO_BIAS] * dt)
     yaw = _summed(turn)
-    speed = drive.distance_m / dt
-    gained = np.gradient(speed) if len(speed) > 1 else np.zeros(1)
-    step = drive.distance_m + numbers[WHEEL_DELAY] * gained
+    gained = _speed_gained(drive, begin, end)
+    step = distance_m + numbers[WHEEL_DELAY] * gained
     middle = np.exp(1j * 0.5 * (yaw[1:] + yaw[:-1]))
     yaw_by = np.zeros((len(yaw), len(NUMBERS)))
     yaw_by[:, TURN_SCALE] = yaw / rate_scale
-    yaw_by[:, GYRO_BIAS] = -rate_scale * (drive.t_s - drive.t_s[0])
+    yaw_by[:, GYRO_BIAS] = -rate_scale * (t_s - t_s[0])
     z_by = np.zeros((len(yaw), len(NUMBERS)), dtype=complex)
     for number in (TURN_SCALE, GYRO_BIAS):
         by = 0.5 * (yaw_by[1:, number] + yaw_by[:-1, number])
         z_by[:, number] = _summed(1j * by * step * middle)
     z_by[:, WHEEL_DELAY] = _summed(gained * middle)
     return Path(yaw, _summed(step * middle), yaw_by, z_by)
+
+
+def _speed_gained(drive: Drive, begin: int, end: int) -> Array:
+    """Change of the wheels' speed over each sample, m/s, by central differences."""
+    first, last = max(begin - 1, 0), min(end + 1, len(drive.distance_m))
+    if last - first < 2:
+        return np.zeros(end - begin)
+    speed = drive.distance_m[first:last] / np.diff(drive.t_s[first : last + 1])
+    return np.asarray(np.gradient(speed)[begin - first :][: end - begin])
 
 
 def _summed(steps: Any) -> Any:

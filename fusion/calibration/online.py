@@ -1,18 +1,21 @@
-"""The numbers of a robot while it drives: one step of the smoother every few seconds."""
+"""The numbers of a robot while it drives: a step of the smoother every few seconds, in slices."""
 
 from __future__ import annotations
 
 import dataclasses
+from collections import deque
+from collections.abc import Sequence
 
 import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration.fit import NODE, Nodes, Noise, refined, started
-from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_due
+from terrafusion.fusion.calibration.fit import combined, started
+from terrafusion.fusion.calibration.motion import LEAST_NODE_S, Drive, dead_reckoned, node_due
 from terrafusion.fusion.calibration.numbers import GNSS_DELAY, Knowledge
+from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
 STEP_S = 4.0
-"""Time between steps while the robot drives; each costs a few milliseconds."""
+"""Time between the begins of steps while the robot drives."""
 FEWEST_NODES, MOST_NODES = 4, 60
 """Nodes before the first step, and those of a stretch: the numbers of a full one are the next one's prior."""
 FORGOTTEN = 1.1
@@ -40,24 +43,25 @@ class SelfCalibration:
         self.prior = self.known = self._before = prior
 
     def _begin(self) -> None:
-        self._start_ns = 0
-        self._t_s: list[float] = []
-        self._distance_m: list[float] = []
-        self._turn_rad: list[float] = []
-        self._first: list[int] = [0]
-        self._rolled_m, self._stepped_s = 0.0, 0.0
+        self._start_ns: int | None = None
         self._start: tuple[complex, float] = (0j, 0.0)
-        self._fix_t_s: list[float] = []
-        self._fix: list[complex] = []
-        self._fix_sigma_m: list[float] = []
+        self._drive = _empty(self._antenna_m)
+        self._first: list[int] = [0]
+        self._now_s, self._node_s, self._stepped_s, self._rolled_m = 0.0, 0.0, 0.0, 0.0
+        # Newer than `_drive`: time, distance and turn of samples; time, east, north and sigma of fixes.
+        self._samples: list[tuple[float, float, float]] = []
+        self._fixes: list[tuple[float, float, float, float]] = []
+        self._last_fix_s, self._sigmas_m = -np.inf, deque[float](maxlen=USUAL_FIXES)
         self._state: Array | None = None
+        self._work: Reduction | None = None
+        self._reduced = False
 
     def restart(self, forget: bool = False) -> None:
         """Begin a new stretch: the path was interrupted; `forget` what the last one gave if it was wrong."""
         if forget:
             self.known = self._before
         self._before = self.known
-        if self._t_s:
+        if self._start_ns is not None:
             self._begin()
 
     def drive(
@@ -70,46 +74,65 @@ class SelfCalibration:
         if distance_m is None:
             self.restart()
             return
-        if not self._t_s:
+        if self._start_ns is None:
             self._start_ns, self._start = t_ns, (complex(*position_m[:2]), yaw_rad)
-            self._t_s.append(0.0)
             return
-        self._t_s.append((t_ns - self._start_ns) * 1e-9)
-        self._distance_m.append(distance_m)
-        self._turn_rad.append(turn_rad)
+        self._now_s = (t_ns - self._start_ns) * 1e-9
+        self._samples.append((self._now_s, distance_m, turn_rad))
         self._rolled_m += abs(distance_m)
-        sigma = float(np.median(self._fix_sigma_m[-USUAL_FIXES:])) if self._fix_sigma_m else 0.0
-        if node_due(self._t_s[-1] - self._t_s[self._first[-1]], self._rolled_m, sigma):
-            self._first.append(len(self._t_s) - 1)
-            self._rolled_m = 0.0
+        apart_s = self._now_s - self._node_s
+        if apart_s >= LEAST_NODE_S:
+            sigma = float(np.median(self._sigmas_m)) if self._sigmas_m else 0.0
+            if node_due(apart_s, self._rolled_m, sigma):
+                self._first.append(len(self._drive.distance_m) + len(self._samples))
+                self._node_s, self._rolled_m = self._now_s, 0.0
 
     def fix(self, t_ns: int, enu_m: Array, sigma_m: float) -> None:
         """A fix by its own stamp."""
+        if self._start_ns is None:
+            return
         t_s = (t_ns - self._start_ns) * 1e-9
-        if self._t_s and t_s > 0.0 and (not self._fix_t_s or t_s - self._fix_t_s[-1] >= FIX_INTERVAL_S):
-            self._fix_t_s.append(t_s)
-            self._fix.append(complex(enu_m[0], enu_m[1]))
-            self._fix_sigma_m.append(sigma_m)
+        if t_s > 0.0 and t_s - self._last_fix_s >= FIX_INTERVAL_S:
+            self._fixes.append((t_s, float(enu_m[0]), float(enu_m[1]), sigma_m))
+            self._last_fix_s = t_s
+            self._sigmas_m.append(sigma_m)
 
-    def step(self) -> bool:
-        """Refine the numbers where that is due; True when they changed."""
-        if min(len(self._first), len(self._fix)) < FEWEST_NODES or self._t_s[-1] - self._stepped_s < STEP_S:
-            return False
-        if self._rolled_m == 0.0 and self._state is not None and len(self._state) == len(self._first):
-            return False
-        self._stepped_s = self._t_s[-1]
-        nodes = self._nodes()
+    def advance(self) -> bool:
+        """A slice of the step under way, or of the next one where that is due; True when it ends and the
+        numbers changed.
+        """
         try:
-            found = refined([nodes], self.known, self._before, self._noise)
+            if self._work is None:
+                if self._due():
+                    self._stepped_s = self._now_s
+                    nodes = self._nodes()
+                    self._work = Reduction.of(nodes, self.known.mean, self.known.slip_spread, self._noise)
+                return False
+            if not self._reduced:
+                self._reduced = self._work.advance()
+                return False
+            return self._end(self._work)
         except np.linalg.LinAlgError:
             self.restart()
             return False
-        if not np.isfinite(found.mean).all() or not np.isfinite(nodes.state).all():
+
+    def _due(self) -> bool:
+        fixes = len(self._drive.fix) + len(self._fixes)
+        if min(len(self._first), fixes) < FEWEST_NODES or self._now_s - self._stepped_s < STEP_S:
+            return False
+        standing = self._rolled_m == 0.0 and self._state is not None
+        return not (standing and self._state is not None and len(self._state) == len(self._first))
+
+    def _end(self, work: Reduction) -> bool:
+        """The numbers by a step whose normal equations are done; True unless they are useless."""
+        found = combined([work], self.known, self._before)
+        self._work, self._reduced = None, False
+        if not np.isfinite(found.mean).all() or not np.isfinite(work.part.state).all():
             self.known = self._before
             self._begin()
             return False
-        self._state, self.known = nodes.state, found
-        if len(self._first) >= MOST_NODES:
+        self._state, self.known = work.part.state, found
+        if len(self._state) >= MOST_NODES:
             wider = dataclasses.replace(found, covariance=found.covariance * FORGOTTEN)
             limit = np.minimum(np.diag(wider.covariance), np.diag(self.prior.covariance))
             shrink = np.sqrt(limit / np.diag(wider.covariance))
@@ -119,24 +142,16 @@ class SelfCalibration:
 
     def _nodes(self) -> Nodes:
         """The stretch with the nodes of the last step, and dead-reckoned new ones."""
-        drive = Drive(
-            np.array(self._t_s),
-            np.array(self._distance_m),
-            np.array(self._turn_rad),
-            np.array(self._fix_t_s),
-            np.array(self._fix, dtype=complex),
-            np.array(self._fix_sigma_m),
-            self._antenna_m,
-            np.array(self._first),
-        )
+        self._drive = drive = _extended(self._drive, self._samples, self._fixes, self._first)
+        self._samples, self._fixes = [], []
         if self._state is None:
             return started(drive, *self._start, self.known.mean)
         known = len(self._state)
         state = np.vstack([self._state, np.zeros((len(self._first) - known, NODE))])
-        path, last = dead_reckoned(drive, self.known.mean), self._state[-1]
-        base, new = self._first[known - 1], drive.first[known:]
-        yaw = last[2] - path.yaw_rad[base]
-        at = complex(last[0], last[1]) + (1.0 + last[3]) * np.exp(1j * yaw) * (path.z[new] - path.z[base])
+        base, last = self._first[known - 1], self._state[-1]
+        path, new = dead_reckoned(drive, self.known.mean, base), drive.first[known:] - base
+        yaw = last[2]
+        at = complex(last[0], last[1]) + (1.0 + last[3]) * np.exp(1j * yaw) * path.z[new]
         state[known:, 0], state[known:, 1], state[known:, 2] = at.real, at.imag, yaw + path.yaw_rad[new]
         state[known:, 3:] = last[3:]
         return Nodes(drive, state)
@@ -145,3 +160,29 @@ class SelfCalibration:
     def gnss_delay_s(self) -> float:
         """Lateness of the fixes' stamps."""
         return float(self.known.mean[GNSS_DELAY])
+
+
+def _empty(antenna_m: complex) -> Drive:
+    none = np.zeros(0)
+    return Drive(np.zeros(1), none, none, none, none.astype(complex), none, antenna_m, np.zeros(1, dtype=int))
+
+
+def _extended(
+    drive: Drive,
+    samples: Sequence[tuple[float, float, float]],
+    fixes: Sequence[tuple[float, float, float, float]],
+    first: Sequence[int],
+) -> Drive:
+    """A drive with what came since."""
+    t_s, distance_m, turn_rad = np.array(samples).reshape(-1, 3).T
+    fix_t_s, east_m, north_m, sigma_m = np.array(fixes).reshape(-1, 4).T
+    return Drive(
+        np.concatenate([drive.t_s, t_s]),
+        np.concatenate([drive.distance_m, distance_m]),
+        np.concatenate([drive.turn_rad, turn_rad]),
+        np.concatenate([drive.fix_t_s, fix_t_s]),
+        np.concatenate([drive.fix, east_m + 1j * north_m]),
+        np.concatenate([drive.fix_sigma_m, sigma_m]),
+        drive.antenna_m,
+        np.array(first),
+    )

@@ -359,7 +359,7 @@ class Estimator:
         return self._covariance
 
     def _upkeep(self) -> None:
-        """Heading check, smoothing and terrain: what no state waits for.
+        """Heading check, smoothing, terrain and learning: what no state waits for.
 
         Done in the call after a keyframe's, at the latest before the next keyframe, so that no call takes
         long.
@@ -374,6 +374,7 @@ class Estimator:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()
         self.weights.update(state, self.imu, self.wheels)
+        self.learned.advance(state.t_ns)
 
     def _wheel_increment(
         self, before_ns: int, t_ns: int, segments: list[ImuSegment], before: KeyState

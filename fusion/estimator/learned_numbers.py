@@ -11,7 +11,7 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.robot import SensorNumbers
 from terrafusion.datasets.core.sensors import ImuSpec
-from terrafusion.fusion.calibration.fit import Noise
+from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
@@ -94,7 +94,7 @@ class LearnedNumbers:
             self.calibration.fix(fix.t_ns, fix.enu_m, float(np.max(fix.sigma_m[:2])))
 
     def keyframe(self, t_ns: int, rolled_m: float | None, turn_rad: float, pose: gtsam.Pose3) -> None:
-        """Learn from the motion since the last keyframe, and correct the sensors where that is due.
+        """Take the motion since the last keyframe.
 
         Args:
             rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
@@ -112,8 +112,11 @@ class LearnedNumbers:
             return
         measured = turn_rad / (1.0 + self._imu.turn_scale)
         learning.drive(t_ns, rolled_m, measured, np.asarray(pose.translation()), pose.rotation().yaw())
-        if learning.step():
-            self._apply(learning.known, t_ns)
+
+    def advance(self, t_ns: int) -> None:
+        """A slice of learning's work, at keyframe `t_ns`; correct the sensors when it gives new numbers."""
+        if self.calibration is not None and self.calibration.advance():
+            self._apply(self.calibration.known, t_ns)
 
     def _slides(self) -> bool:
         """Whether the robot slides beside its wheels, of which nothing can be learned."""

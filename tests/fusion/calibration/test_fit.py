@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from terrafusion.datasets.core.arrays import Array
-from terrafusion.fusion.calibration import fit as smoother
-from terrafusion.fusion.calibration.fit import NODE, Nodes, Noise, fit, information_gained, refined, started
+from terrafusion.fusion.calibration import reduction
+from terrafusion.fusion.calibration.fit import fit, information_gained, refined, started
+from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_starts
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
@@ -72,9 +73,14 @@ def test_derivatives_of_the_path_are_those_of_finite_differences() -> None:
 
 def kinds(nodes: Nodes, numbers: Array) -> list[tuple[Array, Array, Array]]:
     """Whitened rows, residuals and columns of fixes and of links."""
-    path = dead_reckoned(nodes.drive, numbers)
-    links = smoother._link_rows(nodes, path, 0.03, NOISE, numbers)
-    return [smoother._fix_rows(nodes, path, numbers, NOISE), *links]
+    path, count = dead_reckoned(nodes.drive, numbers), len(nodes.state)
+    part = Reduction.of(nodes, numbers, 0.03, NOISE)
+    fixes = (*part._fix_rows(path, 0, slice(None)), part.node, 1)
+    shared = NODE * count + np.arange(len(NUMBERS))
+    return [
+        (rows, left, np.array([[*(NODE * k + np.arange(NODE * span)), *shared] for k in node]))
+        for rows, left, node, span in (fixes, *part._link_rows(path, 0, count))
+    ]
 
 
 def test_derivatives_of_all_rows_are_those_of_finite_differences() -> None:
@@ -143,3 +149,30 @@ def test_a_step_never_loses_information() -> None:
     nodes = started(figure(120.0, fix_sigma_m=0.3), 0j, 0.0, PRIOR.mean)
     after = refined([nodes], PRIOR, PRIOR, NOISE)
     assert (after.sigma <= PRIOR.sigma * (1 + 1e-9)).all()
+
+
+def test_slices_give_the_dense_normal_equations(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reduction, "CAUCHY_SQUARE", np.inf)
+    nodes = started(figure(600.0, fix_sigma_m=0.0), 0j, 0.0, TRUE)
+    nodes.state[:, :2] *= 1.0 + TRUE[WHEEL_SCALE]
+    nodes.state[:, 0] += 0.005
+    count, part = len(nodes.state), Reduction.of(nodes, TRUE, 0.03, NOISE)
+    slices = 1
+    while not part.advance():
+        slices += 1
+    assert slices > 10
+    unknowns = NODE * count + len(NUMBERS)
+    H, g = np.zeros((unknowns, unknowns)), np.zeros(unknowns)
+    for rows, left, columns in kinds(nodes, TRUE):
+        for row, own, places in zip(rows, left, columns, strict=True):
+            H[np.ix_(places, places)] += row.T @ row
+            g[places] -= row.T @ own
+    n = NODE * count
+    back = np.linalg.solve(H[:n, :n], np.column_stack([H[:n, n:], g[:n]]))
+    information = H[n:, n:] - H[n:, :n] @ back[:, :-1]
+    scale = 1.0 / np.sqrt(np.diag(information))
+    assert np.allclose(
+        scale * part.information * scale[:, None], scale * information * scale[:, None], atol=1e-6
+    )
+    right = g[n:] - H[n:, :n] @ back[:, -1]
+    assert np.allclose(part.right * scale, right * scale, atol=1e-6 * np.abs(g).max() * scale.max())

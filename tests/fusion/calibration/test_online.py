@@ -8,7 +8,9 @@ from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.motion import Drive
 from terrafusion.fusion.calibration.numbers import NUMBERS, Knowledge
 from terrafusion.fusion.calibration.online import MOST_NODES, SelfCalibration
-from tests.fusion.calibration.test_fit import NOISE, PRIOR, TRUE, figure
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.twin.simulate import simulate
+from tests.fusion.calibration.test_fit import NOISE, PRIOR, STEP_S, TRUE, figure
 
 
 def driven(drive: Drive, learning: SelfCalibration, begin_ns: int = 0) -> list[Knowledge]:
@@ -25,7 +27,7 @@ def driven(drive: Drive, learning: SelfCalibration, begin_ns: int = 0) -> list[K
             fix = np.array([drive.fix[j].real, drive.fix[j].imag, 0.0])
             learning.fix(begin_ns + round(drive.fix_t_s[j] * 1e9), fix, float(drive.fix_sigma_m[j]))
             j += 1
-        if learning.step():
+        if learning.advance():
             known.append(learning.known)
     return known
 
@@ -40,7 +42,7 @@ def test_numbers_are_found_while_driving_and_their_sigmas_shrink() -> None:
 def test_a_long_drive_is_cut_into_stretches_and_keeps_what_it_learned() -> None:
     learning = SelfCalibration(PRIOR, NOISE, 0j)
     known = driven(figure(600.0, fix_sigma_m=0.05), learning)
-    assert len(learning._first) < MOST_NODES
+    assert len(learning._first) < MOST_NODES + 2
     assert np.allclose(known[-1].mean[:6], TRUE[:6], atol=[3e-3, 3e-4, 6e-3, 0.03, 0.03, 0.03])
 
 
@@ -70,3 +72,40 @@ def test_equal_input_gives_equal_bits() -> None:
 def same(a: Array, b: Array) -> bool:
     """Whether two vectors of numbers have the same bits."""
     return len(a) == len(NUMBERS) and a.tobytes() == b.tobytes()
+
+
+def test_a_step_takes_many_short_slices() -> None:
+    drive = figure(400.0, fix_sigma_m=0.05)
+    learning = SelfCalibration(PRIOR, NOISE, 0j)
+    driven(drive, learning)
+    while learning._work is None:
+        t_ns = learning._start_ns + round((learning._now_s + 0.1) * 1e9)
+        learning.drive(t_ns, 0.1, 0.0, np.zeros(2), 0.0)
+        learning.advance()
+    known, slices = learning.known, 0
+    while learning._work is not None:
+        assert learning.known is known
+        assert learning.advance() == (learning._work is None)
+        slices += 1
+    assert learning.known is not known
+    assert slices > 3
+    assert slices * STEP_S < 4.0
+
+
+def test_an_estimator_restored_within_a_step_learns_the_same() -> None:
+    messages = list(simulate("figure_eight", terrain="asphalt", seed=5).messages())
+    estimator = Estimator.for_vehicle("elevate")
+    learning = estimator.learned.calibration
+    assert learning is not None
+    for place, message in enumerate(messages):
+        estimator.add(message)
+        if learning._work is not None and learning._work.done_nodes:
+            break
+    again = Estimator.restore(estimator.config, estimator.dump())
+    for message in messages[place + 1 : place + 400]:
+        estimator.add(message)
+        again.add(message)
+    assert learning._work is None
+    assert again.learned.calibration is not None
+    assert same(again.learned.calibration.known.mean, learning.known.mean)
+    assert not same(learning.known.mean, learning.prior.mean)
