@@ -361,8 +361,7 @@ class Estimator:
     def _upkeep(self) -> None:
         """Heading check, smoothing, terrain and learning: what no state waits for.
 
-        Done in the call after a keyframe's, at the latest before the next keyframe, so that no call takes
-        long.
+        Done in the call after a keyframe's, at the latest before the next keyframe.
         """
         state, self._fresh = self._fresh, None
         if state is None:

@@ -11,7 +11,6 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.robot import SensorNumbers
 from terrafusion.datasets.core.sensors import ImuSpec
-from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
@@ -24,6 +23,7 @@ from terrafusion.fusion.calibration.numbers import (
     known_before,
 )
 from terrafusion.fusion.calibration.online import SelfCalibration
+from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater

@@ -8,7 +8,6 @@ import pytest
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration import reduction
 from terrafusion.fusion.calibration.fit import fit, information_gained, refined, started
-from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_starts
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
@@ -18,6 +17,7 @@ from terrafusion.fusion.calibration.numbers import (
     WHEEL_SCALE,
     assumed,
 )
+from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
 NOISE = Noise(yaw_density_radps=1e-3, turn_share=0.0, drift_share=0.0, drift_time_s=60.0)
 TRUE = np.array([0.03, 0.002, -0.06, -0.35, 0.1, 0.8, 0.0])
