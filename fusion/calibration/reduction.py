@@ -35,7 +35,7 @@ YAW_PER_S_RAD = 2e-4
 CAUCHY_SQUARE = 6.0
 """Squared normalised residual of a fix (two axes) at which it counts half: 95 % of good ones are below."""
 SLICE_SAMPLES, SLICE_FIXES = 400, 200
-"""Samples and fixes of a slice, a third of a millisecond each; one node at least."""
+"""Samples and fixes of a slice at most, but one node at least: they bound its computing time."""
 _ROW, _COLUMN = np.meshgrid(np.arange(NODE), np.arange(NODE), indexing="ij")
 _LOWER = _ROW >= _COLUMN
 
