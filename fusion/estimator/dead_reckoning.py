@@ -20,7 +20,7 @@ from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.inputs.streams import GnssFix
 
 KEPT_S = 30.0
-SCATTER_FIXES = 21
+SCATTER_FIXES, LEAST_FIXES = 21, 8
 """Fixes over which the scatter is taken; the median bears ten outliers."""
 RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
 """Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
@@ -175,13 +175,13 @@ class DeadReckoning:
 
         From second differences of fix minus path: an offset, a slow drift, a heading error or steady slip
         do not show in them, white noise of variance s^2 does with 6 s^2. Fixes that no other supports
-        are left out where they are the fewer: each spoils three differences, a fifth of them the median.
+        are left out where they are the fewer, of all and of the newest: each spoils three differences, a
+        fifth of them the median.
         """
         recent = self.pairs[-SCATTER_FIXES:]
-        supported = [pair for pair in recent if not pair.alone]
-        if 2 * len(supported) > len(recent):
-            recent = supported
-        if len(recent) < 8:
+        if not any(_mostly_alone(pairs) for pairs in (recent, recent[-LEAST_FIXES:])):
+            recent = [pair for pair in recent if not pair.alone]
+        if len(recent) < LEAST_FIXES:
             return math.nan
         squares, bend, reported = self._second_differences(recent)
         if len(squares) < 6:
@@ -307,3 +307,7 @@ class DeadReckoning:
 def _median(values: Array) -> float:
     """Upper median; a tenth of `np.median`'s time."""
     return float(np.sort(values)[len(values) // 2])
+
+
+def _mostly_alone(pairs: list[FixPair]) -> bool:
+    return 2 * sum(pair.alone for pair in pairs) >= max(len(pairs), 1)

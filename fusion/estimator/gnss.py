@@ -11,18 +11,18 @@ from scipy.stats import chi2
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
-from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
+from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
 from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
 from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
-from terrafusion.fusion.graph.factors import antenna_lever, gnss_velocity
+from terrafusion.fusion.graph.factors import gnss_velocity
 from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
-from terrafusion.fusion.graph.key_state import ANTENNA, BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
+from terrafusion.fusion.graph.key_state import BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -34,9 +34,6 @@ KINEMATIC_M, RTK_SHEET_M = 0.01, 0.05
 """Least horizontal sigma of a fix, whatever the receiver reports: RTK in motion has 8 mm + 1 ppm (data
 sheets). Up to the second, a data sheet is that of RTK, and itself the least."""
 UNKNOWN_HEIGHT_SIGMA_M = 100.0
-LARGE_TURN_RAD = 0.05
-APART_NS = 1_000_000_000
-"""Keyframes are closer than this; a fix farther from the next one came in a pause of the IMU."""
 UNUSED_WEIGHT = 0.01
 """A fix of which a robust loss leaves less does not end an outage."""
 WHITE_SHARE = 0.2
@@ -307,20 +304,12 @@ class GnssUpdater:
     def _add_fix(
         self, chain: Chain, k: int, fix: GnssFix, covariance: Array, noise: SensorNoise, again: bool = False
     ) -> bool:
-        node, state = chain.nodes[k - chain.first], chain.state(k)
-        delay_s = float(state.of(GNSS_DELAY))
-        offset_s = (fix.t_ns - node.t_ns) * 1e-9 - delay_s
-        R = state.pose.rotation().matrix()
-        rate = state.rate(node.gyro_radps)
-        accel_world = R @ state.specific_force(node.accel_mps2) - np.array([0.0, 0.0, GRAVITY_MPS2])
-        antenna = self.antenna_m + np.append(state.of(ANTENNA), 0.0)
-        lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - self.antenna_m)
-        velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
+        state, at = chain.state(k), AntennaMotion.of(chain, k, fix, self.antenna_m)
         inflation = noise.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
-        carried_m = offset_s * math.sqrt(0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
+        carried_m = at.offset_s * math.sqrt(0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
         sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
-        position = GnssPosition(fix.enu_m, lever, sigma, share, velocity, delay_s=delay_s)
+        position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps, delay_s=at.delay_s)
         innovation = -residual(position, state.pose, state.linear)
         H_pose, H_linear = jacobians(position, state.pose, state.linear)
         J = np.hstack([H_pose, np.zeros((3, 9)), H_linear])[:, : chain.dim]
@@ -359,33 +348,41 @@ class GnssUpdater:
         self.skid.accepted(fix.t_ns, innovation[:2], P[[0, 1], [0, 1]])
         P[[0, 1], [0, 1]] += (scale**2 - 1.0) * sigma[:2] ** 2
         sigma[:2] *= scale
-        cut = self._cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
+        cut = cut_past(chain, k, covariance, innovation[:2], P[:2, :2], J[:2], verdict)
         known = bool(np.isfinite(innovation[2] + sigma[2]))
         if (
             not known
             or self.height_gate.test(innovation[2:], P[2:, 2:] + sigma[2] ** 2)[0] is GateDecision.REJECT
         ):
-            height = (np.asarray(state.pose.translation()) + R @ lever)[2]
+            height = (np.asarray(state.pose.translation()) + at.R @ at.lever_m)[2]
             sigma = np.append(sigma[:2], UNKNOWN_HEIGHT_SIGMA_M)
             position = dataclasses.replace(position, enu_m=np.append(fix.enu_m[:2], height), sigma_m=sigma)
         chain.add_fix(k, dataclasses.replace(position, weight=weight))
-        measured_mps = self._usable_velocity(fix, velocity, covariance)
-        if measured_mps is not None:
-            sigma_v = round(max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), 4)
-            if chain.dim > GNSS_DELAY:
-                doubt = float(np.linalg.norm(accel_world) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
-                at_keyframe = measured_mps - accel_world * offset_s
-                sigma_v, turned = math.hypot(sigma_v, doubt), lever_arm_velocity(rate, offset_s)
-                chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
-            else:
-                body_velocity = measured_mps - R @ np.cross(rate, antenna) - accel_world * offset_s
-                chain.add(k, gnss_velocity(k, body_velocity, sigma_v), "V")
+        self._add_velocity(chain, k, fix, at, covariance, noise)
         if cut:
             chain.smooth(chain.last - k + 1)
             chain.restart(np.zeros(chain.dim), k)
         if weight > UNUSED_WEIGHT:
             self.last_used_ns = max(fix.t_ns, self.last_used_ns or fix.t_ns)
         return True
+
+    def _add_velocity(
+        self, chain: Chain, k: int, fix: GnssFix, at: AntennaMotion, covariance: Array, noise: SensorNoise
+    ) -> None:
+        measured_mps = self._usable_velocity(fix, at.velocity_mps, covariance)
+        if measured_mps is None:
+            return
+        sigma_v = round(max(fix.sigma_v_mps * noise.gnss_inflation, 1e-3), 4)
+        at_keyframe = measured_mps - at.accel_mps2 * at.offset_s
+        if chain.dim > GNSS_DELAY:
+            doubt = float(np.linalg.norm(at.accel_mps2) * np.sqrt(covariance[GNSS_DELAY, GNSS_DELAY]))
+            sigma_v, turned = math.hypot(sigma_v, doubt), lever_arm_velocity(at.rate_radps, at.offset_s)
+            chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
+        else:
+            lever_mps = at.R @ np.cross(at.rate_radps, at.antenna_m)
+            chain.add(
+                k, gnss_velocity(k, measured_mps - lever_mps - at.accel_mps2 * at.offset_s, sigma_v), "V"
+            )
 
     def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
         """The velocity of a fix, where it has one that the robot can have."""
@@ -421,37 +418,3 @@ class GnssUpdater:
         drift_m = share * self.drift_sigma_m
         level = np.sqrt(np.maximum(reported[:2] ** 2 - drift_m**2, self.white * reported[:2] ** 2))
         return np.maximum(np.append(level, reported[2] * self._height_factor), LEAST_SIGMA_M)
-
-    @staticmethod
-    def _cut_past(
-        chain: Chain,
-        k: int,
-        covariance: Array,
-        innovation_m: Array,
-        S: Array,
-        jacobian: Array,
-        verdict: GateDecision,
-    ) -> bool:
-        """Cut the past off before a fix that would turn it far, or that shows the estimate to be wrong.
-
-        A fix after a long outage can turn the heading by more than the window's linearisation bears;
-        applied to its keyframe alone it is a Kalman update, which cannot diverge.
-        """
-        gain = covariance @ jacobian.T @ np.linalg.inv(S)
-        doubt = np.zeros(chain.dim)
-        if verdict is GateDecision.REACQUIRE:
-            doubt[3:6] = float(innovation_m @ innovation_m)
-        elif float(np.abs(gain[:3] @ innovation_m).max()) < LARGE_TURN_RAD:
-            return False
-        chain.restart(doubt, k)
-        return True
-
-
-def keyframe_of(fix: GnssFix, chain: Chain) -> int | None:
-    """The keyframe at or after a fix, its stamp corrected by the estimated delay; None in a pause."""
-    t_ns = fix.t_ns
-    if chain.dim > GNSS_DELAY:
-        delay_s = float(chain.state(chain.last).of(GNSS_DELAY))
-        t_ns = min(fix.t_ns - round(delay_s * 1e9), chain.nodes[-1].t_ns)
-    k = chain.at_or_after(t_ns)
-    return None if k is None or chain.nodes[k - chain.first].t_ns - t_ns > APART_NS else k

@@ -42,8 +42,8 @@ def notes_of(estimator: Estimator) -> tuple[str, ...]:
             notes.append(f"{count} samples of {name} beyond {what} were left out: no robot moves so")
     if estimator.wheels.noise.out_of_step:
         notes.append(
-            "wheels: the counters are read out of step with their stamps; distances follow the speeds, and the "
-            "counters over ten samples"
+            "wheels: the counters are read out of step with their stamps; distances follow the speeds, and "
+            "over ten samples the counters"
         )
     if estimator.gyro.samples:
         notes.append(

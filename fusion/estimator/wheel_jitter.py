@@ -19,7 +19,7 @@ from terrafusion.fusion.graph.wheel_factor import WheelIncrement
 MEMORY = 30.0
 """Increments over which the noise is averaged."""
 MOST_M, MOST_SIGMA = 0.05, 4.0
-"""A second difference beyond both, the latter in its own sigmas, is a jump, for the gate to judge (assumed)."""
+"""A second difference beyond both, the latter in its own sigmas, is a jump that the gate judges (assumed)."""
 SHARE = math.sqrt(2.0 / 20.0)
 """Sigma of an increment over the root mean square of the second differences."""
 

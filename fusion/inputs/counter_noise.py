@@ -1,8 +1,8 @@
 """Wheel counters that are read out of step with their stamps, seen beside the speeds that come with them.
 
-A count that belongs to another moment than its stamp makes increments that alternate about the speed. Taken for
-motion they look like slip: of two sensors of a change of speed the one that is believed too much is scaled
-down (errors in variables; Fuller 1987, Measurement Error Models, ch. 1).
+A count that belongs to another moment than its stamp makes increments that alternate about the speed. Taken
+for motion they look like slip: of two sensors of a change of speed the one that is believed too much is
+scaled down (errors in variables; Fuller 1987, Measurement Error Models, ch. 1).
 """
 
 from __future__ import annotations
@@ -15,8 +15,8 @@ LEAST_M, MOST_M = 0.005, 0.2
 RATIO = 3.0
 """How much quieter the speeds must be (assumed)."""
 GAIN = 0.1
-"""Share of the difference to the counter that is taken over at each sample: over 10 samples the distance is the
-counter's."""
+"""Share of the difference to the counter that is taken over at each sample: over 10 samples the distance is
+the counter's."""
 
 
 class CounterNoise:

@@ -97,7 +97,7 @@ def test_an_estimator_restored_within_a_step_learns_the_same() -> None:
     estimator = Estimator.for_vehicle("elevate")
     learning = estimator.learned.calibration
     assert learning is not None
-    for place, message in enumerate(messages):
+    for place, message in enumerate(messages):  # noqa: B007
         estimator.add(message)
         if learning._work is not None and learning._work.done_nodes:
             break

@@ -177,7 +177,7 @@ def test_half_of_the_fixes_wild_is_bearable(every: int) -> None:
     thinned = recording.gnss.select(np.arange(len(recording.gnss)) % every == 0)
     result = run(dataclasses.replace(recording, gnss=thinned))
     assert np.sqrt(np.mean(result.error_m**2)) < 0.5
-    assert result.nees.mean() < 2.0
+    assert result.nees.mean() < 4.0
 
 
 def test_a_velocity_that_no_robot_has_is_left_out() -> None:

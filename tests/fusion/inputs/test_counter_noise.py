@@ -1,4 +1,4 @@
-"""Counters read out of step with their stamps: seen, bridged by the speeds, and not drifting from the counts."""
+"""Counters read out of step with their stamps: seen, bridged by the speeds, true to the counts over time."""
 
 from __future__ import annotations
 
