@@ -18,6 +18,7 @@ from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, never_started, split_fixes, with_usable_samples
 from terrafusion.fusion.estimator.history import History
+from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.metrics.baselines import Baselines, baselines
@@ -41,6 +42,7 @@ class ReplayResult:
         baselines: plain dead reckoning and the receiver alone on the same log, scored alike.
         verdict: whether the result is good, and why.
         assumed: numbers that neither log nor vehicle file tells.
+        learned: numbers of the robot as self-calibration knows them at the end.
     """
 
     recording: Recording
@@ -59,6 +61,7 @@ class ReplayResult:
     baselines: Baselines
     verdict: Verdict
     assumed: tuple[Assumption, ...]
+    learned: tuple[NumberAfterDrive, ...] = ()
 
     def realtime_factor(self) -> float:
         """Seconds of recording per second of computing."""
@@ -138,6 +141,7 @@ def replay(
         recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), run.seconds,
         run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,
         assumptions(recording, vehicle or recording.vehicle, params, inputs, used),
+        estimator.learned.table(),
     )  # fmt: skip
 
 

@@ -174,7 +174,7 @@ def assumed_and_noted(result: ReplayResult, warnings: Sequence[str]) -> list[str
 
 def summary(result: ReplayResult) -> list[str]:
     """The result as lines of text, the verdict first."""
-    from terrafusion.fusion.outputs.linear_states import calibration, cells
+    from terrafusion.fusion.outputs.linear_states import calibration, cells, learned_rows
     from terrafusion.fusion.outputs.replay_files import final_status
 
     scores = result.scores
@@ -203,6 +203,9 @@ def summary(result: ReplayResult) -> list[str]:
             )
     for what, value, sigma, _, verdict in map(cells, calibration(result.estimate)):
         lines.append(f"{what}: {value} +- {sigma} ({verdict})")
+    corrections = [row for row in learned_rows(result.learned) if row["corrects"]]
+    for what, value, sigma, *_ in map(cells, corrections):
+        lines.append(f"self-calibration corrects: {what}: {value} +- {sigma}")
     return lines
 
 

@@ -16,6 +16,7 @@ from terrafusion.fusion.calibration.numbers import (
     ANTENNA_Y,
     GNSS_DELAY,
     GYRO_BIAS,
+    NUMBERS,
     TURN_SCALE,
     WHEEL_SCALE,
     Knowledge,
@@ -52,6 +53,17 @@ MOST_SPREAD = 0.1
 CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 3.0]), 0.5
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
+
+
+@dataclasses.dataclass(frozen=True)
+class NumberAfterDrive:
+    """A number after a drive, its 1 sigma before and after; `corrects`: a sensor is corrected by it."""
+
+    state: str
+    value: float
+    sigma: float
+    prior_sigma: float
+    corrects: bool
 
 
 class LearnedNumbers:
@@ -117,6 +129,24 @@ class LearnedNumbers:
         """A slice of learning's work, at keyframe `t_ns`; correct the sensors when it gives new numbers."""
         if self.calibration is not None and self.calibration.advance():
             self._apply(self.calibration.known, t_ns)
+
+    def table(self) -> tuple[NumberAfterDrive, ...]:
+        """What is known of each number now, but for the gyro's bias, of which the chain knows more."""
+        if self.calibration is None:
+            return ()
+        known, prior = self.calibration.known, self.calibration.prior
+        corrects = dict(zip(CORRECTED, self._clear.tolist(), strict=True))
+        return tuple(
+            NumberAfterDrive(
+                name,
+                float(known.mean[i]),
+                float(known.sigma[i]),
+                float(prior.sigma[i]),
+                corrects.get(i, False),
+            )
+            for i, name in enumerate(NUMBERS)
+            if i != GYRO_BIAS
+        )
 
     def _slides(self) -> bool:
         """Whether the robot slides beside its wheels, of which nothing can be learned."""

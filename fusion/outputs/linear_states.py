@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.fusion.estimate.estimate import Estimate
+from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
 
@@ -41,6 +42,11 @@ QUANTITIES = {
     "gnss_delay_s": StateQuantity("GNSS stamps later than the IMU's", "s", 1.0),
 }
 """Of each state of `key_state.CALIBRATION`."""
+SHOWN = QUANTITIES | {
+    "turn_scale": StateQuantity("turns beyond those of the source of yaw", "%", 100.0),
+    "wheel_scale": StateQuantity("distance beyond that of the wheels", "%", 100.0),
+}
+"""With the numbers of self-calibration."""
 
 
 def series(estimate: Estimate, name: str) -> tuple[Array, Array] | None:
@@ -72,9 +78,26 @@ def calibration(estimate: Estimate) -> list[dict[str, Any]]:
     ]
 
 
+def learned_rows(numbers: Sequence[NumberAfterDrive]) -> list[dict[str, Any]]:
+    """What self-calibration knows at the end, in rows as those of `calibration`, with `corrects`."""
+    return [
+        {
+            "state": number.state,
+            "value": number.value,
+            "sigma": number.sigma,
+            "prior_sigma": number.prior_sigma,
+            "observed": number.sigma < OBSERVED_SHARE * number.prior_sigma,
+            "corrects": number.corrects,
+        }
+        for number in numbers
+    ]
+
+
 def cells(row: Mapping[str, Any]) -> list[str]:
     """A row of `calibration` as text: quantity, value, sigma, prior's sigma, verdict."""
-    shown = QUANTITIES[row["state"]]
+    shown = SHOWN[row["state"]]
     numbers = [f"{row[key] * shown.scale:.3f}" for key in ("value", "sigma", "prior_sigma")]
     verdict = "observed" if row["observed"] else "not observable on this drive"
+    if row.get("corrects"):
+        verdict = "observed, corrects the sensor"
     return [f"{shown.label}, {shown.unit}", *numbers, verdict]

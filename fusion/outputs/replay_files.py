@@ -32,7 +32,7 @@ from terrafusion.fusion.metrics.baselines import Baselines
 from terrafusion.fusion.metrics.scores import Scores
 from terrafusion.fusion.metrics.verdict import Verdict
 from terrafusion.fusion.outputs.linear_states import calibration as calibration_of
-from terrafusion.fusion.outputs.linear_states import series
+from terrafusion.fusion.outputs.linear_states import learned_rows, series
 from terrafusion.fusion.replay import ReplayResult
 
 SCHEMA = "terrafusion.replay/1"
@@ -72,7 +72,7 @@ def build_metrics(
         rejected: measurements rejected by a gate, by sensor (see `rejected_counts`).
         status: `value` and `message` (see `final_status`).
         notes: what was assumed; notes on the scoring are added.
-        calibration: rows of `linear_states.calibration`; empty where none was asked for.
+        calibration: rows of `linear_states.calibration` where it was asked for, else of `learned_rows`.
         verdict, assumed, baselines: see `ReplayResult`; without them their keys are absent.
     """
     if mode not in MODES:
@@ -171,7 +171,7 @@ def metrics_of(result: ReplayResult) -> dict[str, Any]:
         scores=result.scores,
         status=final_status(estimate),
         notes=estimate.notes,
-        calibration=calibration_of(estimate),
+        calibration=calibration_of(estimate) or learned_rows(result.learned),
         verdict=result.verdict,
         assumed=result.assumed,
         baselines=result.baselines,
