@@ -137,7 +137,7 @@ def reposed(quaternion: Callable[[np.ndarray], np.ndarray]) -> Callable[[Recordi
         assert recording.truth is not None
         assert recording.truth.quaternion is not None
         truth = dataclasses.replace(recording.truth, quaternion=quaternion(recording.truth.quaternion))
-        return dataclasses.replace(recording, truth=truth)
+        return dataclasses.replace(recording, truth=truth, truth_channels=())
 
     return flip
 
