@@ -21,7 +21,7 @@ from terrafusion.fusion.inputs.streams import GnssFix
 
 KEPT_S = 30.0
 SCATTER_FIXES, LEAST_FIXES = 21, 8
-"""Fixes over which the scatter is taken; the median bears ten outliers."""
+"""Fixes over which the scatter is taken, and the fewest that show it."""
 RAYLEIGH_MEDIAN = 2.0 * float(np.log(2.0))
 """Median of x^2 + y^2 where x and y have variance 1 (chi-square of two)."""
 LEAST_DIFFERENCES, MOST_DIFFERENCES = 8.0, 300.0

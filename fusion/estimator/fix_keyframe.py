@@ -24,7 +24,8 @@ class AntennaMotion:
     """The antenna at a fix, by the state of the fix's keyframe.
 
     Attributes:
-        offset_s: from the keyframe to the fix, less the delay.
+        offset_s: from the keyframe to the fix, less the delay that the chain estimates.
+        delay_s: that delay.
         R: rotation (3, 3) body to ENU.
         rate_radps, accel_mps2: angular rate (3,), body; acceleration (3,), ENU.
         antenna_m: of the body (3,).

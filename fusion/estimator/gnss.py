@@ -127,6 +127,7 @@ class GnssUpdater:
             self.waiting.sort(key=lambda f: f.t_ns)
 
     def correct(self, antenna_m: Array, delay_s: float) -> None:
+        """Take over a correction (2,) of the lever arm, body x and y, and the lateness of the stamps."""
         self.antenna_m = self.nominal_antenna_m + np.append(antenna_m, 0.0)
         self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
         self.delay_s = delay_s
@@ -307,7 +308,10 @@ class GnssUpdater:
         state, at = chain.state(k), AntennaMotion.of(chain, k, fix, self.antenna_m)
         inflation = noise.gnss_inflation * self.scale
         share = self._drift_share(fix, inflation)
-        carried_m = at.offset_s * math.sqrt(0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2])))
+        # The fix is carried to its keyframe by the speed as it is known now.
+        carried_m = abs(at.offset_s) * math.sqrt(
+            0.5 * float(np.trace(covariance[VELOCITY, VELOCITY][:2, :2]))
+        )
         sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
         position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps, delay_s=at.delay_s)
         innovation = -residual(position, state.pose, state.linear)
@@ -369,6 +373,7 @@ class GnssUpdater:
     def _add_velocity(
         self, chain: Chain, k: int, fix: GnssFix, at: AntennaMotion, covariance: Array, noise: SensorNoise
     ) -> None:
+        """The velocity of a fix as a factor of keyframe k, where the fix has a usable one."""
         measured_mps = self._usable_velocity(fix, at.velocity_mps, covariance)
         if measured_mps is None:
             return
@@ -380,9 +385,7 @@ class GnssUpdater:
             chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
         else:
             lever_mps = at.R @ np.cross(at.rate_radps, at.antenna_m)
-            chain.add(
-                k, gnss_velocity(k, measured_mps - lever_mps - at.accel_mps2 * at.offset_s, sigma_v), "V"
-            )
+            chain.add(k, gnss_velocity(k, at_keyframe - lever_mps, sigma_v), "V")
 
     def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:
         """The velocity of a fix, where it has one that the robot can have."""

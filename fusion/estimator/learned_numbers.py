@@ -160,10 +160,10 @@ class LearnedNumbers:
 
     def with_doubt(self, noise: SensorNoise, t_ns: int, segments: list[ImuSegment]) -> SensorNoise:
         """Noise of the yaw rate, up to a keyframe at `t_ns`, with the uncertainty of its scale."""
-        last_ns = self._gnss.last_used_ns
-        if self.calibration is None or last_ns is None:
+        if self.calibration is None:
             return noise
-        unaided_s = max(t_ns - last_ns, 0) * 1e-9
+        last_ns = self._gnss.last_used_ns
+        unaided_s = math.inf if last_ns is None else max(t_ns - last_ns, 0) * 1e-9
         return with_turn_doubt(noise, self.calibration.known, segments, self._spec, unaided_s)
 
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:

@@ -15,7 +15,9 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import SensorConfig
 from terrafusion.fusion.estimate.estimate import State
+from terrafusion.fusion.estimator.alignment import Start, heading_from_motion, level_start
 from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
@@ -237,3 +239,29 @@ def test_wheels_that_fall_silent_do_not_hold_up_the_start() -> None:
     for i in range(300):
         estimator.add_imu(i * 10_000_000, np.zeros(3), [0.0, 0.0, 9.81])
     assert states
+
+
+def start_of(scatter_m: float) -> Start:
+    """The start by fixes that claim 2 cm and scatter so much, after 12 s."""
+    recording = drive(seconds=12.0)
+    assert recording.gnss is not None
+    assert recording.wheels is not None
+    off = np.random.default_rng(3).normal(0.0, scatter_m, (len(recording.gnss), 2))
+    estimator = Estimator.for_vehicle("elevate")
+    for message in dataclasses.replace(recording, gnss=None).messages():
+        estimator.add(message)
+    fixes = [
+        GnssFix(int(t), at + np.append(d, 0.0), np.full(3, 0.02))
+        for t, at, d in zip(recording.gnss.t_ns, recording.gnss.enu_m, off, strict=True)
+    ]
+    level = level_start(estimator.imu, estimator.wheels, recording.start_ns + 20_000_000)
+    start = heading_from_motion(estimator.imu, estimator.wheels, fixes, level, np.zeros(3))
+    assert start is not None
+    return start
+
+
+def test_fixes_that_disagree_widen_the_start() -> None:
+    honest, wild = start_of(0.0), start_of(1.0)
+    assert honest.yaw_sigma_rad < 0.05
+    assert wild.yaw_sigma_rad > 10.0 * honest.yaw_sigma_rad
+    assert wild.position_sigma_m > 10.0 * honest.position_sigma_m
