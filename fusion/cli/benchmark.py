@@ -30,7 +30,7 @@ def benchmark(
     ] = None,
     docs: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Put the tables into a document (docs/evidence/benchmark.md)."),
+        typer.Option(metavar="FILE", help="Put the tables into a document that has the mark line."),
     ] = None,
 ) -> None:
     """Compare weighting methods on the same runs: twin, perturbed soils, other terramechanics, field logs.

@@ -2,7 +2,7 @@
 
 plan.json        what was asked for, written before the runs: a folder that cannot be written fails at once
 agreement.csv    one row a statement of the study, with its verdict
-agreement.md     the same as the Markdown that docs/evidence/study.md holds
+agreement.md     the same as the Markdown of the stored result, tests/studies/results/source_study.md
 metrics.json     everything measured, with intervals; the plan; the counts
 batch.csv        one row a run of the batch
 report.html      all of it, with the figures

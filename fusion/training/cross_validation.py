@@ -37,7 +37,7 @@ MIN_RUNS = 2
 TEMPERATURES = (1.0, 1.4, 2.0, 2.8, 4.0, 5.6, 8.0)
 """Windows of 2 s every 0.5 s overlap fourfold, and errors within a run are correlated. Calibrated on runs of
 one ground, the temperature would be higher and changes of ground be detected later
-(docs/explanation/detector.md)."""
+(docs/explanation/terrain.md)."""
 
 
 @dataclass(frozen=True, eq=False)

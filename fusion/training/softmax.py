@@ -1,7 +1,7 @@
 """Ground classifier of one robot: calibrated softmax regression over its surface features, in a YAML file.
 
 Multinomial logistic regression, fitted by scikit-learn, evaluated here without it. Cross-validated by run it
-is better than a forest on BorealTC (docs/explanation/detector.md). Missing features count as the training
+is better than a forest on BorealTC (docs/explanation/terrain.md). Missing features count as the training
 mean; training on copies of the windows without whole feature groups keeps it calibrated then.
 """
 

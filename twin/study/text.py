@@ -106,7 +106,7 @@ def markdown_rows(rows: Sequence[ClaimResult], columns: Sequence[str] = COLUMNS)
 
 
 def document_section(study: Study) -> list[str]:
-    """What docs/evidence/study.md holds between its marks: Tab. 4, GNSS noise, counts and tables."""
+    """What tests/studies/results/source_study.md holds between its marks: its tables and counts."""
     tab4 = [[case.label, *table_cells(study, case)] for case in CASES]
     return [
         *_markdown(("mean %, twin / study", *TAB4_HEAD[1:]), tab4),

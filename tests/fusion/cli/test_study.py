@@ -17,7 +17,7 @@ from terrafusion.twin.study.claims import AGREE, NOT_EXAMINED, VERDICTS, load_cl
 from terrafusion.twin.study.published import CASES, FRICTION
 from terrafusion.twin.study.text import COLUMNS
 
-DOCUMENT = Path(__file__).parents[3] / "docs" / "evidence" / "study.md"
+DOCUMENT = Path(__file__).parents[2] / "studies" / "results" / "source_study.md"
 FIXED = {"source", "statement", "quantity", "study", "criterion", "basis"}
 """Columns of the table that no run changes."""
 
@@ -51,7 +51,7 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 
 def documented() -> list[dict[str, str]]:
-    """The table of agreement in docs/evidence/study.md."""
+    """The table of agreement in the stored result."""
     lines = DOCUMENT.read_text(encoding="utf-8").split("<!-- agreement:start -->")[1].splitlines()
     head = f"| {' | '.join(COLUMNS)} |"
     table = lines[lines.index(head) + 2 :]

@@ -1,4 +1,4 @@
-"""A steered drive of the twin on firm ground beside MuJoCo's rigid contact, wheels driven and turned alike."""
+"""Steered drives of the twin on firm ground beside rigid contact in MuJoCo, wheels driven and turned alike."""
 
 from __future__ import annotations
 
