@@ -1,4 +1,4 @@
-"""Steered drives of the twin on firm ground beside rigid contact in MuJoCo, wheels driven and turned alike."""
+"""Steered drives of the twin beside rigid contact in MuJoCo, on firm ground; wheels driven and turned alike."""
 
 from __future__ import annotations
 
