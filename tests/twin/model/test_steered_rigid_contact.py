@@ -1,4 +1,4 @@
-"""Steered drives of the twin beside rigid contact in MuJoCo, on firm ground; wheels driven and turned alike."""
+"""Steered drives of the twin beside rigid contact in MuJoCo, on firm ground, with the same wheel motion."""
 
 from __future__ import annotations
 
