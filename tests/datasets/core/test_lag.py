@@ -168,7 +168,7 @@ def test_ten_minutes_are_quick() -> None:
     lag_between(*signals)
     took = []
     for _ in range(3):
-        start = time.perf_counter()
+        start = time.process_time()
         lag_between(*signals)
-        took.append(time.perf_counter() - start)
+        took.append(time.process_time() - start)
     assert min(took) < 0.1  # 0.03 s on an idle core

@@ -97,14 +97,14 @@ def test_a_stamp_far_ahead_is_left_out_and_the_stream_goes_on(
     running: Running, channel: str, ahead_ns: int
 ) -> None:
     estimator, t = running.again(), running.now_ns + ahead_ns
-    begun = time.perf_counter()
+    begun = time.process_time()
     if channel == "imu":
         estimator.add_imu(t, np.zeros(3), G)
     elif channel == "wheels":
         estimator.add_wheels(t, 1.0, 1.0)
     else:
         estimator.add_gnss(t, np.zeros(3), [0.02] * 3)
-    assert time.perf_counter() - begun < 0.5
+    assert time.process_time() - begun < 0.5
     assert finished(running, estimator) < 1e-9
     assert any(f"samples of {channel}" in note and "left out" in note for note in notes_of(estimator))
 
@@ -113,9 +113,9 @@ def test_a_pause_of_an_hour_takes_no_longer_than_a_second_and_its_sigma_covers_i
     estimator = running.again()
     widest, slowest, count = 0.0, 0.0, 0
     for message in running.rest:
-        begun, before = time.perf_counter(), estimator.latest()
+        begun, before = time.process_time(), estimator.latest()
         estimator.add(message._replace(t_ns=message.t_ns + HOUR_NS))
-        slowest = max(slowest, time.perf_counter() - begun)
+        slowest = max(slowest, time.process_time() - begun)
         state = estimator.latest()
         assert state is not None
         count += state is not before
