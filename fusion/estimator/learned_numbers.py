@@ -149,12 +149,9 @@ class LearnedNumbers:
         )
 
     def _slides(self) -> bool:
-        """Whether the robot slides beside its wheels by its friction, of which nothing can be learned.
-
-        Fixes that refute the wheels are no proof of it: late ones do so, too.
-        """
-        friction = self._gnss.skid.friction
-        return friction is not None and friction.leads
+        """Whether the robot slides beside its wheels, of which nothing can be learned."""
+        skid = self._gnss.skid
+        return skid.rate_m2ps > 0.0 or (skid.friction is not None and skid.friction.leads)
 
     def heading_turned(self) -> None:
         """The heading was wrong, and what was learned with it may be, too."""
