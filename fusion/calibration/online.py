@@ -31,16 +31,19 @@ class SelfCalibration:
     Attributes:
         prior: what was known before the first drive.
         known: the numbers by now.
+        before: the numbers when the stretch under way began.
+        misfit: variance of the fixes' residuals at the last step over that of their noise.
     """
 
     def __init__(self, prior: Knowledge, noise: Noise, antenna_m: complex) -> None:
-        self.prior = self.known = self._before = prior
+        self.prior = self.known = self.before = prior
+        self.misfit = 1.0
         self._noise, self._antenna_m = noise, antenna_m
         self._begin()
 
     def start_from(self, prior: Knowledge) -> None:
         """Begin with what is known of the robot from earlier runs."""
-        self.prior = self.known = self._before = prior
+        self.prior = self.known = self.before = prior
 
     def _begin(self) -> None:
         self._start_ns: int | None = None
@@ -56,11 +59,11 @@ class SelfCalibration:
         self._work: Reduction | None = None
         self._reduced = False
 
-    def restart(self, forget: bool = False) -> None:
-        """Begin a new stretch: the path was interrupted; `forget` what the last one gave if it was wrong."""
-        if forget:
-            self.known = self._before
-        self._before = self.known
+    def restart(self, known: Knowledge | None = None) -> None:
+        """Begin a new stretch, as the path was interrupted; from `known` where what came after it is wrong."""
+        if known is not None:
+            self.known = known
+        self.before = self.known
         if self._start_ns is not None:
             self._begin()
 
@@ -125,18 +128,18 @@ class SelfCalibration:
 
     def _end(self, work: Reduction) -> bool:
         """The numbers by a step whose normal equations are done; True unless they are useless."""
-        found = combined([work], self.known, self._before)
+        found = combined([work], self.known, self.before)
         self._work, self._reduced = None, False
         if not np.isfinite(found.mean).all() or not np.isfinite(work.part.state).all():
-            self.known = self._before
+            self.known = self.before
             self._begin()
             return False
-        self._state, self.known = work.part.state, found
+        self._state, self.known, self.misfit = work.part.state, found, work.misfit
         if len(self._state) >= MOST_NODES:
             wider = dataclasses.replace(found, covariance=found.covariance * FORGOTTEN)
             limit = np.minimum(np.diag(wider.covariance), np.diag(self.prior.covariance))
             shrink = np.sqrt(limit / np.diag(wider.covariance))
-            self._before = dataclasses.replace(wider, covariance=wider.covariance * np.outer(shrink, shrink))
+            self.before = dataclasses.replace(wider, covariance=wider.covariance * np.outer(shrink, shrink))
             self._begin()
         return True
 

@@ -77,6 +77,7 @@ class Reduction:
         information, right: of the numbers, (7, 7) and (7,); without the nodes once all is done.
         factor: Cholesky factor (12, 6 M) of the nodes' band.
         done_nodes, done_fixes: how many are assembled.
+        misfit: variance of the fixes' residuals, by their median, over that of their white noise; at least 1.
     """
 
     part: Nodes
@@ -97,6 +98,7 @@ class Reduction:
     factor: Array | None = None
     done_nodes: int = 0
     done_fixes: int = 0
+    misfit: float = 1.0
 
     @classmethod
     def of(cls, part: Nodes, numbers: Array, spread: float, noise: Noise) -> Reduction:
@@ -159,7 +161,7 @@ class Reduction:
 
     def _assemble_fixes(self) -> None:
         square = np.einsum("fr,fr->f", self.left, self.left)
-        usual = max(1.0, float(np.median(square)) / 1.386)
+        self.misfit = usual = max(1.0, float(np.median(square)) / 1.386)
         chosen = slice(self.done_fixes, self.done_fixes + SLICE_FIXES)
         weight = np.sqrt(1.0 / (1.0 + square[chosen] / (CAUCHY_SQUARE * usual)) / usual)
         rows, left = self.rows[chosen] * weight[:, None, None], self.left[chosen] * weight[:, None]

@@ -50,6 +50,9 @@ LEAST_CORRECTION = np.array([0.008, 0.15, 0.15, 0.1])
 rotation look alike (assumed)."""
 MOST_SPREAD = 0.1
 """Spread of slip beyond which the wheels do not roll, and a slide looks like a delay (assumed)."""
+LEAST_LATE_S, MOST_MISFIT = 0.3, 10.0
+"""Fixes later than this can look like a slide; the delay explains them if they then lie within about three of
+their sigma: a slide leaves a hundred and more (assumed)."""
 CLEAR_SIGMA, STILL_CLEAR = np.array([5.0, 5.0, 5.0, 3.0]), 0.5
 """A correction begins where a number differs by so many sigma from what was known, and ends at half of them:
 the sigmas hold for rolling wheels and a receiver with white noise and drift, and are too small for others."""
@@ -82,6 +85,8 @@ class LearnedNumbers:
         self._spec = config.rig.sensors.imu
         self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
+        self._known = prior
+        self._before_slide: Knowledge | None = None
         if known != SensorNumbers():
             self._apply(prior, 0, known.wheel_scale is not None)
 
@@ -89,7 +94,7 @@ class LearnedNumbers:
         """Begin with what earlier runs of the robot gave."""
         if self.calibration is not None:
             self.calibration.start_from(prior)
-            self._before = prior
+            self._before = self._known = prior
             self._bias_radps = float(prior.mean[GYRO_BIAS])
             self._apply(prior, 0)
 
@@ -119,22 +124,28 @@ class LearnedNumbers:
         if self._gnss.local:
             learning.restart()
             return
-        if self._slides():
-            learning.restart(forget=True)
+        skid = self._gnss.skid
+        if skid.friction is not None and skid.friction.leads:
+            self._forget(self._before_slide or learning.before)
             return
+        self._mark_slide(learning, skid.rate_m2ps > 0.0)
         measured = turn_rad / (1.0 + self._imu.turn_scale)
         learning.drive(t_ns, rolled_m, measured, np.asarray(pose.translation()), pose.rotation().yaw())
 
     def advance(self, t_ns: int) -> None:
         """A slice of learning's work, at keyframe `t_ns`; correct the sensors when it gives new numbers."""
-        if self.calibration is not None and self.calibration.advance():
-            self._apply(self.calibration.known, t_ns)
+        learning = self.calibration
+        if learning is None or not learning.advance():
+            return
+        if self._before_slide is None or self._late_fixes(learning):
+            self._known = learning.known
+            self._apply(self._known, t_ns)
 
     def table(self) -> tuple[NumberAfterDrive, ...]:
         """What is known of each number now, but for the gyro's bias, of which the chain knows more."""
         if self.calibration is None:
             return ()
-        known, prior = self.calibration.known, self.calibration.prior
+        known, prior = self._known, self.calibration.prior
         corrects = dict(zip(CORRECTED, self._clear.tolist(), strict=True))
         return tuple(
             NumberAfterDrive(
@@ -148,15 +159,32 @@ class LearnedNumbers:
             if i != GYRO_BIAS
         )
 
-    def _slides(self) -> bool:
-        """Whether the robot slides beside its wheels, of which nothing can be learned."""
-        skid = self._gnss.skid
-        return skid.rate_m2ps > 0.0 or (skid.friction is not None and skid.friction.leads)
+    def _mark_slide(self, learning: SelfCalibration, slides: bool) -> None:
+        """Keep what was known before a slide, or before late fixes that look like one.
+
+        Where late fixes explain it, learning goes on; after a slide it begins again.
+        """
+        if slides and self._before_slide is None:
+            self._before_slide = learning.before
+        elif not slides and self._before_slide is not None:
+            if not self._late_fixes(learning):
+                self._forget(self._before_slide)
+            self._before_slide = None
+
+    def _late_fixes(self, learning: SelfCalibration) -> bool:
+        """Whether one constant delay, and rolling wheels, explain all fixes of a drive that looks like a slide."""
+        late = abs(float(learning.known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY])) > LEAST_LATE_S
+        return late and learning.misfit < MOST_MISFIT and learning.known.slip_spread < MOST_SPREAD
+
+    def _forget(self, known: Knowledge) -> None:
+        self._before_slide, self._known = None, known
+        if self.calibration is not None:
+            self.calibration.restart(known)
 
     def heading_turned(self) -> None:
         """The heading was wrong, and what was learned with it may be, too."""
         if self.calibration is not None:
-            self.calibration.restart(forget=True)
+            self._forget(self.calibration.before)
 
     def with_doubt(self, noise: SensorNoise, t_ns: int, segments: list[ImuSegment]) -> SensorNoise:
         """Noise of the yaw rate, up to a keyframe at `t_ns`, with the uncertainty of its scale."""
@@ -164,7 +192,7 @@ class LearnedNumbers:
             return noise
         last_ns = self._gnss.last_used_ns
         unaided_s = math.inf if last_ns is None else max(t_ns - last_ns, 0) * 1e-9
-        return with_turn_doubt(noise, self.calibration.known, segments, self._spec, unaided_s)
+        return with_turn_doubt(noise, self._known, segments, self._spec, unaided_s)
 
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
         turn_scale, x_m, y_m, delay_s = self._corrections(known).tolist()

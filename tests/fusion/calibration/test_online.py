@@ -60,7 +60,7 @@ def test_a_wrong_heading_takes_back_its_stretch() -> None:
     learning = SelfCalibration(PRIOR, NOISE, 0j)
     driven(figure(60.0, fix_sigma_m=0.05), learning)
     assert not same(learning.known.mean, PRIOR.mean)
-    learning.restart(forget=True)
+    learning.restart(learning.before)
     assert same(learning.known.mean, PRIOR.mean)
 
 

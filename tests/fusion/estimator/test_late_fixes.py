@@ -1,0 +1,29 @@
+"""Fixes far later than any usual delay refute the wheels as a slide does; the delay is learned all the same."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.replay import replay
+from terrafusion.twin.simulate import simulate
+
+LATE_S = 1.5
+
+
+@pytest.fixture(scope="module")
+def late() -> Recording:
+    run = simulate("figure_eight", terrain="asphalt", seed=2)
+    assert run.gnss is not None
+    gnss = dataclasses.replace(run.gnss, t_ns=run.gnss.t_ns + int(LATE_S * 1e9))
+    return dataclasses.replace(run, gnss=gnss)
+
+
+def test_fixes_late_by_seconds_are_corrected_though_they_look_like_a_slide(late: Recording) -> None:
+    found = replay(late, mode="fixed")
+    delay = next(n for n in found.learned if n.state == "gnss_delay_s")
+    assert any("slid beside its wheels" in note for note in found.estimate.notes)
+    assert delay.corrects
+    assert abs(delay.value - LATE_S) < 2.0 * delay.sigma
