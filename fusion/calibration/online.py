@@ -60,7 +60,7 @@ class SelfCalibration:
         self._reduced = False
 
     def restart(self, known: Knowledge | None = None) -> None:
-        """Begin a new stretch, as the path was interrupted; from `known` where what came after it is wrong."""
+        """Begin a new stretch, as the path was interrupted; from `known` if what came since is wrong."""
         if known is not None:
             self.known = known
         self.before = self.known

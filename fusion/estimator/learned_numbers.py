@@ -172,7 +172,7 @@ class LearnedNumbers:
             self._before_slide = None
 
     def _late_fixes(self, learning: SelfCalibration) -> bool:
-        """Whether one constant delay, and rolling wheels, explain all fixes of a drive that looks like a slide."""
+        """Whether a constant delay of rolling wheels explains a drive that looks like a slide."""
         late = abs(float(learning.known.mean[GNSS_DELAY] - self._before.mean[GNSS_DELAY])) > LEAST_LATE_S
         return late and learning.misfit < MOST_MISFIT and learning.known.slip_spread < MOST_SPREAD
 

@@ -1,4 +1,4 @@
-"""Fixes far later than any usual delay refute the wheels as a slide does; the delay is learned all the same."""
+"""Fixes late by seconds refute the wheels as a slide does; the delay is learned all the same."""
 
 from __future__ import annotations
 
