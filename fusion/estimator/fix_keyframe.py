@@ -11,7 +11,7 @@ from terrafusion.datasets.core.frames import GRAVITY_MPS2
 from terrafusion.fusion.estimator.gates import GateDecision
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import antenna_lever
-from terrafusion.fusion.graph.key_state import ANTENNA, GNSS_DELAY
+from terrafusion.fusion.graph.key_state import ANTENNA, GNSS_DELAY, cross
 from terrafusion.fusion.inputs.door import GnssFix
 
 LARGE_TURN_RAD = 0.05
@@ -48,12 +48,14 @@ class AntennaMotion:
         node, state = chain.nodes[k - chain.first], chain.state(k)
         delay_s = float(state.of(GNSS_DELAY))
         offset_s = (fix.t_ns - node.t_ns) * 1e-9 - delay_s
-        R = state.pose.rotation().matrix()
+        R = state.R
         rate = state.rate(node.gyro_radps)
-        accel_world = R @ state.specific_force(node.accel_mps2) - np.array([0.0, 0.0, GRAVITY_MPS2])
-        antenna = antenna_m + np.append(state.of(ANTENNA), 0.0)
+        accel_world = R @ state.specific_force(node.accel_mps2)
+        accel_world[2] -= GRAVITY_MPS2
+        antenna = antenna_m.copy()
+        antenna[:2] += state.of(ANTENNA)
         lever = antenna_lever(state, offset_s, rate, accel_world, antenna) - (antenna - antenna_m)
-        velocity = state.velocity + accel_world * offset_s + R @ np.cross(rate, antenna)
+        velocity = state.velocity + accel_world * offset_s + R @ cross(rate, antenna)
         return cls(offset_s, delay_s, R, rate, accel_world, antenna, lever, velocity)
 
 

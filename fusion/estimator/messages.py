@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Protocol
 
@@ -90,7 +91,7 @@ def _imu(estimator: Inlets, message: ImuSample) -> None:
     kind = estimator.config.inputs.imu
     needed = message.gyro_radps[2]
     if kind == "six_axis":
-        needed = message.gyro_radps.sum() + message.accel_mps2.sum()
+        needed = sum(message.gyro_radps.tolist()) + sum(message.accel_mps2.tolist())
     if kind != "none" and math.isfinite(needed):
         estimator.add_imu(*message)
 
@@ -119,6 +120,12 @@ def _sides(values: Array, factor: float, names: tuple[str, ...]) -> tuple[float,
     scaled = [factor * value for value in values.tolist()]
     if len(scaled) == 1:
         return scaled[0], scaled[0]
-    left = [v for v, name in zip(scaled, names, strict=True) if name.endswith("left")]
-    right = [v for v, name in zip(scaled, names, strict=True) if name.endswith("right")]
-    return sum(left) / len(left), sum(right) / len(right)
+    left, right = _places(names)
+    return sum([scaled[i] for i in left]) / len(left), sum([scaled[i] for i in right]) / len(right)
+
+
+@functools.lru_cache(maxsize=16)
+def _places(names: tuple[str, ...]) -> tuple[list[int], list[int]]:
+    """Which values are of the left and of the right side."""
+    left = [i for i, name in enumerate(names) if name.endswith("left")]
+    return left, [i for i, name in enumerate(names) if name.endswith("right")]

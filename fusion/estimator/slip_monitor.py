@@ -95,7 +95,7 @@ class MotionMonitor:
 
     def watch(self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None) -> None:
         """`update` from a keyframe's state and the covariance (3, 3) of its velocity, world axes."""
-        forward = key.pose.rotation().matrix()[:, 0]
+        forward = key.R[:, 0]
         sigma = math.sqrt(float(forward @ velocity_covariance @ forward))
         self.update(t_ns, rolled_m, key.forward_mps, sigma)
 
@@ -111,37 +111,42 @@ class MotionMonitor:
         self._steps.append(Step(dt, rolled_m, mean_mps, sigma_mps, self._commanded(t_ns)))
         while len(self._steps) * dt > WINDOWS_S[-1] + 2.0 * dt:
             self._steps.popleft()
-        self._watch_slip(dt)
-        stuck = self.travel(STUCK_S)
+        stuck, *windows = self.travels(STUCK_S, *WINDOWS_S)
+        self._watch_slip(windows, dt)
         self.cause = None if stuck is None else self._cause(stuck)
 
     def travel(self, seconds: float) -> Travel | None:
-        """Travel over the last `seconds`; None before so much is known, or where wheels are missing.
+        """Travel over the last `seconds`; None before so much is known, or where wheels are missing."""
+        return self.travels(seconds)[0]
+
+    def travels(self, *windows_s: float) -> list[Travel | None]:
+        """`travel` over several windows, the shortest first.
 
         Errors of the estimated speed outlast a window: their sigmas add up.
         """
+        found: list[Travel | None] = []
         total = rolled = moved = sigma = 0.0
         least = math.inf
         for step in reversed(self._steps):
-            if step.rolled_m is None:
-                return None
-            total += step.dt_s
+            if step.rolled_m is None or len(found) == len(windows_s):
+                break
+            dt = step.dt_s
+            total += dt
             rolled += step.rolled_m
-            moved += step.speed_mps * step.dt_s
-            sigma += step.sigma_mps * step.dt_s
+            moved += step.speed_mps * dt
+            sigma += step.sigma_mps * dt
             least = min(least, abs(step.command_mps))
-            if total >= seconds - 1e-6:
+            while len(found) < len(windows_s) and total >= windows_s[len(found)] - 1e-6:
                 noise = math.hypot(sigma, self.quantum_m, self._stamp_m)
-                return Travel(total, rolled, moved, noise, least)
-        return None
+                found.append(Travel(total, rolled, moved, noise, least))
+        return found + [None] * (len(windows_s) - len(found))
 
     def _commanded(self, t_ns: int) -> float:
         if self._command is None or t_ns - self._command[0] > COMMAND_HOLD_NS:
             return 0.0
         return self._command[1]
 
-    def _watch_slip(self, dt_s: float) -> None:
-        windows = [self.travel(seconds) for seconds in WINDOWS_S]
+    def _watch_slip(self, windows: list[Travel | None], dt_s: float) -> None:
         if any(window is not None and slips(window) for window in windows):
             self.slipping, self._agreed_s = True, 0.0
         elif self.slipping:

@@ -41,12 +41,15 @@ from terrafusion.fusion.graph.key_state import (
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
-from terrafusion.fusion.graph.wheel_factor import WheelIncrement, jacobians, residual
+from terrafusion.fusion.graph.wheel_factor import WheelIncrement, linearised
 
 _ZERO = np.zeros(3)
 
 
 _SYMBOLS = {"X": (X, POSE), "V": (V, VELOCITY), "B": (B, BIAS)}
+WHEEL_ROWS = 4
+_OF_IMU_FACTOR = np.r_[0:9, 18:24, 9:18, 24:31]
+"""Columns of a `CombinedImuFactor` (X, V, X, V, B, B, right-hand side) in the order X, V, B of both."""
 
 
 class Chain:
@@ -69,6 +72,7 @@ class Chain:
         self.first = 0
         self.nodes: list[Node] = []
         self.values = gtsam.Values()
+        self._inserted = 0  # `values` has the keyframes before this one; an archive, never solved, has none
         self._dirty = 0
         self._anchor: tuple[int, KeyState, Array] | None = None
         self._root = np.zeros((self.dim, self.dim + 1))
@@ -96,7 +100,6 @@ class Chain:
         link = link if link is not None else gtsam.NonlinearFactorGraph()
         node = self._node(point, t_ns, link, markov, wheels, gyro_radps, accel_mps2, preintegrated)
         self.nodes.append(node)
-        self._insert(self.last, point)
         if len(self.nodes) > 1:
             self._dirty = min(self._dirty, self.last - 1)
         if self.archive is not None:
@@ -145,8 +148,7 @@ class Chain:
 
     def state(self, k: int) -> KeyState:
         """Best state of keyframe k as of the last `solve` (newest) or `smooth` (all)."""
-        node = self.nodes[k - self.first]
-        return node.point.retract(node.delta)
+        return self.nodes[k - self.first].state()
 
     def covariance(self) -> Array:
         """Marginal covariance (dim, dim) of the newest keyframe."""
@@ -179,8 +181,8 @@ class Chain:
         for _ in range(iterations):
             self._eliminate_all()
             self._back_substitute_to(begin)
-            deltas = np.abs([node.delta[NAV] for node in self.nodes[begin - self.first :]])
-            if not (deltas > self.RELINEARISE).any():
+            deltas = np.abs([node.delta for node in self.nodes[begin - self.first :]])
+            if not (deltas[:, NAV] > self.RELINEARISE).any():
                 return
             self._back_substitute_to(self.first)
             self._relinearise()
@@ -189,19 +191,20 @@ class Chain:
 
     def _eliminate_all(self) -> None:
         """Eliminate what changed, and solve for the newest keyframe."""
+        self._insert_new()
         for k in range(max(self._dirty, self.first), self.last):
             self._eliminate(k)
         self._dirty = self.last
         node = self.nodes[-1]
-        own = np.vstack([node.prior, self._unary_rows(self.last)])
-        self._root = triangular(own)
+        self._root = triangular(self._own_rows(self.last))
         node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
 
     def forget(self, keep: int) -> None:
         """Drop the oldest keyframes until `keep` are left; their information stays as a prior."""
         while len(self.nodes) > keep and self._dirty > self.first:
-            for symbol, _ in _SYMBOLS.values():
-                self.values.erase(symbol(self.first))
+            if self.first < self._inserted:
+                for symbol, _ in _SYMBOLS.values():
+                    self.values.erase(symbol(self.first))
             self.nodes.pop(0)
             self.first += 1
 
@@ -215,7 +218,7 @@ class Chain:
         self._eliminate_all()
         k = self.last if k is None else k
         node = self.nodes[k - self.first]
-        known = self._root if k == self.last else triangular(np.vstack([node.prior, self._unary_rows(k)]))
+        known = self._root if k == self.last else triangular(self._own_rows(k))
         inverse, _ = lapack.dtrtri(known[:, : self.dim])
         mean = inverse @ known[:, self.dim]
         stays = ~np.isin(np.arange(self.dim), anew)
@@ -227,9 +230,8 @@ class Chain:
         fresh = self._node(point, node.t_ns, empty, None, None, node.gyro_radps, node.accel_mps2, False)
         fresh.prior = np.hstack([root, (root @ (mean - shift))[:, None]])
         self.nodes, self.first, self._dirty = [fresh, *self.nodes[k - self.first + 1 :]], k, k
-        self._anchor, self.values = None, gtsam.Values()
-        for i, kept in enumerate(self.nodes, k):
-            self._insert(i, kept.point)
+        self._anchor = None
+        self.rebuild()
         self._eliminate_all()
 
     def turn(self, yaw_rad: float, from_m: Array, to_m: Array) -> None:
@@ -237,6 +239,7 @@ class Chain:
 
         Motion between keyframes is the same in every frame: only the prior of the first keyframe changes.
         """
+        self._insert_new()
         R = gtsam.Rot3.Rz(yaw_rad).matrix()
         moved = gtsam.Pose3(gtsam.Rot3(R), to_m - R @ from_m)
         for k, node in enumerate(self.nodes, self.first):
@@ -265,9 +268,8 @@ class Chain:
 
     def rebuild(self) -> None:
         """Rebuild the variables of GTSAM from the keyframes."""
-        self.values = gtsam.Values()
-        for k, node in enumerate(self.nodes, self.first):
-            self._insert(k, node.point)
+        self.values, self._inserted = gtsam.Values(), self.first
+        self._insert_new()
 
     def set_prior(self, sigmas: Array) -> None:
         """Prior of the first keyframe at its initial state, independent 1 sigmas (dim,)."""
@@ -278,10 +280,14 @@ class Chain:
     def _node(self, *parts: Any) -> Node:
         return Node(*(*parts, np.zeros((0, self.dim + 1)), np.zeros(self.dim)))
 
-    def _insert(self, k: int, point: KeyState) -> None:
-        self.values.insert(X(k), point.pose)
-        self.values.insert(V(k), point.velocity)
-        self.values.insert(B(k), point.bias)
+    def _insert_new(self) -> None:
+        """Insert the variables of the keyframes that GTSAM does not have yet."""
+        self._inserted = max(self._inserted, self.first)
+        for k, node in enumerate(self.nodes[self._inserted - self.first :], self._inserted):
+            self.values.insert(X(k), node.point.pose)
+            self.values.insert(V(k), node.point.velocity)
+            self.values.insert(B(k), node.point.bias)
+        self._inserted = self.last + 1
 
     def _carry_prior(self) -> None:
         """Move the prior of the first keyframe to its estimate.
@@ -293,14 +299,14 @@ class Chain:
         if self._anchor is None or self._anchor[0] != self.first:
             self._anchor = (self.first, node.point, node.prior)
         _, made_at, rows = self._anchor
-        node.prior = carried_prior(rows, made_at.local(node.point.retract(node.delta)))
+        node.prior = carried_prior(rows, made_at.local(node.state()))
 
     def _move(self, k: int) -> None:
         """Make the current estimate of keyframe k its linearisation point."""
         node = self.nodes[k - self.first]
         if k == self.first:
             self._carry_prior()
-        node.point = node.point.retract(node.delta)
+        node.point = node.state()
         node.delta = np.zeros(self.dim)
         self._publish(k)
 
@@ -330,13 +336,24 @@ class Chain:
         self.values.update(V(k), node.point.velocity)
         self.values.update(B(k), node.point.bias)
 
-    def _unary_rows(self, k: int) -> Array:
-        """Whitened rows over keyframe k alone, shape (m, dim + 1)."""
-        node = self.nodes[k - self.first]
-        blocks = [self._gtsam_rows(k)] if node.unary_keys else []
-        blocks += [gnss_factor.rows(fix, node.point, self.dim) for fix in node.fixes]
-        blocks += [velocity_factor.rows(velocity, node.point, self.dim) for velocity in node.velocities]
-        return np.vstack(blocks) if blocks else np.zeros((0, self.dim + 1))
+    def _own_rows(self, k: int, further: int = 0, width: int = 1) -> Array:
+        """Prior and whitened rows over keyframe k alone, the last column being the right-hand side.
+
+        Shape (m + `further`, `width` dim + 1); the `further` rows are left free.
+        """
+        node, dim = self.nodes[k - self.first], self.dim
+        blocks = [node.prior]
+        if node.unary_keys:
+            blocks.append(self._gtsam_rows(k))
+        blocks += [gnss_factor.rows(fix, node.point, dim) for fix in node.fixes]
+        blocks += [velocity_factor.rows(velocity, node.point, dim) for velocity in node.velocities]
+        rows = np.zeros((sum(map(len, blocks)) + further, width * dim + 1), order="F")
+        begin = 0
+        for block in blocks:
+            end = begin + len(block)
+            rows[begin:end, :dim], rows[begin:end, -1] = block[:, :dim], block[:, dim]
+            begin = end
+        return rows
 
     def _gtsam_rows(self, k: int) -> Array:
         node = self.nodes[k - self.first]
@@ -355,62 +372,64 @@ class Chain:
         rows[:, self.dim] = packed[:, -1]
         return rows
 
-    def _link_rows(self, k: int) -> Array:
-        """Whitened rows over keyframes k - 1 and k, shape (m, 2 dim + 1)."""
-        node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
+    def _linearised(self, k: int) -> Array:
+        """Whitened rows (n, 31) of the link over X, V and B of keyframe k - 1, then of k."""
+        link = self.nodes[k - self.first].link
+        if link.size() == 1 and self.nodes[k - self.first].preintegrated:
+            return np.asarray(link.at(0).linearize(self.values).augmentedJacobian()[:, _OF_IMU_FACTOR])
         ordering = gtsam.Ordering()
         for i in (k - 1, k):
             for symbol in (X, V, B):
                 ordering.push_back(symbol(i))
-        packed = node.link.linearize(self.values).augmentedJacobian(ordering)
-        n, linear = len(packed), self.dim - 15
-        rows = np.zeros((n + linear + 4, 2 * self.dim + 1))
-        rows[:n, NAV] = packed[:, :15]
-        rows[:n, self.dim : self.dim + 15] = packed[:, 15:30]
-        rows[:n, 2 * self.dim] = packed[:, 30]
-        if node.preintegrated and self.dim > IMU_ROTATION.start:
+        return np.asarray(link.linearize(self.values).augmentedJacobian(ordering))
+
+    def _fill_link(self, k: int, rows: Array, packed: Array) -> None:
+        """Whitened rows over keyframes k - 1 and k, those of `_linearised` being `packed`."""
+        node, before = self.nodes[k - self.first], self.nodes[k - 1 - self.first]
+        n, dim = len(packed), self.dim
+        linear = dim - NAV.stop
+        rows[:n, NAV], rows[:n, dim : dim + NAV.stop] = packed[:, :15], packed[:, 15:30]
+        rows[:n, 2 * dim] = packed[:, 30]
+        if node.preintegrated and dim > IMU_ROTATION.start:
             # The bias walk enters with opposite signs at both ends: their sum is what preintegration does
             # with a bias, and a small rotation d of the IMU acts as the bias -d x measured.
             by_bias = packed[:, 9:15] + packed[:, 24:30]
             turn = by_bias[:, :3] @ skew(node.accel_mps2) + by_bias[:, 3:] @ skew(node.gyro_radps)
             rows[:n, IMU_ROTATION] = turn
-            rows[:n, 2 * self.dim] -= turn @ before.point.of(IMU_ROTATION)
+            rows[:n, 2 * dim] -= turn @ before.point.of(IMU_ROTATION)
         if node.markov is not None:
-            step = node.markov
-            own = rows[n : n + linear]
-            places = np.arange(linear)
-            own[places, 15 + places] = -step.decay[:linear]
-            own[places, self.dim + 15 + places] = 1.0
-            own[:, 2 * self.dim] = -step.residual(before.point.linear, node.point.linear)[:linear]
-            own /= step.sigma[:linear, None]
+            step, own = node.markov, rows[n : n + linear]
+            sigma, places = step.sigma[:linear], np.arange(linear)
+            own[places, 15 + places] = -step.decay[:linear] / sigma
+            own[places, dim + 15 + places] = 1.0 / sigma
+            own[:, 2 * dim] = -step.residual(before.point.linear, node.point.linear)[:linear] / sigma
         if node.wheels is not None:
-            poses = before.point.pose, node.point.pose
-            H_i, H_j, H_linear = jacobians(*poses, node.point.linear, node.wheels)
-            wheel = rows[n + linear :]
-            wheel[:, 0:6], wheel[:, self.dim : self.dim + 6] = H_i, H_j
-            wheel[:, self.dim + 15 : 2 * self.dim] = H_linear[:, :linear]
-            wheel[:, 2 * self.dim] = -residual(*poses, node.point.linear, node.wheels)
-            wheel /= node.wheels.sigma[:, None]
-        return rows
+            wheel = rows[n + linear : n + linear + WHEEL_ROWS]
+            left, H_i, H_j, H_linear = linearised(before.point, node.point, node.wheels)
+            sigma = node.wheels.sigma[:, None]
+            wheel[:, 0:6], wheel[:, dim : dim + 6] = H_i / sigma, H_j / sigma
+            wheel[:, dim + 15 : 2 * dim] = H_linear[:, :linear] / sigma
+            wheel[:, 2 * dim] = -left / node.wheels.sigma
+
+    def _stacked(self, k: int) -> Array:
+        """Prior and all whitened rows over keyframes k and k + 1, shape (m, 2 dim + 1)."""
+        packed = self._linearised(k + 1)
+        further = len(packed) + self.dim - NAV.stop + WHEEL_ROWS
+        stacked = self._own_rows(k, further, width=2)
+        self._fill_link(k + 1, stacked[len(stacked) - further :], packed)
+        return stacked
 
     def _eliminate(self, k: int) -> None:
-        node = self.nodes[k - self.first]
-        own = np.vstack([node.prior, self._unary_rows(k)])
-        link = self._link_rows(k + 1)
-        stacked = np.zeros((len(own) + len(link), 2 * self.dim + 1))
-        stacked[: len(own), : self.dim] = own[:, : self.dim]
-        stacked[: len(own), 2 * self.dim] = own[:, self.dim]
-        stacked[len(own) :] = link
-        R = triangular(stacked)
-        node.conditional = R[: self.dim]
+        R = triangular(self._stacked(k))
+        self.nodes[k - self.first].conditional = R[: self.dim]
         self.nodes[k + 1 - self.first].prior = R[self.dim : 2 * self.dim, self.dim :]
 
     def _back_substitute_to(self, begin: int) -> None:
-        following = self.nodes[-1].delta
+        dim, following = self.dim, self.nodes[-1].delta
         for node in self.nodes[-2 : begin - self.last - 2 : -1]:
             assert node.conditional is not None
-            rhs = node.conditional[:, 2 * self.dim] - node.conditional[:, self.dim : 2 * self.dim] @ following
-            node.delta = following = back_substitute(node.conditional[:, : self.dim], rhs)
+            rhs = node.conditional[:, 2 * dim] - node.conditional[:, dim : 2 * dim] @ following
+            node.delta = following = back_substitute(node.conditional[:, :dim], rhs)
 
 
 def carried_prior(rows: Array, offset: Array) -> Array:

@@ -112,7 +112,7 @@ def antenna_lever(
     Within half a keyframe the body is propagated by its velocity, acceleration and rate, so that the fix
     keeps its own time.
     """
-    R_body_world = state.pose.rotation().matrix().T
+    R_body_world = state.R.T
     moved = R_body_world @ (state.velocity * dt_s + 0.5 * accel_world_mps2 * dt_s**2)
     turned = gtsam.Rot3.Expmap(gyro_radps * dt_s).matrix() @ antenna_m
     return np.asarray(moved + turned)
@@ -125,10 +125,10 @@ def gnss_velocity(k: int, velocity_mps: Array, sigma_mps: float) -> gtsam.Nonlin
 
 def mean_rates(segments: list[ImuSegment]) -> tuple[Array, Array]:
     """Mean angular rate (3,) and specific force (3,) over the segments."""
-    total = sum(s.dt_s for s in segments)
-    gyro = sum((s.gyro_radps * s.dt_s for s in segments), np.zeros(3)) / total
-    accel = sum((s.accel_mps2 * s.dt_s for s in segments), np.zeros(3)) / total
-    return gyro, accel
+    dt_s = np.array([s.dt_s for s in segments])[:, None]
+    readings = np.array([(s.gyro_radps, s.accel_mps2) for s in segments]).reshape(-1, 6)
+    mean = (readings * dt_s).sum(axis=0) / sum(s.dt_s for s in segments)
+    return mean[:3], mean[3:]
 
 
 def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gtsam.CombinedImuFactor:
@@ -139,7 +139,7 @@ def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gts
 def carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
     """The state after `dt` seconds by the wheels, or by its velocity where they are silent."""
     if wheels is None:
-        step = gtsam.Pose3(gtsam.Rot3(), before.pose.rotation().matrix().T @ before.velocity * dt)
+        step = gtsam.Pose3(gtsam.Rot3(), before.R.T @ before.velocity * dt)
     else:
         turn = gtsam.Rot3.Rz(before.turning * wheels.turn_rad)
         step = gtsam.Pose3(turn, before.rolling * wheels.displacement_m)

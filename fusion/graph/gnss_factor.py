@@ -54,27 +54,38 @@ class GnssPosition:
 
 def residual(fix: GnssPosition, pose: Any, linear: Array) -> Array:
     """The residual of the module's docstring, unwhitened; `linear` (15,) of the keyframe."""
-    lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
-    late_m = (linear[_DELAY] - fix.delay_s) * fix.velocity_mps
-    antenna = pose.translation() + pose.rotation().matrix() @ lever - late_m
-    return np.asarray(antenna + np.append(fix.drift_share * linear[_DRIFT], 0.0) - fix.enu_m)
+    return _linearised(fix, pose.rotation().matrix(), pose.translation(), linear)[0]
 
 
 def jacobians(fix: GnssPosition, pose: Any, linear: Array) -> tuple[Array, Array]:
     """Derivatives of `residual` by the pose (3, 6; GTSAM tangent) and by the linear states (3, 15)."""
-    R = pose.rotation().matrix()
-    lever = fix.lever_m + np.append(linear[_ANTENNA], 0.0)
-    H = np.zeros((3, MARKOV.stop - MARKOV.start))
-    H[0, _DRIFT.start] = H[1, _DRIFT.start + 1] = fix.drift_share
-    H[:, _ANTENNA] = R[:, :2]
-    H[:, _DELAY] = -fix.velocity_mps
-    return np.hstack([-R @ skew(lever), R]), H
+    return _linearised(fix, pose.rotation().matrix(), pose.translation(), linear)[1:]
 
 
 def rows(fix: GnssPosition, point: KeyState, dim: int) -> Array:
     """Whitened rows (3, dim + 1) at a keyframe's state, the last column being the right-hand side."""
     out = np.zeros((3, dim + 1))
-    H_pose, H_linear = jacobians(fix, point.pose, point.linear)
+    left, H_pose, H_linear = linearised(fix, point)
     out[:, POSE], out[:, NAV.stop : dim] = H_pose, H_linear[:, : dim - NAV.stop]
-    out[:, dim] = -residual(fix, point.pose, point.linear)
+    out[:, dim] = -left
     return out / fix.sigma_m[:, None]
+
+
+def linearised(fix: GnssPosition, at: KeyState) -> tuple[Array, Array, Array]:
+    """`residual` and `jacobians` at a keyframe's state."""
+    return _linearised(fix, at.R, at.pose.translation(), at.linear)
+
+
+def _linearised(fix: GnssPosition, R: Array, p: Array, linear: Array) -> tuple[Array, Array, Array]:
+    lever = fix.lever_m.copy()
+    lever[:2] += linear[_ANTENNA]
+    drift = np.zeros(3)
+    drift[:2] = fix.drift_share * linear[_DRIFT]
+    late_m = (linear[_DELAY] - fix.delay_s) * fix.velocity_mps
+    left = p + R @ lever - late_m + drift - fix.enu_m
+    H_pose, H = np.empty((3, 6)), np.zeros((3, MARKOV.stop - MARKOV.start))
+    H_pose[:, :3], H_pose[:, 3:] = -R @ skew(lever), R
+    H[0, _DRIFT.start] = H[1, _DRIFT.start + 1] = fix.drift_share
+    H[:, _ANTENNA] = R[:, :2]
+    H[:, _DELAY] = -fix.velocity_mps
+    return left, H_pose, H

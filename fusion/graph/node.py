@@ -38,3 +38,11 @@ class Node:
     fixes: list[GnssPosition] = field(default_factory=list)
     velocities: list[GnssVelocity] = field(default_factory=list)
     conditional: Array | None = None
+
+    def state(self) -> KeyState:
+        """The estimate: `point` moved by `delta`."""
+        # Kept beside the fields, so that a snapshot does not write it, and until either of the two is another.
+        held = vars(self).get("_held")
+        if held is None or held[0] is not self.point or held[1] is not self.delta:
+            held = vars(self)["_held"] = self.point, self.delta, self.point.retract(self.delta)
+        return held[2]  # type: ignore[no-any-return]

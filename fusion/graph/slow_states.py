@@ -53,8 +53,11 @@ CALIBRATION_SIGMA = {
 }
 """Prior 1 sigma of a vehicle file (assumed: tyre wear and pressure, tape measure, mounting plate, driver
 clocks)."""
-_WALK = {name: 2e-4 * sigma for name, sigma in CALIBRATION_SIGMA.items()}
+_WALK_SIGMA = 2e-4 * np.array(list(CALIBRATION_SIGMA.values()))
 """Random walk of the calibration per sqrt(s), so that its covariance stays positive."""
+_CONSTANT = slice(6, 6 + len(CALIBRATION_SIGMA))
+_WANDERING = np.r_[0 : _CONSTANT.start, _CONSTANT.stop]
+"""Places of the calibration and of the others among the linear states."""
 
 
 def prior(noise: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
@@ -85,27 +88,19 @@ def step(
     sigma = _stationary(noise, drift_sigma_m)
     sigma[-1] = float(np.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill))
     restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
+    drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
     wandering = markov_step(
         dt_s,
-        mean=[noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill],
-        sigma=sigma,
-        time_s=[
-            SLIP_STEADY * noise.slip_time_s,
-            drift_time_s,
-            drift_time_s,
-            YAW_SCALE_TIME_S,
-            ICR_TIME_S,
-            SIDE_SLIP_TIME_S,
-        ],
-        forget=[restarted, 0.0, 0.0, switch, 0.0, switch],
+        mean=[noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill, noise.slip_per_grade],
+        sigma=[*sigma, _surge_sigma(noise)],
+        time_s=[slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S, SURGE_TIME_S],
+        forget=[restarted, 0.0, 0.0, switch, 0.0, switch, switch],
     )
-    walk = np.array(list(_WALK.values())) * np.sqrt(dt_s)
-    surge = markov_step(dt_s, [noise.slip_per_grade], [_surge_sigma(noise)], [SURGE_TIME_S], [switch])
-    return MarkovStep(
-        np.concatenate([wandering.decay, np.ones(len(walk)), surge.decay]),
-        np.concatenate([wandering.mean, np.zeros(len(walk)), surge.mean]),
-        np.concatenate([wandering.sigma, walk, surge.sigma]),
-    )
+    out = MarkovStep(np.ones(len(LINEAR)), np.zeros(len(LINEAR)), np.empty(len(LINEAR)))
+    for name in ("decay", "mean", "sigma"):
+        getattr(out, name)[_WANDERING] = getattr(wandering, name)
+    out.sigma[_CONSTANT] = _WALK_SIGMA * np.sqrt(dt_s)
+    return out
 
 
 def inflate_slip_covariance(

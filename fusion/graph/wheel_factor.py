@@ -35,6 +35,7 @@ from terrafusion.fusion.graph.key_state import (
     SURGE_SLIP,
     WHEEL_DELAY,
     YAW_SCALE,
+    KeyState,
 )
 
 _S, _K, _I, _B, _R, _T, _A = (
@@ -98,17 +99,7 @@ def slip_of(linear: Array, wheels: WheelIncrement) -> float:
 
 def residual(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> Array:
     """The residual (4,) of the module's docstring, unwhitened; `linear` (15,) of keyframe j."""
-    R = pose_i.rotation().matrix()
-    out = np.empty(4)
-    out[:3] = R.T @ (pose_j.translation() - pose_i.translation())
-    rolled = wheels.displacement_m.copy()
-    rolled[0] += linear[_T] * wheels.speed_change_mps
-    out[:3] -= (1.0 - linear[_S]) * (1.0 + linear[_R]) * rolled
-    out[0] += linear[_A] * wheels.surge_m
-    out[1] -= linear[_B] * wheels.distance_m - linear[_I] * wheels.yaw_rad
-    turned = R.T @ pose_j.rotation().matrix()
-    out[3] = np.arctan2(turned[1, 0], turned[0, 0]) - (1.0 + linear[_K]) * wheels.turn_rad
-    return out
+    return _linearised(*_matrices(pose_i), *_matrices(pose_j), linear, wheels)[0]
 
 
 def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -> tuple[Array, Array, Array]:
@@ -116,27 +107,45 @@ def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -
 
     Pose tangents are GTSAM's: rotation first, both parts in the body frame.
     """
-    R_i, R_j = pose_i.rotation().matrix(), pose_j.rotation().matrix()
-    x, y, z = R_i.T @ (pose_j.translation() - pose_i.translation())
-    T = R_i.T @ R_j
+    return _linearised(*_matrices(pose_i), *_matrices(pose_j), linear, wheels)[1:]
+
+
+def linearised(before: KeyState, now: KeyState, wheels: WheelIncrement) -> tuple[Array, Array, Array, Array]:
+    """`residual` and `jacobians` between two keyframes."""
+    p_i, p_j = before.pose.translation(), now.pose.translation()
+    return _linearised(before.R, p_i, now.R, p_j, now.linear, wheels)
+
+
+def _matrices(pose: Any) -> tuple[Array, Array]:
+    return pose.rotation().matrix(), pose.translation()
+
+
+def _linearised(
+    R_i: Array, p_i: Array, R_j: Array, p_j: Array, linear: Array, wheels: WheelIncrement
+) -> tuple[Array, Array, Array, Array]:
+    moved, T = R_i.T @ (p_j - p_i), R_i.T @ R_j
+    (x, y, z), (c, _, e), (s, g, h), (a, _, _) = moved.tolist(), *T.tolist()
+    state = linear.tolist()
+    slip, radius = 1.0 - state[_S], 1.0 + state[_R]
+    rolled = wheels.displacement_m.copy()
+    rolled[0] += state[_T] * wheels.speed_change_mps
+    out = np.empty(4)
+    out[:3] = moved - slip * radius * rolled
+    out[0] += state[_A] * wheels.surge_m
+    out[1] -= state[_B] * wheels.distance_m - state[_I] * wheels.yaw_rad
+    out[3] = np.arctan2(s, c) - (1.0 + state[_K]) * wheels.turn_rad
+    level = c * c + s * s
     H_i, H_j, H_linear = np.zeros((4, 6)), np.zeros((4, 6)), np.zeros((4, MARKOV.stop - MARKOV.start))
     H_i[0, 1], H_i[0, 2] = -z, y
     H_i[1, 0], H_i[1, 2] = z, -x
     H_i[2, 0], H_i[2, 1] = -y, x
     H_i[0, 3] = H_i[1, 4] = H_i[2, 5] = -1.0
+    H_i[3, :3] = c * a / level, s * a / level, -1.0
     H_j[:3, 3:] = T
-    level = T[0, 0] ** 2 + T[1, 0] ** 2
-    H_i[3, 0] = T[0, 0] * T[2, 0] / level
-    H_i[3, 1] = T[1, 0] * T[2, 0] / level
-    H_i[3, 2] = -1.0
-    H_j[3, 1] = (T[1, 0] * T[0, 2] - T[0, 0] * T[1, 2]) / level
-    H_j[3, 2] = (T[0, 0] * T[1, 1] - T[1, 0] * T[0, 1]) / level
-    rolled = wheels.displacement_m.copy()
-    rolled[0] += linear[_T] * wheels.speed_change_mps
-    slip, radius = 1.0 - linear[_S], 1.0 + linear[_R]
+    H_j[3, 1:3] = (s * e - c * h) / level, (c * g - s * T[0, 1]) / level
     H_linear[:3, _S], H_linear[:3, _R] = radius * rolled, -slip * rolled
     H_linear[0, _A] = wheels.surge_m
     H_linear[0, _T] = -slip * radius * wheels.speed_change_mps
     H_linear[1, _B], H_linear[1, _I] = -wheels.distance_m, wheels.yaw_rad
     H_linear[3, _K] = -wheels.turn_rad
-    return H_i, H_j, H_linear
+    return out, H_i, H_j, H_linear

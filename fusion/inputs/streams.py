@@ -163,8 +163,8 @@ class ImuStream:
         """
         t_ns = checked_time(t_ns, "imu")
         gyro, accel = as_numbers(gyro_radps, "gyro", "imu"), as_numbers(accel_mps2, "accel", "imu")
-        known = gyro.shape == accel.shape == (3,) and np.isfinite(
-            gyro.sum() + accel.sum() if self.six_axis else gyro[2]
+        known = gyro.shape == accel.shape == (3,) and math.isfinite(
+            sum(gyro.tolist()) + sum(accel.tolist()) if self.six_axis else gyro[2]
         )
         if not known:
             wanted = "six finite numbers" if self.six_axis else "six numbers with a finite yaw rate"

@@ -52,13 +52,12 @@ def varied(calibrate: bool, n: int = 12) -> Chain:
 def test_rows_are_those_of_the_chain(calibrate: bool) -> None:
     """Rows may come in another order, so that their information matrices are compared."""
     chain = varied(calibrate)
+    chain.rebuild()
     block = RowBlock(chain.nodes, 0, 0, 12)
     linear = np.array([node.point.linear for node in chain.nodes])
     rows, counts = block.rows(chain.values, linear)
     for k in range(11):
-        unary, link = chain._unary_rows(k), chain._link_rows(k + 1)
-        wanted = np.vstack([np.zeros((len(unary), link.shape[1])), link])
-        wanted[: len(unary), : chain.dim], wanted[: len(unary), -1] = unary[:, :-1], unary[:, -1]
+        wanted = chain._stacked(k)[len(chain.nodes[k].prior) :]
         found = rows[k, chain.dim : counts[k]]
         scale = np.sqrt(np.diag(wanted.T @ wanted)) + 1e-6
         np.testing.assert_allclose(
