@@ -48,7 +48,7 @@ class AntennaMotion:
         node, state = chain.nodes[k - chain.first], chain.state(k)
         delay_s = float(state.of(GNSS_DELAY))
         offset_s = (fix.t_ns - node.t_ns) * 1e-9 - delay_s
-        R = state.R
+        R = state.rotation
         rate = state.rate(node.gyro_radps)
         accel_world = R @ state.specific_force(node.accel_mps2)
         accel_world[2] -= GRAVITY_MPS2

@@ -153,12 +153,14 @@ def wheel_innovation(
         before, point: the last keyframe with its covariance P (dim, dim), and the IMU's prediction from it.
         switch: share of the ground that has just changed.
     """
-    R, rolled_m, sigma_m = before.R, float(wheels.displacement_m[0]), float(wheels.sigma[0])
+    R, rolled_m, sigma_m = before.rotation, float(wheels.displacement_m[0]), float(wheels.sigma[0])
     forward = R[:, 0]
     moved_m = float((R.T @ (point.pose.translation() - before.pose.translation()))[0])
     variance = (
         sigma_m * sigma_m
-        + rolled_m * rolled_m * (P[SLIP, SLIP] + noise.slip_sigma**2 * (2.0 * dt_s / noise.slip_time_s + switch))
+        + rolled_m
+        * rolled_m
+        * (P[SLIP, SLIP] + noise.slip_sigma**2 * (2.0 * dt_s / noise.slip_time_s + switch))
         + dt_s**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
         + (0.5 * GRAVITY_MPS2 * dt_s**2) ** 2 * P[1, 1]
     )

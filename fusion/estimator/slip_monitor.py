@@ -95,7 +95,7 @@ class MotionMonitor:
 
     def watch(self, t_ns: int, key: KeyState, velocity_covariance: Array, rolled_m: float | None) -> None:
         """`update` from a keyframe's state and the covariance (3, 3) of its velocity, world axes."""
-        forward = key.R[:, 0]
+        forward = key.rotation[:, 0]
         sigma = math.sqrt(float(forward @ velocity_covariance @ forward))
         self.update(t_ns, rolled_m, key.forward_mps, sigma)
 

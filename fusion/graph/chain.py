@@ -239,7 +239,6 @@ class Chain:
 
         Motion between keyframes is the same in every frame: only the prior of the first keyframe changes.
         """
-        self._insert_new()
         R = gtsam.Rot3.Rz(yaw_rad).matrix()
         moved = gtsam.Pose3(gtsam.Rot3(R), to_m - R @ from_m)
         for k, node in enumerate(self.nodes, self.first):
@@ -331,6 +330,7 @@ class Chain:
         self._dirty = self.last
 
     def _publish(self, k: int) -> None:
+        self._insert_new()
         node = self.nodes[k - self.first]
         self.values.update(X(k), node.point.pose)
         self.values.update(V(k), node.point.velocity)

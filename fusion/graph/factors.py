@@ -112,7 +112,7 @@ def antenna_lever(
     Within half a keyframe the body is propagated by its velocity, acceleration and rate, so that the fix
     keeps its own time.
     """
-    R_body_world = state.R.T
+    R_body_world = state.rotation.T
     moved = R_body_world @ (state.velocity * dt_s + 0.5 * accel_world_mps2 * dt_s**2)
     turned = gtsam.Rot3.Expmap(gyro_radps * dt_s).matrix() @ antenna_m
     return np.asarray(moved + turned)
@@ -139,7 +139,7 @@ def imu_factor(k: int, measured: gtsam.PreintegratedCombinedMeasurements) -> gts
 def carried(before: KeyState, wheels: WheelIncrement | None, dt: float) -> KeyState:
     """The state after `dt` seconds by the wheels, or by its velocity where they are silent."""
     if wheels is None:
-        step = gtsam.Pose3(gtsam.Rot3(), before.R.T @ before.velocity * dt)
+        step = gtsam.Pose3(gtsam.Rot3(), before.rotation.T @ before.velocity * dt)
     else:
         turn = gtsam.Rot3.Rz(before.turning * wheels.turn_rad)
         step = gtsam.Pose3(turn, before.rolling * wheels.displacement_m)

@@ -73,7 +73,7 @@ def rows(fix: GnssPosition, point: KeyState, dim: int) -> Array:
 
 def linearised(fix: GnssPosition, at: KeyState) -> tuple[Array, Array, Array]:
     """`residual` and `jacobians` at a keyframe's state."""
-    return _linearised(fix, at.R, at.pose.translation(), at.linear)
+    return _linearised(fix, at.rotation, at.pose.translation(), at.linear)
 
 
 def _linearised(fix: GnssPosition, R: Array, p: Array, linear: Array) -> tuple[Array, Array, Array]:

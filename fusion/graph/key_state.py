@@ -69,7 +69,7 @@ class KeyState:
         return self.linear[place - NAV.stop]
 
     @functools.cached_property
-    def R(self) -> Array:
+    def rotation(self) -> Array:
         """Rotation (3, 3) body to world."""
         return np.asarray(self.pose.rotation().matrix())
 
@@ -81,7 +81,7 @@ class KeyState:
     @property
     def forward_mps(self) -> float:
         """Speed along body x, m/s."""
-        return float(self.R[:, 0] @ self.velocity)
+        return float(self.rotation[:, 0] @ self.velocity)
 
     @property
     def rolling(self) -> float:

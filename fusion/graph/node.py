@@ -41,7 +41,7 @@ class Node:
 
     def state(self) -> KeyState:
         """The estimate: `point` moved by `delta`."""
-        # Kept beside the fields, so that a snapshot does not write it, and until either of the two is another.
+        # Beside the fields, so that a snapshot does not write it; made anew where either of the two changed.
         held = vars(self).get("_held")
         if held is None or held[0] is not self.point or held[1] is not self.delta:
             held = vars(self)["_held"] = self.point, self.delta, self.point.retract(self.delta)

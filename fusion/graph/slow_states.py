@@ -91,7 +91,15 @@ def step(
     drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
     wandering = markov_step(
         dt_s,
-        mean=[noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill, noise.slip_per_grade],
+        mean=[
+            noise.slip_at(float(up[0])),
+            0.0,
+            0.0,
+            noise.yaw_scale_mean,
+            0.0,
+            downhill,
+            noise.slip_per_grade,
+        ],
         sigma=[*sigma, _surge_sigma(noise)],
         time_s=[slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S, SURGE_TIME_S],
         forget=[restarted, 0.0, 0.0, switch, 0.0, switch, switch],

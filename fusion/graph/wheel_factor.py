@@ -113,7 +113,7 @@ def jacobians(pose_i: Any, pose_j: Any, linear: Array, wheels: WheelIncrement) -
 def linearised(before: KeyState, now: KeyState, wheels: WheelIncrement) -> tuple[Array, Array, Array, Array]:
     """`residual` and `jacobians` between two keyframes."""
     p_i, p_j = before.pose.translation(), now.pose.translation()
-    return _linearised(before.R, p_i, now.R, p_j, now.linear, wheels)
+    return _linearised(before.rotation, p_i, now.rotation, p_j, now.linear, wheels)
 
 
 def _matrices(pose: Any) -> tuple[Array, Array]:
