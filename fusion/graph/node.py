@@ -42,7 +42,7 @@ class Node:
     def state(self) -> KeyState:
         """The estimate: `point` moved by `delta`."""
         # Beside the fields, so that a snapshot does not write it; made anew where either of the two changed.
-        held = vars(self).get("_held")
+        held: tuple[KeyState, Array, KeyState] | None = vars(self).get("_held")
         if held is None or held[0] is not self.point or held[1] is not self.delta:
             held = vars(self)["_held"] = self.point, self.delta, self.point.retract(self.delta)
-        return held[2]  # type: ignore[no-any-return]
+        return held[2]
