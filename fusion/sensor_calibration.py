@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,7 @@ from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.fusion.calibration.fit import information_gained
+from terrafusion.fusion.calibration.mounting import Angle
 from terrafusion.fusion.calibration.numbers import (
     ANTENNA_X,
     ANTENNA_Y,
@@ -31,6 +33,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.config.sensor_config import sensor_config_of, yaw_factor
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import feed, with_usable_samples
+from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.library import is_named
 from terrafusion.twin.model.vehicle import VehicleParams, reported_geometry
@@ -75,7 +78,7 @@ class SensorCalibration:
         vehicle: as it was known before, with the geometry `overrides` that the logs report.
         extends: its name or file.
         logs: names of the logs used.
-        numbers: by their names in `ROWS`; the antenna as its place in the body frame.
+        numbers: by their names in `ROWS`, and `imu_yaw_rad`; the antenna as its place in the body frame.
         notes: what was left out or assumed.
     """
 
@@ -160,14 +163,18 @@ def calibrate_sensors(
     notes += tuple(f"{name}: left out, it has no fixes or no source of yaw" for name in left_out)
     learners = [(log, learner) for log, learner in ready if learner is not None]
     yaw = _one_source_of_yaw(learners)
-    before = after = learners[0][1].known
+    last, earlier = learners[-1][1], None
+    before, mounted_before = learners[0][1].known, learners[0][1].mounting.known
     for i, (log, learner) in enumerate(learners):
         with errors_of(log.name):
             share = None if progress is None else _part_of(progress, i, len(learners))
-            after = learner.run(after if i else None, share)
+            learner.run(earlier, share)
+        earlier = learner
     logs = tuple(log.name for log, _ in learners)
     extends = vehicle.name if isinstance(vehicle, VehicleParams) else str(vehicle or _named(recordings[0]))
-    numbers = _numbers(before, after, params, yaw)
+    numbers = _numbers(before, last.known, params, yaw)
+    if last.mounting.learns:
+        numbers["imu_yaw_rad"] = _mounting(mounted_before, last.mounting.known)
     return SensorCalibration(params, extends, overrides, logs, numbers, notes)
 
 
@@ -207,13 +214,17 @@ class _Learner:
     def yaw(self) -> str:
         return self.estimator.config.inputs.yaw
 
-    def run(self, earlier: Knowledge | None, progress: Callable[[float], None] | None) -> Knowledge:
-        """What is known after the log, with what earlier logs gave."""
+    @property
+    def mounting(self) -> ImuMounting:
+        return self.estimator.learned.mounting
+
+    def run(self, earlier: _Learner | None, progress: Callable[[float], None] | None) -> None:
+        """Learn from the log, beginning with what the learner of an earlier one knows."""
         if earlier is not None:
-            wide = self.calibration.prior
-            self.estimator.learned.start_from(for_the_next_run(earlier, wide, self.yaw))
+            known = for_the_next_run(earlier.known, self.calibration.prior, self.yaw)
+            self.estimator.learned.start_from(known)
+            self.mounting.start_from(earlier.mounting.known)
         feed(self.estimator, self.given, progress)
-        return self.known
 
 
 def _learner(log: Recording, params: VehicleParams) -> _Learner | None:
@@ -274,6 +285,11 @@ def _numbers(
                 float(gained[row]),
             )
     return found
+
+
+def _mounting(before: Angle, after: Angle) -> LearnedNumber:
+    gained = math.log(before.sigma_rad / after.sigma_rad)
+    return LearnedNumber(after.rad, after.sigma_rad, before.rad, before.sigma_rad, gained)
 
 
 def _digits(value: float, digits: int) -> float:

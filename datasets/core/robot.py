@@ -137,6 +137,7 @@ class SensorNumbers:
         yaw_factor: true yaw rate over that of the wheels and the track, where there is no gyro.
         wheel_scale: true distance over that of the wheels, less one; usual slip included.
         gnss_delay_s, wheel_delay_s: lateness of the stamps against those of the IMU.
+        imu_yaw_rad: angle about z at which the IMU is mounted, counter-clockwise seen from above.
     """
 
     antenna_m: Place | None = None
@@ -146,6 +147,7 @@ class SensorNumbers:
     wheel_scale: Ratio | None = None
     gnss_delay_s: Delay | None = None
     wheel_delay_s: Delay | None = None
+    imu_yaw_rad: Annotated[KnownNumber, Known(Quantity("rad", -3.1416, 3.1416))] | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from terrafusion.fusion.calibration.reduction import Noise
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
+from terrafusion.fusion.estimator.imu_mounting import ImuMounting
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -74,6 +75,7 @@ class LearnedNumbers:
 
     Attributes:
         calibration: None where it is switched off, or there is nothing to learn from.
+        mounting: the angle of the IMU.
     """
 
     def __init__(
@@ -82,6 +84,7 @@ class LearnedNumbers:
         known, prior = config.rig.known, _prior(config)
         self.calibration = _calibration(config, prior)
         self._imu, self._gnss, self._weights = imu, gnss, weights
+        self.mounting = ImuMounting(config, imu, gnss.skid)
         self._spec = config.rig.sensors.imu
         self._bias_radps = float(prior.mean[GYRO_BIAS])
         self._before, self._clear = prior, np.zeros(len(CORRECTED), dtype=bool)
@@ -143,21 +146,21 @@ class LearnedNumbers:
 
     def table(self) -> tuple[NumberAfterDrive, ...]:
         """What is known of each number now, but for the gyro's bias, of which the chain knows more."""
-        if self.calibration is None:
-            return ()
-        known, prior = self._known, self.calibration.prior
+        numbers = [] if self.calibration is None else self._of_fixes(self.calibration.prior)
+        if self.mounting.learns:
+            angle, before = self.mounting.known, self.mounting.before
+            sigmas = angle.sigma_rad, before.sigma_rad
+            numbers.append(NumberAfterDrive("imu_yaw_rad", angle.rad, *sigmas, self.mounting.corrects))
+        return tuple(numbers)
+
+    def _of_fixes(self, prior: Knowledge) -> list[NumberAfterDrive]:
+        mean, sigma = self._known.mean.tolist(), self._known.sigma.tolist()
         corrects = dict(zip(CORRECTED, self._clear.tolist(), strict=True))
-        return tuple(
-            NumberAfterDrive(
-                name,
-                float(known.mean[i]),
-                float(known.sigma[i]),
-                float(prior.sigma[i]),
-                corrects.get(i, False),
-            )
+        return [
+            NumberAfterDrive(name, mean[i], sigma[i], float(prior.sigma[i]), corrects.get(i, False))
             for i, name in enumerate(NUMBERS)
             if i != GYRO_BIAS
-        )
+        ]
 
     def _mark_slide(self, learning: SelfCalibration, slides: bool) -> None:
         """Keep what was known before a slide, or before late fixes that look like one.

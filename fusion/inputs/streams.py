@@ -137,7 +137,8 @@ class ImuStream:
     Without `six_axis` only the yaw rate is used: any other axis may be NaN, and `segments` has in their
     place the readings of a robot that drives straight on level ground.
 
-    `turn_scale` is the true over the measured yaw rate, less one; `segments` and `levelled` correct it.
+    `turn_scale` is the true over the measured yaw rate, less one, and `mounting_rad` the angle about z at
+    which the IMU is mounted; `segments` and `levelled` correct them.
 
     A single rate or force beyond `SPIN_RADPS` or `SHOCK_MPS2` is replaced by the mean of the samples
     before; `spikes` counts them, `impossible` those beyond what any sensor measures, which are left out.
@@ -145,7 +146,7 @@ class ImuStream:
 
     def __init__(self, six_axis: bool = True, newest: Newest | None = None) -> None:
         self.six_axis = six_axis
-        self.turn_scale = 0.0
+        self.turn_scale = self.mounting_rad = 0.0
         self.spikes = self.impossible = 0
         self._spike_ns: list[int] = []
         self._gyro_held_ns: list[int] = []
@@ -234,9 +235,11 @@ class ImuStream:
         scale = 1.0 + self.turn_scale
         if not self.six_axis:
             return np.array([0.0, 0.0, scale * gyro[2]]), np.array([0.0, 0.0, GRAVITY_MPS2])
-        if scale == 1.0:
-            return gyro, accel
-        return np.array([gyro[0], gyro[1], scale * gyro[2]]), accel
+        if scale != 1.0:
+            gyro = np.array([gyro[0], gyro[1], scale * gyro[2]])
+        if self.mounting_rad:
+            gyro, accel = turned(gyro, self.mounting_rad), turned(accel, self.mounting_rad)
+        return gyro, accel
 
     def levelled(self, start_ns: int, end_ns: int) -> tuple[Array, Array]:
         """Rates (n, 3) and forces (n, 3) of a window, as `segments` has them."""
@@ -264,6 +267,13 @@ class ImuStream:
             del self.t_ns[:i], self.gyro[:i], self.accel[:i]
             for times in (self._spike_ns, self._gyro_held_ns, self._accel_held_ns):
                 times[:] = [t for t in times if t >= before_ns]
+
+
+def turned(vector: Array, angle_rad: float) -> Array:
+    """A vector (3,) turned about z."""
+    c, s = math.cos(angle_rad), math.sin(angle_rad)
+    x, y, z = vector
+    return np.array([c * x - s * y, s * x + c * y, z])
 
 
 class WheelStream:

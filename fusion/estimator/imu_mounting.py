@@ -1,0 +1,95 @@
+"""An IMU turned about its vertical axis: learned while the wheels roll, corrected where it is clear."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.fusion.calibration.mounting import ANY_ANGLE_RAD, LEAST_SIGMA_RAD, Angle, MountingAngle
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.skid import SkidDetector
+from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.graph.key_state import BIAS, VELOCITY
+from terrafusion.fusion.inputs.streams import ImuStream, turned
+
+CLEAR_SIGMA, LEAST_RAD, STILL_CLEAR = 5.0, math.radians(5.0), 0.5
+"""A correction begins at so many sigma from what was known and no less than an angle that the noise of the
+accelerations hides; it ends at half of both (assumed)."""
+
+DOUBTFUL_TILT_RAD, DOUBTFUL_MPS = 0.1, 0.3
+"""1 sigma of tilt and speed after driving with turned accelerations (assumed)."""
+
+
+class ImuMounting:
+    """Learns the angle of the IMU about z, and turns its samples.
+
+    Attributes:
+        learns: an estimator of six axes, with self-calibration.
+        before: what was known before the drive; known: now, as it is used.
+        corrects: the samples are turned by what the drive showed.
+    """
+
+    def __init__(self, config: EstimatorConfig, imu: ImuStream, skid: SkidDetector) -> None:
+        self.learns = config.self_calibrate and not config.calibrate and config.inputs.imu == "six_axis"
+        self._imu, self._skid, self._seen = imu, skid, MountingAngle()
+        spec = config.rig.sensors.imu
+        self._bias_sigma = np.repeat([spec.accel_bias_sigma_mps2, spec.gyro_bias_sigma_radps], 3)
+        self.corrects = False
+        self.start_from(_prior(config.rig.known.imu_yaw_rad))
+
+    def start_from(self, before: Angle) -> None:
+        """Begin with what is known of the robot."""
+        self.before = self.known = before
+        self._imu.mounting_rad = before.rad
+
+    def keyframe(
+        self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
+    ) -> bool:
+        """Take the motion over `dt_s` up to the newest keyframe, by the wheels and the mean readings (3,) of
+        the IMU; True when a correction put states in doubt.
+        """
+        friction = self._skid.friction
+        if not self.learns:
+            return False
+        if rolled_m is None or (friction is not None and friction.leads):
+            self._seen.interrupt()
+            return False
+        bias = chain.state(chain.last).bias
+        turn_rad = (float(gyro_radps[2]) - float(bias.gyroscope()[2])) * dt_s
+        raw = turned(accel_mps2, -self._imu.mounting_rad)
+        if not self._seen.add(dt_s, rolled_m, turn_rad, raw) or self._seen.angle is None:
+            return False
+        was_rad = self._imu.mounting_rad
+        self.known = self._in_use(self.before.combined(self._seen.angle))
+        self._imu.mounting_rad = self.known.rad
+        if abs(math.remainder(self._imu.mounting_rad - was_rad, math.tau)) < LEAST_RAD:
+            return False
+        chain.restart(self._doubt(chain.dim, bias.vector()))
+        return True
+
+    def _in_use(self, found: Angle) -> Angle:
+        """What was found where that is clear, else what was known before, its sigma with the difference."""
+        off = abs(math.remainder(found.rad - self.before.rad, math.tau))
+        limit = max(CLEAR_SIGMA * found.sigma_rad, LEAST_RAD)
+        self.corrects = off > (STILL_CLEAR * limit if self.corrects else limit)
+        if self.corrects:
+            return found
+        return Angle(self.before.rad, min(math.hypot(off, found.sigma_rad), self.before.sigma_rad))
+
+    def _doubt(self, dim: int, bias: Array) -> Array:
+        """Variances (dim,) of what turned accelerations have bent."""
+        doubt = np.zeros(dim)
+        doubt[:2] = DOUBTFUL_TILT_RAD**2
+        doubt[VELOCITY] = DOUBTFUL_MPS**2
+        doubt[BIAS] = self._bias_sigma**2 + bias**2
+        return doubt
+
+
+def _prior(known: KnownNumber | None) -> Angle:
+    if known is None or known.known == "assumed":
+        return Angle(0.0, ANY_ANGLE_RAD)
+    sigma = known.sigma if isinstance(known.sigma, float) else LEAST_SIGMA_RAD
+    return Angle(known.number, max(sigma, LEAST_SIGMA_RAD))

@@ -1,0 +1,82 @@
+"""The mounting angle of an IMU about z from made accelerations."""
+
+from __future__ import annotations
+
+import cmath
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.calibration.mounting import Angle, MountingAngle
+
+DT_S = 0.1
+
+
+def learned(
+    angle_rad: float,
+    seconds: float = 120.0,
+    turn_radps: float = 0.5,
+    hill: float = 0.0,
+    noise_mps2: float = 0.0,
+    seed: int = 0,
+) -> MountingAngle:
+    """After a drive at 1 m/s that swings by a third; hills add `hill` times the loss of speed."""
+    rng = np.random.default_rng(seed)
+    t_s = np.arange(0.0, seconds, DT_S)
+    speed = 1.0 + 0.3 * np.sin(0.9 * t_s)
+    gained, turn = 0.27 * np.cos(0.9 * t_s), turn_radps * np.sin(0.23 * t_s)
+    body = (1.0 - hill) * gained + 1j * speed * turn + 0.3
+    noise = noise_mps2 * (rng.normal(size=len(t_s)) + 1j * rng.normal(size=len(t_s)))
+    read = body * cmath.exp(-1j * angle_rad) + noise
+    found = MountingAngle()
+    for v, w, f in zip(speed, turn, read, strict=True):
+        found.add(DT_S, v * DT_S, w * DT_S, force(f))
+    return found
+
+
+def force(f: complex) -> Array:
+    return np.array([f.real, f.imag, 9.81])
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.floats(-math.pi, math.pi))
+def test_any_angle_is_found_without_noise(angle: float) -> None:
+    found = learned(angle).angle
+    assert found is not None
+    assert abs(math.remainder(found.rad - angle, math.tau)) < 0.005
+
+
+def test_sigma_holds_the_error_of_noisy_accelerations() -> None:
+    angles = [learned(2.0, noise_mps2=0.5, seed=seed).angle for seed in range(40)]
+    off = np.array([(a.rad - 2.0) / a.sigma_rad for a in angles if a is not None])
+    assert len(off) >= 35
+    assert 0.4 < np.sqrt(np.mean(off**2)) < 1.2
+
+
+def test_a_straight_drive_tells_no_angle() -> None:
+    assert learned(2.0, turn_radps=0.0, noise_mps2=0.05).angle is None
+
+
+@pytest.mark.parametrize("hill", [2.0, 3.0])
+def test_hills_on_which_the_robot_slows_down_do_not_turn_the_imu_round(hill: float) -> None:
+    assert learned(0.0, hill=hill).angle is None
+
+
+def test_an_interruption_begins_a_new_window() -> None:
+    found = MountingAngle()
+    for i in range(300):
+        if i % 9 == 0:
+            found.interrupt()
+        found.add(DT_S, 0.1 + 0.01 * (i % 5), 0.05 * (i % 7 - 3), force(1.0 + 0j))
+    assert found.angle is None
+
+
+def test_angles_combine_the_short_way_round() -> None:
+    both = Angle(math.radians(175.0), 0.1).combined(Angle(math.radians(-175.0), 0.1))
+    assert abs(both.rad) == pytest.approx(math.pi)
+    assert both.sigma_rad == pytest.approx(0.1 / math.sqrt(2.0))
+    assert Angle(0.0, 1.8).combined(Angle(1.0, 0.02)).rad == pytest.approx(1.0, abs=1e-3)

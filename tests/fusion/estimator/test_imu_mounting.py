@@ -1,0 +1,72 @@
+"""A twin's IMU that is mounted turned about z: learned and corrected, carried on by the vehicle file."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.config.estimator_config import EstimatorConfig, EstimatorOptions
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
+from terrafusion.fusion.inputs.streams import turned
+from terrafusion.fusion.metrics.scores import Outage
+from terrafusion.fusion.outputs.robot_file import write_robot
+from terrafusion.fusion.replay import replay
+from terrafusion.fusion.sensor_calibration import calibrate_sensors
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate
+
+ANGLE_RAD = math.radians(120.0)
+
+
+def mounted(run: Recording, angle_rad: float) -> Recording:
+    """The drive as an IMU mounted at an angle about z measures it."""
+    assert run.imu is not None
+    gyro, accel = (
+        np.array([turned(row, -angle_rad) for row in rows])
+        for rows in (run.imu.gyro_radps, run.imu.accel_mps2)
+    )
+    return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro, accel_mps2=accel))
+
+
+@pytest.fixture(scope="module")
+def run() -> Recording:
+    lap = (
+        DriveSegment(5.0, 1.0),
+        DriveSegment(5.0, 0.6, 0.5),
+        DriveSegment(4.0, 1.4),
+        DriveSegment(6.0, 0.7, -0.5),
+    )
+    route = (RouteLeg("asphalt"),)
+    laps = Scenario("laps", 82.0, route=route, drive=(DriveSegment(2.0), *lap, *lap, *lap, *lap))
+    return mounted(simulate(laps, seed=3), ANGLE_RAD)
+
+
+def learned(numbers: tuple[NumberAfterDrive, ...]) -> NumberAfterDrive:
+    return next(number for number in numbers if number.state == "imu_yaw_rad")
+
+
+def test_a_turned_imu_is_found_and_corrected(run: Recording) -> None:
+    outage = [Outage(45.0, 30.0)]
+    found = replay(run, mode="fixed", outages=outage)
+    without = replay(run, mode="fixed", outages=outage, settings=EstimatorOptions(self_calibrate=False))
+    angle = learned(found.learned)
+    assert angle.corrects
+    assert abs(angle.value - ANGLE_RAD) < 3.0 * angle.sigma
+    drifts = [result.scores.outages[0].end_error_m or 0.0 for result in (found, without)]
+    assert drifts[0] < 0.5
+    assert drifts[1] > 3.0 * drifts[0]
+
+
+def test_the_file_carries_the_angle_to_the_next_drive(run: Recording, tmp_path: Path) -> None:
+    found = calibrate_sensors([run], "elevate")
+    assert found.numbers["imu_yaw_rad"].observed
+    robot = load_vehicle(write_robot(tmp_path / "my_robot.yaml", found))
+    estimator = Estimator(EstimatorConfig(robot.rig(), robot.name))
+    assert estimator.imu.mounting_rad == pytest.approx(ANGLE_RAD, abs=math.radians(5.0))
