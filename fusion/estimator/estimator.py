@@ -337,10 +337,7 @@ class Estimator:
         self._zero_velocity(k, t_ns, before, link)
         rolled_m = rolled.distance_m if rolled else None
         self._finish_keyframe(t_ns, gyro, rolled_m)
-        pose = self.chain.state(self.chain.last).pose
-        rolled_m = None if gap else rolled_m
-        self.learned.keyframe(t_ns, rolled_m, float(gyro[2]) * dt, pose)
-        if self.learned.mounting.keyframe(self.chain, dt, rolled_m, gyro, accel):
+        if self.learned.keyframe(self.chain, dt, None if gap else rolled_m, gyro, accel):
             self._covariance = self.chain.covariance()
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:

@@ -29,6 +29,7 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.alignment import Start
 from terrafusion.fusion.estimator.gnss import WHITE_SHARE, GnssUpdater
 from terrafusion.fusion.estimator.imu_mounting import ImuMounting
+from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.key_state import KeyState
 from terrafusion.fusion.inputs.streams import GnssFix, ImuSegment, ImuStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -113,17 +114,22 @@ class LearnedNumbers:
         if self.calibration is not None:
             self.calibration.fix(fix.t_ns, fix.enu_m, float(np.max(fix.sigma_m[:2])))
 
-    def keyframe(self, t_ns: int, rolled_m: float | None, turn_rad: float, pose: gtsam.Pose3) -> None:
-        """Take the motion since the last keyframe.
+    def keyframe(
+        self, chain: Chain, dt_s: float, rolled_m: float | None, gyro_radps: Array, accel_mps2: Array
+    ) -> bool:
+        """Take the motion of `dt_s` up to the newest keyframe; True when that put states in doubt.
 
         Args:
             rolled_m: mean distance of the wheels; None where samples of wheels or IMU are missing.
-            turn_rad: by the corrected source of yaw.
-            pose: of the keyframe.
+            gyro_radps, accel_mps2: (3,) mean readings, corrected.
         """
-        learning = self.calibration
-        if learning is None:
-            return
+        if self.calibration is not None:
+            self._drive(self.calibration, chain, rolled_m, float(gyro_radps[2]) * dt_s)
+        return self.mounting.keyframe(chain, dt_s, rolled_m, gyro_radps, accel_mps2)
+
+    def _drive(
+        self, learning: SelfCalibration, chain: Chain, rolled_m: float | None, turn_rad: float
+    ) -> None:
         if self._gnss.local:
             learning.restart()
             return
@@ -132,8 +138,9 @@ class LearnedNumbers:
             self._forget(self._before_slide or learning.before)
             return
         self._mark_slide(learning, skid.rate_m2ps > 0.0)
-        measured = turn_rad / (1.0 + self._imu.turn_scale)
-        learning.drive(t_ns, rolled_m, measured, np.asarray(pose.translation()), pose.rotation().yaw())
+        pose, measured = chain.state(chain.last).pose, turn_rad / (1.0 + self._imu.turn_scale)
+        t_ns, place = chain.nodes[-1].t_ns, np.asarray(pose.translation())
+        learning.drive(t_ns, rolled_m, measured, place, pose.rotation().yaw())
 
     def advance(self, t_ns: int) -> None:
         """A slice of learning's work, at keyframe `t_ns`; correct the sensors when it gives new numbers."""
