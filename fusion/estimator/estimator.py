@@ -34,6 +34,7 @@ from terrafusion.fusion.estimator.key_states import state_fields
 from terrafusion.fusion.estimator.learned_numbers import LearnedNumbers
 from terrafusion.fusion.estimator.messages import add_message
 from terrafusion.fusion.estimator.odometry import Propagator
+from terrafusion.fusion.estimator.odometry_frame import OdometryFrame, in_map
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.estimator.slip_monitor import MotionMonitor
 from terrafusion.fusion.estimator.starting import StartSearch
@@ -101,25 +102,22 @@ class Estimator:
         self.wheels = WheelStream(self.newest)
         self.gyro = StuckGyro(config.rig, config.inputs)
         self.steering = SteeringStream(rig, self.newest)
-        self._turn = steered_turn(rig, config.inputs)
-        self.weights = TerrainNoise(config)
+        self._turn, self.weights = steered_turn(rig, config.inputs), TerrainNoise(config)
         self._preintegrator = config.inputs.preintegrator(config.rig.sensors.imu)
         self._skid = SkidDetector(friction_estimator(config, self._preintegrator, self.weights.record))
         self.gnss = GnssUpdater(config, self._report, self.weights.per_measurement, self._skid)
         self.aids = AidingSensors(config.rig, config.declination_rad, self._report)
-        self.wheels_rejected = 0
         self._on_state, self._on_innovation = on_state, on_innovation
-        self._wheel_gate = WheelGate(config.wheel_gate_sigma)
-        self._jitter = WheelJitter()
+        self._wheel_gate, self._jitter = WheelGate(config.wheel_gate_sigma), WheelJitter()
         self._search = StartSearch(config, self.aids, self.gnss)
         self._set_step(config.keyframe_s)
         self._state: State | None = None
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
-        self._silent = False
+        self._silent, self.wheels_rejected = False, 0
         self._stationarity = StationarityDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
-        self._propagator = Propagator(self._preintegrator)
+        self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
         self.learned = LearnedNumbers(config, self.imu, self.gnss, self.weights)
 
     @classmethod
@@ -218,11 +216,14 @@ class Estimator:
         """The newest state, or None before the start."""
         return self._state
 
-    def odometry(self) -> State | None:
-        """The newest state carried to the newest IMU sample; None before the start."""
+    def odometry(self, frame: str = "map") -> State | None:
+        """The newest state carried to the newest IMU sample, in the frame "map", or "odom" in which no fix
+        makes the path jump (`OdometryFrame`); None before the start.
+        """
         if self._state is None:
             return None
-        return self._propagator.carry(self._state, self._covariance, self.imu, self.weights.noise)
+        now = self._propagator.carry(self._state, self._covariance, self.imu, self.weights.noise)
+        return now if in_map(frame) else self._frame.of(self._state, now)
 
     def dump(self) -> bytes:
         """The state of a running estimator, for `restore`; see `snapshot`."""
@@ -342,6 +343,7 @@ class Estimator:
 
     def _finish_keyframe(self, t_ns: int, gyro: Array, rolled_m: float | None) -> None:
         chain, before = self.chain, self._solve()
+        self._frame.step(chain)
         if self.gnss.update(chain, before, self.weights.noise):
             self._solve()
         if self.aids.update(chain, self.imu.t_ns[-1], before, self._covariance, self.gnss):
@@ -424,13 +426,10 @@ class Estimator:
             add_zero_velocity(self.chain, k, link)
 
     def _emitted(self, t_ns: int, gyro: Array) -> State:
-        key, wheels, noise = (
-            self.chain.state(self.chain.last),
-            self.chain.nodes[-1].wheels,
-            self.weights.noise,
-        )
+        key, wheels = self.chain.state(self.chain.last), self.chain.nodes[-1].wheels
         outage = self.gnss.last_used_ns is None or (t_ns - self.gnss.last_used_ns) * 1e-9 > OUTAGE_S
-        gyro_sigma = gyro_sigma_radps(self.config.rig.sensors.imu, self.config.keyframe_s, noise)
+        spec = self.config.rig.sensors.imu
+        gyro_sigma = gyro_sigma_radps(spec, self.config.keyframe_s, self.weights.noise)
         state = State(
             t_ns=t_ns,
             slip=key.slip if wheels is None else slip_of(key.linear, wheels),
@@ -440,10 +439,10 @@ class Estimator:
             immobilised=self.monitor.immobilised,
             **state_fields(key, self._covariance, gyro, gyro_sigma),
         )
-        self._state = state = self.gnss.plausible.widened(state, self.gnss.track.reach_m)
+        self._state = self.gnss.plausible.widened(state, self.gnss.track.reach_m)
         if self._on_state is not None and not self._silent:
-            self._on_state(state)
-        return state
+            self._on_state(self._state)
+        return self._state
 
     def _report(self, innovation: Innovation) -> None:
         if self._on_innovation is not None and not self._silent:
