@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import statistics
 from collections import deque
 from collections.abc import Sequence
 
@@ -55,6 +56,7 @@ class SelfCalibration:
         self._samples: list[tuple[float, float, float]] = []
         self._fixes: list[tuple[float, float, float, float]] = []
         self._last_fix_s, self._sigmas_m = -np.inf, deque[float](maxlen=USUAL_FIXES)
+        self._usual_sigma_m = 0.0
         self._state: Array | None = None
         self._work: Reduction | None = None
         self._reduced = False
@@ -85,8 +87,7 @@ class SelfCalibration:
         self._rolled_m += abs(distance_m)
         apart_s = self._now_s - self._node_s
         if apart_s >= LEAST_NODE_S:
-            sigma = float(np.median(self._sigmas_m)) if self._sigmas_m else 0.0
-            if node_due(apart_s, self._rolled_m, sigma):
+            if node_due(apart_s, self._rolled_m, self._usual_sigma_m):
                 self._first.append(len(self._drive.distance_m) + len(self._samples))
                 self._node_s, self._rolled_m = self._now_s, 0.0
 
@@ -99,6 +100,7 @@ class SelfCalibration:
             self._fixes.append((t_s, float(enu_m[0]), float(enu_m[1]), sigma_m))
             self._last_fix_s = t_s
             self._sigmas_m.append(sigma_m)
+            self._usual_sigma_m = statistics.median(self._sigmas_m)
 
     def advance(self) -> bool:
         """A slice of the step under way, or of the next one where that is due; True when it ends and the

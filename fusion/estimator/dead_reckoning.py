@@ -9,10 +9,12 @@ from __future__ import annotations
 
 import bisect
 import cmath
+import functools
 import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.planar_alignment import planar_rotation
@@ -82,6 +84,35 @@ class FixPair:
     alone: bool = False
 
 
+@dataclass(frozen=True, eq=False)
+class _Columns:
+    """Pairs as arrays (n,)."""
+
+    t_ns: NDArray[np.int64]
+    z: NDArray[np.complex128]
+    fix: NDArray[np.complex128]
+    sigma_m: Array
+
+    @classmethod
+    def of(cls, pairs: list[FixPair]) -> _Columns:
+        """Columns of pairs."""
+        return cls(
+            np.array([p.t_ns for p in pairs], dtype=np.int64),
+            np.array([p.z for p in pairs], dtype=complex),
+            np.array([p.fix for p in pairs], dtype=complex),
+            np.array([p.sigma_m for p in pairs], dtype=float),
+        )
+
+    def and_then(self, pair: FixPair) -> _Columns:
+        """The columns with one more pair."""
+        return _Columns(
+            np.concatenate([self.t_ns, [pair.t_ns]]),
+            np.concatenate([self.z, [pair.z]]),
+            np.concatenate([self.fix, [pair.fix]]),
+            np.concatenate([self.sigma_m, [pair.sigma_m]]),
+        )
+
+
 class DeadReckoning:
     """The dead-reckoned path of the antenna and the fixes along it, for the last `KEPT_S`."""
 
@@ -110,24 +141,24 @@ class DeadReckoning:
     def step(self, chain: Chain, skids: bool = False) -> None:
         """Extend the path to the newest keyframe by its wheels, or its velocity where they are rejected."""
         node, state = chain.nodes[-1], chain.state(chain.last)
-        R = state.pose.rotation().matrix()
-        self._yaw_chain = float(np.arctan2(R[1, 0], R[0, 0]))
+        R = state.rotation
+        self._yaw_chain = math.atan2(R[1, 0], R[0, 0])
         if not self._t_ns or len(chain.nodes) < 2:
             self._append(node.t_ns, self._z[-1] if self._z else 0j, self._yaw[-1] if self._yaw else 0.0, 0.0)
             return
         dt = (node.t_ns - self._t_ns[-1]) * 1e-9
         moved, known = R.T @ state.velocity * dt, False
-        speed_mps = float(np.linalg.norm(state.velocity))
-        if node.wheels is not None and np.isfinite(node.wheels.sigma[0]):
+        speed_mps = math.sqrt(state.velocity @ state.velocity)
+        if node.wheels is not None and math.isfinite(node.wheels.sigma[0]):
             moved, known = node.wheels.displacement_m, not skids
             speed_mps = max(speed_mps, abs(node.wheels.distance_m) / dt)
             self._top_mps = max(self._top_mps, speed_mps)
-        east, north, _ = R @ moved
-        turn = float((R @ state.rate(node.gyro_radps))[2]) * dt
-        level = complex(east, north) * np.exp(-1j * self._yaw_chain)
+        east, north, _ = (R @ moved).tolist()
+        turn = float(R[2] @ state.rate(node.gyro_radps)) * dt
+        level = complex(east, north) * cmath.exp(-1j * self._yaw_chain)
         self._append(
             node.t_ns,
-            self._z[-1] + level * np.exp(1j * self._yaw[-1]),
+            self._z[-1] + level * cmath.exp(1j * self._yaw[-1]),
             self._yaw[-1] + turn,
             MARGIN * (speed_mps if known else max(speed_mps, self._top_mps)) * dt,
         )
@@ -142,9 +173,10 @@ class DeadReckoning:
             del self._t_ns[:old], self._z[:old], self._yaw[:old], self._reach_m[:old]
             kept = [p for p in self.pairs if p.t_ns >= self._t_ns[0]]
             # The differences that go with them, which their two neighbours complete.
-            self._forgotten += self._difference_sums(self.pairs[: len(self.pairs) - len(kept) + 2])
+            self._forgotten += self._difference_sums(slice(0, len(self.pairs) - len(kept) + 2))
             self._forgotten *= min(MOST_DIFFERENCES / max(self._forgotten[1], 1.0), 1.0)
             self.pairs = kept
+            vars(self).pop("_columns", None)
 
     def add(self, fix: GnssFix) -> None:
         """Keep a fix with the path at its time."""
@@ -155,6 +187,9 @@ class DeadReckoning:
     def keep(self, pair: FixPair) -> None:
         """Keep a pair, in order of time."""
         bisect.insort(self.pairs, pair, key=lambda p: p.t_ns)
+        columns: _Columns | None = vars(self).pop("_columns", None)
+        if columns is not None and pair is self.pairs[-1]:
+            vars(self)["_columns"] = columns.and_then(pair)
 
     def pair(self, fix: GnssFix) -> FixPair | None:
         """A fix with the path at its time; None where that is not known."""
@@ -165,7 +200,7 @@ class DeadReckoning:
         share = min((fix.t_ns - begin) / (end - begin), 1.0)
         z = self._z[i - 1] + share * (self._z[i] - self._z[i - 1])
         yaw = self._yaw[i - 1] + share * (self._yaw[i] - self._yaw[i - 1])
-        at = z + self.lever * complex(np.cos(yaw), np.sin(yaw))
+        at = z + self.lever * complex(math.cos(yaw), math.sin(yaw))
         reach_m = self._reach_m[i - 1] + share * (self._reach_m[i] - self._reach_m[i - 1])
         there = complex(fix.enu_m[0], fix.enu_m[1])
         return FixPair(fix.t_ns, at, there, float(np.max(fix.sigma_m[:2])), reach_m)
@@ -178,12 +213,14 @@ class DeadReckoning:
         are left out where they are the fewer, of all and of the newest: each spoils three differences, a
         fifth of them the median.
         """
-        recent = self.pairs[-SCATTER_FIXES:]
+        begin = max(len(self.pairs) - SCATTER_FIXES, 0)
+        recent = self.pairs[begin:]
+        taken = list(range(begin, len(self.pairs)))
         if not any(_mostly_alone(pairs) for pairs in (recent, recent[-LEAST_FIXES:])):
-            recent = [pair for pair in recent if not pair.alone]
-        if len(recent) < LEAST_FIXES:
+            taken = [i for i, pair in enumerate(recent, begin) if not pair.alone]
+        if len(taken) < LEAST_FIXES:
             return math.nan
-        squares, bend, reported = self._second_differences(recent)
+        squares, bend, reported = self._second_differences(taken)
         if len(squares) < 6:
             return math.nan
         return math.sqrt(_median(np.maximum(2.0 * squares / RAYLEIGH_MEDIAN - bend, 0.0) / reported))
@@ -196,29 +233,36 @@ class DeadReckoning:
         Assoc. 48). Where slip may have bent the path by more than the reported sigma, a difference is left
         out.
         """
-        total, counted = self._forgotten + self._difference_sums(self.pairs)
+        total, counted = self._forgotten + self._difference_sums(slice(None))
         return float(total / counted) if counted >= LEAST_DIFFERENCES else math.nan
 
-    def _difference_sums(self, pairs: list[FixPair]) -> Array:
+    def _difference_sums(self, at: slice) -> Array:
         """Sum and number (2,) of squared second differences over the reported variance."""
-        if len(pairs) < 3:
+        if len(self.pairs[at]) < 3:
             return np.zeros(2)
-        squares, bend, reported = self._second_differences(pairs)
+        squares, bend, reported = self._second_differences(at)
         share = (squares / reported)[bend < reported]
         return np.array([np.minimum(share, CENSORED).sum(), np.count_nonzero(share < CENSORED)])
 
-    def _second_differences(self, pairs: list[FixPair]) -> tuple[Array, Array, Array]:
+    def _second_differences(self, at: slice | list[int]) -> tuple[Array, Array, Array]:
         """Squares (m2, each axis) of second differences of fix minus path where fixes come evenly, what slip
         may add to them, and their expectation by the reported sigma.
         """
-        z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
-        gap = np.diff(np.array([p.t_ns - pairs[0].t_ns for p in pairs]) * 1e-9)
+        columns = self._columns
+        t_ns, z, fix, sigma_m = columns.t_ns[at], columns.z[at], columns.fix[at], columns.sigma_m[at]
+        t_s = (t_ns - t_ns[0]) * 1e-9
+        gap = t_s[1:] - t_s[:-1]
         even = np.abs(gap[1:] - gap[:-1]) < 0.5 * np.minimum(gap[1:], gap[:-1])
-        left_m = fix - np.exp(1j * (self._yaw_chain - self._yaw[-1])) * z
-        squares = 0.5 * np.abs(left_m[2:] - 2.0 * left_m[1:-1] + left_m[:-2]) ** 2
-        bend = 2.0 * (SLIP_CHANGE * 0.5 * np.abs(z[2:] - z[:-2])) ** 2
-        reported = 6.0 * np.array([p.sigma_m for p in pairs])[1:-1] ** 2
+        left_m = fix - self.heading * z
+        squares = 0.5 * _square(left_m[2:] - 2.0 * left_m[1:-1] + left_m[:-2])
+        bend = 0.5 * SLIP_CHANGE**2 * _square(z[2:] - z[:-2])
+        reported = 6.0 * sigma_m[1:-1] ** 2
         return squares[even], bend[even], reported[even]
+
+    @functools.cached_property
+    def _columns(self) -> _Columns:
+        """The pairs as arrays; dropped where `pairs` changes otherwise than at its end."""
+        return _Columns.of(self.pairs)
 
     def extent_m(self) -> float:
         """Distance between the first and the last of the fixes over which the scatter is taken."""
@@ -255,6 +299,7 @@ class DeadReckoning:
     def restart(self) -> None:
         """Forget the fixes: the filter has been corrected."""
         self.pairs.clear()
+        vars(self).pop("_columns", None)
         self._confirmed = 0
 
     def _heading_error(self, yaw_sigma_rad: float, scale: float) -> float | None:
@@ -277,11 +322,13 @@ class DeadReckoning:
         """The path aligned with the fixes, their sigmas times `scale`; None until its turn is known to
         `yaw_sigma_rad`.
         """
-        pairs = [p for p in self.pairs if p.usable]
-        if len(pairs) < 5:
+        usable = [i for i, p in enumerate(self.pairs) if p.usable]
+        if len(usable) < 5:
             return None
-        z, fix = np.array([p.z for p in pairs]), np.array([p.fix for p in pairs])
-        weight = np.array([1.0 / (scale * p.sigma_m) ** 2 for p in pairs])
+        columns = self._columns
+        at = slice(None) if len(usable) == len(self.pairs) else usable
+        z, fix = columns.z[at], columns.fix[at]
+        weight = 1.0 / (scale * columns.sigma_m[at]) ** 2
         inlier = np.ones(len(z), dtype=bool)
         for _ in range(2):  # a second time without what stands out, so that a lone spike turns nothing
             turn, information = planar_rotation(z[inlier], fix[inlier], weight[inlier])
@@ -307,6 +354,10 @@ class DeadReckoning:
 def _median(values: Array) -> float:
     """Upper median; a tenth of `np.median`'s time."""
     return float(np.sort(values)[len(values) // 2])
+
+
+def _square(z: NDArray[np.complex128]) -> Array:
+    return np.asarray(z.real**2 + z.imag**2)
 
 
 def _mostly_alone(pairs: list[FixPair]) -> bool:

@@ -61,7 +61,7 @@ from terrafusion.fusion.inputs.streams import (
     ImuSegment,
     ImuStream,
     WheelStream,
-    longest_gap_s,
+    is_gap,
     usual_interval_s,
 )
 from terrafusion.fusion.weighting.adaptive import TerrainNoise
@@ -262,9 +262,10 @@ class Estimator:
         """Whether the samples cover a keyframe at `t_ns`, or the wheels have been waited for."""
         if not self.imu.covers(t_ns):
             return False
+        if last or self.wheels.covers(t_ns):
+            return True
         wait_s = max(self.config.wheel_wait_s, 1.5 * usual_interval_s(self.wheels.t_ns))
-        waited = t_ns + round(wait_s * 1e9)
-        return last or self.wheels.covers(t_ns) or self.imu.covers(waited)
+        return self.imu.covers(t_ns + round(wait_s * 1e9))
 
     def _begin(self, start: Start) -> None:
         slowest_s = max(usual_interval_s(self.imu.t_ns), usual_interval_s(self.wheels.t_ns))
@@ -313,7 +314,7 @@ class Estimator:
         segments, wheels = self._skid.friction_link(t_ns, dt, segments, wheels, before, self._covariance)
         k = self.chain.last + 1
         gyro, accel = mean_rates(segments)
-        gap = self.imu.largest_gap_s(before_ns, t_ns) > longest_gap_s(self.imu.t_ns)
+        gap = is_gap(self.imu.largest_gap_s(before_ns, t_ns), self.imu.t_ns)
         link, preintegrated = gtsam.NonlinearFactorGraph(), False
         if dt > LONGEST_PAUSE_NS * 1e-9:
             point, link, wheels = *pause(k, before, dt), None
@@ -329,7 +330,7 @@ class Estimator:
             if not self.config.inputs.planar:  # the planar link does not test the wheels
                 preintegrated = True
                 wheels = self._gated(t_ns, wheels, before, point, switch)
-        up = before.pose.rotation().matrix()[2]
+        up = before.rotation[2]
         markov = slow_states.step(dt, noise, up, *drift, switch, wheels)
         self.imu.late.used_ns = self.wheels.late.used_ns = t_ns
         self.chain.append(t_ns, point, link, markov, wheels, gyro, accel, preintegrated)

@@ -56,7 +56,7 @@ class GnssGate:
 
         `innovation_m` (d,) is fix minus prediction, `covariance_m2` (d, d) of it.
         """
-        nis = float(innovation_m @ np.linalg.solve(covariance_m2, innovation_m))
+        nis = normalised_square(innovation_m, covariance_m2)
         if nis <= self.threshold:
             self.rejected.clear()
             return GateDecision.ACCEPT, nis
@@ -138,6 +138,15 @@ class WheelGate:
         return np.inf if self.faulty else float(np.sqrt(nis)) / self.limit_sigma
 
 
+def normalised_square(innovation: Array, covariance: Array) -> float:
+    """Normalised square of an innovation (d,) with covariance (d, d), d being 1 or 2."""
+    if len(innovation) == 1:
+        return float(innovation[0] ** 2 / covariance[0, 0])
+    (x, y), ((a, b), (_, d)) = innovation.tolist(), covariance.tolist()
+    left = y - b / a * x
+    return float(x * x / a + left * left / (d - b * b / a))
+
+
 def wheel_innovation(
     wheels: WheelIncrement,
     before: KeyState,
@@ -155,13 +164,12 @@ def wheel_innovation(
     """
     R, rolled_m, sigma_m = before.rotation, float(wheels.displacement_m[0]), float(wheels.sigma[0])
     forward = R[:, 0]
-    moved_m = float((R.T @ (point.pose.translation() - before.pose.translation()))[0])
+    moved_m = float(forward @ (point.pose.translation() - before.pose.translation()))
+    slip_variance = float(P[SLIP, SLIP]) + noise.slip_sigma**2 * (2.0 * dt_s / noise.slip_time_s + switch)
     variance = (
         sigma_m * sigma_m
-        + rolled_m
-        * rolled_m
-        * (P[SLIP, SLIP] + noise.slip_sigma**2 * (2.0 * dt_s / noise.slip_time_s + switch))
+        + rolled_m * rolled_m * slip_variance
         + dt_s**2 * float(forward @ P[VELOCITY, VELOCITY] @ forward)
-        + (0.5 * GRAVITY_MPS2 * dt_s**2) ** 2 * P[1, 1]
+        + (0.5 * GRAVITY_MPS2 * dt_s**2) ** 2 * float(P[1, 1])
     )
-    return moved_m - before.rolling * rolled_m, float(variance)
+    return moved_m - before.rolling * rolled_m, variance

@@ -15,14 +15,14 @@ from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
-from terrafusion.fusion.estimator.gates import GateDecision, GnssGate
+from terrafusion.fusion.estimator.gates import GateDecision, GnssGate, normalised_square
 from terrafusion.fusion.estimator.map_alignment import MapAlignment, align_to_map
 from terrafusion.fusion.estimator.plausibility import BEYOND, FixPlausibility
 from terrafusion.fusion.estimator.skid import SkidDetector
 from terrafusion.fusion.graph.chain import Chain
 from terrafusion.fusion.graph.factors import gnss_velocity
-from terrafusion.fusion.graph.gnss_factor import GnssPosition, jacobians, residual
-from terrafusion.fusion.graph.key_state import BIAS, DRIFT, GNSS_DELAY, SLIP, VELOCITY
+from terrafusion.fusion.graph.gnss_factor import GnssPosition, linearised
+from terrafusion.fusion.graph.key_state import BIAS, DRIFT, GNSS_DELAY, NAV, POSE, SLIP, VELOCITY, cross
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity, lever_arm_velocity
 from terrafusion.fusion.inputs.door import GnssFix
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -197,14 +197,14 @@ class GnssUpdater:
         off = self._pair.fix - place
         innovation = np.array([off.real, off.imag])
         S = covariance[3:5, 3:5] + np.diag(fix.sigma_m[:2] ** 2)
-        nis = float(innovation @ np.linalg.solve(S, innovation))
+        nis = normalised_square(innovation, S)
         self._report(Innovation(fix.t_ns, "gnss", np.append(innovation, np.nan), nis, 2, False, refused))
         return True
 
     def _antenna(self, chain: Chain, k: int) -> complex:
         """The antenna at keyframe k by the estimate, east + i north, m."""
-        pose = chain.state(k).pose
-        at = np.asarray(pose.translation()) + pose.rotation().matrix() @ self.antenna_m
+        state = chain.state(k)
+        at = state.pose.translation() + state.rotation @ self.antenna_m
         return complex(at[0], at[1])
 
     def _gated(self, chain: Chain, k: int, innovation_m: Array, S: Array) -> tuple[GateDecision, float]:
@@ -314,9 +314,9 @@ class GnssUpdater:
         )
         sigma = np.hypot(self._white_sigma(fix, inflation, share), carried_m)
         position = GnssPosition(fix.enu_m, at.lever_m, sigma, share, at.velocity_mps, delay_s=at.delay_s)
-        innovation = -residual(position, state.pose, state.linear)
-        H_pose, H_linear = jacobians(position, state.pose, state.linear)
-        J = np.hstack([H_pose, np.zeros((3, 9)), H_linear])[:, : chain.dim]
+        left, H_pose, H_linear = linearised(position, state)
+        innovation, J = -left, np.zeros((3, chain.dim))
+        J[:, POSE], J[:, NAV.stop :] = H_pose, H_linear[:, : chain.dim - NAV.stop]
         P = J @ covariance @ J.T
         predicted_m2 = P[[0, 1], [0, 1]].copy()
         # The gate allows for all that the receiver reports, whatever share of it is taken to be white.
@@ -384,7 +384,7 @@ class GnssUpdater:
             sigma_v, turned = math.hypot(sigma_v, doubt), lever_arm_velocity(at.rate_radps, at.offset_s)
             chain.add_velocity(k, GnssVelocity(at_keyframe, sigma_v, self.antenna_m, turned))
         else:
-            lever_mps = at.R @ np.cross(at.rate_radps, at.antenna_m)
+            lever_mps = at.R @ cross(at.rate_radps, at.antenna_m)
             chain.add(k, gnss_velocity(k, at_keyframe - lever_mps, sigma_v), "V")
 
     def _usable_velocity(self, fix: GnssFix, predicted_mps: Array, covariance: Array) -> Array | None:

@@ -51,7 +51,7 @@ def state_fields(key: KeyState, P: Array, gyro_radps: Array, gyro_sigma_radps: A
         "linear": key.linear,
         "linear_sigma": linear_sigma(P),
         "slip_sigma": float(np.sqrt(P[SLIP, SLIP])),
-        **covariance_fields(P, key.pose.rotation().matrix(), key.velocity, gyro_sigma_radps),
+        **covariance_fields(P, key.rotation, key.velocity, gyro_sigma_radps),
     }
 
 

@@ -10,9 +10,12 @@ and neither wheels nor robot move ("motors stalled"; at the wheels alone a stall
 
 from __future__ import annotations
 
+import bisect
 import math
 from collections import deque
 from dataclasses import dataclass
+
+import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
@@ -37,17 +40,6 @@ COMMAND_MPS = 0.1
 COMMAND_HOLD_NS = 500_000_000
 """A command holds for so long when no other comes."""
 SPINNING, STALLED = "traction lost", "motors stalled"
-
-
-@dataclass(frozen=True)
-class Step:
-    """Between keyframes: time, wheel travel (None: unknown), mean speed, its sigma, command."""
-
-    dt_s: float
-    rolled_m: float | None
-    speed_mps: float
-    sigma_mps: float
-    command_mps: float
 
 
 @dataclass(frozen=True)
@@ -76,7 +68,8 @@ class MotionMonitor:
         self._stamp_m = 0.5 * 1.0 / rig.sensors.wheels.rate_hz**2
         self.slipping = False
         self.cause: str | None = None
-        self._steps: deque[Step] = deque()
+        # Between keyframes: time, wheel travel (NaN: unknown), estimated travel, its sigma, the command's size.
+        self._steps: deque[tuple[float, ...]] = deque()
         self._command: tuple[int, float] | None = None
         self._t_ns: int | None = None
         self._agreed_s = 0.0
@@ -108,7 +101,8 @@ class MotionMonitor:
             return
         mean_mps = 0.5 * (self._speed_mps + speed_mps)
         self._speed_mps = speed_mps
-        self._steps.append(Step(dt, rolled_m, mean_mps, sigma_mps, self._commanded(t_ns)))
+        rolled = math.nan if rolled_m is None else rolled_m
+        self._steps.append((dt, rolled, mean_mps * dt, sigma_mps * dt, abs(self._commanded(t_ns))))
         while len(self._steps) * dt > WINDOWS_S[-1] + 2.0 * dt:
             self._steps.popleft()
         stuck, *windows = self.travels(STUCK_S, *WINDOWS_S)
@@ -124,22 +118,19 @@ class MotionMonitor:
 
         Errors of the estimated speed outlast a window: their sigmas add up.
         """
+        newest_first = np.array(list(self._steps)).reshape(-1, 5)[::-1]
+        sums = np.cumsum(newest_first[:, :4], axis=0)
+        seconds = sums[:, 0].tolist()
         found: list[Travel | None] = []
-        total = rolled = moved = sigma = 0.0
-        least = math.inf
-        for step in reversed(self._steps):
-            if step.rolled_m is None or len(found) == len(windows_s):
-                break
-            dt = step.dt_s
-            total += dt
-            rolled += step.rolled_m
-            moved += step.speed_mps * dt
-            sigma += step.sigma_mps * dt
-            least = min(least, abs(step.command_mps))
-            while len(found) < len(windows_s) and total >= windows_s[len(found)] - 1e-6:
-                noise = math.hypot(sigma, self.quantum_m, self._stamp_m)
-                found.append(Travel(total, rolled, moved, noise, least))
-        return found + [None] * (len(windows_s) - len(found))
+        for window_s in windows_s:
+            last = bisect.bisect_left(seconds, window_s - 1e-6)
+            if last == len(seconds) or math.isnan(sums[last, 1]):
+                found.append(None)
+                continue
+            total, rolled, moved, sigma = sums[last].tolist()
+            noise = math.hypot(sigma, self.quantum_m, self._stamp_m)
+            found.append(Travel(total, rolled, moved, noise, float(newest_first[: last + 1, 4].min())))
+        return found
 
     def _commanded(self, t_ns: int) -> float:
         if self._command is None or t_ns - self._command[0] > COMMAND_HOLD_NS:

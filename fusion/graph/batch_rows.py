@@ -7,7 +7,9 @@ linear states' steps, the wheels (4), then whatever else a keyframe has.
 
 from __future__ import annotations
 
+import functools
 from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -112,14 +114,18 @@ class RowBlock:
         used: Places,
     ) -> list[_Group]:
         found: dict[tuple[tuple[int, ...], int], list[tuple[int, int, int]]] = defaultdict(list)
+        count, rows = 0, used.tolist()
         for graphs in (links, unary):
             for i, graph in enumerate(graphs):
                 for j in range(graph.size()):
                     factor = graph.at(j)
-                    key = (self._columns(factor, self.begin + i), factor.dim())
-                    found[key].append((self._graph.size(), i, int(used[i])))
+                    height = factor.dim()
+                    key = (_columns(factor.keys(), self.begin + i, self.dim), height)
+                    found[key].append((count, i, rows[i]))
                     self._graph.add(factor)
-                    used[i] += factor.dim()
+                    count += 1
+                    rows[i] += height
+        used[:] = rows
         groups = []
         for (columns, height), members in found.items():
             index, keyframes, first_row = zip(*members, strict=True)
@@ -127,15 +133,6 @@ class RowBlock:
                 _Group(np.array(columns), list(index), np.array(keyframes), np.array(first_row), height)
             )
         return groups
-
-    def _columns(self, factor: gtsam.NonlinearFactor, k: int) -> tuple[int, ...]:
-        """The columns of its states in the rows of keyframe k, the right-hand side last."""
-        columns: list[int] = []
-        keys = factor.keys()
-        for symbol in map(gtsam.Symbol, keys):
-            place, shift = _PLACES[symbol.chr()], (symbol.index() - k) * self.dim
-            columns.extend(range(place.start + shift, place.stop + shift))
-        return (*columns, 2 * self.dim)
 
     def _fill_graph(self, rows: Array, values: gtsam.Values, linear: Array) -> None:
         linearised = self._graph.linearize(values)
@@ -159,6 +156,21 @@ class RowBlock:
         rows[at[:, None, None], place[:, :, None], np.arange(IMU_ROTATION.start, IMU_ROTATION.stop)] = turn
         d = linear[at][:, IMU_ROTATION.start - NAV.stop : IMU_ROTATION.stop - NAV.stop]
         rows[at[:, None], place, -1] -= np.einsum("kri,ki->kr", turn, d)
+
+
+def _columns(keys: Sequence[int], k: int, dim: int) -> tuple[int, ...]:
+    """The columns of a factor's states in the rows of keyframe k, the right-hand side last."""
+    return _places_of(tuple([key - k for key in keys]), dim)
+
+
+@functools.lru_cache(maxsize=256)
+def _places_of(keys: tuple[int, ...], dim: int) -> tuple[int, ...]:
+    """`_columns` by the keys less the keyframe's index, which an index after a key's letter makes small."""
+    columns: list[int] = []
+    for symbol in map(gtsam.Symbol, keys):
+        place, shift = _PLACES[symbol.chr()], symbol.index() * dim
+        columns.extend(range(place.start + shift, place.stop + shift))
+    return (*columns, 2 * dim)
 
 
 class _Markov:

@@ -12,6 +12,7 @@ from terrafusion.fusion.graph.key_state import DIM, VELOCITY, skew
 from terrafusion.fusion.noise.policy import SensorNoise
 
 _ROTATION = slice(0, 3)
+_RATES, _BIASES = np.arange(3, 6), np.array([12, 13, 14, 9, 10, 11])
 
 
 def twist_jacobian(R: Array, velocity_mps: Array, dim: int = DIM) -> Array:
@@ -46,7 +47,7 @@ def twist_covariance(P: Array, R: Array, velocity_mps: Array, gyro_sigma_radps: 
     """
     J = twist_jacobian(R, velocity_mps, len(P))
     Q = J @ P @ J.T
-    Q[range(3, 6), range(3, 6)] += gyro_sigma_radps**2
+    Q[_RATES, _RATES] += gyro_sigma_radps**2
     return np.asarray(0.5 * (Q + Q.T))
 
 
@@ -58,4 +59,4 @@ def gyro_sigma_radps(imu: ImuSpec, keyframe_s: float, noise: SensorNoise) -> Arr
 
 def bias_sigma(P: Array) -> Array:
     """1 sigma (6,) of the gyro biases, rad/s, then of the accelerometer biases, m/s2."""
-    return np.sqrt(np.maximum(np.diagonal(P)[[12, 13, 14, 9, 10, 11]], 0.0))
+    return np.sqrt(np.maximum(np.diagonal(P)[_BIASES], 0.0))

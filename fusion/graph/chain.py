@@ -108,34 +108,37 @@ class Chain:
 
     def add(self, k: int, factor: gtsam.NonlinearFactor, keys: str) -> None:
         """Add a factor that touches only the states `keys` (of "XVB") of keyframe k."""
-        node = self.nodes[k - self.first]
+        node = self._changed(k)
         node.unary.add(factor)
         node.unary_keys.update(keys)
-        self._dirty = min(self._dirty, k)
         if self.archive is not None:
             self.archive.add(k, factor, keys)
 
     def add_fix(self, k: int, fix: GnssPosition) -> None:
         """Add a GNSS position to keyframe k."""
-        self.nodes[k - self.first].fixes.append(fix)
-        self._dirty = min(self._dirty, k)
+        self._changed(k).fixes.append(fix)
         if self.archive is not None:
             self.archive.add_fix(k, fix)
 
     def add_velocity(self, k: int, velocity: GnssVelocity) -> None:
         """Add a GNSS velocity to keyframe k; without a calibration it is a prior of the velocity instead."""
-        self.nodes[k - self.first].velocities.append(velocity)
-        self._dirty = min(self._dirty, k)
+        self._changed(k).velocities.append(velocity)
         if self.archive is not None:
             self.archive.add_velocity(k, velocity)
 
     def replace_fix(self, k: int, old: GnssPosition, new: GnssPosition) -> None:
         """Replace a GNSS position of keyframe k by one of another weight."""
-        fixes = self.nodes[k - self.first].fixes
+        fixes = self._changed(k).fixes
         fixes[fixes.index(old)] = new
-        self._dirty = min(self._dirty, k)
         if self.archive is not None:
             self.archive.replace_fix(k, old, new)
+
+    def _changed(self, k: int) -> Node:
+        """Keyframe k, of which a factor of its own is about to change."""
+        self._dirty = min(self._dirty, k)
+        node = self.nodes[k - self.first]
+        node.forget_rows()
+        return node
 
     def at_or_after(self, t_ns: int) -> int | None:
         """The first keyframe held at or after a time; None when there is none, or when older ones were
@@ -180,11 +183,11 @@ class Chain:
         begin = max(self.last - window + 1, self.first)
         for _ in range(iterations):
             self._eliminate_all()
-            self._back_substitute_to(begin)
+            solved = self._back_substitute_to(begin)
             deltas = np.abs([node.delta for node in self.nodes[begin - self.first :]])
             if not (deltas[:, NAV] > self.RELINEARISE).any():
                 return
-            self._back_substitute_to(self.first)
+            self._back_substitute_to(self.first, solved)
             self._relinearise()
         self._eliminate_all()
         self._back_substitute_to(begin)
@@ -196,7 +199,9 @@ class Chain:
             self._eliminate(k)
         self._dirty = self.last
         node = self.nodes[-1]
-        self._root = triangular(self._own_rows(self.last))
+        # What elimination leaves of the keyframes before is a triangle: alone it is the root itself.
+        alone = len(self.nodes) > 1 and not self._measured_rows(self.last)
+        self._root = node.prior if alone else triangular(self._own_rows(self.last))
         node.delta = back_substitute(self._root[:, : self.dim], self._root[:, self.dim])
 
     def forget(self, keep: int) -> None:
@@ -342,11 +347,7 @@ class Chain:
         Shape (m + `further`, `width` dim + 1); the `further` rows are left free.
         """
         node, dim = self.nodes[k - self.first], self.dim
-        blocks = [node.prior]
-        if node.unary_keys:
-            blocks.append(self._gtsam_rows(k))
-        blocks += [gnss_factor.rows(fix, node.point, dim) for fix in node.fixes]
-        blocks += [velocity_factor.rows(velocity, node.point, dim) for velocity in node.velocities]
+        blocks = [node.prior, *self._measured_rows(k)]
         rows = np.zeros((sum(map(len, blocks)) + further, width * dim + 1), order="F")
         begin = 0
         for block in blocks:
@@ -354,6 +355,17 @@ class Chain:
             rows[begin:end, :dim], rows[begin:end, -1] = block[:, :dim], block[:, dim]
             begin = end
         return rows
+
+    def _measured_rows(self, k: int) -> list[Array]:
+        """Whitened rows (m, dim + 1) of the factors that touch keyframe k alone."""
+        node, dim = self.nodes[k - self.first], self.dim
+        held = node.held_rows()
+        if held is not None:
+            return held
+        blocks = [self._gtsam_rows(k)] if node.unary_keys else []
+        blocks += [gnss_factor.rows(fix, node.point, dim) for fix in node.fixes]
+        blocks += [velocity_factor.rows(velocity, node.point, dim) for velocity in node.velocities]
+        return node.hold_rows(blocks)
 
     def _gtsam_rows(self, k: int) -> Array:
         node = self.nodes[k - self.first]
@@ -424,12 +436,15 @@ class Chain:
         self.nodes[k - self.first].conditional = R[: self.dim]
         self.nodes[k + 1 - self.first].prior = R[self.dim : 2 * self.dim, self.dim :]
 
-    def _back_substitute_to(self, begin: int) -> None:
-        dim, following = self.dim, self.nodes[-1].delta
-        for node in self.nodes[-2 : begin - self.last - 2 : -1]:
+    def _back_substitute_to(self, begin: int, solved: int | None = None) -> int:
+        """Solve for the keyframes from `begin` on, those from `solved` on (the newest) being so; `begin`."""
+        solved = self.last if solved is None else solved
+        dim, following = self.dim, self.nodes[solved - self.first].delta
+        for node in self.nodes[begin - self.first : solved - self.first][::-1]:
             assert node.conditional is not None
             rhs = node.conditional[:, 2 * dim] - node.conditional[:, dim : 2 * dim] @ following
             node.delta = following = back_substitute(node.conditional[:, :dim], rhs)
+        return begin
 
 
 def carried_prior(rows: Array, offset: Array) -> Array:

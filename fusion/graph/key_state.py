@@ -125,11 +125,11 @@ class KeyState:
 
     def rate(self, gyro_radps: Array) -> Array:
         """Angular rate (3,) of the body from a gyro reading: bias and mounting corrected."""
-        return np.asarray(gyro_radps - self.bias.gyroscope() + self._mounting(gyro_radps))
+        return self._turned(gyro_radps - self.bias.gyroscope(), gyro_radps)
 
     def specific_force(self, accel_mps2: Array) -> Array:
         """Specific force (3,) of the body from an accelerometer reading, likewise."""
-        return np.asarray(accel_mps2 - self.bias.accelerometer() + self._mounting(accel_mps2))
+        return self._turned(accel_mps2 - self.bias.accelerometer(), accel_mps2)
 
     def reading(self, rate_radps: Array) -> Array:
         """The gyro reading (3,) of an angular rate; the inverse of `rate` to first order."""
@@ -137,8 +137,12 @@ class KeyState:
         return np.asarray(reading - self._mounting(reading))
 
     def _mounting(self, reading: Array) -> Array:
+        return self._turned(np.zeros(3), reading)
+
+    def _turned(self, true: Array, reading: Array) -> Array:
+        """`true` and what the rotation of the IMU adds to it, where there is one."""
         turn = self.of(IMU_ROTATION)
-        return cross(turn, reading) if turn.any() else np.zeros(3)
+        return true + cross(turn, reading) if any(turn.tolist()) else true
 
     def bias_seen(self, gyro_radps: Array, accel_mps2: Array) -> gtsam.imuBias.ConstantBias:
         """The bias equivalent to bias and mounting: a small rotation d adds d x measured to a reading."""

@@ -46,3 +46,17 @@ class Node:
         if held is None or held[0] is not self.point or held[1] is not self.delta:
             held = vars(self)["_held"] = self.point, self.delta, self.point.retract(self.delta)
         return held[2]
+
+    def held_rows(self) -> list[Array] | None:
+        """What `hold_rows` got, while it is true: until the linearisation point or a factor is another."""
+        held: tuple[KeyState, list[Array]] | None = vars(self).get("_rows")
+        return held[1] if held is not None and held[0] is self.point else None
+
+    def hold_rows(self, rows: list[Array]) -> list[Array]:
+        """Keep the whitened rows of its own factors, beside the fields."""
+        vars(self)["_rows"] = self.point, rows
+        return rows
+
+    def forget_rows(self) -> None:
+        """A factor of its own changes."""
+        vars(self).pop("_rows", None)

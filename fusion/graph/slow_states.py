@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -56,8 +57,8 @@ clocks)."""
 _WALK_SIGMA = 2e-4 * np.array(list(CALIBRATION_SIGMA.values()))
 """Random walk of the calibration per sqrt(s), so that its covariance stays positive."""
 _CONSTANT = slice(6, 6 + len(CALIBRATION_SIGMA))
-_WANDERING = np.r_[0 : _CONSTANT.start, _CONSTANT.stop]
-"""Places of the calibration and of the others among the linear states."""
+"""Places of the calibration among the linear states."""
+_NONE, _FOREVER = [0.0] * len(CALIBRATION_SIGMA), [math.inf] * len(CALIBRATION_SIGMA)
 
 
 def prior(noise: SensorNoise, grade: float, drift_sigma_m: float) -> tuple[Array, Array]:
@@ -86,28 +87,19 @@ def step(
     backwards = wheels is not None and wheels.distance_m < 0.0
     downhill = -SIDE_SLIP_PER_GRADE * noise.slip_per_grade * float(up[1]) * (-1.0 if backwards else 1.0)
     sigma = _stationary(noise, drift_sigma_m)
-    sigma[-1] = float(np.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill))
+    sigma[-1] = math.hypot(sigma[-1], SIDE_SLIP_DOUBT * downhill)
     restarted = 1.0 - (1.0 - switch) * (1.0 - _traction_change(dt_s, wheels))
     drift, slip_time_s = drift_time_s, SLIP_STEADY * noise.slip_time_s
-    wandering = markov_step(
+    mean = [noise.slip_at(float(up[0])), 0.0, 0.0, noise.yaw_scale_mean, 0.0, downhill]
+    time_s = [slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S]
+    out = markov_step(
         dt_s,
-        mean=[
-            noise.slip_at(float(up[0])),
-            0.0,
-            0.0,
-            noise.yaw_scale_mean,
-            0.0,
-            downhill,
-            noise.slip_per_grade,
-        ],
-        sigma=[*sigma, _surge_sigma(noise)],
-        time_s=[slip_time_s, drift, drift, YAW_SCALE_TIME_S, ICR_TIME_S, SIDE_SLIP_TIME_S, SURGE_TIME_S],
-        forget=[restarted, 0.0, 0.0, switch, 0.0, switch, switch],
+        mean=[*mean, *_NONE, noise.slip_per_grade],
+        sigma=[*sigma, *_NONE, _surge_sigma(noise)],
+        time_s=[*time_s, *_FOREVER, SURGE_TIME_S],
+        forget=[restarted, 0.0, 0.0, switch, 0.0, switch, *_NONE, switch],
     )
-    out = MarkovStep(np.ones(len(LINEAR)), np.zeros(len(LINEAR)), np.empty(len(LINEAR)))
-    for name in ("decay", "mean", "sigma"):
-        getattr(out, name)[_WANDERING] = getattr(wandering, name)
-    out.sigma[_CONSTANT] = _WALK_SIGMA * np.sqrt(dt_s)
+    out.sigma[_CONSTANT] = _WALK_SIGMA * math.sqrt(dt_s)
     return out
 
 
@@ -149,5 +141,5 @@ def _surge_sigma(noise: SensorNoise) -> float:
 def _stationary(noise: SensorNoise, drift_sigma_m: float) -> list[float]:
     slow_side_slip = SIDE_SLIP_SHARE * noise.side_slip_sigma
     drift = [drift_sigma_m, drift_sigma_m]
-    yaw_scale = float(np.hypot(noise.yaw_scale_sigma, YAW_SCALE_ROBOT))
+    yaw_scale = math.hypot(noise.yaw_scale_sigma, YAW_SCALE_ROBOT)
     return [noise.slip_sigma, *drift, yaw_scale, ICR_SIGMA_M, slow_side_slip]

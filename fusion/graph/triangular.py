@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.linalg import lapack
 
@@ -44,7 +46,7 @@ def back_substitute(R: Array, rhs: Array) -> Array:
         ArithmeticError: R is singular, or the solution not finite.
     """
     solution, info = lapack.dtrtrs(R, rhs)
-    if info or not np.isfinite(solution).all():
+    if info or not math.isfinite(solution.sum()):
         raise ArithmeticError("a keyframe is not determined by its factors")
     return np.asarray(solution)
 

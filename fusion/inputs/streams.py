@@ -79,6 +79,11 @@ def longest_gap_s(times: list[int]) -> float:
     return max(USUAL_GAP_S, GAP_INTERVALS * min(usual_interval_s(times), SLOWEST_INTERVAL_S))
 
 
+def is_gap(seconds: float, times: list[int]) -> bool:
+    """Whether so long a time between two samples of a stream is a gap."""
+    return seconds > USUAL_GAP_S and seconds > longest_gap_s(times)
+
+
 class Lateness:
     """Disorder of a stream in time, and samples that came too late.
 
@@ -365,20 +370,19 @@ class WheelStream:
 
     def travelled(self, start_ns: int, end_ns: int) -> tuple[float, float] | None:
         """Distance of the left and right side between two times, m; None where samples are missing."""
-        gap_s = max(1.0, longest_gap_s(self.t_ns))
-        a, b = self._at(start_ns, gap_s), self._at(end_ns, gap_s)
+        a, b = self._at(start_ns), self._at(end_ns)
         if a is None or b is None:
             return None
         return b[0] - a[0], b[1] - a[1]
 
-    def _at(self, t_ns: int, gap_s: float) -> tuple[float, float] | None:
+    def _at(self, t_ns: int) -> tuple[float, float] | None:
         j = bisect.bisect_left(self.t_ns, t_ns)
         if j == len(self.t_ns) or (j == 0 and self.t_ns[0] != t_ns):
             return None
         if self.t_ns[j] == t_ns:
             return self.left_m[j], self.right_m[j]
         span = self.t_ns[j] - self.t_ns[j - 1]
-        if span * 1e-9 > gap_s:
+        if span * 1e-9 > 1.0 and is_gap(span * 1e-9, self.t_ns):
             return None
         w = (t_ns - self.t_ns[j - 1]) / span
         left = self.left_m[j - 1] + w * (self.left_m[j] - self.left_m[j - 1])
