@@ -11,7 +11,7 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.calibration.fit import combined, started
-from terrafusion.fusion.calibration.motion import LEAST_NODE_S, Drive, dead_reckoned, node_due
+from terrafusion.fusion.calibration.motion import Drive, dead_reckoned, node_due
 from terrafusion.fusion.calibration.numbers import GNSS_DELAY, Knowledge
 from terrafusion.fusion.calibration.reduction import NODE, Nodes, Noise, Reduction
 
@@ -86,10 +86,9 @@ class SelfCalibration:
         self._samples.append((self._now_s, distance_m, turn_rad))
         self._rolled_m += abs(distance_m)
         apart_s = self._now_s - self._node_s
-        if apart_s >= LEAST_NODE_S:
-            if node_due(apart_s, self._rolled_m, self._usual_sigma_m):
-                self._first.append(len(self._drive.distance_m) + len(self._samples))
-                self._node_s, self._rolled_m = self._now_s, 0.0
+        if node_due(apart_s, self._rolled_m, self._usual_sigma_m):
+            self._first.append(len(self._drive.distance_m) + len(self._samples))
+            self._node_s, self._rolled_m = self._now_s, 0.0
 
     def fix(self, t_ns: int, enu_m: Array, sigma_m: float) -> None:
         """A fix by its own stamp."""

@@ -68,7 +68,7 @@ class MotionMonitor:
         self._stamp_m = 0.5 * 1.0 / rig.sensors.wheels.rate_hz**2
         self.slipping = False
         self.cause: str | None = None
-        # Between keyframes: time, wheel travel (NaN: unknown), estimated travel, its sigma, the command's size.
+        # Between keyframes: time, wheel travel (NaN: unknown), estimated travel, its sigma, size of command.
         self._steps: deque[tuple[float, ...]] = deque()
         self._command: tuple[int, float] | None = None
         self._t_ns: int | None = None

@@ -28,16 +28,7 @@ from terrafusion.fusion.graph import gnss_factor, velocity_factor
 from terrafusion.fusion.graph.batch_rows import RowBlock
 from terrafusion.fusion.graph.gauss_markov import MarkovStep
 from terrafusion.fusion.graph.gnss_factor import GnssPosition
-from terrafusion.fusion.graph.key_state import (
-    BIAS,
-    IMU_ROTATION,
-    NAV,
-    POSE,
-    VELOCITY,
-    KeyState,
-    dim_of,
-    skew,
-)
+from terrafusion.fusion.graph.key_state import BIAS, IMU_ROTATION, NAV, POSE, VELOCITY, KeyState, dim_of, skew
 from terrafusion.fusion.graph.node import Node
 from terrafusion.fusion.graph.triangular import back_substitute, covariance_before, eliminated, triangular
 from terrafusion.fusion.graph.velocity_factor import GnssVelocity
