@@ -18,6 +18,10 @@ from terrafusion.fusion.estimator.plausibility import plausible_fixes
 from terrafusion.fusion.estimator.stationarity import drop_before_start
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 
+SILENT_NS, ROUGH_YAW_RAD = 3_000_000_000, 0.8
+"""Without a fix for so long the start no longer waits for a better heading, where there is one that tells
+forward from sideways (45 deg; assumed)."""
+
 
 class StartSearch:
     """Finds the first state.
@@ -30,6 +34,7 @@ class StartSearch:
     def __init__(self, config: EstimatorConfig, aids: AidingSensors, gnss: GnssUpdater) -> None:
         self.known: KnownStart | None = None
         self.level: Start | None = None
+        self._rough: Start | None = None
         self._config, self._aids, self._gnss = config, aids, gnss
         self._antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
 
@@ -56,8 +61,13 @@ class StartSearch:
             if start is not None and start.yaw_sigma_rad <= self._config.yaw_sigma_start_rad:
                 self._gnss.refuse_waiting(fitting)
                 return start
+            self._rough = start
             if drop_before_start(imu, wheels, fixes):
-                self.level = None
+                self.level = self._rough = None
+        elif fixes and (last or imu.t_ns[-1] - fixes[-1].t_ns > SILENT_NS):
+            if self._rough is not None and self._rough.yaw_sigma_rad <= ROUGH_YAW_RAD:
+                self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
+                return self._rough
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):
             self._gnss.local = True
             return self.level

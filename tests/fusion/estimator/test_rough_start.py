@@ -1,0 +1,44 @@
+"""A start whose fixes end before the heading is good: it begins with what is known, and says how well."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.replay import replay
+from terrafusion.twin.simulate import simulate
+
+SIGMA_M = 1.0
+USUAL_YAW_SIGMA_RAD = 0.12
+"""As good as the heading of a start otherwise is."""
+
+
+def with_few_fixes(seconds: float, seed: int) -> Recording:
+    """A drive with fixes once a second, a metre off and without velocity, that end `seconds` after its begin."""
+    run = simulate("figure_eight", terrain="asphalt", seed=1)
+    assert run.gnss is not None
+    t_s = (run.gnss.t_ns - run.start_ns) * 1e-9
+    gnss = run.gnss.select((np.arange(len(t_s)) % 5 == 0) & (t_s < seconds))
+    off = SIGMA_M * np.random.default_rng(seed).normal(size=gnss.enu_m.shape)
+    sigma = np.full(gnss.enu_m.shape, SIGMA_M)
+    enu_m = gnss.enu_m + off
+    plain = dataclasses.replace(gnss, enu_m=enu_m, sigma_enu_m=sigma, velocity_enu_mps=None, sigma_v_mps=None)
+    return dataclasses.replace(run, gnss=plain)
+
+
+def test_fixes_that_end_before_the_heading_is_good_still_give_a_start() -> None:
+    found = replay(with_few_fixes(9.0, 0), mode="fixed")
+    path, errors = found.estimate.trajectory, found.scores.errors
+    assert path.covariance is not None
+    assert errors is not None
+    assert float(np.sqrt(path.covariance[0, 5, 5])) > USUAL_YAW_SIGMA_RAD
+    assert float(np.nanmedian(2.0 * errors.nees())) < 5.991
+
+
+def test_without_any_hint_of_the_heading_there_is_no_start() -> None:
+    with pytest.raises(DataError, match="never moved far enough"):
+        replay(with_few_fixes(4.0, 0), mode="fixed")
