@@ -18,7 +18,7 @@ USUAL_YAW_SIGMA_RAD = 0.12
 
 
 def with_few_fixes(seconds: float, seed: int) -> Recording:
-    """A drive with fixes once a second, a metre off and without velocity, that end `seconds` after its begin."""
+    """A drive with fixes once a second, a metre off and without velocity, that end after `seconds`."""
     run = simulate("figure_eight", terrain="asphalt", seed=1)
     assert run.gnss is not None
     t_s = (run.gnss.t_ns - run.start_ns) * 1e-9
