@@ -26,6 +26,8 @@ STEERING_GAIN_PER_S = 1.5
 MAX_STEERING_RADPS = 0.8
 SLOWEST_TURN = 0.3
 """Share of the speed at which a vehicle that cannot turn on the spot turns to a waypoint behind it."""
+SLEW_STEP_S = 0.01
+"""Commands are brought within the limit of acceleration at about this interval: that of a log's replay."""
 STANDING_MPS = 0.02
 MOST_TURN = 1.6
 """Most of curvature times track: the wheels inside of a curve stay ahead of its centre."""
@@ -33,20 +35,26 @@ MOST_TURN = 1.6
 
 @dataclass(frozen=True, eq=False)
 class DrivenStates:
-    """Commanded twist (N, 2) before limits, inputs of the model (N, U), integrated states (N, X)."""
+    """Commanded twist (N, 2) before the vehicle's limits, inputs of the model (N, U), states (N, X)."""
 
     commanded: Array
     inputs: Array
     states: Array
 
 
-def limit_slew(
-    commanded: Array, dt_s: float, vehicle: VehicleParams, scenario: Scenario, start: Array
-) -> Array:
-    """Twist (N, 2) that follows `commanded` within limits of speed and acceleration, from `start` (2,)."""
+def within_limit(commanded: Array, dt_s: float, scenario: Scenario, start_mps: float = 0.0) -> Array:
+    """Commands (N, 2) within the scenario's own limit of acceleration: what the robot is sent, and logs."""
+    out = commanded.copy()
+    if math.isfinite(scenario.max_accel_mps2):
+        out[:, 0] = follow(commanded[:, 0], scenario.max_accel_mps2 * dt_s, start_mps)
+    return out
+
+
+def limit_slew(commanded: Array, dt_s: float, vehicle: VehicleParams, start: Array) -> Array:
+    """Twist (N, 2) that follows `commanded` within the vehicle's limits of speed and acceleration, from
+    `start` (2,)."""
     drive = vehicle.drive
-    accel = min(drive.max_accel_mps2, scenario.max_accel_mps2)
-    steps = (accel * dt_s, drive.max_yaw_accel_radps2 * dt_s)
+    steps = (drive.max_accel_mps2 * dt_s, drive.max_yaw_accel_radps2 * dt_s)
     goal_v = np.clip(commanded[:, 0], -drive.max_speed_mps, drive.max_speed_mps)
     goals = zip((goal_v, commanded[:, 1]), steps, start.tolist(), strict=True)
     return np.stack([follow(goal, step, first) for goal, step, first in goals], axis=1)
@@ -69,6 +77,11 @@ def follow(goal: Array, step: float, start: float) -> Array:
             now += step if missing > 0.0 else -step
             out[i] = now
     return out
+
+
+def _parts(dt_s: float) -> int:
+    """How many steps of about `SLEW_STEP_S` one sample is."""
+    return max(1, round(dt_s / SLEW_STEP_S))
 
 
 def side_speeds(twist: Array, vehicle: VehicleParams) -> Array:
@@ -160,8 +173,11 @@ def settled(scenario: Scenario, state: Array) -> Array:
 def open_loop(scenario: Scenario, t_s: Array, vehicle: VehicleParams) -> tuple[Array, Array]:
     """Commanded twist (N, 2) and inputs (N, U) of a scenario without waypoints."""
     dt = float(t_s[-1]) / (len(t_s) - 1)
-    commanded = scenario.commanded(t_s)
-    twist = limit_slew(commanded, dt, vehicle, scenario, np.zeros(2))
+    parts = _parts(dt)
+    fine_s = np.interp(np.arange((len(t_s) - 1) * parts + 1) / parts, np.arange(len(t_s)), t_s)
+    sent = within_limit(scenario.commanded(fine_s), dt / parts, scenario)
+    twist = limit_slew(sent, dt / parts, vehicle, np.zeros(2))[::parts]
+    commanded = sent[::parts]
     axles = axle_angles(steering_angles(twist, dt, vehicle), vehicle)
     return commanded, delayed_inputs(side_speeds(twist, vehicle), dt, vehicle.drive.dead_time_s, axles)
 
@@ -189,7 +205,7 @@ def _steer(
     states, commanded = np.empty((len(t_s), len(STATES))), np.empty((len(t_s), 2))
     states[0], commanded[0] = start, 0.0
     twists, front = np.zeros((len(t_s), 2)), np.zeros(len(t_s))
-    goal, first = 1, 0
+    goal, first, parts = 1, 0, _parts(dt)
     while first < len(t_s) - 1:
         last = min(first + period, len(t_s) - 1)
         pose = states[first, :3]
@@ -197,9 +213,12 @@ def _steer(
             goal += 1
         least = SLOWEST_TURN if vehicle.steered() else 0.0
         twist = _towards(points, goal, pose, scenario.waypoint_speed_mps, least)
-        block = np.tile(twist, (last - first, 1))
         rows = slice(first + 1, last + 1)
-        twists[rows] = limit_slew(block, dt, vehicle, scenario, twists[first])
+        # The new twist holds from the next sample on.
+        held = np.repeat([commanded[first], twist], [parts - 1, (last - first - 1) * parts + 1], axis=0)
+        sent = within_limit(held, dt / parts, scenario, float(commanded[first, 0]))
+        commanded[rows] = sent[parts - 1 :: parts]
+        twists[rows] = limit_slew(sent, dt / parts, vehicle, twists[first])[parts - 1 :: parts]
         front[rows] = steering_angles(twists[rows], dt, vehicle, float(front[first]))
         known = max(0, first - reach)
         some = slice(known, last + 1)
@@ -209,7 +228,6 @@ def _steer(
         states[first : last + 1] = integrate(
             states[first], inputs[first - known :], dt_s, plant, t0_s=t0_s, backend=backend
         )
-        commanded[first + 1 : last + 1] = twist
         first = last
     axles = axle_angles(front, vehicle)
     inputs = delayed_inputs(side_speeds(twists, vehicle), dt, vehicle.drive.dead_time_s, axles)

@@ -130,7 +130,8 @@ class Scenario:
     grounds join smoothly over `transition` metres or seconds. `variation` and `patches`
     make the whole plane uneven, differently for each seed (see `ground`). With `waypoints`
     ((x, y) m in the plane from the start, x east on flat ground) the robot steers by
-    its true pose at `waypoint_speed_mps` instead of following `drive`.
+    its true pose at `waypoint_speed_mps` instead of following `drive`. Commands accelerate by at most
+    `max_accel_mps2`; the vehicle's own limit holds in any case.
 
     The ground rises by `slope_deg` towards `aspect_deg` (0 east, left positive) and by
     `cross_slope_deg` to the left of the start heading; both make one plane. The payload's
@@ -146,7 +147,7 @@ class Scenario:
     stops: tuple[Interval, ...] = ()
     waypoints: tuple[tuple[float, float], ...] = ()
     waypoint_speed_mps: float = 1.0
-    max_accel_mps2: float = 1.5
+    max_accel_mps2: float = math.inf
     route: tuple[RouteLeg, ...] = (RouteLeg("asphalt"),)
     route_over: str = "travel"
     transition: float = 0.3

@@ -4,10 +4,15 @@ from __future__ import annotations
 
 import hypothesis.strategies as st
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
+from terrafusion.twin.calibrate.inputs import DT_S, twin_input
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.run_setup import set_up
 from terrafusion.twin.scenario.commands import delayed_inputs, follow
+from terrafusion.twin.simulate import simulate
 
 SPEEDS = st.floats(-3.0, 3.0).map(lambda v: round(v, 2))
 
@@ -40,3 +45,18 @@ def test_a_command_that_is_not_late_is_the_limit_of_one_that_is_hardly_late() ->
     hardly = delayed_inputs(sides, 0.01, 1e-12)
     np.testing.assert_allclose(hardly[1:], prompt[1:], atol=1e-6)
     np.testing.assert_array_equal(prompt[0, 2:], 0.0)
+
+
+@pytest.mark.parametrize("robot", ["elevate", "husky", "warthog"])
+@pytest.mark.parametrize("drive", ["staircase", "demo"])
+def test_a_log_drives_the_twin_as_the_robot_was_driven(robot: str, drive: str) -> None:
+    """Whatever the limits of vehicle and scenario: up to the corners of ramps between samples."""
+    vehicle = load_vehicle(robot)
+    setup = set_up(drive, vehicle=vehicle, soils=None)
+    given = twin_input(simulate(drive, vehicle=vehicle), vehicle, "command")
+    late = setup.t_s - vehicle.drive.dead_time_s
+    own = np.stack(
+        [np.interp(late, DT_S * np.arange(len(given.sides)), side) for side in given.sides.T], axis=1
+    )
+    driven = setup.drive("auto").inputs[:, :2]
+    assert np.sqrt(np.mean((own - driven) ** 2)) < 0.02  # rad/s
