@@ -266,11 +266,16 @@ def at_hand(entry: CatalogFile, folders: list[Path]) -> Path | None:
 def data_folders() -> list[Path]:
     """Where local copies are looked for: `TERRAFUSION_DATA`, then the download cache."""
     given = os.environ.get(DATA_VARIABLE)
-    return [*([Path(given)] if given else []), cache_folder()]
+    cache = cache_folder()
+    return [*([Path(given)] if given else []), *([] if cache is None else [cache])]
 
 
-def cache_folder() -> Path:
-    """The folder that downloads go to, as the operating system has it."""
+def cache_folder() -> Path | None:
+    """The folder that downloads go to, as the operating system has it; None where the user has no home."""
     import pooch
 
-    return Path(pooch.os_cache("terrafusion"))
+    try:
+        folder = Path(pooch.os_cache("terrafusion"))
+    except RuntimeError:  # neither HOME nor an entry for the user
+        return None
+    return folder if folder.is_absolute() else None

@@ -96,8 +96,15 @@ def fetch(
                 file=entry.file,
                 remedy="run again without --offline, or name a folder that holds it in TERRAFUSION_DATA",
             )
-        path = here or _download(entry, cache_folder() if folder is None else folder, progress)
+        path = here or _download(entry, folder or _cache(), progress)
         yield Fetched(entry, path, downloaded=here is None)
+
+
+def _cache() -> Path:
+    folder = cache_folder()
+    if folder is None:
+        raise DataError("there is no home folder to keep files in", remedy="name a folder with --to")
+    return folder
 
 
 def _brought(entry: CatalogFile, folder: Path) -> Path | None:

@@ -160,5 +160,5 @@ def is_firm(recording: Recording) -> bool:
         return recording.terrain_name not in SOFT
     labels = {recording.terrain_name}
     if recording.terrain is not None:
-        labels |= set(recording.terrain.label.astype(str).tolist())
+        labels |= set(map(str, recording.terrain.label.tolist()))
     return not labels & set(SOFT)

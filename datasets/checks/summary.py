@@ -102,7 +102,7 @@ def _ranges(channel: Channel) -> dict[str, Any]:
     ranges: dict[str, Any] = {}
     for column, values in channel.columns().items():
         if values.dtype == object:
-            ranges[column] = dict(sorted(Counter(values.astype(str).tolist()).items()))
+            ranges[column] = dict(sorted(Counter(map(str, values.tolist())).items()))
         elif (known := values[np.isfinite(values)]).size:
             ranges[column] = [float(known.min()), float(known.max())]
     return ranges

@@ -1,9 +1,21 @@
-"""Types of arrays."""
+"""Types of arrays, and arrays of texts."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 """Array of floating-point numbers; shapes are in the docstrings."""
+
+
+def distinct(texts: NDArray[Any]) -> tuple[list[str], NDArray[np.intp]]:
+    """The different texts of (N,), in order of appearance, and which of them each is (N,).
+
+    NumPy's own arrays of texts give every one the room of the longest.
+    """
+    listed = list(map(str, texts.tolist()))
+    number = {text: k for k, text in enumerate(dict.fromkeys(listed))}
+    return list(number), np.fromiter(map(number.__getitem__, listed), dtype=np.intp, count=len(listed))

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.scratch import sweep
 
 
 def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
@@ -19,6 +20,7 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
+        sweep(path.parent, f".{path.name}.")
         write(temporary)
         os.replace(temporary, path)
     except OSError as error:
@@ -27,6 +29,14 @@ def write_atomically(path: Path, write: Callable[[Path], object]) -> Path:
         if path.parent.is_dir():
             temporary.unlink(missing_ok=True)
     return path
+
+
+def expanded(text: str | Path) -> Path:
+    """The path with the user's home for `~`, where there is one."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        return Path(text)
 
 
 def check_folder(path: Path) -> None:

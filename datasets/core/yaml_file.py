@@ -11,26 +11,28 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import ConfigError
 
-MAX_BYTES = 256 * 1024
-"""A larger file is no parameter file: pure-Python YAML would take seconds over it."""
-MAX_DEPTH = 32
-MAX_VALUES = 50_000
-"""Values of a file, each alias written out."""
 _TAG = "tag:yaml.org,2002:"
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, most_bytes: int = limits.YAML_BYTES) -> dict[str, Any]:
     """The mapping at the top of a YAML file.
+
+    Args:
+        path: the file.
+        most_bytes: a larger one is refused: pure-Python YAML would take seconds over it.
 
     Raises:
         ConfigError: the file is missing, very large, not UTF-8, not YAML, or not a mapping.
     """
     try:
-        if path.stat().st_size > MAX_BYTES:
+        if not path.is_file() and path.exists():
+            raise ConfigError("is no file", file=path, remedy="give a text file")
+        if path.stat().st_size > most_bytes:
             raise ConfigError(
-                f"the file has more than {MAX_BYTES // 1024} KiB", file=path, remedy="give a parameter file"
+                f"the file has more than {most_bytes // 1024} KiB", file=path, remedy="give a parameter file"
             )
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -93,15 +95,17 @@ class _Builder:
             value = self._scalar(event)
         else:
             value = self._collection(event, kind, depth)
-        if self._values > MAX_VALUES:
-            raise _problem(event, f"more than {MAX_VALUES} values; aliases count as what they stand for")
+        if self._values > limits.YAML_VALUES:
+            raise _problem(
+                event, f"more than {limits.YAML_VALUES} values; aliases count as what they stand for"
+            )
         if event.anchor is not None:
             self._anchors[event.anchor] = value, self._values - before
         return value
 
     def _collection(self, event: Any, kind: str, depth: int) -> Any:
-        if depth >= MAX_DEPTH:
-            raise _problem(event, f"nested more than {MAX_DEPTH} deep")
+        if depth >= limits.YAML_DEPTH:
+            raise _problem(event, f"nested more than {limits.YAML_DEPTH} deep")
         if event.tag is not None and str(event.tag) not in (f"{_TAG}map", f"{_TAG}seq", "!"):
             raise _problem(event, f"the tag {event.tag} is not known here")
         if kind == "SequenceStartEvent":
@@ -136,6 +140,8 @@ class _Builder:
             return event.value
         if kind not in ("int", "float", "bool", "null"):
             raise _problem(event, f"the tag {tag} is not known here")
+        if len(event.value) > limits.YAML_NUMBER:
+            raise _problem(event, f"a number of {len(event.value)} characters")
         node = self._scalar_node(tag, event.value, event.start_mark, event.end_mark)
         return getattr(self._yaml.constructor, f"construct_yaml_{kind}")(node)
 

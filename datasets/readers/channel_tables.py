@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import distinct
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -23,6 +24,7 @@ from terrafusion.datasets.core.channels import (
 )
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
+from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.csv_table import CsvTable
 from terrafusion.datasets.readers.log_meta import Meta
@@ -149,12 +151,12 @@ class ChannelReader:
             self.notes.append("gnss: the log has no fix class; all fixes are taken as 'single'")
             return np.full(len(table.t_ns), Fix.SINGLE, dtype=np.uint8)
         codes = {fix.name.lower(): fix for fix in Fix} | {"": Fix.SINGLE}
-        words, inverse = np.unique(table.texts["fix"].astype(str), return_inverse=True)
+        words, inverse = distinct(table.texts["fix"])
         for k, word in enumerate(words):
             if word not in codes:
                 row = int(np.flatnonzero(inverse == k)[0])
                 remedy = f"give one of {', '.join(fix.name.lower() for fix in Fix)}"
-                raise self._row_error("gnss", table, row, f"column 'fix' is '{word}'", remedy)
+                raise self._row_error("gnss", table, row, f"column 'fix' is '{shown(word)}'", remedy)
         unknown = int((table.texts["fix"] == "").sum())
         if unknown:
             self.notes.append(f"gnss: {unknown} rows have no fix class; taken as 'single'")

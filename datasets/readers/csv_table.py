@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import ClockError, DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
@@ -93,6 +94,7 @@ def _header(
         header = [name.strip() for name in next(csv.reader([data.split(b"\n", 1)[0].decode()]), [])]
     except csv.Error as error:
         raise not_a_table(path, 1, error) from None
+    limits.check_columns(path, len(header))
     allowed = ["t_s", *known, *texts]
     for name in header:
         if name in allowed or any(name.startswith(p) and name != p for p in prefixes):
@@ -101,9 +103,9 @@ def _header(
         meant = f"did you mean '{close[0]}'? " if close else ""
         listed = ", ".join([*allowed, *(f"{p}<name>" for p in prefixes)])
         raise DataError(f"unknown column '{shown(name)}'", file=path, remedy=f"{meant}allowed: {listed}")
-    repeated = [name for i, name in enumerate(header) if name in header[:i]]
+    repeated = limits.repeated(header)
     if repeated:
-        raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="keep one of them")
+        raise DataError(f"column '{shown(repeated)}' comes twice", file=path, remedy="keep one of them")
     if "t_s" not in header:
         raise DataError("column 't_s' is missing", file=path, remedy="add it: seconds from start_ns")
     return header

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import gzip
 import io
+import os
 import re
 import zlib
 from collections.abc import Iterator, Sequence
@@ -20,14 +21,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.decimals import NotADecimal, to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 
 Array = NDArray[np.float64]
 
-MAX_BYTES = 2**29
-MAX_LINE = 2**16
 BOM = b"\xef\xbb\xbf"
 BLANKS = r"\s+"
 """The separator that stands for any run of blanks and tabs."""
@@ -117,13 +117,12 @@ def read_text(path: Path) -> bytes:
     """
     try:
         with gzip.open(path) if path.suffix == ".gz" else path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+            packed = os.fstat(file.fileno()).st_size
+            data = file.read(min(limits.FREE_BYTES + limits.EXPANSION * packed, limits.TEXT_BYTES) + 1)
     except (OSError, EOFError, zlib.error) as error:
         what = f"cannot be read: {getattr(error, 'strerror', '') or error}"
         raise DataError(what, file=path, remedy="is it complete?") from None
-    if len(data) > MAX_BYTES:
-        what, remedy = f"has more than {MAX_BYTES // 2**20} MB", "split it, or convert it to Parquet"
-        raise DataError(what, file=path, remedy=remedy)
+    _check_size(path, data, packed)
     data = data.removeprefix(BOM)
     if not data or data.isspace():
         raise DataError("the file is empty", file=path, remedy="copy it again; a table has at least a header")
@@ -136,13 +135,38 @@ def read_text(path: Path) -> bytes:
     return data
 
 
+def _check_size(path: Path, data: bytes, packed: int) -> None:
+    """Refuse more bytes, rows or bytes in a line than a text file may have."""
+    if len(data) > limits.TEXT_BYTES:
+        raise limits.too_much(path, "MB", limits.TEXT_BYTES / 2**20, "split it, or convert it to Parquet")
+    limits.check_expansion(path, len(data), packed)
+    if max(data.count(b"\n"), data.count(b"\r")) > limits.ROWS:
+        raise limits.too_much(path, "lines", limits.ROWS)
+    check_lines(path, data)
+
+
+def check_lines(path: Path, data: bytes) -> None:
+    """Refuse a line that is too long for one.
+
+    Raises:
+        DataError: there is one.
+    """
+    begin = 0
+    while len(data) - begin > limits.LINE_BYTES:
+        end = data.rfind(b"\n", begin, begin + limits.LINE_BYTES) + 1
+        if not end:
+            line = data.count(b"\n", 0, begin) + 1
+            raise limits.too_much(path, f"bytes in line {line}", limits.LINE_BYTES, "is it a text file?")
+        begin = end
+
+
 def head_lines(data: bytes, count: int = 1000) -> Iterator[tuple[int, str]]:
     """Number, from 1, and text of the first lines; one that is too long for a line of a table ends them."""
     begin = len(BOM) if data.startswith(BOM) else 0
     for number in range(1, count + 1):
-        end = data.find(b"\n", begin, begin + MAX_LINE)
+        end = data.find(b"\n", begin, begin + limits.LINE_BYTES)
         if end < 0:
-            if begin < len(data) <= begin + MAX_LINE:
+            if begin < len(data) <= begin + limits.LINE_BYTES:
                 yield number, data[begin:].decode("utf-8", "replace").rstrip("\r")
             return
         yield number, data[begin:end].decode("utf-8", "replace").rstrip("\r")
@@ -182,6 +206,9 @@ def read_columns(
     """
     end, notes = _complete_end(path, data, layout)
     data = data[:end]
+    limits.check_columns(path, len(layout.names))
+    if data.count(b"\n") * (len(numbers) + len(texts)) > limits.VALUES:
+        raise limits.too_much(path, "values", limits.VALUES)
     _check_counts(path, data, layout)
     table = _parse(data, layout, numbers, texts)
     if table is None or _is_suspect(table, data, layout, numbers):
@@ -201,8 +228,8 @@ def _complete_end(path: Path, data: bytes, layout: TextLayout) -> tuple[int, tup
     if data.endswith((b"\n", b"\r")):
         return len(data), ()
     begin = data.rfind(b"\n") + 1
-    last = data[begin : begin + MAX_LINE].decode("utf-8", "replace")
-    long = len(data) - begin > MAX_LINE
+    last = data[begin : begin + limits.LINE_BYTES].decode("utf-8", "replace")
+    long = len(data) - begin > limits.LINE_BYTES
     first = data.count(b"\n", 0, begin) + 1 < layout.first_line
     if not (long or first or layout.strict) and len(split(last, layout.separator)) < len(layout.names):
         return begin, (f"{path.name}: the last line was cut off and is left out",)

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.core.yaml_file import MAX_BYTES
 from terrafusion.datasets.readers.channel_tables import WHEEL_LAYOUTS
 from terrafusion.datasets.readers.csv_table import MAX_T_S
 from terrafusion.datasets.readers.log_folder import CHANNELS, META
@@ -167,9 +167,9 @@ def _meta_text(meta: dict[str, Any], folder: Path) -> str:
     """One key a line, its value in JSON, which is YAML too."""
     text = "".join(f"{key}: {json.dumps(value, ensure_ascii=False)}" + "\n" for key, value in meta.items())
     text = _UNPRINTABLE.sub(lambda found: f"\\u{ord(found[0]):04x}", text)
-    if len(text.encode()) > MAX_BYTES:
+    if len(text.encode()) > limits.YAML_BYTES:
         raise DataError(
-            f"its texts take more than {MAX_BYTES // 1024} KiB",
+            f"its texts take more than {limits.YAML_BYTES // 1024} KiB",
             file=folder / META,
             remedy="shorten the notes",
         )

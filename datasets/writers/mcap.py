@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +15,7 @@ from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import META
 from terrafusion.datasets.writers import ros_messages as ros
@@ -89,8 +89,8 @@ def write_mcap(
         for topic in topics:
             _check_times(topic, path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent, prefix=".mcap-") as scratch:
-            whole = Path(scratch) / path.name
+        with scratch_folder(path.parent) as scratch:
+            whole = scratch / path.name
             write_mcap_file(whole, topics, _definitions(topics), "terrafusion")
             whole.replace(path)
     return tuple(parts.unseen)

@@ -57,7 +57,7 @@ class OutputTable:
     def is_full(self) -> bool:
         """Whether there are rows, and each holds a value."""
         if "label" in self.columns:
-            held = self.columns["label"].astype(str) != ""
+            held = self.columns["label"].astype(object) != ""
         else:
             numbers = {name: c for name, c in self.columns.items() if c.dtype.kind == "f"}
             held = rows_with_values(numbers, len(self.t_ns))

@@ -191,7 +191,7 @@ def ground_of(log: str, recording: Recording) -> str:
     """ "firm" or "slipping" by the log's label, else by its set; "" where neither tells."""
     labels = {recording.terrain_name} - {""}
     if recording.terrain is not None:
-        labels |= set(recording.terrain.label.astype(str).tolist())
+        labels |= set(map(str, recording.terrain.label.tolist()))
     if labels - {"unknown", "mixed"}:
         return "slipping" if labels & set(SLIPPING) else "firm"
     return SET_GROUND.get(log.partition("/")[0], "")

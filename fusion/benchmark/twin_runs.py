@@ -9,14 +9,13 @@ development.
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 import zlib
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.fusion.benchmark.methods import true_labels
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.labels import GroundLabels
@@ -153,8 +152,8 @@ def simulate_case(case: BenchmarkCase) -> BenchmarkRun:
 def soils_of(case: BenchmarkCase, names: set[str]) -> dict[str, SoilParams]:
     """Soils of a case: scattered as in training, or every parameter off by `PERTURBATION`."""
     rng = case.stream(case.family, case.plant, "soil")
-    with tempfile.TemporaryDirectory() as folder:
-        scattered = {n: load_soil(scattered_soil(n, rng, Path(folder))) for n in sorted(names)}
+    with scratch_folder() as folder:
+        scattered = {n: load_soil(scattered_soil(n, rng, folder)) for n in sorted(names)}
     return {n: perturbed(load_soil(n), rng) if case.plant == "perturbed" else s for n, s in scattered.items()}
 
 

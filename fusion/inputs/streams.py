@@ -65,6 +65,8 @@ sensor)."""
 GAP_INTERVALS, SLOWEST_INTERVAL_S = 2.5, 2.0
 """A slow stream has a gap where samples are missing by its own interval, of at most 2 s."""
 INTERVALS_SEEN = 21
+JUMP_M = 5.0
+"""A counter that moves by this much more than a wheel of the fastest robot can has jumped (assumed)."""
 
 
 def usual_interval_s(times: list[int]) -> float:
@@ -284,12 +286,14 @@ def turned(vector: Array, angle_rad: float) -> Array:
 class WheelStream:
     """Travelled distance of the left and right side over time.
 
-    Samples with a speed or travel that no robot has are left out; `impossible` counts them.
+    Samples with a speed or travel that no robot has are left out; `impossible` counts them. Over a jump of
+    the counters (a reset) the speeds give the distance; `jumps` counts these.
     """
 
     def __init__(self, newest: Newest | None = None) -> None:
         self.late = Lateness("wheels", newest)
-        self.impossible = 0
+        self.impossible = self.jumps = 0
+        self._offset_m = 0.0, 0.0
         self.t_ns: list[int] = []
         self.left_m: list[float] = []
         self.right_m: list[float] = []
@@ -334,6 +338,7 @@ class WheelStream:
             return
         self.t_ns.insert(i, t_ns)
         self._speeds.insert(i, (left_mps, right_mps))
+        counted = self._continued(i, counted)
         self._counted.insert(i, counted)
         self.left_m.insert(i, counted[0] if counted else 0.0)
         self.right_m.insert(i, counted[1] if counted else 0.0)
@@ -341,6 +346,20 @@ class WheelStream:
             self._watch(i)
         if counted is None or self.noise.out_of_step:
             self._integrate_from(max(i, 1))
+
+    def _continued(self, i: int, counted: tuple[float, float] | None) -> tuple[float, float] | None:
+        """Counters of sample `i` without the jumps before it."""
+        if counted is None:
+            return None
+        left, right = (m + offset for m, offset in zip(counted, self._offset_m, strict=True))
+        before = self._counted[i - 1] if 0 < i == len(self.t_ns) - 1 else None
+        if before is not None:
+            most_m = JUMP_M + MOST_MPS * (self.t_ns[i] - self.t_ns[i - 1]) * 1e-9
+            if max(abs(left - before[0]), abs(right - before[1])) > most_m:
+                self.jumps += 1
+                left, right = (m + rolled for m, rolled in zip(before, self._by_speeds(i), strict=True))
+                self._offset_m = left - counted[0], right - counted[1]
+        return left, right
 
     def _watch(self, i: int) -> None:
         """Compare the increment of the counters that ends at sample `i` with that of the speeds."""

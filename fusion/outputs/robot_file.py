@@ -9,7 +9,7 @@ from typing import Any
 
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.files import expanded, write_atomically
 from terrafusion.datasets.core.robot import KnownNumber, RobotFile
 from terrafusion.fusion.sensor_calibration import SensorCalibration
 from terrafusion.twin.model.library import read_named
@@ -48,7 +48,7 @@ def _before(path: Path, vehicle: str) -> dict[str, Any]:
     """What the file is made from: another one of the short form, or the name or path of a complete one."""
     if vehicle in vehicle_names():
         return {"extends": vehicle}
-    old = Path(vehicle).expanduser()
+    old = expanded(vehicle)
     raw, _ = read_named("vehicles", vehicle, kind="vehicle")
     if is_short(raw):
         robot = dict(raw["robot"])

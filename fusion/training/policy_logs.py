@@ -111,7 +111,7 @@ def grounds_of(recording: Recording) -> list[tuple[int, str]]:
     """
     terrain = recording.terrain
     if terrain is not None and len(terrain) and terrain.source in TRUE_SOURCES:
-        label = terrain.label.astype(str)
+        label = terrain.label.astype(object)
         first = np.flatnonzero(np.append(True, label[1:] != label[:-1]))
         return list(zip(terrain.t_ns[first].tolist(), label[first].tolist(), strict=True))
     if recording.terrain_name:

@@ -6,7 +6,6 @@ import copy
 import dataclasses
 import hashlib
 import json
-import tempfile
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.core.gauss_markov import markov_decay, markov_spread
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.scratch import scratch_folder
 from terrafusion.fusion.terrain.features import Window
 from terrafusion.twin.model.library import read_named
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -59,8 +59,8 @@ class Condition:
         scenario = dataclasses.replace(
             load_scenario(self.scenario), heading_deg=float(rng.uniform(0.0, 360.0))
         )
-        with tempfile.TemporaryDirectory() as folder:
-            soil = scattered_soil(self.terrain, rng, Path(folder))
+        with scratch_folder() as folder:
+            soil = scattered_soil(self.terrain, rng, folder)
             return simulate(
                 scenario,
                 vehicle=self.vehicle,

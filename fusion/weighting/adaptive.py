@@ -13,6 +13,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State, WeightChange
+from terrafusion.fusion.inputs.door import as_numbers
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.terrain.classifier import UNKNOWN, load_terrain_model
@@ -128,14 +129,19 @@ class TerrainNoise:
         Raises:
             DataError: a class the policy does not know, or numbers that are no probabilities.
         """
-        unknown = sorted(set(probabilities) - set(self.detector.classes))
+        if not isinstance(probabilities, Mapping):
+            raise DataError(
+                f"{probabilities!r} names no classes", channel="terrain", remedy="give {class: probability}"
+            )
+        unknown = sorted(set(map(str, probabilities)) - set(self.detector.classes))
         if unknown:
             raise DataError(
                 f"unknown class '{unknown[0]}'",
                 channel="terrain",
                 remedy=f"the policy knows {', '.join(self.detector.classes)}",
             )
-        self.detector.fuse(np.array([probabilities.get(name, 0.0) for name in self.detector.classes]))
+        given = [probabilities.get(name, 0.0) for name in self.detector.classes]
+        self.detector.fuse(as_numbers(given, "probabilities", "terrain"))
         self._source = "external source"
         self._reweight(t_ns)
 

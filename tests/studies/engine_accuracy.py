@@ -20,7 +20,7 @@ from terrafusion.twin.model.soil import load_soil
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.physics.layout import INDEX, STATES
-from terrafusion.twin.scenario.commands import delayed_inputs, limit_slew, side_speeds
+from terrafusion.twin.scenario.commands import delayed_inputs, limit_slew, side_speeds, within_limit
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate_run
@@ -41,7 +41,7 @@ def path_of(scenario: str, terrain: str, substeps: int) -> Array:
     """Positions (N, 2), m, of a scenario's command on one ground, driven open loop."""
     plan, vehicle = load_scenario(scenario), load_vehicle("elevate")
     t_s: Array = np.arange(round(plan.duration_s / DT_S) + 1, dtype=float) * DT_S
-    twist = limit_slew(plan.commanded(t_s), DT_S, vehicle, plan, np.zeros(2))
+    twist = limit_slew(within_limit(plan.commanded(t_s), DT_S, plan), DT_S, vehicle, np.zeros(2))
     inputs = delayed_inputs(side_speeds(twist, vehicle), DT_S)
     return integrate(np.zeros(len(STATES)), inputs, DT_S, _plant(terrain), substeps=substeps)[:, :2]
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +12,6 @@ from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.observations import sample_interval_s
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.scenario.commands import limit_slew, side_speeds
-from terrafusion.twin.scenario.scenario import Scenario
 
 Array = NDArray[np.float64]
 
@@ -23,8 +21,9 @@ DT_S = 0.01
 """Sample interval of the twin's runs."""
 MOVING_RADPS = 0.3
 """A log that starts with faster wheels starts on the move."""
-STEP = 4.0
-"""Commands that change this many times faster than the robot may accelerate are steps."""
+STEP, ALONE = 4.0, 0.2
+"""Commands that change this many times faster than the robot may accelerate are steps; so are those that
+before and after change by less than this share of it."""
 LONGEST_GAP_S = 0.5
 """Measurements within a longer gap of the input are not used."""
 
@@ -135,8 +134,7 @@ def _commands(recording: Recording, vehicle: VehicleParams) -> TwinInput:
     limits = np.array([vehicle.drive.max_accel_mps2, vehicle.drive.max_yaw_accel_radps2])
     wanted = np.stack([_between(t_s, twist[:, i], grid, limits[i]) for i in range(2)], axis=1)
     first = np.zeros(2) if _rests(recording, vehicle) else wanted[0]
-    free = Scenario(name=recording.name, duration_s=math.inf, max_accel_mps2=math.inf)
-    sides = side_speeds(limit_slew(wanted, DT_S, vehicle, free, first), vehicle)
+    sides = side_speeds(limit_slew(wanted, DT_S, vehicle, first), vehicle)
     # Rare commands hold until the next one.
     gaps = _gaps(t_s) if sample_interval_s(t_s) <= 0.5 * LONGEST_GAP_S else np.zeros((0, 2))
     notes = [f"the commands have {len(gaps)} hole(s) of up to {np.diff(gaps).max():.1f} s: what falls into "
@@ -155,7 +153,9 @@ def _between(t_s: Array, wanted: Array, grid: Array, limit: float) -> Array:
     before = np.clip(np.searchsorted(t_s, grid + 1e-6, side="right") - 1, 0, len(t_s) - 1)
     out = wanted[before]
     apart = np.append(np.diff(t_s), np.inf)
-    follows = np.append(np.abs(np.diff(wanted)) <= STEP * limit * np.diff(t_s), False)
+    change = np.abs(np.diff(wanted))
+    beside = np.maximum(np.append(0.0, change[:-1]), np.append(change[1:], 0.0))
+    follows = np.append((change <= STEP * limit * np.diff(t_s)) & (ALONE * change <= beside), False)
     # A slope at a sample is the central difference where both neighbours are reached smoothly.
     slopes = np.where(follows, np.diff(wanted, append=wanted[-1]) / apart, 0.0)
     both = follows & np.append(False, follows[:-1])

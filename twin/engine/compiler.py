@@ -1,13 +1,10 @@
 """C source to shared library: compiled once, cached, found again.
 
-The cache lies in `$TERRAFUSION_CACHE`, else `$XDG_CACHE_HOME/terrafusion`, else
-`~/.cache/terrafusion`; entries are named by a hash of source, flags, compiler and processor.
+Entries of the cache (`library_cache`) are named by a hash of source, flags, compiler and processor.
 """
 
 from __future__ import annotations
 
-import atexit
-import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -17,12 +14,12 @@ import platform
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from terrafusion.datasets.core.errors import TerrafusionError
-from terrafusion.datasets.core.files import write_atomically
+from terrafusion.datasets.core.scratch import process_folder, scratch_folder
+from terrafusion.twin.engine import library_cache
+from terrafusion.twin.engine.library_cache import cache_folder
 
 LOG = logging.getLogger("terrafusion.twin")
 
@@ -30,15 +27,6 @@ LOG = logging.getLogger("terrafusion.twin")
 FLAGS = ("-O3", "-std=gnu99", "-ffp-contract=off", "-fno-math-errno", "-fno-trapping-math", "-Wno-psabi",
          "-fPIC", "-shared")  # fmt: skip
 NATIVE = "-march=native"
-
-
-def cache_folder() -> Path:
-    """Where compiled libraries are kept (not created by this call)."""
-    own = os.environ.get("TERRAFUSION_CACHE")
-    if own:
-        return Path(own)
-    base = os.environ.get("XDG_CACHE_HOME")
-    return (Path(base) if base else Path.home() / ".cache") / "terrafusion"
 
 
 def find_compiler() -> tuple[str, ...] | None:
@@ -66,14 +54,11 @@ def remembered(what: str | None, source: Callable[[], str], compiler: tuple[str,
     if what is None:
         return compiled(source(), compiler)
     note = cache_folder() / f"{_name(what, compiler)}.is"
-    with contextlib.suppress(OSError, ValueError):
-        target = cache_folder() / note.read_text(encoding="ascii")
-        if target.is_file():
-            return target
+    known = library_cache.noted(note)
+    if known is not None:
+        return known
     path = compiled(source(), compiler)
-    if path.parent == note.parent:
-        with contextlib.suppress(TerrafusionError, OSError):
-            write_atomically(note, lambda part: part.write_text(path.name, encoding="ascii"))
+    library_cache.write_note(note, path)
     return path
 
 
@@ -84,16 +69,13 @@ def compiled(source: str, compiler: tuple[str, ...]) -> Path:
         OSError, subprocess.SubprocessError: the compiler cannot be run or fails (the text is its last line).
     """
     target = cache_folder() / f"{_name(source, compiler)}.so"
-    if target.is_file():
+    if library_cache.is_whole(target):
         return target
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
         return _compile_into(target, source, compiler)
     except OSError as error:  # a read-only or full home: compile for this process only
         LOG.info("no cache in %s (%s)", target.parent, error)
-        folder = Path(tempfile.mkdtemp(prefix="terrafusion-"))
-        atexit.register(shutil.rmtree, folder, ignore_errors=True)
-        return _compile_into(folder / target.name, source, compiler)
+        return _compile_into(process_folder() / target.name, source, compiler)
 
 
 def _name(text: str, compiler: tuple[str, ...]) -> str:
@@ -119,15 +101,14 @@ def processor() -> str:
 
 
 def _compile_into(target: Path, source: str, compiler: tuple[str, ...]) -> Path:
-    with tempfile.TemporaryDirectory(dir=target.parent) as scratch:
-        code, library = Path(scratch) / "twin.c", Path(scratch) / "twin.so"
+    with scratch_folder(target.parent) as scratch:
+        code, library = scratch / "twin.c", scratch / "twin.so"
         code.write_text(source, encoding="utf-8")
         message = ""
         for native in ((NATIVE,), ()):  # a compiler that does not know the processor takes its baseline
             command = [*compiler, *FLAGS, *native, "-o", str(library), str(code), "-lm"]
             done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
             if done.returncode == 0:
-                os.replace(library, target)
-                return target
+                return library_cache.keep(library, target)
             message = message or (done.stderr.strip().splitlines() or ["no message"])[-1]
         raise subprocess.SubprocessError(f"{' '.join(compiler)}: {message}")

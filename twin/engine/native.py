@@ -159,7 +159,7 @@ def _driver(variant: Variant) -> Driver | None:
         what = codegen.follows_from((*variant[:-1], sorted(variant.active)), variant.effects)
         path = compiler.remembered(what, lambda: codegen.source(variant), command)
         return Driver(ctypes.CDLL(str(path)), variant)
-    except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
+    except (OSError, ValueError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
         _say(f"the twin's C code could not be compiled ({error}): it runs in CasADi's virtual machine")
         return None
 

@@ -58,7 +58,7 @@ def reader(effects: tuple[str, ...], fixed_ground: bool) -> Reader | None:
             what = codegen.follows_from(("reader", fixed_ground), effects)
             path = compiler.remembered(what, lambda: codegen.reader_source(effects, fixed_ground), command)
         return Reader(ctypes.CDLL(str(path)))
-    except (OSError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
+    except (OSError, ValueError, subprocess.SubprocessError, codegen.UnsupportedOperationError) as error:
         LOG.warning(
             "the sensors' graph could not be compiled (%s): it runs in CasADi's virtual machine", error
         )

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.twin.model.soil_table import is_published, published_soil
 
@@ -31,7 +32,7 @@ def read_named(folder: str, name_or_path: str | Path, *, kind: str) -> tuple[dic
     if text in known_names(folder):
         return _own_file(folder, text), f"{folder}/{text}.yaml"
     if _is_path(text):
-        return read_yaml(Path(text).expanduser()), text
+        return read_yaml(expanded(text)), text
     raise ConfigError(
         f"unknown {kind} '{text}'",
         remedy=f"known are {', '.join(known_names(folder))}; or give the path of a .yaml file",
@@ -44,10 +45,10 @@ def is_named(folder: str, name_or_path: str) -> bool:
 
 
 def _is_path(text: str) -> bool:
-    path = Path(text).expanduser()
+    path = expanded(text)
     try:
         is_file = path.is_file()
-    except OSError:  # a name that no file can have
+    except (OSError, ValueError):  # a name that no file can have
         is_file = False
     return path.suffix in (".yaml", ".yml") or is_file
 

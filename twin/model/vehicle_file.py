@@ -8,6 +8,7 @@ from typing import Any
 
 from terrafusion.datasets.core.config import structure
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import expanded
 from terrafusion.datasets.core.robot import KnownNumber, Robot, RobotFile, SensorNumbers
 from terrafusion.datasets.core.sensors import STEERED_DRIVES
 from terrafusion.twin.model.library import known_names, read_named
@@ -53,12 +54,12 @@ def _shipped(name_or_path: str | Path) -> bool:
 
 def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, ...]) -> dict[str, Any]:
     """The content of the file that it extends, with the numbers of `robot` in place."""
-    here = str(Path(file).expanduser().resolve())
+    here = str(expanded(file).resolve())
     if here in above:
         raise ConfigError(f"'extends: {robot.extends}' comes back to this file", file=file)
     under = robot.extends
     if not _shipped(under):
-        path = Path(file).expanduser().parent / Path(under).expanduser()
+        path = expanded(file).parent / expanded(under)
         if not path.is_file():
             raise ConfigError(
                 f"'robot.extends' is '{under}', neither a known vehicle nor a file beside this one",

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.readers.ros.raw import (
     BagError,
     BagSource,
@@ -20,6 +22,9 @@ from terrafusion.datasets.readers.ros.raw import (
 LANGUAGES = {"ros2msg": "msg", "ros2idl": "idl"}
 BLOCK_BYTES, MAX_ROWS = 1 << 21, 8192
 """So many bytes of messages are fetched at once, and at most so many rows."""
+STEPS_AT_A_TIME = 100_000
+TABLES = "SELECT name, sql FROM sqlite_master WHERE type = 'table'"
+USED = {"topics", "messages", "message_definitions"}
 
 
 class Db3File:
@@ -35,10 +40,14 @@ class Db3File:
 
     def __init__(self, path: Path, counts: Mapping[str, int] | None = None) -> None:
         _refuse_cut(path)
+        self._path, self._bytes, self._steps = path, path.stat().st_size, 0
         uri = f"{path.absolute().as_uri()}?mode=ro&immutable=1"
         self._database = sqlite3.connect(uri, uri=True)
+        self._database.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, limits.MESSAGE_BYTES)
+        self._database.set_progress_handler(self._is_endless, STEPS_AT_A_TIME)
+        self._database.set_authorizer(_allowed)
         try:
-            self.sources = self._sources(counts)
+            self.sources: list[BagSource] = self._sources(counts)
         except BaseException:
             self.close()
             raise
@@ -46,9 +55,26 @@ class Db3File:
     def close(self) -> None:
         self._database.close()
 
+    def _is_endless(self) -> bool:
+        """Whether a question needs more steps than a file of this size can need."""
+        self._steps += STEPS_AT_A_TIME
+        return self._steps > limits.SQL_STEPS + limits.SQL_STEPS_PER_BYTE * self._bytes
+
+    def _run(self, query: str, values: Sequence[Any] = ()) -> sqlite3.Cursor:
+        self._steps = 0
+        return self._database.execute(query, values)
+
+    def _check_tables(self) -> set[str]:
+        """Names of the tables, which must be plain: a computed column or a view can hold any amount."""
+        tables = {str(name): str(sql) for name, sql in self._run(TABLES)}
+        for name in tables.keys() & USED:
+            computed = any(hidden for *_, hidden in self._run(f"PRAGMA table_xinfo({name})"))
+            if computed or not tables[name].upper().startswith("CREATE TABLE"):
+                raise BagError(f"its table {name} is computed, not stored")
+        return set(tables)
+
     def _sources(self, known_counts: Mapping[str, int] | None) -> list[BagSource]:
-        run = self._database.execute
-        tables = {name for (name,) in run("SELECT name FROM sqlite_master WHERE type = 'table'")}
+        run, tables = self._run, self._check_tables()
         if not {"topics", "messages"} <= tables:
             raise BagError("the database has no tables of topics and messages")
         counts: dict[int, int] = {}
@@ -58,11 +84,13 @@ class Db3File:
         if "message_definitions" in tables:
             query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions"
             definitions = {str(name): (str(language), str(text)) for name, language, text in run(query)}
-        sources = []
+        sources: list[BagSource] = []
         for number, topic, name, encoding in run("SELECT id, name, type, serialization_format FROM topics"):
             language, text = definitions.get(name, ("", ""))
             known = LANGUAGES.get(language, "msg")
             count = int(counts.get(number, 0) if known_counts is None else known_counts.get(topic, 0))
+            if len(sources) >= limits.TOPICS:
+                raise limits.too_much(self._path, "topics", limits.TOPICS)
             sources.append(
                 BagSource(int(number), str(topic), normal_type(str(name)), text, known, str(encoding), count)
             )
@@ -73,17 +101,38 @@ class Db3File:
         topics = tuple(number for ids in wanted for number in ids)
         marks = ", ".join("?" * len(topics))
         query = f"SELECT topic_id, timestamp, data FROM messages WHERE topic_id IN ({marks}) ORDER BY id"
-        rows = self._database.execute(query, topics)
-        count = 16
-        while block := rows.fetchmany(count):
+        unpacked = 0
+        for block in _blocks(self._run(query, topics)):
             numbers, times, blobs = zip(*block, strict=True)
             ids, receipt_ns = np.array(numbers, dtype=np.int64), np.array(times, dtype=np.int64)
             sizes = np.fromiter(map(len, blobs), dtype=np.int64, count=len(blobs))
             starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
-            count = int(np.clip(BLOCK_BYTES * len(sizes) // max(int(sizes.sum()), 1), 1, MAX_ROWS))
+            unpacked += int(sizes.sum())
+            limits.check_expansion(self._path, unpacked, self._bytes)
             data = np.frombuffer(b"".join(blobs), dtype=np.uint8)
             for group, mine in grouped(ids, wanted):
                 yield MessageBatch(group, data, starts[mine], sizes[mine], receipt_ns[mine])
+
+
+def _blocks(rows: Iterable[tuple[int, int, bytes]]) -> Iterator[list[tuple[int, int, bytes]]]:
+    """Rows in blocks of a few megabytes."""
+    block, size = [], 0
+    for row in rows:
+        block.append(row)
+        size += len(row[2])
+        if size >= BLOCK_BYTES or len(block) >= MAX_ROWS:
+            yield block
+            block, size = [], 0
+    if block:
+        yield block
+
+
+def _allowed(action: int, first: str | None, *_: str | None) -> int:
+    """SQLite's authorizer: reading tables and counting, nothing else."""
+    reading = action in (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
+    describing = action == sqlite3.SQLITE_PRAGMA and first == "table_xinfo"
+    counting = action == sqlite3.SQLITE_FUNCTION and "count" in _[:1]
+    return sqlite3.SQLITE_OK if reading or describing or counting else sqlite3.SQLITE_DENY
 
 
 def _refuse_cut(path: Path) -> None:

@@ -19,8 +19,8 @@ from mcap.opcode import Opcode
 from mcap.records import Channel, Chunk, Schema, Statistics
 from mcap.writer import MCAP0_MAGIC
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.readers.ros.raw import (
-    MAX_CHUNK_BYTES,
     BagError,
     BagSource,
     Groups,
@@ -30,7 +30,6 @@ from terrafusion.datasets.readers.ros.raw import (
     grouped,
     normal_type,
     numbers_at,
-    within_reason,
 )
 
 MESSAGE = int(Opcode.MESSAGE)
@@ -60,7 +59,7 @@ class McapFile:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
+        self._path, self._file = path, path.open("rb")
         self._end = path.stat().st_size
         self._schemas: dict[int, Schema] = {}
         self._channels: dict[int, Channel] = {}
@@ -125,7 +124,7 @@ class McapFile:
             yield kind, position - size, size
 
     def _read(self, position: int, size: int) -> bytes:
-        if size > MAX_CHUNK_BYTES:
+        if size > limits.CHUNK_BYTES:
             raise BagError(f"a record claims {size} bytes")
         self._file.seek(max(position, 0))
         return self._file.read(size)
@@ -182,7 +181,7 @@ class McapFile:
             for chunk in self._chunks
             if not (wanted and chunk.channels) or not all(chunk.channels.isdisjoint(ids) for ids in wanted)
         )
-        return within_reason(chunks, self._end)
+        return limits.within(self._path, chunks, self._end)
 
     def _unpack(self, place: _ChunkPlace) -> bytes:
         chunk = Chunk.read(ReadDataStream(BytesIO(self._read(place.start, place.size))))

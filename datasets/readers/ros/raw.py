@@ -15,16 +15,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
+
 Bytes = NDArray[np.uint8]
 Places = NDArray[np.int64]
 
 Groups = Sequence[Collection[int]]
 """Ids of sources whose messages are wanted together."""
-
-MAX_CHUNK_BYTES = 1 << 28
-"""A chunk that claims to hold more is not believed: recorders write chunks of a few MB."""
-MAX_EXPANSION = 200
-"""Nor are chunks, beyond the first such one, that together unpack to so many times the size of the file."""
 
 
 class BagError(Exception):
@@ -123,27 +120,13 @@ def rows_at(data: Bytes, starts: Places, size: int) -> Bytes:
     return numbers_at(data, starts, f"V{size}").view(np.uint8).reshape(len(starts), size)
 
 
-def within_reason(chunks: Iterator[bytes], file_bytes: int) -> Iterator[bytes]:
-    """The unpacked chunks of a file, as long as there are not many times as many bytes as in the file.
-
-    Raises:
-        BagError: then.
-    """
-    room = MAX_CHUNK_BYTES + MAX_EXPANSION * file_bytes
-    for chunk in chunks:
-        room -= len(chunk)
-        if room < 0:
-            raise BagError(f"its chunks unpack to more than {MAX_EXPANSION} times its size")
-        yield chunk
-
-
 def decompress(data: bytes, compression: str, size: int) -> bytes:
     """The `size` bytes of a chunk; never more memory than it claims and may claim.
 
     Raises:
         BagError: too large, of another size than claimed, or compressed in an unknown way.
     """
-    if size > MAX_CHUNK_BYTES:
+    if size > limits.CHUNK_BYTES:
         raise BagError(f"a chunk claims to hold {size} bytes")
     out = data
     if compression not in ("", "none"):

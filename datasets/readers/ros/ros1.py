@@ -14,11 +14,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros.bag import read_bag
 from terrafusion.datasets.readers.ros.raw import (
-    MAX_CHUNK_BYTES,
     BagError,
     BagSource,
     Bytes,
@@ -30,7 +30,6 @@ from terrafusion.datasets.readers.ros.raw import (
     normal_type,
     numbers_at,
     rows_at,
-    within_reason,
 )
 
 MAGIC = b"#ROSBAG V2.0\n"
@@ -71,7 +70,7 @@ class Ros1File:
     """
 
     def __init__(self, path: Path) -> None:
-        self._file = path.open("rb")
+        self._path, self._file = path, path.open("rb")
         self._end = path.stat().st_size
         self._chunks: list[_Chunk] = []
         self._connections: dict[int, tuple[dict[str, bytes], dict[str, bytes]]] = {}
@@ -150,7 +149,7 @@ class Ros1File:
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of connections, chunk by chunk."""
-        for data in within_reason(self._unpacked(wanted), self._end):
+        for data in limits.within(self._path, self._unpacked(wanted), self._end):
             yield from _messages(data, wanted)
 
     def _unpacked(self, wanted: Groups) -> Iterator[bytes]:
@@ -158,7 +157,7 @@ class Ros1File:
         for chunk in self._chunks:
             if all(chunk.counts.keys().isdisjoint(ids) for ids in wanted):
                 continue
-            if chunk.size > MAX_CHUNK_BYTES:
+            if chunk.size > limits.CHUNK_BYTES:
                 raise BagError(f"a chunk claims {chunk.size} bytes")
             packed = self._read(chunk.start, chunk.size)
             yield decompress(packed, chunk.compression, chunk.unpacked)

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
+from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.scratch import scratch_folder
+from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.ros.bag import read_bag
 from terrafusion.datasets.readers.ros.db3_file import Db3File
 from terrafusion.datasets.readers.ros.mcap_file import McapFile
 from terrafusion.datasets.readers.ros.raw import (
-    MAX_CHUNK_BYTES,
     BagContainer,
     BagError,
     BagSource,
@@ -26,9 +29,6 @@ from terrafusion.datasets.readers.ros.raw import (
     zstd,
 )
 
-MAX_METADATA_BYTES = 1 << 24
-MAX_EXPANSION = 100
-"""A file that grows more than this when unpacked is no recording."""
 STORAGES: dict[str, type[McapFile] | type[Db3File]] = {"mcap": McapFile, "sqlite3": Db3File}
 
 
@@ -63,9 +63,10 @@ class Ros2Folder:
     """
 
     def __init__(self, folder: Path) -> None:
+        self._folder = folder
         self._files: list[BagContainer] = []
         self._ids: list[dict[int, int]] = []
-        self._scratch: tempfile.TemporaryDirectory[str] | None = None
+        self._scratch = ExitStack()
         self.sources: list[BagSource] = []
         metadata = _metadata(folder / "metadata.yaml")
         storage = STORAGES.get(str(metadata.get("storage_identifier")))
@@ -93,8 +94,7 @@ class Ros2Folder:
     def close(self) -> None:
         for file in self._files:
             file.close()
-        if self._scratch is not None:
-            self._scratch.cleanup()
+        self._scratch.close()
 
     def _add(self, file: BagContainer) -> None:
         self._files.append(file)
@@ -116,15 +116,10 @@ class Ros2Folder:
 
     def _unpacked(self, path: Path) -> Path:
         """A file without its zstd compression, in a scratch folder."""
-        if self._scratch is None:
-            self._scratch = tempfile.TemporaryDirectory()
-        target = Path(self._scratch.name) / path.stem
-        room = MAX_EXPANSION * path.stat().st_size
+        target = self._scratch.enter_context(scratch_folder()) / path.stem
         with zstd().open(path, "rb") as packed, target.open("wb") as out:
-            while block := packed.read(1 << 20):
-                room -= len(block)
-                if room < 0:
-                    raise BagError(f"{path.name} unpacks to more than {MAX_EXPANSION} times its size")
+            blocks = iter(lambda: packed.read(1 << 20), b"")
+            for block in limits.within(path, blocks, path.stat().st_size):
                 out.write(block)
         return target
 
@@ -135,19 +130,24 @@ class Ros2Folder:
             here = [group for group, own in enumerate(mine) if own]
             for batch in file.batches([mine[group] for group in here]) if here else ():
                 found = batch._replace(group=here[batch.group])
-                yield _unpacked_messages(found) if self._packed else found
+                yield _unpacked_messages(self._folder, found) if self._packed else found
 
 
-def _unpacked_messages(batch: MessageBatch) -> MessageBatch:
+def _unpacked_messages(folder: Path, batch: MessageBatch) -> MessageBatch:
     """Messages that were compressed one by one."""
-    messages = []
-    for start, size in zip(batch.starts.tolist(), batch.sizes.tolist(), strict=True):
-        packed = batch.data[start : start + size].tobytes()
-        size = zstd().get_frame_info(packed).decompressed_size
-        messages.append(decompress(packed, "zstd", MAX_CHUNK_BYTES + 1 if size is None else size))
+    messages = list(limits.within(folder, _messages(batch), int(batch.sizes.sum())))
     sizes = np.array([len(m) for m in messages], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     return batch._replace(data=np.frombuffer(b"".join(messages), dtype=np.uint8), starts=starts, sizes=sizes)
+
+
+def _messages(batch: MessageBatch) -> Iterator[bytes]:
+    for start, size in zip(batch.starts.tolist(), batch.sizes.tolist(), strict=True):
+        packed = batch.data[start : start + size].tobytes()
+        whole = zstd().get_frame_info(packed).decompressed_size
+        if whole is None or whole > limits.MESSAGE_BYTES:
+            raise BagError(f"a message claims {whole or 'an unknown number of'} bytes")
+        yield decompress(packed, "zstd", whole)
 
 
 def _counts(metadata: dict[str, Any]) -> dict[str, int] | None:
@@ -161,16 +161,11 @@ def _counts(metadata: dict[str, Any]) -> dict[str, int] | None:
 
 
 def _metadata(path: Path) -> dict[str, Any]:
-    from ruamel.yaml import YAML
-    from ruamel.yaml.error import YAMLError
-
-    if path.stat().st_size > MAX_METADATA_BYTES:
-        raise BagError(f"metadata.yaml has {path.stat().st_size} bytes")
     try:
-        content = YAML(typ="safe").load(path.read_text(encoding="utf-8"))
-    except YAMLError as error:
-        raise BagError(f"metadata.yaml is not valid YAML: {str(error).splitlines()[0]}") from None
-    metadata = content.get("rosbag2_bagfile_information") if isinstance(content, dict) else None
+        content = read_yaml(path, limits.METADATA_BYTES)
+    except ConfigError as error:
+        raise BagError(f"metadata.yaml: {error.what}") from None
+    metadata = content.get("rosbag2_bagfile_information")
     if not isinstance(metadata, dict):
         raise BagError("metadata.yaml holds no rosbag2_bagfile_information")
     return metadata

@@ -8,6 +8,7 @@ from functools import cache
 
 import numpy as np
 
+from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.ros.layout import Fields, MessageBlock, MessageDecoder
 from terrafusion.datasets.readers.ros.messages import Stream
 from terrafusion.datasets.readers.ros.raw import BagContainer, BagError, BagSource
@@ -22,6 +23,8 @@ def foreign(topic: str | None = None) -> Iterator[None]:
     """Around parsers: the bytes are of unknown origin, so whatever they raise, the bag is broken."""
     try:
         yield
+    except DataError:  # a limit, which names the file
+        raise
     except Exception as error:
         raise BagError(str(error).rstrip(".") or type(error).__name__, topic) from None
 

@@ -1,7 +1,7 @@
 """MATLAB v7.3 files, which are HDF5: numeric variables and the columns of MATLAB tables, within bounds.
 
 A file may claim any shape, fill it from a few bytes, or point to other files: whatever is larger than
-`MAX_VALUES`, stored elsewhere or a link is refused before it is read.
+`limits.HDF5_VALUES`, stored elsewhere or a link is refused before it is read.
 """
 
 from __future__ import annotations
@@ -15,15 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import DataError
 
 Array = NDArray[np.float64]
 
-MAX_VALUES = 2_000_000
-"""Values of a variable, and of a stored piece of one: two hours at 250 Hz."""
 LARGEST = 1e30
 """No number of a log is larger; squares of these are still numbers."""
-MAX_REFERENCES = 10_000
 MAGIC = b"\x89HDF\r\n\x1a\n"
 USER_BLOCK = 512
 """Bytes of text that MATLAB puts before the HDF5."""
@@ -115,7 +113,7 @@ class MatlabFile:
         largest = max(math.prod(data.shape or ()), math.prod(data.chunks or ()))
         if data.dtype.kind not in "fiu" or data.dtype.itemsize > 8 or data.dtype.subdtype is not None:
             raise self._wrong(name, f"holds {data.dtype}, not numbers")
-        if largest > MAX_VALUES or data.external or data.is_virtual:
+        if largest > limits.HDF5_VALUES or data.external or data.is_virtual:
             raise self._wrong(name, f"claims {largest} values, or keeps them in other files")
         values = np.asarray(data[()], dtype=float)
         values[np.isnan(values)] = np.nan  # a signalling NaN, which only broken files have, warns when used
@@ -153,7 +151,7 @@ class MatlabFile:
 
         if not isinstance(data, h5py.Dataset) or h5py.check_ref_dtype(data.dtype) is not h5py.Reference:
             return []
-        if math.prod(data.shape) > MAX_REFERENCES or data.external or data.is_virtual:
+        if math.prod(data.shape) > limits.HDF5_REFERENCES or data.external or data.is_virtual:
             return []
         return [self._file[reference] for reference in data[()].ravel() if reference]
 

@@ -2,8 +2,8 @@
 
 The format is MathWorks' "MAT-File Level 5"; only what such structures need is read. A few bytes can
 claim any number of values or inflate to gigabytes: every count is compared with the bytes that are there,
-and inflating ends at `MAX_BYTES`. scipy.io is not safe here: it recurses into nested cells without a limit,
-so that a file of 1 MB crashes the interpreter.
+and inflating ends at `limits.MATLAB_BYTES`. scipy.io is not safe here: it recurses into nested cells
+without a limit, so that a file of 1 MB crashes the interpreter.
 """
 
 from __future__ import annotations
@@ -19,12 +19,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import DataError
 
 Array = NDArray[np.float64]
 
-MAX_BYTES = 64 * 2**20
-MAX_STRUCTURES, MAX_FIELDS, MAX_VARIABLES = 10_000, 64, 1_000
 HEADER_BYTES, BEGINNING_BYTES = 128, 1 << 14
 MATRIX, COMPRESSED = 14, 15
 STRUCTURE_CLASS, NUMERIC_CLASSES = 2, range(6, 16)
@@ -66,7 +65,7 @@ def read_structures(path: Path, fields: set[str]) -> dict[str, list[Array]]:
         DataError: it cannot be read or is too large, or there is none.
     """
     try:
-        for payload in _variables(path, MAX_BYTES):
+        for payload in _variables(path, limits.MATLAB_BYTES):
             layout = _layout(payload)
             if layout is not None and fields <= set(layout.fields):
                 return _values(payload, layout)
@@ -82,11 +81,11 @@ def read_structures(path: Path, fields: set[str]) -> dict[str, list[Array]]:
 
 
 def _variables(path: Path, limit: int) -> Iterator[memoryview]:
-    """Payloads of the variables: whole, `MAX_BYTES` together, or the first `limit` bytes of each."""
-    if path.stat().st_size > MAX_BYTES:
-        raise ValueError(f"more than {MAX_BYTES >> 20} MiB")
-    data, at, whole = memoryview(path.read_bytes()), HEADER_BYTES, limit == MAX_BYTES
-    for _ in range(MAX_VARIABLES):
+    """Payloads of the variables: whole, together of limited size, or the first `limit` bytes of each."""
+    if path.stat().st_size > limits.MATLAB_BYTES:
+        raise ValueError(f"more than {limits.MATLAB_BYTES >> 20} MiB")
+    data, at, whole = memoryview(path.read_bytes()), HEADER_BYTES, limit == limits.MATLAB_BYTES
+    for _ in range(limits.MATLAB_VARIABLES):
         if at >= len(data):
             return
         kind, payload, after = _element(data, at)
@@ -95,14 +94,16 @@ def _variables(path: Path, limit: int) -> Iterator[memoryview]:
             inflated = memoryview(zlib.decompressobj().decompress(payload, limit))
             kind, size = struct.unpack_from("<II", inflated)
             if whole and size > len(inflated) - 8:
-                raise ValueError(f"a variable is cut off, or there is more than {MAX_BYTES >> 20} MiB")
+                raise ValueError(
+                    f"a variable is cut off, or there is more than {limits.MATLAB_BYTES >> 20} MiB"
+                )
             if whole:
                 limit = max(limit - len(inflated), 1)
             payload = inflated[8:]
         if kind == MATRIX:
             yield payload
         at = after
-    raise ValueError(f"more than {MAX_VARIABLES} variables")
+    raise ValueError(f"more than {limits.MATLAB_VARIABLES} variables")
 
 
 def _element(data: memoryview, at: int) -> tuple[int, memoryview, int]:
@@ -137,9 +138,9 @@ def _layout(matrix: memoryview) -> _Layout | None:
     _, length, at = _element(matrix, at)
     _, names, at = _element(matrix, at)
     (width,) = struct.unpack("<i", length)
-    if not 0 < width <= 64 or count > MAX_STRUCTURES:
+    if not 0 < width <= 64 or count > limits.MATLAB_STRUCTURES:
         raise ValueError(f"{count} structures with names of {width} letters")
-    if len(names) > width * MAX_FIELDS:
+    if len(names) > width * limits.MATLAB_FIELDS:
         raise ValueError(f"structures of {len(names) // width} fields")
     texts = [bytes(names[i : i + width]).split(b"\0")[0] for i in range(0, len(names), width)]
     return _Layout(count, tuple(text.decode("ascii", "replace") for text in texts), at)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, sha256_of
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Command, Imu, Motor, Terrain, Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError, errors_of
@@ -22,7 +23,7 @@ from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
-from terrafusion.datasets.readers.sets.safe_pickle import MAX_BYTES, numbers, read_table
+from terrafusion.datasets.readers.sets.safe_pickle import numbers, read_table
 
 Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
@@ -63,7 +64,7 @@ def read(request: Request) -> list[Recording]:
     path = request.path
     if not request.trusted:
         size = path.stat().st_size
-        which = f"SHA-256 {sha256_of(path)}" if size <= MAX_BYTES else f"{size >> 20} MiB"
+        which = f"SHA-256 {sha256_of(path)}" if size <= limits.PICKLE_BYTES else f"{size >> 20} MiB"
         raise DataError(
             f"a pickle can run code, and this one ({which}) is in no catalogue",
             file=path,

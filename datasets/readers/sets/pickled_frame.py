@@ -17,8 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-MAX_CELLS = 20_000_000
-"""Values of all that is built for a frame; the largest published table has 370 000."""
+from terrafusion.datasets.core import limits
 
 
 class StandIn:
@@ -50,7 +49,7 @@ class PickledDtype(StandIn):
     def numbers(self, data: Any, shape: tuple[int, ...], order: str) -> NDArray[Any]:
         """An array over the bytes `data`, or over a list of texts and numbers where the kind is "object"."""
         count = math.prod(shape)
-        if len(shape) > 2 or min(shape, default=0) < 0 or count > MAX_CELLS:
+        if len(shape) > 2 or min(shape, default=0) < 0 or count > limits.PICKLE_CELLS:
             raise ValueError(f"an array of the shape {str(shape)[:60]}")
         if self.is_object():
             if not isinstance(data, list) or len(data) != count:
@@ -127,7 +126,7 @@ def arrow_array(data: tuple[Any, ...]) -> PickledArray:
     kind, length, _, start, (_, offsets, letters) = data[:5]
     width = {"large_string": np.int64, "string": np.int32}[kind[0]]
     ends = np.frombuffer(offsets, width)[start : start + length + 1]
-    if len(ends) != length + 1 or length > MAX_CELLS or (np.diff(ends) < 0).any() or ends[0] < 0:
+    if len(ends) != length + 1 or length > limits.PICKLE_CELLS or (np.diff(ends) < 0).any() or ends[0] < 0:
         raise ValueError("an arrow array whose offsets do not fill it")
     cuts = ends.tolist()
     array = PickledArray()
@@ -139,8 +138,8 @@ def arrow_array(data: tuple[Any, ...]) -> PickledArray:
 def chunked(chunks: list[PickledArray], *_: Any) -> PickledArray:
     """`pyarrow.lib.chunked_array`."""
     array = PickledArray()
-    if sum(chunk.cells() for chunk in chunks) > MAX_CELLS:
-        raise ValueError(f"more than {MAX_CELLS} cells")
+    if sum(chunk.cells() for chunk in chunks) > limits.PICKLE_CELLS:
+        raise ValueError(f"more than {limits.PICKLE_CELLS} cells")
     array.values = np.concatenate([chunk.values for chunk in chunks])
     return array
 
@@ -208,8 +207,8 @@ class PickledManager(StandIn):
                 found[names[place]] = row
         if len(found) != len(names) or len({len(column) for column in found.values()}) > 1:
             raise ValueError("columns that are missing or differ in length")
-        if sum(len(column) for column in found.values()) > MAX_CELLS:
-            raise ValueError(f"more than {MAX_CELLS} cells")
+        if sum(len(column) for column in found.values()) > limits.PICKLE_CELLS:
+            raise ValueError(f"more than {limits.PICKLE_CELLS} cells")
         return {name: found[name] for name in names}
 
 

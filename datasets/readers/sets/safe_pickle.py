@@ -17,11 +17,11 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.sets.pickled_frame import (
     ALLOWED,
-    MAX_CELLS,
     PickledFrame,
     PickledPartial,
     StandIn,
@@ -30,8 +30,6 @@ from terrafusion.datasets.readers.sets.pickled_frame import (
 LARGEST = 1e30
 """No number of a log is larger; squares of these are still numbers."""
 
-MAX_BYTES = 32 * 2**20
-"""A longer pickle is refused; two hours of a published log have 32 MiB."""
 
 _OPCODES = b"".join(
     (
@@ -93,8 +91,8 @@ class _Machine(pickle._Unpickler):
 
     def _counted(self, made: Any) -> Any:
         self.cells += made.cells() if isinstance(made, StandIn) else 0
-        if self.cells > MAX_CELLS:
-            raise ValueError(f"more than {MAX_CELLS} cells")
+        if self.cells > limits.PICKLE_CELLS:
+            raise ValueError(f"more than {limits.PICKLE_CELLS} cells")
         return made
 
     def load_reduce(self) -> None:
@@ -111,7 +109,7 @@ class _Machine(pickle._Unpickler):
     def load_bytes8(self) -> None:
         """Reads at most what is there; the library's own makes room for what is claimed."""
         (size,) = struct.unpack("<Q", self.read(8))
-        if size > MAX_BYTES:
+        if size > limits.PICKLE_BYTES:
             raise EOFError
         self.append(self.read(size))
 
@@ -128,12 +126,12 @@ def read_table(path: Path) -> dict[str, NDArray[Any]]:
     """
     try:
         size = path.stat().st_size
-        data = path.read_bytes() if size <= MAX_BYTES else b""
+        data = path.read_bytes() if size <= limits.PICKLE_BYTES else b""
     except OSError as error:
         raise DataError(f"cannot be read: {error.strerror or error}", file=path) from None
     if not data:
         what = f"the pickle has {size / 2**20:.0f} MiB" if size else "the file is empty"
-        raise DataError(what, file=path, remedy=f"give a table of up to {MAX_BYTES // 2**20} MiB")
+        raise DataError(what, file=path, remedy=f"give a table of up to {limits.PICKLE_BYTES // 2**20} MiB")
     try:
         frame = _Machine(io.BytesIO(data)).load()
         if not isinstance(frame, PickledFrame) or frame.manager is None:

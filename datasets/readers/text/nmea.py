@@ -9,11 +9,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
-from terrafusion.datasets.readers.delimited import MAX_BYTES
+from terrafusion.datasets.readers.delimited import check_lines
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, NmeaEpochs, collect
@@ -35,9 +36,11 @@ def claims(path: Path, head: bytes) -> bool:
 def read(request: Request) -> list[Recording]:
     """The one recording of a log: its GNSS channel."""
     path = request.path
-    if path.stat().st_size > MAX_BYTES:
-        raise DataError(f"has more than {MAX_BYTES // 2**20} MB", file=path, remedy="split it")
-    epochs, notes = collect(path, path.read_bytes().decode("latin-1"))
+    if path.stat().st_size > limits.TEXT_BYTES:
+        raise limits.too_much(path, "MB", limits.TEXT_BYTES / 2**20)
+    data = path.read_bytes()
+    check_lines(path, data)
+    epochs, notes = collect(path, data.decode("latin-1"))
     t_ns, date_notes = _dated(path, epochs)
     times = row_times(request, "gnss", t_ns)
     fixes, more = _fixes(request, epochs, t_ns)

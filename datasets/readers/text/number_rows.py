@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
@@ -24,8 +25,6 @@ from terrafusion.datasets.readers.delimited import (
 
 Array = NDArray[np.float64]
 
-MAX_LINES = 1_000_000
-"""83 minutes of a 200 Hz IMU, read in some 8 s and 0.6 GB; longer files are refused."""
 MAX_T_NS = 4 * 10**18
 """A time beyond this (year 2096) is none of a recording, and differences of times stay within 64 bits."""
 
@@ -78,9 +77,8 @@ def read_rows(
             its time. Times are not checked for order: `put_in_time` does that.
     """
     data = read_text(path)
-    if data.count(b"\n") > MAX_LINES:
-        remedy = "split it into shorter recordings"
-        raise DataError(f"has more than {MAX_LINES} lines", file=path, remedy=remedy)
+    if data.count(b"\n") > limits.NUMBER_ROWS:
+        raise limits.too_much(path, "lines", limits.NUMBER_ROWS, "split it into shorter recordings")
     names = _header(path, data, columns, separator) if header else tuple(columns)
     layout = TextLayout(names, separator, first_line=2 if header else 1, time=columns[0])
     table = read_columns(path, data, layout, columns[1:], texts=columns[:1])

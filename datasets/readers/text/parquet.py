@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.decimals import NS_PER
 from terrafusion.datasets.core.errors import DataError
-
-MAX_VALUES = 2**27
-"""A gigabyte of numbers."""
+from terrafusion.datasets.core.quantity import shown
 
 
 class ParquetColumns:
@@ -39,20 +38,50 @@ class ParquetColumns:
             raise self._damaged(error) from None
         self.names: list[str] = list(self._file.schema_arrow.names)
         self.rows: int = self._file.metadata.num_rows
+        limits.check_columns(path, len(self.names))
         if not self.names or len(set(self.names)) < len(self.names):
             raise DataError("has no columns, or two of one name", file=path, remedy="name each column once")
         self._table: Any = None
 
     def read(self, names: list[str]) -> None:
-        """Read these columns."""
-        if self.rows * len(names) > MAX_VALUES:
-            raise DataError(
-                f"has {self.rows} rows: too many to read at once", file=self.path, remedy="split it"
-            )
+        """Read these columns; texts stay packed until they are asked for."""
+        size = self.path.stat().st_size
+        limits.check_table(self.path, self.rows, len(names), size)
+        limits.check_expansion(self.path, self._stored_bytes(names), size)
+        self._check_kinds(names)
         try:
-            self._table = self._file.read(columns=names)
+            self._table = self._reopened(names).read(columns=names)
         except self._refused as error:
             raise self._damaged(error) from None
+
+    def _check_kinds(self, names: list[str]) -> None:
+        """Refuse columns of lists: rows say nothing about how much they hold."""
+        import pyarrow as pa
+
+        for name in names:
+            kind = self._file.schema_arrow.field(name).type
+            if pa.types.is_nested(kind):
+                what = f"column '{shown(name)}' holds {shown(str(kind))}, no numbers or texts"
+                raise DataError(what, file=self.path, remedy="write it as double or string")
+
+    def _stored_bytes(self, names: list[str]) -> int:
+        """Bytes of the columns' pages when unpacked, by the file's own account."""
+        about, asked = self._file.metadata, set(names)
+        return sum(
+            column.total_uncompressed_size
+            for group in map(about.row_group, range(about.num_row_groups))
+            for column in map(group.column, range(group.num_columns))
+            if column.path_in_schema in asked
+        )
+
+    def _reopened(self, names: list[str]) -> Any:
+        """The file with equal texts kept once: a text that many rows repeat takes a few bytes in the file."""
+        import pyarrow as pa
+        import pyarrow.parquet
+
+        kinds = {name: self._file.schema_arrow.field(name).type for name in names}
+        texts = [n for n, kind in kinds.items() if pa.types.is_string(kind) or pa.types.is_large_string(kind)]
+        return pyarrow.parquet.ParquetFile(self.path, read_dictionary=texts)
 
     def numbers(self, name: str) -> NDArray[np.float64]:
         """A column of numbers (N,), NaN where it is null."""
@@ -74,9 +103,13 @@ class ParquetColumns:
 
     def texts(self, name: str) -> NDArray[Any]:
         """A column as texts (N,), "" where it is null."""
-        return np.array(
-            ["" if x is None else str(x) for x in self._table.column(name).to_pylist()], dtype=object
-        )
+        coded = self._table.column(name).dictionary_encode()
+        parts = [np.zeros(0, dtype=object)]
+        for chunk in coded.chunks:
+            words = ["" if x is None else str(x) for x in [*chunk.dictionary.to_pylist(), None]]
+            places = chunk.indices.fill_null(len(words) - 1).to_numpy(zero_copy_only=False)
+            parts.append(np.array(words, dtype=object)[places])
+        return np.concatenate(parts)
 
     def times_ns(self, name: str, unit: str) -> NDArray[np.int64] | None:
         """A column of times in ns (N,); None where it holds texts.

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
@@ -113,6 +114,7 @@ def _header(path: Path, data: bytes) -> PosHeader:
         mark = line[line.index(kind) + len(kind) :][:1]
         separator = mark if mark and not mark.isspace() else ("\t" if mark == "\t" else BLANKS)
         time_system, *names = split(line[1:].strip(), separator)
+        limits.check_columns(path, len(names))
         found = PosHeader(number, tuple(names), kind, separator, time_system, base)
     if found is None:
         raise DataError(

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
@@ -208,7 +209,7 @@ class _Source:
         texts = self.columns.texts(of.column)[self.times.order]
         if name != "fix" or not of.unit:
             return texts
-        words, inverse = np.unique(texts.astype(str), return_inverse=True)
+        words, inverse = distinct(texts)
         codes = FIX_WORDS[of.unit]
         meanings = [codes.get(_whole(word), "") for word in words]
         for word, meant in zip(words, meanings, strict=True):

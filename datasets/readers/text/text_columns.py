@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.delimited import (
     TextLayout,
@@ -79,9 +80,10 @@ def _layout(path: Path, data: bytes, column_map: ColumnMap | None) -> TextLayout
         cells, first_line = [str(i) for i in range(1, len(cells) + 1)], number
     elif comment and len(split(comment, separator)) == len(cells) and _is_row(cells):
         cells, first_line = split(comment, separator), number
-    repeated = [name for i, name in enumerate(cells) if name in cells[:i] and name]
+    limits.check_columns(path, len(cells))
+    repeated = limits.repeated(name for name in cells if name)
     if repeated:
-        raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="rename one of them")
+        raise DataError(f"column '{repeated}' comes twice", file=path, remedy="rename one of them")
     return TextLayout(tuple(cells), separator, first_line, COMMENT)
 
 

@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -113,15 +115,16 @@ def _columns(path: Path) -> tuple[TextTable, dict[str, str], list[str]]:
     number, line, settings = found
     separator = separator_of(line)
     raw = split(line, separator)
+    limits.check_columns(path, len(raw))
     if raw and not raw[-1]:
         raw.pop()
     names = [_bare(name) for name in raw]
     for full, name in zip(raw, names, strict=True):
         if full != name:
             settings[f"unit of {name}"] = full[len(name) :].strip(" []()")
-    repeated = [name for i, name in enumerate(names) if name in names[:i]]
+    repeated = limits.repeated(names)
     if repeated:
-        raise DataError(f"column '{repeated[0]}' comes twice", file=path, remedy="export it again")
+        raise DataError(f"column '{repeated}' comes twice", file=path, remedy="export it again")
     layout = TextLayout((*names, *_unnamed(data, number, separator, len(names))), separator, number + 1)
     attitudes = [name for group in ATTITUDES for name in group]
     wanted = {*COUNTERS, TICKS, *ACC, *GYR, *INCREMENTS[0], *INCREMENTS[1], *attitudes, *POSITION, *UTC}
@@ -188,16 +191,16 @@ def _fix(path: Path, columns: TextTable, rows: NDArray[np.bool_]) -> tuple[NDArr
         return np.full(int(rows.sum()), Fix.SINGLE, dtype=np.uint8), [
             "gnss: the export has no StatusWord; all fixes are taken as 'single'"
         ]
-    words, inverse = np.unique(columns.texts[name].astype(str), return_inverse=True)
+    words, inverse = distinct(columns.texts[name])
     codes = np.array([_class_of(status) for status in _status_words(path, name, words)], dtype=np.uint8)
     fix = codes[inverse]
-    if (words == "").any():  # the status may come at a lower rate than the position
-        last = np.maximum.accumulate(np.where(words[inverse] != "", np.arange(len(fix)), 0))
+    if "" in words:  # the status may come at a lower rate than the position
+        last = np.maximum.accumulate(np.where(inverse != words.index(""), np.arange(len(fix)), 0))
         fix = fix[last]
     return fix[rows], []
 
 
-def _status_words(path: Path, name: str, words: NDArray[np.str_]) -> list[int]:
+def _status_words(path: Path, name: str, words: list[str]) -> list[int]:
     """Status words written as 32 binary digits, in hexadecimal, or in decimal."""
     cells = [word.strip() for word in words]
     given = [cell for cell in cells if cell]

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
-from terrafusion.datasets.readers import delimited, open_recording
+from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder, write_mcap
 
 META = "start_ns: 1700000000123456789\nvehicle: husky\n"
@@ -287,7 +288,7 @@ def test_a_line_of_blanks_late_in_a_log(tmp_path: Path) -> None:
 
 def test_a_packed_bomb_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A few kilobytes of gzip can stand for gigabytes."""
-    monkeypatch.setattr(delimited, "MAX_BYTES", 2**20)
+    monkeypatch.setattr(limits, "TEXT_BYTES", 2**20)
     folder = folder_with(tmp_path)
     (folder / "imu.csv.gz").write_bytes(gzip.compress(b"t_s,gyro_z_radps\n" + b"0,0\n" * 10**6))
     with pytest.raises(TerrafusionError) as caught:

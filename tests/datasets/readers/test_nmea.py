@@ -295,6 +295,6 @@ def test_any_fields_are_told_as_errors_or_read(
 def test_ten_megabytes_of_one_line(tmp_path: Path, piece: str) -> None:
     path = log(tmp_path, "$GPGGA,1\r\n" + piece * (10_000_000 // len(piece)))
     begun = time.process_time()
-    with pytest.raises(DataError, match="damaged"):
+    with pytest.raises(DataError, match="more than 65 536 bytes in line 2"):
         open_recording(path)
-    assert time.process_time() - begun < 10.0
+    assert time.process_time() - begun < 1.0

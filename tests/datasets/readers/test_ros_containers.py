@@ -219,8 +219,8 @@ def test_a_small_bag_that_unpacks_to_gigabytes(
     tmp_path: Path, kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each chunk is as it claims; together they are more than a recording could be."""
-    monkeypatch.setattr("terrafusion.datasets.readers.ros.raw.MAX_CHUNK_BYTES", 20_000)
-    monkeypatch.setattr("terrafusion.datasets.readers.ros.raw.MAX_EXPANSION", 1)
+    monkeypatch.setattr("terrafusion.datasets.core.limits.FREE_BYTES", 20_000)
+    monkeypatch.setattr("terrafusion.datasets.core.limits.EXPANSION", 1)
     with pytest.raises(TerrafusionError, match="more than 1 times its size"):
         open_recording(make(tmp_path, kind))
 
@@ -232,6 +232,7 @@ def test_a_chunk_of_nothing_is_refused_in_time(
     """Zeros are records without content, as many as there are: not one of them is gone through."""
     path = make(tmp_path, kind)
     module = "ros1" if kind.startswith("bag") else "mcap_file"
+    monkeypatch.setattr("terrafusion.datasets.core.limits.FREE_BYTES", 2**28)
     monkeypatch.setattr(
         f"terrafusion.datasets.readers.ros.{module}.decompress", lambda *_: bytes(200_000_000)
     )

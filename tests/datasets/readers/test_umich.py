@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from terrafusion.datasets.core import limits
 from terrafusion.datasets.core.differences import differences
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers import files_of, open_recording
 from terrafusion.datasets.readers.sets import umich_text
-from terrafusion.datasets.readers.text import number_rows
 
 START_S = 1_652_300_000
 FAMILY = ("trial4_wheel_imu.txt", "trial4_wheel_vel.txt", "trial4_loop_center.txt", "trial4_loop_front.txt")
@@ -205,8 +205,8 @@ def test_other_text_is_not_claimed(tmp_path: Path) -> None:
 
 
 def test_a_file_of_too_many_lines_is_refused(trial: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(number_rows, "MAX_LINES", 2999)
-    with pytest.raises(DataError, match=r"trial4_wheel_imu\.txt: has more than 2999 lines"):
+    monkeypatch.setattr(limits, "NUMBER_ROWS", 2999)
+    with pytest.raises(DataError, match=r"trial4_wheel_imu\.txt: has more than 2 999 lines"):
         open_recording(trial / FAMILY[0])
 
 

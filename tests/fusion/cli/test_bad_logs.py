@@ -197,18 +197,18 @@ BAD_LOGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "beyond a double": (cells("imu.csv", "gyro_z_radps", "1e999"), ("imu.csv", "'1e999'", "line 52")),
     "a single line of 10 MB": (
         text_of("imu.csv", "t_s,gyro_z_radps" + ",x" * 5_000_000),
-        ("imu.csv", "unknown column 'x'"),
+        ("imu.csv", "65 536 bytes in line 1"),
     ),
     "one cell of 10 MB": (
         text_of("imu.csv", "t_s,gyro_z_radps\n0," + "9" * 10_000_000 + "\n"),
-        ("imu.csv", "line 2", "131072"),
+        ("imu.csv", "65 536 bytes in line 2"),
     ),
     "one name of 10 MB": (
         text_of("imu.csv", "t_s," + "g" * 10_000_000 + "\n0,0\n"),
-        ("imu.csv", "line 1", "131072"),
+        ("imu.csv", "65 536 bytes in line 1"),
     ),
-    "a name of 100 kB": (
-        text_of("imu.csv", "t_s," + "g" * 100_000 + "\n0,0\n"),
+    "a name of 60 kB": (
+        text_of("imu.csv", "t_s," + "g" * 60_000 + "\n0,0\n"),
         ("imu.csv", "unknown column 'ggg"),
     ),
     "an open quote and 5 MB": (

@@ -378,6 +378,7 @@ def test_fixes_of_a_robot_that_stood_show_no_heading_whatever_else_was_seen() ->
 @pytest.mark.parametrize("sigma", [0.0, -1.0, float("nan"), float("inf")])
 def test_a_velocity_of_unknown_sigma_is_left_out(sigma: float) -> None:
     taken = checked_fix(0, [1.0, 2.0, 3.0], [0.1, 0.1, 0.0], [1.0, 0.0, 0.0], sigma, None)
+    assert taken is not None
     assert taken.velocity_mps is None
     assert np.isnan(taken.sigma_m[2]), "nor is a height"
 

@@ -213,6 +213,35 @@ def test_wheels_beyond_any_robot_are_left_out(running: Running) -> None:
     assert any(note.startswith("2 samples of wheels beyond") for note in notes_of(estimator))
 
 
+@pytest.mark.parametrize("probabilities", [None, "asphalt", {"asphalt": "x"}, {"asphalt": None}, {1: 1.0}])
+def test_what_names_no_grounds_is_a_data_error(running: Running, probabilities: Any) -> None:
+    with pytest.raises(DataError, match="terrain"):
+        running.again().add_terrain(running.now_ns, probabilities)
+
+
+@pytest.mark.parametrize("at", [0.02, 0.9])
+@pytest.mark.parametrize("off_m", [1e8, -3000.0])
+def test_counters_that_are_reset_or_leap_cost_nothing(at: float, off_m: float) -> None:
+    drive = (DriveSegment(2.0), DriveSegment(10.0, v_mps=1.0, yaw_rate_radps=0.1))
+    log = simulate(Scenario("short", 10.0, drive=drive), seed=1, vehicle="elevate")
+    wheels = log.wheels
+    assert wheels is not None
+    assert wheels.angle_rad is not None
+    angle = wheels.angle_rad.copy()
+    angle[int(at * len(angle)) :] += off_m / 0.1
+    reset = dataclasses.replace(log, wheels=dataclasses.replace(wheels, angle_rad=angle))
+    ends = []
+    for one in (log, reset):
+        estimator = Estimator.for_vehicle("elevate")
+        for message in one.messages():
+            estimator.add(message)
+        state = estimator.latest()
+        assert state is not None
+        ends.append(state.position_m)
+        assert any("counters jumped once" in note for note in notes_of(estimator)) == (one is reset)
+    assert np.linalg.norm(ends[1] - ends[0]) < 0.02
+
+
 def test_the_numbers_of_a_fix() -> None:
     endless = checked_fix(0, [1.0, 2.0, np.inf], [0.1, 0.1, 0.1], None, np.nan, None)
     assert endless is not None

@@ -205,8 +205,11 @@ def test_forms_that_cannot_work_are_refused(own_forms) -> None:
 
 def test_the_table_of_the_docs_is_the_catalogue() -> None:
     """Every parameter with its unit, typical size, range and law; nothing else."""
-    rows = re.findall(r"^\| `([^`]+)` \|(.*)\|$", DOCS.read_text(), re.M)
-    table = {key: [cell.strip() for cell in rest.split("|")] for key, rest in rows}
+    rows = re.findall(r"^\| `([^`]+)`(?:, `([^`]+)`)? \|(.*)\|$", DOCS.read_text(), re.M)
+    table = {}
+    for first, second, rest in rows:  # `.../x`, `y` is a row of two parameters
+        for key in (first, f"{first.rpartition('/')[0]}/{second}") if second else (first,):
+            table[key] = [cell.strip() for cell in rest.split("|")]
     known = {
         form.parameter_key(p): (form, p) for form in catalogue.built_in().values() for p in form.parameters
     }
