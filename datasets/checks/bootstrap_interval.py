@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from terrafusion.datasets.checks.motion import Array
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import percentile_interval
 
 RESAMPLES, SEED = 400, 20_240_811

@@ -7,15 +7,13 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, clocks_of, counted, period_s, retimed
 from terrafusion.datasets.checks.motion import Signal
 from terrafusion.datasets.checks.sensor_pairs import LEAST_R, Pair, SensorPairs, near_lag, reason
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
-
-TimesNs = NDArray[np.int64]
 
 LEAST_JUMP_S, JUMP_PERIODS, MOST_JUMPS = 0.3, 3.0, 4
 SURE_JUMP_S = 1.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.clocks import clock_drifts, clock_jumps, drift_finding, jump_findings
 from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s, retimed
-from terrafusion.datasets.checks.motion import Array, Signal
+from terrafusion.datasets.checks.motion import Signal
 from terrafusion.datasets.checks.path import path_by
 from terrafusion.datasets.checks.path_model import path_model
 from terrafusion.datasets.checks.sensor_pairs import (
@@ -26,6 +26,7 @@ from terrafusion.datasets.checks.sensor_pairs import (
 )
 from terrafusion.datasets.checks.signals import without_stuck
 from terrafusion.datasets.checks.timing import gap_findings
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.lag import Lag
 from terrafusion.datasets.core.recording import Recording
 

@@ -6,12 +6,10 @@ from collections.abc import Iterator, Mapping
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields, without_rows
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
-
-Array = NDArray[np.float64]
 
 PRESSURE_PA = (30e3, 110e3)
 """Static pressure where robots drive: 9 km high (ISA) to below the Dead Sea."""

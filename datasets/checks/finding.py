@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
 
-TimesNs = NDArray[np.int64]
 Repair = Callable[[Recording], Recording]
 
 

@@ -8,21 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, counted, without_rows
-from terrafusion.datasets.checks.motion import (
-    Array,
-    Complex,
-    cumulative,
-    on_plane,
-    runs,
-    seconds,
-    typical_sigma,
-    wheel_speed,
-)
+from terrafusion.datasets.checks.motion import cumulative, on_plane, runs, seconds, typical_sigma, wheel_speed
 from terrafusion.datasets.checks.path import antenna, dead_reckoned
 from terrafusion.datasets.checks.timing import GAP_PERIODS
+from terrafusion.datasets.core.arrays import Array, Complex, Mask
 from terrafusion.datasets.core.channels import Fix, Gnss
-
-Mask = NDArray[np.bool_]
 
 FROZEN_S = 3.0
 AROUND, LEAST_SHARE, SLIP_SHARE = 8, 0.5, 0.25

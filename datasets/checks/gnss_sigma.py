@@ -11,16 +11,14 @@ from collections.abc import Iterator
 from functools import partial
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
-from terrafusion.datasets.checks.motion import Array, typical_sigma
+from terrafusion.datasets.checks.motion import typical_sigma
 from terrafusion.datasets.checks.path import scatter_m
+from terrafusion.datasets.core.arrays import Array, Mask
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
-
-Mask = NDArray[np.bool_]
 
 OVERCONFIDENT, LEAST_SCATTER_M = 5.0, 0.03
 LEAST_FIXES, LEAST_VALUES, SHARE = 20, 3, 0.99

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
 from terrafusion.datasets.checks.motion import (
-    Array,
-    Complex,
     Integral,
     agreement,
     cumulative,
@@ -30,6 +28,7 @@ from terrafusion.datasets.checks.motion import (
 )
 from terrafusion.datasets.checks.signals import ROLLED_OVER, without_stuck
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
+from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply

@@ -10,7 +10,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.delays import opposed
 from terrafusion.datasets.checks.finding import CheckContext, with_fields
@@ -18,7 +17,6 @@ from terrafusion.datasets.checks.imu import nearest_axis
 from terrafusion.datasets.checks.motion import (
     LEAST_WINDOWS,
     WINDOW_S,
-    Array,
     common_span,
     speeds,
     typical_sigma,
@@ -35,12 +33,11 @@ from terrafusion.datasets.checks.path import (
 )
 from terrafusion.datasets.checks.plausibility import check_magnitude
 from terrafusion.datasets.checks.sensor_pairs import far_lag, near_lag
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import Rig
-
-TimesNs = NDArray[np.int64]
 
 LEAST_SPREAD_M = 0.1
 """Least root mean square distance from its centre of a recording too short for windows."""

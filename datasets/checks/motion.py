@@ -13,12 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext
+from terrafusion.datasets.core.arrays import Array, Complex, TimesNs
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.recording import Recording
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-TimesNs = NDArray[np.int64]
 Signal = tuple[TimesNs, Array]
 
 ANY_RADIUS_M = 0.15

@@ -5,13 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, counted, without_rows
-from terrafusion.datasets.checks.motion import ANY_RADIUS_M, Array
+from terrafusion.datasets.checks.motion import ANY_RADIUS_M
 from terrafusion.datasets.checks.signals import SensorAxes, sensors_of, stuck_cells, without_cells
-
-Mask = NDArray[np.bool_]
+from terrafusion.datasets.core.arrays import Array, Mask
 
 CLIPPED_SHARE, CLIPPED_ROWS, PILE = 0.002, 10, 5.0
 """Share and number of values exactly at the extreme, and how many times more than at the values beside it."""

@@ -15,8 +15,6 @@ from numpy.typing import NDArray
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED
 from terrafusion.datasets.checks.finding import CheckContext
 from terrafusion.datasets.checks.motion import (
-    Array,
-    Complex,
     cumulative,
     gyro_angle,
     on_plane,
@@ -24,6 +22,7 @@ from terrafusion.datasets.checks.motion import (
     typical_sigma,
     wheel_speed,
 )
+from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.datasets.core.recording import Recording
 

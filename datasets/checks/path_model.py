@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, BootstrapInterval, interval_of
 from terrafusion.datasets.checks.finding import CheckContext
-from terrafusion.datasets.checks.motion import Array, Complex, cumulative, gyro_angle, wheel_speed
+from terrafusion.datasets.checks.motion import cumulative, gyro_angle, wheel_speed
 from terrafusion.datasets.checks.path import MeasuredPath
+from terrafusion.datasets.core.arrays import Array, Complex
 from terrafusion.datasets.core.bootstrap import resampled_rows
 
 LEAST_WINDOWS, LEAST_CONTRIBUTING, LEAST_ROWS, MOST_HZ = 5, 2.0, 8, 5.0

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, without_rows
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.recording import Recording
-
-TimesNs = NDArray[np.int64]
 
 MOST_ROWS = 0.2
 """Where a larger share of the rows is impossible, the unit is wrong rather than some rows."""

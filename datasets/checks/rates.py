@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, period_s
-from terrafusion.datasets.checks.motion import Array, TimesNs
+from terrafusion.datasets.core.arrays import Array, TimesNs
 
 SLOW_HZ = 5.0
 """Faster channels are not judged: noise from sample to sample would look like motion."""

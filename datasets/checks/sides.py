@@ -12,7 +12,6 @@ from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, Boot
 from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
 from terrafusion.datasets.checks.imu import at_rest
 from terrafusion.datasets.checks.motion import (
-    Array,
     Integral,
     agreement,
     common_span,
@@ -22,6 +21,7 @@ from terrafusion.datasets.checks.motion import (
 )
 from terrafusion.datasets.checks.path import scales
 from terrafusion.datasets.checks.scale import is_firm
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.datasets.core.paired_sides import paired_sides, sampled_apart
 from terrafusion.datasets.core.recording import Recording

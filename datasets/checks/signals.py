@@ -7,18 +7,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields, without_rows
-from terrafusion.datasets.checks.motion import ANY_RADIUS_M, Array, runs, yaw_rates
+from terrafusion.datasets.checks.motion import ANY_RADIUS_M, runs, yaw_rates
+from terrafusion.datasets.core.arrays import Array, Mask, TimesNs
 from terrafusion.datasets.core.channels import Channel, Imu, Wheels
 from terrafusion.datasets.core.conventions import true_updates
 from terrafusion.datasets.core.lag import held_rows
 from terrafusion.datasets.core.paired_sides import sampled_apart
 from terrafusion.datasets.core.recording import Recording
-
-Mask = NDArray[np.bool_]
-TimesNs = NDArray[np.int64]
 
 HELD_SHARE, LEAST_UPDATES = 0.5, 10
 STUCK_S, STUCK_ZERO_S, STUCK_ROWS = 2.0, 5.0, 20

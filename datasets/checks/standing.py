@@ -7,9 +7,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from terrafusion.datasets.checks.finding import CheckContext, Finding
-from terrafusion.datasets.checks.motion import Array, Complex, runs
+from terrafusion.datasets.checks.motion import runs
 from terrafusion.datasets.checks.path import dead_reckoned, measured_paths
 from terrafusion.datasets.checks.scale import is_firm
+from terrafusion.datasets.core.arrays import Array, Complex
 
 WINDOW_S, LEAST_EXTENT_M = (10.0, 120.0), 5.0
 """Windows last so long that noise matters little against the path by wheels and gyro, within these limits."""

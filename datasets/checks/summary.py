@@ -13,16 +13,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.finding import Finding
 from terrafusion.datasets.checks.measures import Measures
 from terrafusion.datasets.checks.timing import GAP_PERIODS, GAP_S
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.json_text import finite
 from terrafusion.datasets.core.recording import Recording
-
-TimesNs = NDArray[np.int64]
 
 
 def summarise(recording: Recording, measures: Measures, findings: Sequence[Finding]) -> dict[str, Any]:

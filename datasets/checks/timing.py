@@ -18,11 +18,9 @@ from terrafusion.datasets.checks.finding import (
     period_s,
     retimed,
 )
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Channel
 from terrafusion.datasets.core.recording import Recording
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 CLOCKED = ("command", "wheels", "imu", "gnss", "motor")
 """Channels that are sampled evenly; terrain labels are not."""

@@ -12,7 +12,6 @@ from terrafusion.datasets.checks.imu import gravity, heading, wheels_turn_backwa
 from terrafusion.datasets.checks.motion import (
     ANY_RADIUS_M,
     SURE_R,
-    Array,
     Integral,
     agreement,
     common_span,
@@ -24,6 +23,7 @@ from terrafusion.datasets.checks.motion import (
 )
 from terrafusion.datasets.checks.path import measured_paths
 from terrafusion.datasets.checks.scale import is_firm
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.conventions import Conventions, apply
 from terrafusion.datasets.core.recording import Recording

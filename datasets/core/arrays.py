@@ -9,6 +9,12 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 """Array of floating-point numbers; shapes are in the docstrings."""
+Complex = NDArray[np.complex128]
+"""Array of complex numbers, such as positions east + i north."""
+TimesNs = NDArray[np.int64]
+"""Times in nanoseconds."""
+Mask = NDArray[np.bool_]
+"""Array of truth values."""
 
 
 def distinct(texts: NDArray[Any]) -> tuple[list[str], NDArray[np.intp]]:

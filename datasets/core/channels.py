@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.messages import (
     BarometerSample,
@@ -33,8 +34,6 @@ from terrafusion.datasets.core.messages import (
 if TYPE_CHECKING:
     import pandas as pd
 
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 TERRAINS = ("asphalt", "gravel", "grass", "medium_sand", "loose_sand", "ploughed_soil", "mud", "snow")
 """Terrain classes by name; `unknown` is none of them."""

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 
-TimesNs = NDArray[np.int64]
 Step = tuple[int, int]
 """First row after a step, and the nanoseconds to add to its time and all later ones."""
 

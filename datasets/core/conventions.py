@@ -13,13 +13,13 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Channel, Imu, Terrain
 from terrafusion.datasets.core.quantity import Position, Sourced, Word
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.sensors import DRIVES, axes_matrix
 from terrafusion.datasets.core.trajectory import Trajectory
 
-Array = NDArray[np.float64]
 Sign = Annotated[float, Sourced("", -1.0, 1.0)]
 BODY_AXES = ("+x", "+y", "+z")
 

@@ -11,9 +11,9 @@ is expressed in the parent frame. `gtsam_to_ros_covariance` converts.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
 
 GRAVITY_MPS2 = 9.80665
 """Standard gravity (3rd CGPM, 1901), m/s2."""

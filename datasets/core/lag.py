@@ -7,10 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import percentile_interval
 from terrafusion.datasets.core.conventions import true_updates
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.02
 """Resolution of the search; the peak is refined by a parabola."""

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
+from terrafusion.datasets.core.arrays import Array, Complex
 
 
 def planar_rotation(source: Complex, target: Complex, weights: Array | None = None) -> tuple[complex, float]:

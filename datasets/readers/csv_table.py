@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ClockError, DataError
 from terrafusion.datasets.core.quantity import shown
 from terrafusion.datasets.readers.delimited import TextLayout, not_a_table, read_columns, read_text
-
-Array = NDArray[np.float64]
 
 MAX_T_S = 1e9
 """A |t_s| beyond this (32 years) is a Unix time, not seconds from the start."""

@@ -22,11 +22,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.decimals import NotADecimal, to_ns
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
-
-Array = NDArray[np.float64]
 
 BOM = b"\xef\xbb\xbf"
 BLANKS = r"\s+"

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import ClockError, DataError
 from terrafusion.datasets.core.recording import Recording
@@ -25,7 +25,6 @@ from terrafusion.datasets.readers.formats import Request, logs_in
 from terrafusion.datasets.readers.log_meta import Meta, read_meta
 
 META = "meta.yaml"
-TimesNs = NDArray[np.int64]
 CHANNELS = (*Recording.CHANNELS, "truth")
 
 

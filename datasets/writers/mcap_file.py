@@ -33,10 +33,9 @@ from mcap.records import (
 from mcap.writer import MCAP0_MAGIC
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.readers.ros.raw import zstd
 from terrafusion.datasets.writers.cdr import split
-
-TimesNs = NDArray[np.int64]
 
 CHUNK_MESSAGES = 4096
 ZSTD_LEVEL = 1

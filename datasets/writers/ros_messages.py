@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -27,9 +28,6 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.ros.exact import PREFIX, ROW, STAMP
 from terrafusion.datasets.writers.cdr import CdrTemplate, split
 from terrafusion.datasets.writers.mcap_file import TopicMessages
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 UNKNOWN_VARIANCE = 1e6
 """By ROS custom: a variance this large marks a quantity that is not known."""

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from terrafusion.datasets.core.arrays import Array
 
 KNOT_S = 0.25
 """Knot spacing of the velocity (assumed: half of the averaging time of errors)."""

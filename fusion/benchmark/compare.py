@@ -15,13 +15,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import resampled_rows
 from terrafusion.fusion.benchmark.methods import ADAPTIVE, BASELINE, ORACLE
 from terrafusion.fusion.benchmark.run_score import RunScore
 
-Array = NDArray[np.float64]
 Interval = tuple[float, float]
 
 RESAMPLES = 4000

@@ -8,12 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.benchmark.body_velocity import CHUNK_S, Poses, body_velocity, speed_noise
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
-
-Array = NDArray[np.float64]
 
 DT_S = 0.05
 JOIN_RADPS, JOIN_WHEEL_RADPS = 0.25, 1.5

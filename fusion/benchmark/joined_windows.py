@@ -21,8 +21,6 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.benchmark.body_velocity import heading
 from terrafusion.fusion.benchmark.field_runs import DT_S, FieldRun, chain_starts, chains_of, field_run
 
-Array = NDArray[np.float64]
-
 MAX_TRUTH_GAP_S = 1.0
 """A joined run with a longer gap in its truth gets no truth."""
 

@@ -15,8 +15,6 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.metrics.scores import Outage
 
-Array = NDArray[np.float64]
-
 LEAD_S, LEAD_SHARE = 40.0, 0.2
 """Aiding before an outage, or its share of a short log: heading and slip must be observable first."""
 TAIL_S = 1.0

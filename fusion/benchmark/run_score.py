@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.benchmark.field_logs import UNFORESEEN
 from terrafusion.fusion.benchmark.methods import Method, replay_options
@@ -21,7 +22,6 @@ from terrafusion.fusion.noise.policy import load_policy
 from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.fusion.terrain.classifier import UNKNOWN
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 
 

@@ -18,16 +18,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, Complex, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss, Wheels
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.error_series import ALIGN_M, Errors, align_start, known_keyframes
 from terrafusion.fusion.metrics.scores import Outage, Scores
-
-Array = NDArray[np.float64]
-Complex = NDArray[np.complex128]
-TimesNs = NDArray[np.int64]
 
 REST_MPS, REST_S = 0.01, 1.0
 """Wheels slower than this for so long at the start: the mean of the gyro is its bias."""

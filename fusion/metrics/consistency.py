@@ -23,13 +23,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimate.estimate import Estimate, Innovation
 from terrafusion.fusion.metrics.error_series import Errors
 from terrafusion.fusion.terrain.external import TRUE_SOURCES
 
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 Rows = NDArray[np.bool_]
 
 CONFIDENCE = 0.95

@@ -11,15 +11,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle, yaw_of
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.fusion.estimate.estimate import Estimate
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 MIN_STEP_M = 0.1
 """Shorter displacements of a reference do not count as distance: they may be its noise at rest."""

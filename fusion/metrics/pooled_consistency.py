@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.bootstrap import percentile_interval, resampled_rows
 from terrafusion.fusion.metrics.consistency import CONFIDENCE, Consistency, band, verdict
-
-Array = NDArray[np.float64]
 
 RESAMPLES = 4000
 IN_OUTAGE = ", outage"

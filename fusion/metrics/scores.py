@@ -22,6 +22,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
@@ -42,8 +43,6 @@ from terrafusion.fusion.metrics.error_series import (
     travelled_m,
 )
 
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 Rows = NDArray[np.int64]
 
 RPE_LENGTHS_M = (10, 50, 100)

@@ -11,7 +11,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import binom
 
 from terrafusion.datasets.checks import CheckContext, Finding
@@ -26,8 +25,6 @@ from terrafusion.fusion.metrics.consistency import ALL, CONFIDENCE, Consistency
 from terrafusion.fusion.metrics.error_series import known_keyframes
 from terrafusion.fusion.metrics.health import examine_estimate
 from terrafusion.fusion.metrics.scores import Scores
-
-Array = NDArray[np.float64]
 
 GOOD, DOUBTFUL, UNUSABLE = "good", "doubtful", "not_to_be_used"
 WORDS = {GOOD: "good", DOUBTFUL: "doubtful", UNUSABLE: "not to be used"}

@@ -8,14 +8,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.graph.key_state import CALIBRATION, LINEAR
 from terrafusion.fusion.graph.slow_states import CALIBRATION_SIGMA
-
-Array = NDArray[np.float64]
 
 OBSERVED_SHARE = 0.5
 """A state counts as observed once its sigma is below this share of the prior's."""

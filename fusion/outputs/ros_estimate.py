@@ -9,10 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.writers.mcap_estimate import Level, Status, WrittenEstimate
 from terrafusion.fusion.estimate.estimate import STATUS, Estimate
 from terrafusion.fusion.graph.key_state import LINEAR
-from terrafusion.fusion.outputs.linear_states import Array, series
+from terrafusion.fusion.outputs.linear_states import series
 from terrafusion.fusion.outputs.replay_files import is_local
 
 EVERY_S = 1.0

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.sensors.imu import at_rest
-
-Array = NDArray[np.float64]
 
 CONFIDENCE = 0.95
 REWEIGHTINGS = 5

@@ -14,10 +14,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss, Imu
 from terrafusion.datasets.core.recording import Recording
-
-Array = NDArray[np.float64]
 
 MATCH_S = 0.050
 """Samples further apart in time are not compared (the study's figure)."""

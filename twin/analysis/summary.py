@@ -6,16 +6,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.sensors import STEERED_DRIVES
 from terrafusion.twin.model.motion import BodyMotion
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import ENDS, INDEX, SIDES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.physics.motors import gear_loss, motor_current, motor_voltage, winding_loss
 from terrafusion.twin.scenario.commands import DrivenStates, wheel_angles
-
-Array = NDArray[np.float64]
 
 MOVING_MPS = 0.1
 """Slip is averaged over samples that move faster than this."""

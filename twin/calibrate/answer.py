@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.identifiability import NOT_IDENTIFIED, Identifiability
 from terrafusion.twin.calibrate.model import Model
@@ -16,8 +16,6 @@ from terrafusion.twin.calibrate.noise_learning import by_channel
 from terrafusion.twin.calibrate.problem import Problem, ResidualBlock
 from terrafusion.twin.calibrate.result import Calibration, ChannelFit, FittedParameter
 from terrafusion.twin.calibrate.solver import OUTCOMES, Solution
-
-Array = NDArray[np.float64]
 
 MISFIT = 5.0
 """A channel whose residuals exceed this many times its noise is reported (assumed)."""

@@ -8,8 +8,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError, TerrafusionError
 from terrafusion.datasets.core.quantity import Quantity, checked_number
 from terrafusion.datasets.core.recording import Recording
@@ -31,8 +31,6 @@ from terrafusion.twin.calibrate.start import (
 )
 from terrafusion.twin.model.vehicle import VehicleParams, geometry_notes, load_vehicle, reported_geometry
 from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
-
-Array = NDArray[np.float64]
 
 PARAMETERS = (
     "soil.shear.friction_cap", "soil.shear.shear_modulus_m", "soil.resistance.rolling",

@@ -9,13 +9,11 @@ weights (Newey and West 1987): H^-1 (M + prior) H^-1 (Huber 1967; White 1980).
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.observations import BIN_S
 from terrafusion.twin.calibrate.problem import Problem
 from terrafusion.twin.calibrate.solver import Solution
-
-Array = NDArray[np.float64]
 
 MEMORY_S = 2.0
 """Scores further apart than this are taken as independent."""

@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.observations import sample_interval_s
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.scenario.commands import limit_slew, side_speeds
-
-Array = NDArray[np.float64]
 
 SOURCES = ("auto", "command", "wheels")
 """What drives the twin: the log's commands or its wheel speeds; "auto" takes commands where there are any."""

@@ -7,14 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS, twin_input
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed, observe
 from terrafusion.twin.calibrate.window_starts import window_starts
-
-Array = NDArray[np.float64]
 
 START_S = 1.0
 """The first second of a log that starts on the move, or of the motion on a slope, is not compared: how soil,

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.config import quantities
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.quantity import Quantity
@@ -24,8 +24,6 @@ from terrafusion.twin.model.soil import SoilParams
 from terrafusion.twin.model.vectors import soil_vector, vehicle_vector
 from terrafusion.twin.model.vehicle import VehicleParams
 from terrafusion.twin.physics.layout import SOIL_PARAMETERS, VEHICLE_PARAMETERS
-
-Array = NDArray[np.float64]
 
 STEP = 1e-6
 """Relative step of the central differences from a named number to parameters of the graph: these maps (a

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.model.vehicle import VehicleParams
 
-Array = NDArray[np.float64]
 Rows = NDArray[np.int64]
 
 BIN_S = 0.1

@@ -10,11 +10,10 @@ import subprocess
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine.compiler import compiled, find_compiler
 
-Array = NDArray[np.float64]
 LOG = logging.getLogger("terrafusion.twin")
 
 _LOOP = """

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.inputs import DT_S, MOVING_RADPS
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
 from terrafusion.twin.calibrate.model import Model
@@ -23,8 +24,6 @@ from terrafusion.twin.model.plant import Plant, RouteTable
 from terrafusion.twin.model.vectors import soil_vector
 from terrafusion.twin.physics.layout import INDEX, STATES, VEHICLE_PARAMETERS, state_slice
 from terrafusion.twin.scenario.commands import delayed_inputs
-
-Array = NDArray[np.float64]
 
 LEAD_S = 5.0
 """Run-up under the first input of a log, so that the twin starts in steady state."""

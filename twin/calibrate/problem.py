@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.coordinates import Coordinate
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog, window_of
@@ -21,8 +22,6 @@ from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.noise import ResidualNoise
 from terrafusion.twin.calibrate.predict import POSE, predict
 from terrafusion.twin.calibrate.sensor_offsets import sensor_errors
-
-Array = NDArray[np.float64]
 
 POSE_SIGMA = np.array([10.0, 10.0, 1.0])
 """1 sigma of a window's start about its guess (assumed, m and rad): wide, as the log determines it."""

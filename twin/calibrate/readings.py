@@ -5,8 +5,8 @@ from __future__ import annotations
 import functools
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.pointwise import Pointwise, pointwise
 from terrafusion.twin.engine.sensitivity import Directions
@@ -21,8 +21,6 @@ from terrafusion.twin.model.motion import plane_rotation
 from terrafusion.twin.model.plant import Plant, RouteTable, smoothstep
 from terrafusion.twin.model.vectors import mounting_vector
 from terrafusion.twin.physics.layout import INDEX, OUTPUTS, WHEELS
-
-Array = NDArray[np.float64]
 
 
 def readings(

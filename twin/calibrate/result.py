@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.calibrate.identifiability import IDENTIFIED, Identifiability
 from terrafusion.twin.calibrate.model import Model
-
-Array = NDArray[np.float64]
 
 SCHEMA = "terrafusion.calibration/1"
 CONVERGED = ("converged", "at_bound")

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.noise_learning import (
     extrapolated,
@@ -27,8 +28,6 @@ from terrafusion.twin.calibrate.noise_learning import (
     rescaled,
 )
 from terrafusion.twin.calibrate.problem import NoiseModel, Normal, Point, Problem, ResidualBlock
-
-Array = NDArray[np.float64]
 
 MAX_STEP = 1.5
 """Longest step of a parameter, in prior sigmas."""

@@ -7,8 +7,8 @@ import math
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.coordinates import Coordinate, Prior
 from terrafusion.twin.calibrate.log import prepare
@@ -18,8 +18,6 @@ from terrafusion.twin.calibrate.problem import Problem
 from terrafusion.twin.calibrate.result import Calibration
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
-
-Array = NDArray[np.float64]
 
 SECONDS = 60.0
 CANDIDATES = (

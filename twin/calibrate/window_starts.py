@@ -6,15 +6,13 @@ import math
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed, observe
 from terrafusion.twin.model.motion import plane_rotation
-
-Array = NDArray[np.float64]
 
 AROUND_S = 15.0
 """The heading at a window's start is that of the track this long before and after."""

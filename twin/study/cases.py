@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.analysis.speeds import OTHERS, Profiles, SpeedErrors, profiles_of, speed_errors
 from terrafusion.twin.analysis.summary import RunSummary
 from terrafusion.twin.model.ground import Variation
@@ -15,8 +16,6 @@ from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.file import load_scenario
 from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.study.published import StudyCase
-
-Array = NDArray[np.float64]
 
 SCENARIO = "paper_profile"  # v(t) = 1.0 + 0.5 sin(2 pi t / 60) m/s for 300 s with short stops
 VEHICLE = "elevate"

@@ -13,8 +13,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Recording
@@ -22,8 +22,6 @@ from terrafusion.twin.analysis.speeds import CUTOFF_HZ, imu_speed, low_pass
 from terrafusion.twin.scenario.scenario import Canopy, DriveSegment, Interval, RouteLeg, Scenario
 from terrafusion.twin.simulate import simulate
 from terrafusion.twin.study.cases import UNEVEN, VEHICLE
-
-Array = NDArray[np.float64]
 
 FIELD_DRIVE = Scenario(
     name="field_sand",

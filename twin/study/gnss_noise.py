@@ -14,8 +14,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.analysis.speeds import (
     OTHERS,
     USUAL,
@@ -26,8 +26,6 @@ from terrafusion.twin.analysis.speeds import (
     mean_percent,
 )
 from terrafusion.twin.study.cases import CaseRun
-
-Array = NDArray[np.float64]
 
 RATES_HZ = (1.0, 5.0, 10.0, 100.0)  # rates at which positions may have been differenced; the study names none
 SIGMAS_M = (1e-4, 10.0)  # sizes of noise that are searched

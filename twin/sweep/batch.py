@@ -6,15 +6,14 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.twin.engine.integrate import raise_if_diverged
 from terrafusion.twin.engine.lanes import integrate_many
 from terrafusion.twin.run_setup import RunSetup
 from terrafusion.twin.scenario.commands import SETTLE_S, DrivenStates, open_loop, settled, settling
 from terrafusion.twin.sensors.effects import as_driven
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 TOGETHER = 8

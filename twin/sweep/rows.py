@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.analysis.summary import RunSummary
@@ -23,7 +23,6 @@ from terrafusion.twin.simulate import simulate_run
 from terrafusion.twin.sweep.batch import TOGETHER, attempt, drive_many
 from terrafusion.twin.sweep.plan import Sweep, SweepPoint, at_speed, top_speed_mps
 
-Array = NDArray[np.float64]
 Row = dict[str, str | float | int | None]
 
 DONE, SPINNING, IMMOBILISED, SLID, FAILED = ("done", "spinning", "immobilised", "slid", "failed")

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import (
     Barometer,
     Command,
@@ -35,8 +36,6 @@ from terrafusion.datasets.readers.ros.joints import (
 from terrafusion.datasets.readers.ros.messages import ACKERMANN_AT, UNKNOWN_VARIANCE, Stream, poses, twists
 from terrafusion.datasets.readers.text.fixes import Fixes, located
 
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 Datum = tuple[float, float, float]
 
 NOMINAL_TRACK_M = 1.0

@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Steering, Wheels
 from terrafusion.datasets.readers.ros.messages import Stream
-
-Array = NDArray[np.float64]
 
 _SIDES = {"left": "left", "l": "left", "right": "right", "r": "right"}
 _ENDS = {"front": "front", "f": "front", "rear": "rear", "back": "rear", "b": "rear", "hind": "rear"}

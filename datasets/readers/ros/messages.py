@@ -9,12 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.readers.ros import topics
 from terrafusion.datasets.readers.ros.layout import MessageBlock
 from terrafusion.datasets.readers.ros.raw import BagError
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 UNKNOWN_VARIANCE = 1e6
 """By ROS custom, a variance this large marks an unknown quantity."""

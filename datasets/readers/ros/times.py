@@ -10,12 +10,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.ros.messages import Stream
 
-TimesNs = NDArray[np.int64]
 Times = dict[str, TimesNs]
 """Times (N,) by channel."""
 

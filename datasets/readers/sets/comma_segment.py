@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss, Imu, Steering, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_from_ecef, matrix_to_quaternion, quaternion_to_matrix
@@ -26,9 +27,6 @@ from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import META, truth_contents
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.row_times import row_times
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 MAGIC = b"\x93NUMPY"
 LOG, POSE = "processed_log", "global_pose"

@@ -13,12 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
-
-Array = NDArray[np.float64]
 
 LARGEST = 1e30
 """No number of a log is larger; squares of these are still numbers."""

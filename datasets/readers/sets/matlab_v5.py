@@ -17,12 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
-
-Array = NDArray[np.float64]
 
 HEADER_BYTES, BEGINNING_BYTES = 128, 1 << 14
 MATRIX, COMPRESSED = 14, 15

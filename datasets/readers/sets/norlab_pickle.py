@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from terrafusion.datasets.catalog.catalog import CATALOG_VARIABLE, sha256_of
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Command, Imu, Motor, Terrain, Wheels
 from terrafusion.datasets.core.conventions import Conventions
 from terrafusion.datasets.core.errors import DataError, errors_of
@@ -25,7 +26,6 @@ from terrafusion.datasets.core.trajectory import Trajectory
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.sets.safe_pickle import numbers, read_table
 
-Array = NDArray[np.float64]
 Table = dict[str, NDArray[Any]]
 
 SUFFIXES = (".pkl", ".pickle")

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.gnss_time import GPS_EPOCH_S, WEEK_S, gps_to_unix_ns
 from terrafusion.datasets.core.lag import lag_between
 from terrafusion.datasets.readers.sets.matlab_hdf5 import MatlabFile
-
-Array = NDArray[np.float64]
 
 UNIX_SINCE_S = 1e9
 """Times beyond this are unix seconds, smaller ones seconds of the GPS week."""

@@ -6,8 +6,8 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Gnss, Imu, Wheels
 from terrafusion.datasets.core.errors import DataError, errors_of
 from terrafusion.datasets.core.frames import geodetic_to_enu
@@ -20,8 +20,6 @@ from terrafusion.datasets.readers.sets.pathfinder_fixes import (
     times_by_rows,
     times_in_file,
 )
-
-Array = NDArray[np.float64]
 
 NEEDED = {"tTimu", "tTodom", "Ax", "Ay", "Az", "Gx", "Gy", "Gz", "frontLeftVel", "rearRightVel"}
 WHEELS = ("frontLeft", "frontRight", "rearLeft", "rearRight")

@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import geodetic_to_enu
 from terrafusion.datasets.core.sensors import ASSUMED_SIGMA_M
 from terrafusion.datasets.readers.formats import Request
 
-Array = NDArray[np.float64]
 Datum = tuple[float, float, float]
 
 UP_FACTOR = 2.0

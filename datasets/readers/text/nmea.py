@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -19,8 +20,6 @@ from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import UP_FACTOR, Fixes, gnss_channel
 from terrafusion.datasets.readers.text.nmea_sentences import DAY_NS, NmeaEpochs, collect
 from terrafusion.datasets.readers.text.row_times import row_times
-
-Array = NDArray[np.float64]
 
 SENTENCE = re.compile(rb"\$(?:G[PNLABQI]|BD|QZ|IN)(?:GGA|RMC|GST|ZDA|VTG|GLL|GSA|GSV),")
 WEEKS_1024_DAYS = 1024 * 7

@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.errors import DataError
-
-Array = NDArray[np.float64]
 
 SENTENCE = re.compile(
     r"\$(([A-Z]{2})(GGA|RMC|GST|ZDA|VTG),([\x20-\x23\x25-\x29\x2b-\x7e]{0,200}))(\*([0-9A-Fa-f]{2}))?"

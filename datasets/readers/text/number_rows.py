@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.clock import in_order, repair_together
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.quantity import shown
@@ -22,8 +23,6 @@ from terrafusion.datasets.readers.delimited import (
     read_text,
     split,
 )
-
-Array = NDArray[np.float64]
 
 MAX_T_NS = 4 * 10**18
 """A time beyond this (year 2096) is none of a recording, and differences of times stay within 64 bits."""

@@ -8,14 +8,12 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import TimesNs
 from terrafusion.datasets.core.clock import in_order, repair
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import ClockJump
 from terrafusion.datasets.readers.formats import Request
-
-TimesNs = NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)

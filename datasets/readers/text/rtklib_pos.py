@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
@@ -30,9 +31,6 @@ from terrafusion.datasets.readers.delimited import (
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.text.fixes import Datum, Fixes, gnss_channel, with_assumed_sigma
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
-
-Array = NDArray[np.float64]
-TimesNs = NDArray[np.int64]
 
 DEGREES, DMS, ECEF, BASELINE = "latitude(deg)", "latitude(d'\")", "x-ecef(m)", "e-baseline(m)"
 POSITIONS = {

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from terrafusion.datasets.core.arrays import distinct
+from terrafusion.datasets.core.arrays import Array, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.conventions import apply
 from terrafusion.datasets.core.decimals import NotADecimal, dates_to_ns
@@ -38,8 +38,6 @@ from terrafusion.datasets.readers.text.parquet import ParquetColumns
 from terrafusion.datasets.readers.text.row_times import RowTimes, row_times
 from terrafusion.datasets.readers.text.text_columns import TextColumns
 from terrafusion.datasets.readers.text.units import units_of
-
-Array = NDArray[np.float64]
 
 SUFFIXES, LOOSE_SUFFIXES = (".csv", ".tsv"), (".txt", ".dat")
 

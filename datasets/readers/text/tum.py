@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
@@ -20,8 +21,6 @@ from terrafusion.datasets.readers.delimited import (
 from terrafusion.datasets.readers.formats import Request
 from terrafusion.datasets.readers.log_folder import truth_contents
 from terrafusion.datasets.readers.text.row_times import row_times
-
-Array = NDArray[np.float64]
 
 COLUMNS = ("x", "y", "z", "qx", "qy", "qz", "qw")
 NORM_TOLERANCE = 0.01

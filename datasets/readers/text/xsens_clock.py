@@ -9,11 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.readers.delimited import TextTable
-
-TimesNs = NDArray[np.int64]
-Array = NDArray[np.float64]
 
 UTC = tuple(f"UTC_{part}" for part in ("Year", "Month", "Day", "Hour", "Minute", "Second", "Nano", "Valid"))
 UTC_LOWEST, UTC_HIGHEST = (1980, 1, 1, 0, 0, 0, -(10**9)), (2200, 12, 31, 23, 59, 60, 10**9)

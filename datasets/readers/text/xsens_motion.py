@@ -7,12 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Imu
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.readers.delimited import TextTable
-
-Array = NDArray[np.float64]
 
 ACC, GYR = ("Acc_X", "Acc_Y", "Acc_Z"), ("Gyr_X", "Gyr_Y", "Gyr_Z")
 INCREMENTS = (("VelInc_X", "VelInc_Y", "VelInc_Z"), ("OriInc_q0", "OriInc_q1", "OriInc_q2", "OriInc_q3"))

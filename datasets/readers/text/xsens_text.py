@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core import limits
-from terrafusion.datasets.core.arrays import distinct
+from terrafusion.datasets.core.arrays import Array, distinct
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.recording import Recording
@@ -34,8 +34,6 @@ from terrafusion.datasets.readers.text.fixes import Fixes, gnss_channel
 from terrafusion.datasets.readers.text.row_times import row_times
 from terrafusion.datasets.readers.text.xsens_clock import UTC, clock_of
 from terrafusion.datasets.readers.text.xsens_motion import ACC, ATTITUDES, GYR, INCREMENTS, inertial
-
-Array = NDArray[np.float64]
 
 COUNTERS = ("PacketCounter", "Counter")
 TICKS = "SampleTimeFine"
