@@ -12,12 +12,12 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix, rpy_to_quaternion, wrap_angle
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
-from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.estimator.feed import split_fixes
 from terrafusion.fusion.metrics.scores import Outage
-from terrafusion.fusion.replay import replay
+from terrafusion.fusion.replay import ReplayResult, replay
 from terrafusion.twin.model.choose import choose_vehicle
 from terrafusion.twin.model.vehicle import load_vehicle
 from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
@@ -31,7 +31,20 @@ def exact() -> Recording:
 
 @pytest.fixture(scope="module")
 def mixed() -> Recording:
+    """Over all grounds, 225 s."""
     return simulate("mixed_terrain", seed=11)
+
+
+@pytest.fixture(scope="module")
+def short(mixed: Recording) -> Recording:
+    """Its first 110 s: what happens before does not depend on what comes after."""
+    return until(mixed, 110.0)
+
+
+@pytest.fixture(scope="module")
+def replayed(short: Recording) -> ReplayResult:
+    """The short drive as it is."""
+    return replay(short)
 
 
 def turned(recording: Recording, angle_rad: float, shift_m: tuple[float, float]) -> Recording:
@@ -62,29 +75,31 @@ def test_exact_data_give_exact_estimates(exact: Recording, batch: bool) -> None:
 
 @pytest.mark.parametrize(("angle_rad", "shift_m"), [(2.0, (0.0, 0.0)), (-2.9, (350.0, -900.0))])
 def test_start_pose_and_heading_do_not_matter(
-    mixed: Recording, angle_rad: float, shift_m: tuple[float, float]
+    short: Recording, replayed: ReplayResult, angle_rad: float, shift_m: tuple[float, float]
 ) -> None:
-    here, there = replay(mixed).scores, replay(turned(mixed, angle_rad, shift_m)).scores
+    here, there = replayed.scores, replay(turned(short, angle_rad, shift_m)).scores
     assert here.ate_m is not None
     assert there.ate_m == pytest.approx(here.ate_m, rel=0.02, abs=1e-3)
 
 
-def test_same_input_gives_the_same_bits(mixed: Recording) -> None:
-    def bits(estimate: Estimate) -> bytes:
-        return estimate.trajectory.position_m.tobytes() + estimate.slip.tobytes()
+def test_same_input_gives_the_same_bits(short: Recording, replayed: ReplayResult) -> None:
+    again = replay(short).estimate
+    assert again.trajectory.position_m.tobytes() == replayed.estimate.trajectory.position_m.tobytes()
+    assert again.slip.tobytes() == replayed.estimate.slip.tobytes()
 
-    assert bits(replay(mixed).estimate) == bits(replay(mixed).estimate)
 
-
-def test_estimates_are_consistent_on_noisy_data(mixed: Recording) -> None:
-    """Normalised position error stays near one: neither overconfident nor blind."""
-    scores = replay(mixed, mode="adaptive").scores
+def test_estimates_are_consistent_on_noisy_data_and_weights_adapt(mixed: Recording) -> None:
+    """Normalised position error is near one, neither overconfident nor blind; weights change for a reason."""
+    result = replay(mixed, mode="adaptive")
+    scores, estimate = result.scores, result.estimate
     assert scores.nees_mean is not None
     assert 0.1 < scores.nees_mean < 2.0
+    assert estimate.changes
+    assert all("terrain" in change.reason and change.before != change.after for change in estimate.changes)
 
 
 def test_an_outage_is_bridged_and_left_without_a_jump(mixed: Recording) -> None:
-    result = replay(mixed, outages=[Outage(70.0, 40.0)])
+    result = replay(until(mixed, 155.0), outages=[Outage(70.0, 40.0)])
     score = result.scores.outages[0]
     assert score.percent is not None
     assert score.percent < 10.0
@@ -98,7 +113,7 @@ def test_an_outage_is_bridged_and_left_without_a_jump(mixed: Recording) -> None:
 
 def test_slip_is_seen_where_the_ground_gives_way() -> None:
     """Loose sand on 5 deg: the slip state follows the twin's true slip while GNSS is there."""
-    recording = simulate("paper_profile", terrain="loose_sand", slope_deg=5.0, seed=3)
+    recording = until(simulate("paper_profile", terrain="loose_sand", slope_deg=5.0, seed=3), 150.0)
     estimate = replay(recording).estimate
     truth, wheels = recording.truth, recording.wheels
     assert truth is not None
@@ -113,17 +128,11 @@ def test_slip_is_seen_where_the_ground_gives_way() -> None:
     assert np.median(np.abs(estimate.slip[moving] - true_slip)) < 0.06
 
 
-def test_fixed_weights_do_not_change(mixed: Recording) -> None:
-    estimate = replay(mixed, mode="fixed").estimate
+def test_fixed_weights_do_not_change(short: Recording) -> None:
+    estimate = replay(short, mode="fixed").estimate
     assert not estimate.changes
     learned = ("slip_mean", "slip_sigma")  # the robot's own, by self-calibration
     assert all(np.ptp(series) == 0.0 for name, series in estimate.weights.items() if name not in learned)
-
-
-def test_adaptive_weights_change_with_a_reason(mixed: Recording) -> None:
-    estimate = replay(mixed, mode="adaptive").estimate
-    assert estimate.changes
-    assert all("terrain" in change.reason and change.before != change.after for change in estimate.changes)
 
 
 def test_without_gnss_the_path_is_local_and_said_to_be(mixed: Recording) -> None:
@@ -143,36 +152,35 @@ def test_a_long_local_drive_with_stops_does_not_diverge() -> None:
     assert result.scores.ate_m < 6.0
 
 
-def test_a_wild_fix_is_refused(mixed: Recording) -> None:
+def test_a_wild_fix_is_refused(short: Recording, replayed: ReplayResult) -> None:
     """One fix 707 m off moves the path by less than 0.1 m."""
-    gnss = mixed.gnss
+    gnss = short.gnss
     assert gnss is not None
     enu = gnss.enu_m.copy()
     enu[len(enu) // 2] += [500.0, 500.0, 0.0]
-    spiked = replay(dataclasses.replace(mixed, gnss=dataclasses.replace(gnss, enu_m=enu)))
-    clean = replay(mixed)
-    assert spiked.rejected_gnss == clean.rejected_gnss + 1
-    moved = spiked.estimate.trajectory.position_m - clean.estimate.trajectory.position_m
+    spiked = replay(dataclasses.replace(short, gnss=dataclasses.replace(gnss, enu_m=enu)))
+    assert spiked.rejected_gnss == replayed.rejected_gnss + 1
+    moved = spiked.estimate.trajectory.position_m - replayed.estimate.trajectory.position_m
     assert np.hypot(*moved[:, :2].T).max() < 0.1
 
 
-def test_a_jump_of_all_fixes_is_followed_in_the_end(mixed: Recording) -> None:
+def test_a_jump_of_all_fixes_is_followed_in_the_end(short: Recording) -> None:
     """When GNSS stays elsewhere, the estimate gives in instead of locking good fixes out for ever."""
-    gnss = mixed.gnss
+    gnss = short.gnss
     assert gnss is not None
     enu = gnss.enu_m.copy()
     enu[len(enu) // 2 :, 0] += 40.0
-    result = replay(dataclasses.replace(mixed, gnss=dataclasses.replace(gnss, enu_m=enu)))
+    result = replay(dataclasses.replace(short, gnss=dataclasses.replace(gnss, enu_m=enu)))
     end = result.estimate.trajectory
     error = end.position_m[-1, 0] - np.interp(end.t_ns[-1], gnss.t_ns, enu[:, 0])
     assert abs(error) < 1.0
 
 
-def test_a_hole_in_the_imu_is_bridged(mixed: Recording) -> None:
-    imu = mixed.imu
+def test_a_hole_in_the_imu_is_bridged(short: Recording) -> None:
+    imu = short.imu
     assert imu is not None
-    t = (imu.t_ns - mixed.start_ns) * 1e-9
-    result = replay(dataclasses.replace(mixed, imu=imu.select((t < 60.0) | (t > 63.0))))
+    t = (imu.t_ns - short.start_ns) * 1e-9
+    result = replay(dataclasses.replace(short, imu=imu.select((t < 60.0) | (t > 63.0))))
     assert result.scores.ate_m is not None
     assert result.scores.ate_m < 2.0
 
@@ -194,11 +202,11 @@ def test_a_turn_in_a_hole_of_the_imu_is_no_greater_than_the_robot_turns() -> Non
     assert np.abs(wrong[:5]).max() < 0.05
 
 
-def test_late_wheels_do_not_stop_the_estimator(mixed: Recording) -> None:
-    wheels = mixed.wheels
+def test_late_wheels_do_not_stop_the_estimator(short: Recording) -> None:
+    wheels = short.wheels
     assert wheels is not None
-    t = (wheels.t_ns - mixed.start_ns) * 1e-9
-    result = replay(dataclasses.replace(mixed, wheels=wheels.select((t < 60.0) | (t > 64.0))))
+    t = (wheels.t_ns - short.start_ns) * 1e-9
+    result = replay(dataclasses.replace(short, wheels=wheels.select((t < 60.0) | (t > 64.0))))
     assert result.scores.ate_m is not None
     assert result.scores.ate_m < 2.0
 
