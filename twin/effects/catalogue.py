@@ -17,9 +17,9 @@ _OWN: dict[str, Form] = {}
 @functools.cache
 def built_in() -> dict[str, Form]:
     """The forms that come with the library, by key `effect/form`."""
-    from terrafusion.twin.effects import environment, sensing, terrain, vehicle
+    from terrafusion.twin.effects import chassis, environment, sensing, terrain, vehicle
 
-    forms = (*terrain.FORMS, *vehicle.FORMS, *sensing.FORMS, *environment.FORMS)
+    forms = (*terrain.FORMS, *vehicle.FORMS, *sensing.FORMS, *environment.FORMS, *chassis.FORMS)
     return {form.key: form for form in forms}
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from terrafusion.datasets.core.errors import ConfigError
-from terrafusion.twin.physics.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS
+from terrafusion.twin.physics.layout import MOUNTING, OUTPUTS, SOIL_PARAMETERS, VEHICLE_PARAMETERS, WHEELS
 
 Quantities = Mapping[str, Any]
 """What a stage knows, by name: CasADi expressions."""
@@ -27,6 +27,7 @@ STAGES: dict[str, tuple[str, ...]] = {
         *(f"d_command_{kind}_{side}" for kind in ("lag", "delay") for side in ("left", "right")),
     ),
     "supply": ("voltage_share",),
+    "loads": ("lean_x_mps2", "lean_y_mps2"),
     "corner": (
         "radius_m", "width_m", "load_n", "hub_forward_m", "hub_left_m", "grouser_height_m", "grouser_count",
         "heading_cos", "heading_sin", "path_share",
@@ -37,7 +38,11 @@ STAGES: dict[str, tuple[str, ...]] = {
         "gear_efficiency", "no_load_radps", "stall_torque_nm", "torque_limit_nm", "loop_p_nms", "loop_i_nm",
         "lag_s",
     ),
-    "wheel": ("drive_torque_nm", "force_x_n", "force_y_n", "traction_x_n", "traction_y_n", "drag_torque_nm"),
+    "wheel": (
+        "drive_torque_nm", "force_x_n", "force_y_n", "traction_x_n", "traction_y_n", "drag_torque_nm",
+        "scrub_nm",
+    ),
+    "shafts": tuple(f"d_wheel_speed_{name}" for name in WHEELS),
     "body": ("body_force_x_n", "body_force_y_n", "body_moment_nm"),
     "mounting": MOUNTING,
     "measurement": OUTPUTS,
@@ -45,9 +50,9 @@ STAGES: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 """Stages in the order in which they are built, and the quantities a term may set there.
 
-`corner`, `ground`, `motor` and `wheel` are built once a wheel. In the stage `stamp` the time
-derivative of an output is known as `d_<output>`. `heading_cos` and `heading_sin` turn the wheel about z;
-without them it points along body x.
+`corner`, `ground`, `motor` and `wheel` are built once a wheel; `loads` knows the wheels' forces on the body
+under static loads. In the stage `stamp` the time derivative of an output is known as `d_<output>`.
+`heading_cos` and `heading_sin` turn the wheel about z; without them it points along body x.
 """
 
 PLANE = frozenset(

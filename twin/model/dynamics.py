@@ -86,12 +86,13 @@ def graph(effects: tuple[str, ...] = ()) -> ModelGraph:
     q |= _gravity_along_body(q)
     q = terms.apply("command", q | _commands(q))
     q = terms.apply("supply", q | _supply(q))
-    wheels = [
-        _wheel(i, q, [ps[k, i] for k in range(len(SOIL_PARAMETERS))], terms) for i in range(len(WHEELS))
-    ]
-    forces = _forces(wheels)
+    q |= {f"lean_{axis}_mps2": q[f"gravity_body_{axis}_mps2"] for axis in ("x", "y")}
+    forces, wheels = _ground_forces(q, ps, terms)
+    if terms.at("loads"):  # which may depend on the forces under static loads
+        q = terms.apply("loads", q | forces)
+        forces, wheels = _ground_forces(q, ps, terms)
     q = terms.apply("body", q | forces)
-    d = _derivatives(q, wheels)
+    d = _derivatives(q, wheels, terms)
     if terms.at("body"):  # forces on the body from elsewhere than the wheels
         d["resistance_work"] = d["resistance_work"] + _power(forces, q) - _power(q, q)
     derivative = ca.vertcat(*(d[name] for name in STATES))
@@ -107,17 +108,17 @@ def wheel_positions(p: dict[str, Any]) -> list[tuple[Any, Any]]:
     ]
 
 
-def wheel_loads(p: dict[str, Any], gravity_x: Any, gravity_y: Any) -> list[Any]:
-    """Quasi-static wheel loads, N: weight shared by the position of the centre of gravity and by the slope.
+def wheel_loads(p: dict[str, Any], lean_x: Any, lean_y: Any) -> list[Any]:
+    """Quasi-static wheel loads, N: weight shared by where the centre of gravity is and leans.
 
-    `gravity_x`, `gravity_y` are gravity along body x and y, m/s2. A load is
+    `lean_x`, `lean_y` are gravity along body x and y, less acceleration where that counts, m/s2. A load is
     bounded above zero smoothly: the model does not tip over.
     """
     from terrafusion.twin.physics.smooth import smooth_max
 
     weight = p["mass_kg"] * p["gravity_normal_mps2"]
-    lean_x = (p["cg_forward_m"] + p["cg_height_m"] * gravity_x / p["gravity_normal_mps2"]) / p["wheelbase_m"]
-    lean_y = (p["cg_left_m"] + p["cg_height_m"] * gravity_y / p["gravity_normal_mps2"]) / p["track_m"]
+    lean_x = (p["cg_forward_m"] + p["cg_height_m"] * lean_x / p["gravity_normal_mps2"]) / p["wheelbase_m"]
+    lean_y = (p["cg_left_m"] + p["cg_height_m"] * lean_y / p["gravity_normal_mps2"]) / p["track_m"]
     shares = [(0.5 + end * lean_x) * (0.5 + side * lean_y) for end, side in zip(ENDS, SIDES, strict=True)]
     return [smooth_max(weight * share, 1.0, 1.0) for share in shares]
 
@@ -164,7 +165,7 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
     name, side, end = WHEELS[i], SIDES[i], ENDS[i]
     forward, left = wheel_positions(q)[i]
     w = {**q, "side": side, "end": end, "hub_forward_m": forward, "hub_left_m": left}
-    w["load_n"] = wheel_loads(q, q["gravity_body_x_mps2"], q["gravity_body_y_mps2"])[i]
+    w["load_n"] = wheel_loads(q, q["lean_x_mps2"], q["lean_y_mps2"])[i]
     states = ("wheel_speed", "shear_x", "shear_y", "torque", "speed_error", "brake", "play")
     w |= {state: q[f"{state}_{name}"] for state in states}
     w = terms.apply("corner", w)
@@ -203,7 +204,7 @@ def _wheel(i: int, q: dict[str, Any], soil: list[Any], terms: Any) -> dict[str, 
     w["d_torque"] = (wanted - w["torque"]) / w["lag_s"]
     w["current_a"] = motor_current(w, w["torque"], w["wheel_speed"])
 
-    w["drive_torque_nm"] = w["torque"]
+    w["drive_torque_nm"], w["scrub_nm"] = w["torque"], 0.0
     w = terms.apply("wheel", w)
     w["push_x_n"], w["push_y_n"] = w["force_x_n"], w["force_y_n"]
     if "heading_cos" in w:
@@ -218,12 +219,20 @@ def _turned(cos: Any, sin: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return cos * x - sin * y, sin * x + cos * y
 
 
+def _ground_forces(q: dict[str, Any], soils: Any, terms: Any) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    """The wheels, and the sum of their forces on the body; soils (S, 4)."""
+    rows = range(len(SOIL_PARAMETERS))
+    wheels = [_wheel(i, q, [soils[k, i] for k in rows], terms) for i in range(len(WHEELS))]
+    return _forces(wheels), wheels
+
+
 def _forces(wheels: list[dict[str, Any]]) -> dict[str, Any]:
     """Sum of the wheels' forces on the body, N and N m about the centre of gravity."""
     force_x, force_y, moment = 0.0, 0.0, 0.0
     for w in wheels:
         force_x, force_y = force_x + w["push_x_n"], force_y + w["push_y_n"]
         moment = moment + w["hub_forward_m"] * w["push_y_n"] - w["hub_left_m"] * w["push_x_n"]
+        moment = moment + w["scrub_nm"]
     return {"body_force_x_n": force_x, "body_force_y_n": force_y, "body_moment_nm": moment}
 
 
@@ -233,7 +242,7 @@ def _power(forces: dict[str, Any], q: dict[str, Any]) -> Any:
     return along + forces["body_moment_nm"] * q["r"]
 
 
-def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> dict[str, Any]:
+def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]], terms: Any) -> dict[str, Any]:
     """dx/dt by the names of `STATES`."""
     from terrafusion.twin.physics.wheel import WheelSoil, clog_rate
 
@@ -250,8 +259,12 @@ def _derivatives(q: dict[str, Any], wheels: list[dict[str, Any]]) -> dict[str, A
         d["clog"] = d["clog"] + 0.25 * clog_rate(ground, q["clog"], w["rim_mps"], w["ground_slip"])
         d["motor_work"] = d["motor_work"] + w["drive_torque_nm"] * w["wheel_speed"]
         slipping, lost = _dissipated(w)
+        lost = lost - w["scrub_nm"] * q["r"]
         d["slip_work"] = d["slip_work"] + slipping
         d["resistance_work"] = d["resistance_work"] + lost - slipping
+    free = {f"d_{name}": d[name] for name in (f"wheel_speed_{wheel}" for wheel in WHEELS)}
+    turned = terms.apply("shafts", q | free)
+    d |= {name.removeprefix("d_"): turned[name] for name in free}
     d["u"] = q["body_force_x_n"] / q["mass_kg"] + q["gravity_body_x_mps2"] + q["r"] * q["v"]
     d["v"] = q["body_force_y_n"] / q["mass_kg"] + q["gravity_body_y_mps2"] - q["r"] * q["u"]
     d["r"] = q["body_moment_nm"] / q["yaw_inertia_kgm2"]

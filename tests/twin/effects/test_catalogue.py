@@ -45,10 +45,12 @@ BODY = ("u", "v", "r")
 REACH = {
     "command": ("torque", "speed_error", "command"),
     "supply": ("torque", "speed_error"),
+    "loads": (*BODY, "wheel_speed", "shear", "brake", "clog", "slip_work", "resistance_work"),
     "corner": (*BODY, "wheel_speed", "shear", "brake", "clog", "slip_work", "resistance_work"),
     "ground": (*BODY, "wheel_speed", "shear", "brake", "clog", "slip_work", "resistance_work"),
     "motor": ("torque", "speed_error", "play"),
     "wheel": (*BODY, "wheel_speed", "motor_work", "slip_work", "resistance_work"),
+    "shafts": ("wheel_speed",),
     "body": (*BODY, "resistance_work"),
 } | dict.fromkeys(SENSOR_STAGES, ())
 """States whose derivative a term at a stage can change at once; what lies upstream it cannot."""
@@ -71,8 +73,9 @@ each_form = pytest.mark.parametrize("form", FORMS, ids=named)
 
 def test_every_effect_of_the_contract_is_there_in_two_forms_or_more() -> None:
     assert len(CONTRACT) == 37
-    assert {form.effect for form in FORMS} == set(CONTRACT)
-    assert min(Counter(form.effect for form in FORMS).values()) >= 2
+    causes = Counter(form.effect for form in FORMS if form.candidate)
+    assert set(causes) == set(CONTRACT)
+    assert min(causes.values()) >= 2
     assert set(effect_names()) >= set(CONTRACT)
 
 
