@@ -15,6 +15,7 @@ import pytest
 
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -30,7 +31,7 @@ PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "integration.md"
 
 @pytest.fixture(scope="module")
 def drive() -> Recording:
-    return simulate("figure_eight", terrain="asphalt", seed=5)
+    return until(simulate("figure_eight", terrain="asphalt", seed=5), 50.0)
 
 
 @pytest.fixture(scope="module")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import pytest
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.datasets.core.frames import wrap_angle
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import until
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.estimator.estimator import Estimator
@@ -22,16 +24,28 @@ from tests.fusion.metrics.test_aided_drives import aided
 WITHOUT_S = 50.0
 
 
-def drive(heading_deg: float, fix: Fix | None = None, terrain: str = "asphalt", seed: int = 100) -> Recording:
-    """A figure of eight whose receiver finds itself after 50 s."""
+def drive(
+    heading_deg: float,
+    fix: Fix | None = None,
+    terrain: str = "asphalt",
+    seed: int = 100,
+    end_s: float = 75.0,
+) -> Recording:
+    """A figure of eight whose receiver finds itself after 50 s, cut off after `end_s`."""
     scenario = dataclasses.replace(load_scenario("figure_eight"), heading_deg=heading_deg, gnss_fix=fix)
     recording = simulate(scenario, terrain=terrain, seed=seed)
     assert recording.gnss is not None
     late = recording.gnss.t_ns > recording.start_ns + round(WITHOUT_S * 1e9)
-    return dataclasses.replace(recording, gnss=recording.gnss.select(late))
+    return until(dataclasses.replace(recording, gnss=recording.gnss.select(late)), end_s)
 
 
-UP_M = 30.0
+@functools.cache
+def replayed(heading_deg: float, terrain: str = "asphalt") -> ReplayResult:
+    """Several tests look at the same replay."""
+    return replay(drive(heading_deg, terrain=terrain))
+
+
+UP_M, END_S = 30.0, 85.0
 
 
 def aided_drive(heading_deg: float, until_s: float) -> Recording:
@@ -42,7 +56,9 @@ def aided_drive(heading_deg: float, until_s: float) -> Recording:
     assert gnss is not None
     t_s = (gnss.t_ns - recording.start_ns) * 1e-9
     lifted = dataclasses.replace(gnss, enu_m=gnss.enu_m + np.array([0.0, 0.0, UP_M]))
-    return dataclasses.replace(recording, gnss=lifted.select((t_s > WITHOUT_S) & (t_s < until_s)))
+    return until(
+        dataclasses.replace(recording, gnss=lifted.select((t_s > WITHOUT_S) & (t_s < until_s))), END_S
+    )
 
 
 def yaw_errors(result: ReplayResult) -> np.ndarray:
@@ -54,7 +70,7 @@ def yaw_errors(result: ReplayResult) -> np.ndarray:
 @pytest.mark.parametrize("heading_deg", [0.0, 137.0, -100.0])
 @pytest.mark.parametrize("terrain", ["asphalt", "loose_sand"])
 def test_the_path_lies_where_the_robot_was_whatever_its_heading(heading_deg: float, terrain: str) -> None:
-    result = replay(drive(heading_deg, terrain=terrain))
+    result = replayed(heading_deg, terrain)
     errors = result.scores.errors
     assert errors is not None
     status = result.estimate.status
@@ -104,7 +120,7 @@ def test_a_batch_of_them_is_on_the_map_from_its_first_moment() -> None:
 def test_with_stand_alone_fixes_it_waits_until_they_tell_the_heading() -> None:
     nees = []
     for seed in range(100, 104):
-        result = replay(drive(60.0, Fix.SINGLE, seed=seed))
+        result = replay(drive(60.0, Fix.SINGLE, seed=seed, end_s=106.0))
         errors = result.scores.errors
         assert errors is not None
         assert (errors.t_ns[0] - result.recording.start_ns) * 1e-9 > WITHOUT_S + 3.0
@@ -125,7 +141,7 @@ def test_a_batch_knows_the_path_from_its_first_moment() -> None:
 
 def test_what_lies_before_is_shown_where_it_was() -> None:
     """The local part, moved as the fixes told, meets the rest without a jump."""
-    result = replay(drive(137.0))
+    result = replayed(137.0)
     path = result.estimate.trajectory
     local = result.estimate.status == "no_gnss"
     truth = result.recording.truth
@@ -137,7 +153,7 @@ def test_what_lies_before_is_shown_where_it_was() -> None:
 
 
 def test_a_robot_that_hardly_moves_stays_local() -> None:
-    recording = drive(30.0, Fix.SINGLE, "mud")
+    recording = drive(30.0, Fix.SINGLE, "mud", end_s=106.0)
     truth, gnss = recording.truth, recording.gnss
     assert truth is not None
     assert gnss is not None
