@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields, without_rows
+from terrafusion.datasets.checks.finding import CheckContext, Finding, scaled, with_fields, without_rows
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.recording import Recording
 
 PRESSURE_PA = (30e3, 110e3)
 """Static pressure where robots drive: 9 km high (ISA) to below the Dead Sea."""
 CODES = {"barometer": "pressure-unit", "magnetometer": "field-unit"}
+FIELDS = {"barometer": "pressure_pa", "magnetometer": "field_t"}
 PRESSURE_UNITS = {"hPa": 1e2, "kPa": 1e3}
 FIELD_T = (15e-6, 80e-6)
 """Size of the field: Earth's is 22 to 67 uT (World Magnetic Model 2020), widened by iron of the robot."""
@@ -88,13 +88,8 @@ def _range(
         else f"the {quantity} is outside Earth's range",
         f"median size {size:.4g}; possible are {limits[0]:g} to {limits[1]:g} {unit}",
         f"multiply by {units[meant]:g}" if meant else fix,
-        partial(_scaled, channel=channel, factor=units[meant]) if meant else None,
+        scaled(channel, units[meant], FIELDS[channel]) if meant else None,
     )  # fmt: skip
-
-
-def _scaled(recording: Recording, channel: str, factor: float) -> Recording:
-    field = {"barometer": "pressure_pa", "magnetometer": "field_t"}[channel]
-    return with_fields(recording, channel, **{field: getattr(getattr(recording, channel), field) * factor})
 
 
 def _within_range(recording: Recording) -> Recording:

@@ -72,6 +72,16 @@ def with_fields(recording: Recording, channel: str, **fields: Any) -> Recording:
     return dataclasses.replace(recording, **{channel: changed})
 
 
+def scaled(channel: str, factor: float, *fields: str) -> Repair:
+    """A repair that multiplies fields of a channel."""
+
+    def repair(recording: Recording) -> Recording:
+        part = getattr(recording, channel)
+        return with_fields(recording, channel, **{name: getattr(part, name) * factor for name in fields})
+
+    return repair
+
+
 def without_rows(channel: str, rows: NDArray[np.bool_]) -> Repair:
     """A repair that drops the rows of a mask."""
     return lambda recording: dataclasses.replace(

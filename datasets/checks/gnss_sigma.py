@@ -12,7 +12,7 @@ from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, scaled, with_fields
 from terrafusion.datasets.checks.motion import typical_sigma
 from terrafusion.datasets.checks.path import scatter_m
 from terrafusion.datasets.core.arrays import Array, Mask
@@ -107,13 +107,8 @@ def check_scatter(context: CheckContext) -> Iterator[Finding]:
         f"the fixes scatter {factor:.0f} times more than their sigma{hint}",
         f"{scatter:.3f} m about the path by wheels and gyro, median sigma {sigma:.4f} m",
         f"multiply the sigmas by {factor:.1f}",
-        partial(_scaled, factor=factor),
+        scaled("gnss", factor, "sigma_enu_m"),
     )  # fmt: skip
-
-
-def _scaled(recording: Recording, factor: float) -> Recording:
-    assert recording.gnss is not None
-    return with_fields(recording, "gnss", sigma_enu_m=recording.gnss.sigma_enu_m * factor)
 
 
 def check_dilution(context: CheckContext) -> Iterator[Finding]:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.checks.bootstrap_interval import RESAMPLES, SEED, interval_of
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, scaled, with_fields
 from terrafusion.datasets.checks.motion import (
     Integral,
     agreement,
@@ -104,17 +104,13 @@ def check_gravity(context: CheckContext) -> Iterator[Finding]:
     size = float(np.linalg.norm(mean))
     if 0.85 < size < 1.15:
         what, fix = "acceleration looks like g, not m/s2", f"multiply by {GRAVITY_MPS2}"
-        yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, _to_mps2)
+        repair = scaled("imu", GRAVITY_MPS2, "accel_mps2")
+        yield Finding("accel-in-g", "error", "imu", what, _mean_force(mean), fix, repair)
         return
     removed = ": gravity has been removed" if size < REMOVED_SHARE * GRAVITY_MPS2 else ""
     what = f"mean specific force is {size:.2f} m/s2, not 9.8{removed}"
     fix = "give raw accelerometer data in m/s2, gravity included"
     yield Finding("accel-magnitude", "error", "imu", what, _mean_force(mean), fix)
-
-
-def _to_mps2(recording: Recording) -> Recording:
-    assert recording.imu is not None
-    return with_fields(recording, "imu", accel_mps2=recording.imu.accel_mps2 * GRAVITY_MPS2)
 
 
 def check_bias(context: CheckContext) -> Iterator[Finding]:
@@ -361,7 +357,11 @@ def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repa
     turning = turning_axis(context)
     alone = turning == "+z"  # the gyro is right as it is: the accelerometer has other axes
     if alone and up == "-z":
-        return "; gyro z turns with the wheels", "change the sign of the specific force", _negated
+        return (
+            "; gyro z turns with the wheels",
+            "change the sign of the specific force",
+            scaled("imu", -1.0, "accel_mps2"),
+        )
     axes, evidence = _axes_for(context, imu, up, alone)
     if turning is not None:
         evidence = f"; the gyro turns with the wheels about {turning}{evidence}"
@@ -396,8 +396,3 @@ def _turned(recording: Recording, axes: Axes, *, gyro: bool) -> Recording:
     if gyro or recording.imu is None:
         return turned
     return with_fields(turned, "imu", gyro_radps=recording.imu.gyro_radps)
-
-
-def _negated(recording: Recording) -> Recording:
-    assert recording.imu is not None
-    return with_fields(recording, "imu", accel_mps2=-recording.imu.accel_mps2)

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, scaled
 from terrafusion.datasets.checks.motion import wheel_speed
 from terrafusion.datasets.checks.path import PathScale, scales
 from terrafusion.datasets.core.channels import TERRAINS
@@ -70,7 +70,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
             f"the speeds look like {names}: the ground speed is {scale.ratio:.3g} times as large",
             evidence,
             f"multiply them by {factor:.6g}" if len(units) == 1 else "give the unit: more than one fits",
-            partial(_scaled, factor=factor) if len(units) == 1 else None,
+            scaled("wheels", factor, "speed") if len(units) == 1 else None,
         )  # fmt: skip
     elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
@@ -93,7 +93,7 @@ def _too_slow(context: CheckContext, scale: PathScale, evidence: str, unit: str,
         fix = "check wheel radius and unit"
         fix += ", or did it roll downhill on braked wheels?" if downhill else ""
     elif unit == "mps":
-        repair = partial(_scaled, factor=scale.ratio)
+        repair = scaled("wheels", scale.ratio, "speed")
         fix = f"multiply the speeds by {scale.ratio:.3f}"
     else:
         repair = partial(apply, conventions=Conventions(wheel_radius_m=fitting))
@@ -135,11 +135,6 @@ def _fitting_units(context: CheckContext, scale: PathScale, spread: float) -> li
         return [unit for unit in fitting if abs(commanded / unit.factor - 1.0) < 2.0 * UNIT_ERROR]
     rated = float(np.nanpercentile(np.abs(wheels.side_speeds_mps(radius)), 95))
     return fitting if scale.ratio > 1.0 or (rated > FAST_MPS and spread < EVEN) else []
-
-
-def _scaled(recording: Recording, factor: float) -> Recording:
-    assert recording.wheels is not None
-    return with_fields(recording, "wheels", speed=recording.wheels.speed * factor)
 
 
 def _descent(recording: Recording) -> float:

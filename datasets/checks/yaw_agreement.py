@@ -6,11 +6,12 @@ Where two contradict each other, the smallest set of sources whose reversal make
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
 from itertools import combinations, product
 
 import numpy as np
 
-from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, with_fields
+from terrafusion.datasets.checks.finding import CheckContext, Finding, Repair, scaled, with_fields
 from terrafusion.datasets.checks.gnss_frame import reflection
 from terrafusion.datasets.checks.imu import heading, is_upright
 from terrafusion.datasets.checks.motion import (
@@ -70,7 +71,7 @@ def check_gyro_unit(context: CheckContext) -> Iterator[Finding]:
             f"gyro z is far larger than the turn rate of {NAMES[other]}: it looks like deg/s",
             f"{abs(both.slope):.0f} {unit}; correlation {both.r:.2f}",
             "multiply by pi / 180",
-            _to_radians,
+            scaled("imu", np.pi / 180.0, "gyro_radps"),
         )  # fmt: skip
         return
 
@@ -215,25 +216,18 @@ def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
     """What to do where one source turns the wrong way."""
     if name == "gnss":
         return reflection(context.recording)
+    gyro_sign = partial(apply, conventions=Conventions(gyro_z_sign=-1.0))
+    command_sign = scaled("command", -1.0, "yaw_rate_radps")
     return {
-        "gyro": ("change the sign of gyro z (left turn positive)", _gyro_sign),
+        "gyro": ("change the sign of gyro z (left turn positive)", gyro_sign),
         "wheels": ("swap left and right wheels", _swap_sides),
         "truth": ("check the truth's frame: its yaw must grow to the left", None),
-        "command": ("change the sign of the commanded yaw rate (left turn positive)", _command_sign),
+        "command": ("change the sign of the commanded yaw rate (left turn positive)", command_sign),
         "accelerometer": (
             "check the accelerometer's axes: x, y and z must make a right-handed frame",
             None,
         ),
     }[name]
-
-
-def _to_radians(recording: Recording) -> Recording:
-    assert recording.imu is not None
-    return with_fields(recording, "imu", gyro_radps=np.radians(recording.imu.gyro_radps))
-
-
-def _gyro_sign(recording: Recording) -> Recording:
-    return apply(recording, Conventions(gyro_z_sign=-1.0))
 
 
 def _swap_sides(recording: Recording) -> Recording:
@@ -242,8 +236,3 @@ def _swap_sides(recording: Recording) -> Recording:
     other = [0] if len(wheels.names) == 1 else [k ^ 1 for k in range(len(wheels.names))]
     angle = None if wheels.angle_rad is None else wheels.angle_rad[:, other]
     return with_fields(recording, "wheels", speed=wheels.speed[:, other], angle_rad=angle)
-
-
-def _command_sign(recording: Recording) -> Recording:
-    assert recording.command is not None
-    return with_fields(recording, "command", yaw_rate_radps=-recording.command.yaw_rate_radps)

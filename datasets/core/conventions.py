@@ -89,7 +89,7 @@ def _geometry(recording: Recording, c: Conventions) -> Recording:
 def _inertial(recording: Recording, c: Conventions) -> Recording:
     imu, field = recording.imu, recording.magnetometer
     if field is not None and c.imu_axes != BODY_AXES:
-        turned = dataclasses.replace(field, field_t=_turned(axes_matrix(c.imu_axes), field.field_t))
+        turned = dataclasses.replace(field, field_t=permuted(axes_matrix(c.imu_axes), field.field_t))
         recording = dataclasses.replace(recording, magnetometer=turned).with_notes(
             "magnetometer: assumed to have the IMU's axes, and turned with it"
         )
@@ -97,7 +97,7 @@ def _inertial(recording: Recording, c: Conventions) -> Recording:
         return recording
     if c.imu_axes != BODY_AXES:
         R = axes_matrix(c.imu_axes)
-        imu = Imu(imu.t_ns, _turned(R, imu.gyro_radps), _turned(R, imu.accel_mps2))
+        imu = Imu(imu.t_ns, permuted(R, imu.gyro_radps), permuted(R, imu.accel_mps2))
         recording = recording.with_notes(
             f"imu: axes {', '.join(c.imu_axes)} brought to x forward, y left, z up"
         )
@@ -107,8 +107,8 @@ def _inertial(recording: Recording, c: Conventions) -> Recording:
     return dataclasses.replace(recording, imu=imu)
 
 
-def _turned(R: Array, values: Array) -> Array:
-    """R @ v for signed permutations; NaN axes do not affect the others."""
+def permuted(R: Array, values: Array) -> Array:
+    """R @ v of vectors (N, 3) for a signed permutation R; NaN axes do not affect the others."""
     source = np.abs(R).argmax(axis=1)
     return values[:, source] * R[np.arange(3), source]
 

@@ -21,7 +21,7 @@ from terrafusion.datasets.core.channels import (
     Terrain,
     Wheels,
 )
-from terrafusion.datasets.core.conventions import BODY_AXES, Conventions
+from terrafusion.datasets.core.conventions import BODY_AXES, Conventions, permuted
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.core.trajectory import Trajectory
@@ -126,7 +126,7 @@ class ChannelBuilder:
         out = []
         for values in vectors:
             turned = values.copy()
-            turned[turn] = _rotate(R, values[turn])
+            turned[turn] = permuted(R, values[turn])
             out.append(turned)
         return tuple(out)
 
@@ -351,9 +351,3 @@ class ChannelBuilder:
                 time_s=self._since(t_ns[i]),
                 remedy="correct the driver, or filter these messages out of the bag",
             )
-
-
-def _rotate(R: Array, values: Array) -> Array:
-    """`values` (N, 3) turned by the signed permutation R, exactly: NaN stays on its own axis."""
-    source = np.abs(R).argmax(axis=1)
-    return np.asarray(values[:, source] * R[np.arange(3), source])

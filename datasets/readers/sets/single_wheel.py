@@ -22,9 +22,18 @@ LARGEST = 1e6
 """No force in N, speed in mm/s or height in mm of the test bed is larger."""
 
 SLIP_TOLERANCE = 0.02
-FIELDS = {
-    *(f"{kind}_{name}" for kind in ("avg", "std") for name in ("Fx", "Fy", "Fz", "Vx", "Vry", "angle", "Z")),
-    *("Vry", "beta", "trial_num", "slip"),
+_QUANTITIES = {
+    "angle": ("side_slip", "rad", np.pi / 180.0),
+    "Fy": ("tractive_force", "n", -1.0),
+    "Fx": ("side_force", "n", 1.0),
+    "Fz": ("load", "n", -1.0),
+    "Z": ("sinkage", "m", -1e-3),
+    "Vx": ("travel_speed", "mps", 1e-3),
+    "Vry": ("rim_speed", "mps", 1e-3),
+}
+"""Name and unit in `WheelTrials`, and the factor from axes and units of the file to SI and the wheel's axes."""
+FIELDS = {f"{kind}_{key}" for kind in ("avg", "std") for key in _QUANTITIES} | {
+    *("Vry", "beta", "trial_num", "slip")
 }
 
 
@@ -119,36 +128,19 @@ def read_wheel_trials(path: Path | str) -> WheelTrials:
     columns = {name: _column(path, name, raw[name]) for name in FIELDS}
     if not len(columns["slip"]):
         raise DataError("holds no trials", file=path, remedy="give the file as published")
-    by_kind = [{name: columns[f"{kind}_{name}"] for name in _SCALE} for kind in ("avg", "std")]
-    mean = {name: scale * by_kind[0][name] for name, scale in _SCALE.items()}
-    spread = {name: abs(scale) * by_kind[1][name] for name, scale in _SCALE.items()}
+    means = {f"{name}_{unit}": f * columns[f"avg_{key}"] for key, (name, unit, f) in _QUANTITIES.items()}
+    spreads = {
+        f"{name}_sd_{unit}": abs(f) * columns[f"std_{key}"] for key, (name, unit, f) in _QUANTITIES.items()
+    }
     return WheelTrials(
         slip=columns["slip"],
-        side_slip_rad=mean["angle"],
-        tractive_force_n=mean["Fy"],
-        side_force_n=mean["Fx"],
-        load_n=mean["Fz"],
-        sinkage_m=mean["Z"],
-        travel_speed_mps=mean["Vx"],
-        rim_speed_mps=mean["Vry"],
-        side_slip_sd_rad=spread["angle"],
-        tractive_force_sd_n=spread["Fy"],
-        side_force_sd_n=spread["Fx"],
-        load_sd_n=spread["Fz"],
-        sinkage_sd_m=spread["Z"],
-        travel_speed_sd_mps=spread["Vx"],
-        rim_speed_sd_mps=spread["Vry"],
-        commanded_rim_speed_mps=columns["Vry"] * _SCALE["Vry"],
-        commanded_side_slip_rad=columns["beta"] * _SCALE["angle"],
+        **means,
+        **spreads,
+        commanded_rim_speed_mps=columns["Vry"] * _QUANTITIES["Vry"][2],
+        commanded_side_slip_rad=columns["beta"] * _QUANTITIES["angle"][2],
         trial=columns["trial_num"].astype(np.int64),
-        notes=_checked_slip(columns["slip"], mean["Vx"], mean["Vry"]),
+        notes=_checked_slip(columns["slip"], means["travel_speed_mps"], means["rim_speed_mps"]),
     )
-
-
-_SCALE = {
-    "Fx": 1.0, "Fy": -1.0, "Fz": -1.0, "Z": -1e-3, "Vx": 1e-3, "Vry": 1e-3, "angle": np.pi / 180.0
-}  # fmt: skip
-"""From the file's axes and units to the wheel's axes and SI."""
 
 
 def _column(path: Path, name: str, cells: list[Array]) -> Array:

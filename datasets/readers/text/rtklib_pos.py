@@ -17,6 +17,7 @@ from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Fix, Gnss
 from terrafusion.datasets.core.decimals import NS_PER, NotADecimal, dates_to_ns
 from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.frames import enu_from_ecef
 from terrafusion.datasets.core.gnss_time import FULL_WEEK_MIN, WEEK_S, gps_to_unix_ns, leap_note
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers.delimited import (
@@ -268,7 +269,7 @@ class _Solution:
                 remedy="process the observations again",
             )
         llh = np.stack(pymap3d.ecef2geodetic(*xyz.T), axis=1)
-        R = _enu_from_ecef(llh[0, 0], llh[0, 1])  # one rotation: a robot stays near its first fix
+        _, R, _ = enu_from_ecef(xyz[:1])  # one rotation: a robot stays near its first fix
         velocity = self.stack("vx(m/s)", "vy(m/s)", "vz(m/s)") @ R.T
         P = _covariances(
             self.stack("sdx(m)", "sdy(m)", "sdz(m)"), self.stack("sdxy(m)", "sdyz(m)", "sdzx(m)")
@@ -303,17 +304,6 @@ class _Solution:
 def _horizontal(sigma: Array) -> Array:
     """One sigma (N,) for both horizontal axes of (N, 2)."""
     return np.asarray(np.sqrt((sigma**2).mean(axis=1)))
-
-
-def _enu_from_ecef(lat_deg: float, lon_deg: float) -> Array:
-    lat, lon = np.radians([lat_deg, lon_deg])
-    return np.array(
-        [
-            [-np.sin(lon), np.cos(lon), 0.0],
-            [-np.sin(lat) * np.cos(lon), -np.sin(lat) * np.sin(lon), np.cos(lat)],
-            [np.cos(lat) * np.cos(lon), np.cos(lat) * np.sin(lon), np.sin(lat)],
-        ]
-    )
 
 
 def _covariances(sigma: Array, cross: Array) -> Array:

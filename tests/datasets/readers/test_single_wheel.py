@@ -104,8 +104,9 @@ def test_axes_as_the_file_has_them_are_seen(smooth: Path, monkeypatch: pytest.Mo
 
     for name, check in (("Fy", "a locked wheel drags"), ("Fz", "the load presses"), ("Z", "it sinks")):
         with monkeypatch.context() as patch:
-            flipped = single_wheel._SCALE | {name: -single_wheel._SCALE[name]}
-            patch.setattr(single_wheel, "_SCALE", flipped)
+            *words, factor = single_wheel._QUANTITIES[name]
+            flipped = single_wheel._QUANTITIES | {name: (*words, -factor)}
+            patch.setattr(single_wheel, "_QUANTITIES", flipped)
             assert not axes_checks(read_wheel_trials(smooth))[check]
 
 
