@@ -31,7 +31,7 @@ _QUANTITIES = {
     "Vx": ("travel_speed", "mps", 1e-3),
     "Vry": ("rim_speed", "mps", 1e-3),
 }
-"""Name and unit in `WheelTrials`, and the factor from axes and units of the file to SI and the wheel's axes."""
+"""Name and unit of each, and the factor from the file's axes and units to the wheel's axes and SI."""
 FIELDS = {f"{kind}_{key}" for kind in ("avg", "std") for key in _QUANTITIES} | {
     *("Vry", "beta", "trial_num", "slip")
 }
