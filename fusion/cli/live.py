@@ -1,32 +1,167 @@
-"""`terrafusion live`: a recording through the live loop, with the computing time of each call."""
+"""`terrafusion live`: the estimator on a running robot over DDS, or a recording through the same loop."""
 
 from __future__ import annotations
 
+import os
+import signal
+import time
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from terrafusion.fusion.cli.common import LogArgument, VehicleOption
+from terrafusion.fusion.cli.common import StampsOption, TopicOption, VehicleOption, check_stamps, parse_topics
 
 if TYPE_CHECKING:
     from terrafusion.fusion.estimate.estimate import State
+    from terrafusion.fusion.live.node import LiveNode, LiveOptions
 
+LogArgument = Annotated[
+    str | None,
+    typer.Argument(metavar="[LOG]", help="A recording to run in place of a robot; without one, DDS is used."),
+]
 RealtimeOption = Annotated[bool, typer.Option("--realtime", help="At the pace of the recording.")]
+ModeOption = Annotated[str, typer.Option(help="adaptive, fixed, robust or innovation, as of `replay`.")]
+DomainOption = Annotated[
+    int | None, typer.Option("--domain", help="DDS domain; by default ROS_DOMAIN_ID, else 0.")
+]
+LoopbackOption = Annotated[bool, typer.Option("--loopback", help="Speak to this machine only (127.0.0.1).")]
+ReliableOption = Annotated[
+    bool, typer.Option("--reliable", help="Ask for lost messages again; by default as ROS 2's sensor data.")
+]
+RateOption = Annotated[float, typer.Option("--rate", help="Odometry a second, at most.")]
+DatumOption = Annotated[
+    str | None,
+    typer.Option("--datum", metavar="LAT,LON,HEIGHT", help="Origin of map, instead of the first fix."),
+]
+SimTimeOption = Annotated[bool, typer.Option("--use-sim-time", help="The time of the robot is /clock.")]
+NamespaceOption = Annotated[
+    str, typer.Option("--namespace", help="Put before the published topics, such as /robot1.")
+]
+WaitOption = Annotated[
+    float, typer.Option("--wait", help="Seconds that samples wait for others of the same time.")
+]
+SecondsOption = Annotated[float | None, typer.Option("--seconds", help="Stop after so long; else Ctrl-C.")]
+FoxgloveOption = Annotated[
+    int | None, typer.Option("--foxglove", metavar="PORT", help="Show it in Foxglove at ws://localhost:PORT.")
+]
 
 
-def live(log: LogArgument, vehicle: VehicleOption = None, realtime: RealtimeOption = False) -> None:
-    """Run the estimator as on a robot: message by message, odometry after every IMU sample.
+def live(
+    log: LogArgument = None,
+    vehicle: VehicleOption = None,
+    realtime: RealtimeOption = False,
+    mode: ModeOption = "adaptive",
+    topic: TopicOption = None,
+    stamps: StampsOption = "header",
+    domain: DomainOption = None,
+    loopback: LoopbackOption = False,
+    reliable: ReliableOption = False,
+    rate: RateOption = 50.0,
+    datum: DatumOption = None,
+    use_sim_time: SimTimeOption = False,
+    namespace: NamespaceOption = "",
+    wait: WaitOption = 0.02,
+    seconds: SecondsOption = None,
+    foxglove: FoxgloveOption = None,
+) -> None:
+    """Run the estimator beside a ROS 2 robot, without ROS: it speaks DDS itself.
 
-    Prints how long updates and odometry take, the last state, and the verdict on the run.
-    docs/how-to/integration.md has the same
-    loop as a ROS 2 node.
+    Finds IMU, wheels and GNSS by type and name; publishes /odometry, /odometry/map, /tf, slip, ground and
+    /diagnostics (docs/how-to/ros2.md). With LOG it runs a recording message by message, and prints
+    computing times and the verdict.
+
+    Example: terrafusion live --vehicle husky
+
+    Example: terrafusion live --vehicle husky --topic wheels=/odom --domain 7 --foxglove 8765
 
     Example: terrafusion live drive.bag --vehicle husky --realtime
     """
+    if log is not None:
+        _run_log(log, vehicle, realtime)
+        return
+    from terrafusion.fusion.config.estimator_config import MODES
+    from terrafusion.fusion.live.node import LiveOptions
+
+    if mode not in MODES:
+        raise typer.BadParameter(f"'{mode}' is none of {', '.join(MODES)}", param_hint="--mode")
+    options = LiveOptions(
+        vehicle, mode, parse_topics(topic), check_stamps(stamps), frequency=rate, datum=_datum(datum),
+        wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
+    )  # fmt: skip
+    _run_robot(options, _domain(domain), loopback, reliable, seconds, foxglove)
+
+
+def _run_robot(
+    options: LiveOptions,
+    domain: int,
+    loopback: bool,
+    reliable: bool,
+    seconds: float | None,
+    foxglove: int | None,
+) -> None:
+    from terrafusion.fusion.live.dds import DdsBus
+    from terrafusion.fusion.live.foxglove import FoxgloveView
+    from terrafusion.fusion.live.node import LiveNode
+    from terrafusion.fusion.live.serve import serve
+
+    bus = DdsBus(domain, loopback=loopback, reliable=reliable)
+    view = FoxgloveView(foxglove) if foxglove is not None else None
+
+    def publish(topic: str, msgtype: str, cdr: bytes) -> None:
+        bus.publish(topic, msgtype, cdr)
+        if view is not None:
+            view.publish(topic, msgtype, cdr)
+
+    def say(line: str) -> None:
+        print(line, flush=True)
+
+    stopped: list[int] = []
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stopped.append(1))
+    node = LiveNode(options, publish, say)
+    where = "this machine only" if loopback else "the network"
+    say(f"on DDS domain {domain}, {where}; Ctrl-C ends it")
+    begun = time.monotonic()
+    serve(bus, node, lambda: bool(stopped) or (seconds is not None and time.monotonic() - begun >= seconds))
+    say(_summary(node))
+    bus.close()
+    if view is not None:
+        view.close()
+
+
+def _summary(node: LiveNode) -> str:
+    counts = ", ".join(f"{count} {name}" for name, count in sorted(node.counts.items()))
+    state = None if node.estimator is None else node.estimator.latest()
+    if state is None:
+        return f"the estimator never started; {counts}"
+    return f"{state.status}: {state.position_m.round(2).tolist()} m, slip {state.slip:.2f}; {counts}"
+
+
+def _domain(domain: int | None) -> int:
+    if domain is not None:
+        return domain
+    text = os.environ.get("ROS_DOMAIN_ID") or "0"
+    if not text.isdecimal():
+        raise typer.BadParameter(f"ROS_DOMAIN_ID is '{text}', which is no number", param_hint="--domain")
+    return int(text)
+
+
+def _datum(text: str | None) -> tuple[float, float, float] | None:
+    if text is None:
+        return None
+    try:
+        latitude, longitude, height_m = map(float, text.split(","))
+    except ValueError:
+        raise typer.BadParameter(f"'{text}' is not LAT,LON,HEIGHT", param_hint="--datum") from None
+    return latitude, longitude, height_m
+
+
+def _run_log(log: str, vehicle: str | None, realtime: bool) -> None:
+    """A recording message by message, odometry after every IMU sample."""
     from terrafusion.datasets.core.errors import DataError, errors_of
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.estimator.history import History
-    from terrafusion.fusion.live import live_estimator, run, verdict_of
+    from terrafusion.fusion.live.loop import live_estimator, run, verdict_of
 
     recording = open_recording(log)
     newest: list[State] = []

@@ -51,7 +51,7 @@ def read_bag(request: Request, open_container: Callable[[Path], BagContainer], r
         with foreign():
             container = open_container(path)
         try:
-            return _assemble(container, request)
+            return recording_of(container, request)
         finally:
             container.close()
     except BagError as error:
@@ -59,15 +59,12 @@ def read_bag(request: Request, open_container: Callable[[Path], BagContainer], r
         raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
 
 
-def _assemble(container: BagContainer, request: Request) -> Recording:
+def chosen_topics(container: BagContainer, request: Request) -> tuple[dict[str, BagTopic], list[str]]:
+    """The topic of each channel, and notes; raises as `choose_topics` does."""
     path, rig = request.path, request.rig
-    there = {(source.topic, source.msgtype) for source in container.sources if source.count}
-    if META in there and not request.topics and request.stamps == "header":
-        return restore(functools.partial(read_streams, container), there, path)
     joints = joints_given(request.topics)
-    topics = _topics_of(container)
-    chosen, notes = choose_topics(
-        topics,
+    return choose_topics(
+        _topics_of(container),
         file=path,
         user=request.topics,
         usual=rig.topics if rig else None,
@@ -75,6 +72,19 @@ def _assemble(container: BagContainer, request: Request) -> Recording:
         one_of=functools.partial(_one_sensor, container, path, rig),
         is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
     )
+
+
+def recording_of(container: BagContainer, request: Request) -> Recording:
+    """The recording that an open bag holds.
+
+    Raises:
+        DataError, BagError: no usable topic, or what the channels refuse.
+    """
+    path, rig = request.path, request.rig
+    there = {(source.topic, source.msgtype) for source in container.sources if source.count}
+    if META in there and not request.topics and request.stamps == "header":
+        return restore(functools.partial(read_streams, container), there, path)
+    chosen, notes = chosen_topics(container, request)
     streams = _streams(container, chosen)
     if META in there:
         notes.append(f"{META[0].rpartition('/')[0]} is not used: topics or stamps were asked for")
@@ -84,7 +94,7 @@ def _assemble(container: BagContainer, request: Request) -> Recording:
     if "gnss" not in streams:
         streams.pop("gnss_velocity", None)
     if not set(streams) - {"datum", "gnss_velocity"}:
-        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in topics) or "none"
+        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in _topics_of(container)) or "none"
         raise DataError(
             f"no topic of a type this library uses; topics here: {seen}",
             file=path,
@@ -93,6 +103,7 @@ def _assemble(container: BagContainer, request: Request) -> Recording:
     datum = streams.pop("datum", None)
     timing = timing_of(streams, stamps=request.stamps, repair_clock=request.repair_clock, file=path)
     start_ns = min(int(t[0]) for t in timing.times.values())
+    joints = joints_given(request.topics)
     builder = ChannelBuilder(path, rig, request.conventions, start_ns, joints, [*notes, *timing.notes])
     return _build(builder, timing, datum)
 

@@ -282,6 +282,8 @@ class MessageDecoder:
         """Receipt times (N,) of all messages, and blocks that together hold them; empties the decoder."""
         receipt_ns = np.concatenate([np.zeros(0, dtype=np.int64), *self._receipts])
         blocks = tuple(_joined(self._pieces.pop(shape)) for shape in list(self._pieces))
+        self._receipts.clear()
+        self.count = 0
         return receipt_ns, blocks
 
 

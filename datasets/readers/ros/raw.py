@@ -75,7 +75,10 @@ class MessageBatch(NamedTuple):
 class BagContainer(Protocol):
     """An open bag file."""
 
-    sources: list[BagSource]
+    @property
+    def sources(self) -> list[BagSource]:
+        """Who sent its messages."""
+        ...
 
     def batches(self, wanted: Groups) -> Iterator[MessageBatch]:
         """The messages of the wanted groups of sources."""

@@ -18,7 +18,7 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.estimator import Estimator
-from terrafusion.fusion.live import run
+from terrafusion.fusion.live.loop import run
 from terrafusion.twin.simulate import simulate
 
 Array = NDArray[np.float64]

@@ -42,9 +42,20 @@ class Latencies:
 
 
 def live_estimator(
-    recording: Recording, vehicle: str | None = None, history: History | None = None
+    recording: Recording,
+    vehicle: str | None = None,
+    history: History | None = None,
+    mode: str = "adaptive",
+    gnss: bool = False,
 ) -> Estimator:
-    """An estimator for the robot and the sensors of a recording; `history` collects its states.
+    """An estimator for the robot and the sensors of a recording.
+
+    Args:
+        recording: of the robot, however short.
+        vehicle: name or YAML file; by default what the recording names.
+        history: collects the states.
+        mode: as in `EstimatorConfig`.
+        gnss: fixes will come, though the recording has none.
 
     Raises:
         DataError: the log has no IMU or no wheels, or nothing tells the robot's geometry.
@@ -56,7 +67,8 @@ def live_estimator(
         )
     robot, _ = choose_vehicle(recording, vehicle)
     inputs = sensor_config_of(recording, recording.gnss)
-    config = EstimatorConfig(robot.rig(), robot.name, inputs=inputs)
+    inputs = dataclasses.replace(inputs, gnss=inputs.gnss or gnss)
+    config = EstimatorConfig(robot.rig(), robot.name, mode, inputs=inputs)
     if history is None:
         return Estimator(config)
     estimator = Estimator(

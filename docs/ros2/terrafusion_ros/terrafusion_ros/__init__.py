@@ -1,0 +1,1 @@
+"""The terrafusion estimator as a ROS 2 node."""

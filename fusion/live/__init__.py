@@ -1,0 +1,1 @@
+"""Run the estimator as messages arrive: from a recording, over DDS, or in a ROS 2 node."""

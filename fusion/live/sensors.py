@@ -1,0 +1,106 @@
+"""Which sensors a running robot has: found in what it sends for a second, as in a short bag."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.datasets.core.conventions import BODY_AXES
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.readers.formats import Request
+from terrafusion.datasets.readers.ros.arriving import KINDS, ArrivingMessages, GatheredMessages, RawMessage
+from terrafusion.datasets.readers.ros.bag import chosen_topics, recording_of
+from terrafusion.datasets.readers.ros.static_frames import StaticFrames
+from terrafusion.datasets.readers.ros.topics import BagTopic
+
+NEEDED = ("imu", "wheels")
+
+
+@dataclass
+class Sensors:
+    """The sensors that were found.
+
+    Attributes:
+        recording: what they sent so far.
+        arriving: turns their next messages into samples.
+        notes: what was chosen and assumed, a sentence each.
+    """
+
+    recording: Recording
+    arriving: ArrivingMessages
+    notes: list[str]
+
+    @property
+    def gnss(self) -> bool:
+        """Whether fixes will come."""
+        return "gnss" in self.arriving.chosen
+
+
+def find_sensors(
+    gathered: GatheredMessages,
+    request: Request,
+    frames: StaticFrames,
+    base: str,
+    datum: tuple[float, float, float] | None,
+) -> Sensors | str:
+    """The sensors of a robot by the messages it has sent so far, or what is missing, in words.
+
+    Args:
+        gathered: those messages.
+        request: vehicle, topics and stamps, as for a bag.
+        frames: fixed transforms; where they lead to a sensor, its position and rotation are theirs.
+        base: name of the robot's frame.
+        datum: origin of ENU, deg and m; None for the first fix.
+
+    Raises:
+        DataError, BagError: the messages cannot be used.
+    """
+    chosen, notes = chosen_topics(gathered, request)
+    chosen = {kind: topic for kind, topic in chosen.items() if kind in KINDS}
+    missing = [kind for kind in NEEDED if kind not in chosen]
+    if missing:
+        return f"no topic of {' and '.join(missing)} yet; where it has another type, name it with --topic"
+    mounted = {}
+    for kind in ("imu", "gnss"):
+        frame = _frame(gathered, chosen[kind]) if kind in chosen else ""
+        found = frames.mounting(base, frame)
+        if found is not None:
+            mounted[kind] = found
+            notes.append(f"{kind}: {frame} is at {np.round(found[0], 3).tolist()} m, by /tf_static")
+    turn = mounted["imu"][1] if "imu" in mounted else None
+    if turn is not None:
+        request = _without_axes(request)
+    # Stamps out of order are no reason to wait: only the kinds of sensors are taken from this recording.
+    recording = recording_of(gathered, dataclasses.replace(request, repair_clock=True))
+    overrides = recording.overrides
+    if "imu" in mounted:
+        overrides = dataclasses.replace(overrides, imu_m=mounted["imu"][0])
+    if "gnss" in mounted:
+        overrides = dataclasses.replace(overrides, antenna_m=mounted["gnss"][0])
+    recording = dataclasses.replace(recording, overrides=overrides)
+    arriving = ArrivingMessages(request, chosen, datum or recording.datum, _if_turned(turn))
+    notes = [*(f"{kind}: {topic.name} ({topic.msgtype})" for kind, topic in chosen.items()), *notes]
+    return Sensors(recording, arriving, [*notes, *recording.notes])
+
+
+def _frame(gathered: GatheredMessages, topic: BagTopic) -> str:
+    """The frame of a topic's first message."""
+    first: RawMessage = next(message for message in gathered.messages if message.topic == topic.name)
+    names = first.stream(("header.frame_id",)).frame_ids
+    return str(names[0]) if len(names) else ""
+
+
+def _without_axes(request: Request) -> Request:
+    """The request without the vehicle's IMU axes: the robot's own transforms hold."""
+    if request.rig is None:
+        return request
+    sensors = request.rig.sensors
+    sensors = dataclasses.replace(sensors, imu=dataclasses.replace(sensors.imu, axes=BODY_AXES))
+    return dataclasses.replace(request, rig=dataclasses.replace(request.rig, sensors=sensors))
+
+
+def _if_turned(R: NDArray[np.float64] | None) -> NDArray[np.float64] | None:
+    return None if R is None or np.array_equal(R, np.eye(3)) else R
