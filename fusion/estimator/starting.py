@@ -21,6 +21,9 @@ from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 SILENT_NS, ROUGH_YAW_RAD = 3_000_000_000, 0.8
 """Without a fix for so long the start no longer waits for a better heading, where there is one that tells
 forward from sideways (45 deg; assumed)."""
+MANY_FIXES, ROUGHEST_YAW_RAD = 10, 1.6
+"""From so many fixes on their scatter, and with it the sigma of the heading, is known well enough that one
+that tells forward from backward will do (90 deg; assumed)."""
 
 
 class StartSearch:
@@ -65,7 +68,8 @@ class StartSearch:
             if drop_before_start(imu, wheels, fixes):
                 self.level = self._rough = None
         elif fixes and (last or imu.t_ns[-1] - fixes[-1].t_ns > SILENT_NS):
-            if self._rough is not None and self._rough.yaw_sigma_rad <= ROUGH_YAW_RAD:
+            roughest = ROUGH_YAW_RAD if len(fixes) < MANY_FIXES else ROUGHEST_YAW_RAD
+            if self._rough is not None and self._rough.yaw_sigma_rad <= roughest:
                 self._gnss.refuse_waiting(plausible_fixes(fixes, wheels))
                 return self._rough
         elif not fixes and (last or elapsed_s > self._config.longest_wait_s):

@@ -40,7 +40,7 @@ class Study:
 
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "known_changes",
+    "outage_terms", "known_changes",
 )  # fmt: skip
 
 
@@ -179,6 +179,12 @@ STUDIES = (
             for seconds in (10, 30, 60)
         },
         "opponents.png",
+    ),
+    Study(
+        "outage_terms",
+        "Which term of dead reckoning are errors after 10 s without fixes made of?",
+        _module("opponents.decompose"),
+        5,
     ),
     Study(
         "known_changes",

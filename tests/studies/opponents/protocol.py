@@ -122,7 +122,7 @@ def scored(streams: Streams, seconds: float, run: Callable[[Blocked], tuple[Arra
     """Rows of an estimator: `run(blocked)` gives times (N,) and path (N, 2), without the blocked fixes."""
     rows = []
     for starts in streams.passes(seconds):
-        t_s, path = run(_blocked(starts, seconds))
+        t_s, path = run(blocked_in(starts, seconds))
         for a in starts:
             error = streams.error_m(t_s, path, a, seconds)
             if error is not None:
@@ -130,5 +130,6 @@ def scored(streams: Streams, seconds: float, run: Callable[[Blocked], tuple[Arra
     return rows
 
 
-def _blocked(starts: list[float], seconds: float) -> Blocked:
+def blocked_in(starts: list[float], seconds: float) -> Blocked:
+    """Whether a time lies in an outage of that length."""
     return lambda t: any(a <= t < a + seconds for a in starts)
