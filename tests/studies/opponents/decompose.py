@@ -7,9 +7,10 @@ Errors e(t) against the reference in an outage are fitted by the linear error mo
     e(t) = e0 + heading J d(t) + scale d(t) + drift J (t d(t) - integral of d) ,  J = turn by 90 deg,
 
 with the displacement d(t) of the reference since the start (Borenstein and Feng 1996, systematic errors of
-odometry, continuous form). The table gives the length of each term at the end of the outage, m, as a mean over
-outages, and what the four leave. Where the reference is held-out fixes, `as read` is terrafusion's position
-plus the receiver's drift that it estimates: what the fixes should read. They hold that drift, too.
+odometry, continuous form). The table gives the length of each term at the end of the outage, m, as a mean
+over outages, and what the four leave. Where the reference is held-out fixes that are not RTK, `as read` is
+terrafusion's position plus the receiver's drift that it estimates: what the fixes should read. They hold
+that drift, too.
 """
 
 from __future__ import annotations
@@ -39,6 +40,8 @@ LOGS = (
     "wvu_pathfinder/test17run",
 )
 """Logs of the tuning half, and one on which an RTK receiver makes the start of an outage easy to judge."""
+RTK_M = 0.1
+"""Fixes with a smaller sigma hold next to nothing of the drift state."""
 DRIFT = ("gnss_drift_e_m", "gnss_drift_n_m")
 RIDGE = np.array([1e-4, 1e-4, 1e-3, 1e-3, 1e-1])
 """Weak prior information, so that terms that an outage does not tell apart are shared out, not blown up."""
@@ -90,8 +93,9 @@ def paths_of(drive: Drive, inputs: Inertial, seconds: float, mode: str) -> list[
         poses = estimate.trajectory
         xy = (poses.position_m + Rotation.from_quat(poses.quaternion).apply(point))[:, :2]
         t_s = (poses.t_ns - drive.recording.start_ns) * 1e-9
+        t_s, xy = np.asarray(t_s, dtype=float), np.asarray(xy, dtype=float)
         runs[mode] = Path(t_s, xy)
-        if of_antenna and estimate.linear is not None:
+        if of_antenna and estimate.linear is not None and float(np.median(inputs.fixes[:, 4])) > RTK_M:
             drift = [estimate.linear_names.index(name) for name in DRIFT]
             runs["as read"] = Path(t_s, xy + estimate.linear[:, drift])
         out += [(name, a, path) for name, path in runs.items() for a in starts]
