@@ -27,7 +27,7 @@ def write_blind(out: Path, scores: Scores, provenance: Mapping[str, object] | No
         f"Of {len(met)} targets {met.count(True)} are met, {met.count(False)} are missed, {met.count(None)} "
         f"not measured. {len(scores['crashes'])} trials ended in a crash, which counts as a wrong answer. "
         "The trials come from a plant that shares no equation with the twin; their labels were sealed until "
-        "all answers were in."
+        f"all answers were in. Plant {plots.plant_name(scores)}."
     )
     write_page(
         out / "report.html", "blind.html.j2", f"Blind check of the diagnosis, {scores['trials']} trials",
@@ -67,7 +67,8 @@ def rate_text(rate: Mapping[str, Any]) -> str:
 def summary(scores: Scores) -> list[str]:
     """The result in a few lines of text."""
     alarms = rate_text(scores["false_alarms"]["all"])
-    lines = [f"{scores['trials']} trials, {len(scores['crashes'])} crashes; false alarms {alarms}"]
+    plant, crashes = plots.plant_name(scores), len(scores["crashes"])
+    lines = [f"{scores['trials']} trials of plant {plant}, {crashes} crashes; false alarms {alarms}"]
     width = max(len(t["name"]) for t in scores["targets"])
     for t in scores["targets"]:
         met = "MISSED" if t["met"] is False else MET[t["met"]]

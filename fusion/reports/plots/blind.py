@@ -31,7 +31,13 @@ def plot_sheet(scores: Scores) -> Figure:
     fig, axes = style.canvases(2, (11.0, 8.0), 2, sharex=False)
     for draw, ax in zip((plot_power, plot_ranks, plot_reliability, plot_claims), axes, strict=True):
         draw(scores, ax)
+    fig.suptitle(f"{scores['trials']} trials, plant {plant_name(scores)}", fontsize="small")
     return fig
+
+
+def plant_name(scores: Scores) -> str:
+    """First twelve digits of the plant's hash."""
+    return str(scores.get("plant_sha256", "unknown"))[:12]
 
 
 def plot_power(scores: Scores, ax: Axes | None = None) -> tuple[Figure, Axes]:

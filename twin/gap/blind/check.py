@@ -16,6 +16,7 @@ from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.files import write_atomically
 from terrafusion.twin.gap.blind import seal
 from terrafusion.twin.gap.blind.answers import Diagnose, answer_all, answered, ask_oracle
+from terrafusion.twin.gap.blind.pin import plant_sha256
 from terrafusion.twin.gap.blind.plan import FULL, QUICK, CheckSize, Trial, from_text, plan, to_text
 from terrafusion.twin.gap.blind.score import score
 
@@ -42,13 +43,18 @@ def run_blind_check(
         oracle: the diagnosis once more, given the true `effects`: how far the gap could shrink.
 
     Raises:
-        ConfigError: the folder holds a check of another seed or scale.
+        ConfigError: the folder holds a check of another seed, scale or plant.
         DataError: answers or labels were changed, see `seal.unseal`.
         TerrafusionError: the folder cannot be written, or the workers died.
     """
     folder, scale = Path(out), scale or (QUICK if quick else FULL)
     trials = plan(seed, scale)
-    public = {"seed": seed, "scale": _scale_json(scale), "trials": len(trials)}
+    public = {
+        "seed": seed,
+        "scale": _scale_json(scale),
+        "trials": len(trials),
+        "plant_sha256": plant_sha256(),
+    }
     _sealed(folder, trials, public)
     if not (folder / seal.CLOSED).is_file():
         answer_all(folder, trials, diagnose, jobs, progress)
@@ -79,7 +85,9 @@ def _sealed(folder: Path, trials: list[Trial], public: Mapping[str, Any]) -> Non
         seal.seal(folder, to_text(trials), public)
     elif {name: before.get(name) for name in public} != dict(public):
         raise ConfigError(
-            "holds a blind check of another seed or size", file=folder, remedy="give another folder to --out"
+            "holds a blind check of another seed or size, or of another version of the plant",
+            file=folder,
+            remedy="give another folder to --out",
         )
 
 
