@@ -47,6 +47,10 @@ class Judged:
         """Whether the first truth is held by the classes of the first `places` causes."""
         return bool(self.ranks) and 1 <= self.ranks[0] <= places
 
+    def right(self) -> bool:
+        """Whether the class ranked first holds the truth and the verdict is not *unknown*."""
+        return self.top(1) and self.verdict != "unknown"
+
     def exact(self) -> bool:
         """Whether the cause ranked first is the truth itself and not a look-alike."""
         return self.first is not None and self.first in self.trial.effects()

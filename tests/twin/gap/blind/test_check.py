@@ -383,3 +383,16 @@ def test_the_observer_measures_as_mahalanobis_does() -> None:
     assert size_for([(1.0, 3.0), (2.0, 12.0)], 27.0, 99.0) == pytest.approx(3.0)
     assert half_power_multiple((1.0, 4.0, 16.0) * 2, (False, False, True) * 2) == pytest.approx(8.0, rel=0.2)
     assert size_for([(1.0, 1.0), (2.0, 2.0)], 50.0, 9.0) == 9.0
+
+
+def test_a_right_cause_called_unknown_is_not_right() -> None:
+    """Ranked first is not enough for the headline; only the verdict differs between the two checks."""
+    trials = [t for t in plan(0, FULL) if t.family in ("same", "shifted")]
+    for verdict, rate in (("effect", 1.0), ("unknown", 0.0)):
+        answers = {
+            t.trial: {"seconds": 1.0, "answer": fake.diagnosis(verdict, [(t.effects()[0], 0.9)])}
+            for t in trials
+        }
+        scores = score(trials, answers)
+        assert {scores["right"][family]["rate"] for family in ("same", "shifted")} == {rate}
+        assert {scores["top1"][family]["rate"] for family in ("same", "shifted")} == {1.0}
