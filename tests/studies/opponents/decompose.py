@@ -91,9 +91,8 @@ def paths_of(drive: Drive, inputs: Inertial, seconds: float, mode: str) -> list[
         if of_antenna or drive.recording.truth_frame == "antenna":
             point = antenna
         poses = estimate.trajectory
-        xy = (poses.position_m + Rotation.from_quat(poses.quaternion).apply(point))[:, :2]
-        t_s = (poses.t_ns - drive.recording.start_ns) * 1e-9
-        t_s, xy = np.asarray(t_s, dtype=float), np.asarray(xy, dtype=float)
+        xy: Array = (poses.position_m + Rotation.from_quat(poses.quaternion).apply(point))[:, :2]
+        t_s: Array = np.asarray((poses.t_ns - drive.recording.start_ns) * 1e-9, dtype=float)
         runs[mode] = Path(t_s, xy)
         if of_antenna and estimate.linear is not None and float(np.median(inputs.fixes[:, 4])) > RTK_M:
             drift = [estimate.linear_names.index(name) for name in DRIFT]
