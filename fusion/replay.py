@@ -21,6 +21,7 @@ from terrafusion.fusion.estimator.history import History
 from terrafusion.fusion.estimator.learned_numbers import NumberAfterDrive
 from terrafusion.fusion.estimator.notes import notes_of
 from terrafusion.fusion.graph.chain import Chain
+from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.metrics.baselines import Baselines, baselines
 from terrafusion.fusion.metrics.scores import Outage, Scores, score
 from terrafusion.fusion.metrics.verdict import Run, Verdict, judge
@@ -43,6 +44,7 @@ class ReplayResult:
         verdict: whether the result is good, and why.
         assumed: numbers that neither log nor vehicle file tells.
         learned: numbers of the robot as self-calibration knows them at the end.
+        grounds: ground memory after the drive; None where the terrain model knows the robot.
     """
 
     recording: Recording
@@ -62,6 +64,7 @@ class ReplayResult:
     verdict: Verdict
     assumed: tuple[Assumption, ...]
     learned: tuple[NumberAfterDrive, ...] = ()
+    grounds: GroundMemory | None = None
 
     def realtime_factor(self) -> float:
         """Seconds of recording per second of computing."""
@@ -79,6 +82,7 @@ def replay(
     progress: Callable[[float], None] | None = None,
     magnetometer: bool = False,
     settings: EstimatorOptions | None = None,
+    grounds: GroundMemory | None = None,
     findings: Sequence[Finding] | None = None,
 ) -> ReplayResult:
     """Estimate and score one run.
@@ -92,6 +96,7 @@ def replay(
         progress: called with the share done, 0 to 1.
         magnetometer: use the log's magnetometer, too; a barometer is used wherever there is one.
         settings: fields of `EstimatorConfig` that are not its defaults.
+        grounds: what the robot learned of its grounds on earlier drives.
         findings: of the log checks, where they are known already.
 
     Raises:
@@ -103,7 +108,7 @@ def replay(
     noise = policy if isinstance(policy, Policy) else load_policy(policy)
     inputs = sensor_config_of(recording, used)
     given = with_usable_samples(recording, inputs, used, magnetometer)
-    config = EstimatorConfig(params.rig(), params.name, mode, noise, inputs=inputs, **(settings or {}))
+    config = EstimatorConfig(params.rig(), params.name, mode, noise, inputs=inputs, grounds=grounds, **(settings or {}))
 
     # Feed it as live; for a batch, then smooth the whole run.
     run = _run_estimator(config, given, used, batch, progress)
@@ -141,7 +146,7 @@ def replay(
         recording, params, mode, noise, estimate, scores, used, held_out, tuple(outages), run.seconds,
         run.latencies_ms, estimator.gnss.rejected, estimator.wheels_rejected, rivals, verdict,
         assumptions(recording, vehicle or recording.vehicle, params, inputs, used),
-        estimator.learned.table(),
+        estimator.learned.table(), estimator.weights.learned_grounds(),
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ from typing import TypedDict
 from terrafusion.datasets.core.errors import ConfigError
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.config.sensor_config import SensorConfig
+from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.noise.labels import GroundLabels
 from terrafusion.fusion.noise.modes import INNOVATION_METHODS, MODES, ROBUST_LOSSES, ModeTuning, load_modes
 from terrafusion.fusion.noise.policy import Policy, load_policy
@@ -62,6 +63,8 @@ class EstimatorConfig:
         declination_rad: magnetic north, east of true north; with it a magnetometer measures the
             heading, without it it holds that of GNSS or the start.
         labels: the ground over time, in place of the detector; None: it detects.
+        grounds: what the robot learned of its grounds on earlier drives; with it, and on robots that the
+            terrain model does not know, grounds are recognised by `grounds.memory`.
     """
 
     rig: Rig
@@ -83,6 +86,7 @@ class EstimatorConfig:
     self_calibrate: bool = True
     declination_rad: float | None = None
     labels: GroundLabels | None = None
+    grounds: GroundMemory | None = None
 
     @property
     def longest_wait_s(self) -> float:

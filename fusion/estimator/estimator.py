@@ -375,7 +375,7 @@ class Estimator:
         if turned or self.chain.last % SMOOTH_EVERY == 0:
             self.chain.smooth(SMOOTH_WINDOW)
             self._covariance = self.chain.covariance()
-        self.weights.update(state, self.imu, self.wheels)
+        self.weights.update(state, self.imu, self.wheels, self._skid.friction)
         self.learned.advance(state.t_ns)
 
     def _wheel_increment(

@@ -86,7 +86,8 @@ class FrictionEstimator:
         dry = np.full(
             len(FRICTION_MPS2) - len(SLIPPERY), 0.5 * ROLLING_PRIOR / (len(FRICTION_MPS2) - len(SLIPPERY))
         )
-        self._prior = np.log([*(1.0 - ROLLING_PRIOR) * prior / prior.sum(), *dry, 0.5 * ROLLING_PRIOR])
+        self._base = np.log([*(1.0 - ROLLING_PRIOR) * prior / prior.sum(), *dry, 0.5 * ROLLING_PRIOR])
+        self._prior = self._base
         self._score = np.zeros(len(self._prior))
         self._velocity: Array | None = None
         self._paths: deque[tuple[int, Array]] = deque()
@@ -96,6 +97,19 @@ class FrictionEstimator:
     def leads(self) -> bool:
         """Whether the fixes favour the friction model over rolling wheels."""
         return self._leading() is not None
+
+    def base(self) -> Array:
+        """Prior probabilities (K + 1,) of the limits and of rolling, on any ground."""
+        return np.asarray(np.exp(self._base))
+
+    def scored(self) -> Array:
+        """Probabilities (K + 1,) by `base` and the fixes of the last while."""
+        weight = np.exp(self._base + self._score)
+        return np.asarray(weight / weight.sum())
+
+    def expect(self, probabilities: Array) -> None:
+        """Prior probabilities (K + 1,) of the ground the robot is on."""
+        self._prior = np.log(np.maximum(probabilities, 1e-6))
 
     def _leading(self) -> slice | None:
         """The leading models: of slippery ground where likely, all where friction is nearly certain."""

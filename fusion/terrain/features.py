@@ -119,16 +119,12 @@ def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
     gap shows that some are missing.
     """
     levels = np.full(SLIP, np.nan)
+    rate = sample_rate_hz(t_s)
+    if rate is None:
+        return levels
     n = len(t_s)
-    if n < 4:
-        return levels
-    step = np.diff(t_s)
-    span = float(t_s[-1] - t_s[0])
-    if not span > _MIN_SPAN_S or float(step.max()) > 4.0 * span / (n - 1):
-        return levels
-    rate = (n - 1) / span
     signals = np.hstack([accel_mps2, gyro_radps[:, :2]])
-    density = _periodogram(signals, rate)
+    density = periodogram(signals, rate)
     frequency = np.arange(len(density)) * rate / n
 
     def power(band: tuple[float, float], columns: slice) -> float:
@@ -152,7 +148,18 @@ def vibration_levels(t_s: Array, accel_mps2: Array, gyro_radps: Array) -> Array:
     return np.asarray(0.5 * np.log10(powers + floors**2))
 
 
-def _periodogram(signals: Array, rate_hz: float) -> Array:
+def sample_rate_hz(t_s: Array) -> float | None:
+    """Rate of the samples at `t_s` (n,), s; None where they are too few or have a gap."""
+    n = len(t_s)
+    if n < 4:
+        return None
+    span = float(t_s[-1] - t_s[0])
+    if not span > _MIN_SPAN_S or float(np.diff(t_s).max()) > 4.0 * span / (n - 1):
+        return None
+    return (n - 1) / span
+
+
+def periodogram(signals: Array, rate_hz: float) -> Array:
     """One-sided spectral density (n // 2 + 1, k) of signals (n, k), unit^2/Hz (Welch 1967, one segment)."""
     n = len(signals)
     line = np.arange(n) - (n - 1) / 2.0

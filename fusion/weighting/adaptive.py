@@ -13,6 +13,8 @@ from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimate.estimate import State, WeightChange
+from terrafusion.fusion.grounds.learner import FrictionBank, GroundLearner
+from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.inputs.door import as_numbers
 from terrafusion.fusion.inputs.streams import ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
@@ -56,12 +58,13 @@ class TerrainNoise:
         self.policy = config.tuning.adaptive.applied_to_policy(config.policy)
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
-        self.detector = TerrainDetector(model, config.policy.names())
+        self.grounds = None if config.grounds is None else GroundLearner(config.grounds)
+        self.detector = TerrainDetector(model if self.grounds is None else None, config.policy.names())
         self._labels = config.labels
         self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
-        self._pooled = fixed
-        self._starts_pooled = model.slip_only
+        self._pooled = self._learned = fixed
+        self._starts_pooled = model.slip_only or self.grounds is not None
         if self._starts_pooled:
             # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
@@ -74,7 +77,7 @@ class TerrainNoise:
         self._has_yaw_slip = config.inputs.sides and config.inputs.yaw == "gyro"
         self.per_measurement = _weighting_for(config, self)
         self._before = self._shares
-        self._next_ns = 0
+        self._next_ns = self._updated_ns = 0
         self._grade = 0.0
         self._last_speed = 0.0
         self._source = "detector"
@@ -85,9 +88,14 @@ class TerrainNoise:
         if not self.adaptive:
             self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma)
         elif self._starts_pooled:
+            self._learned = learned
             classes = {**self.policy.classes, UNKNOWN: learned}
             self.policy = dataclasses.replace(self.policy, classes=classes)
             self._reweight(t_ns)
+
+    def learned_grounds(self) -> GroundMemory | None:
+        """What the ground memory holds by now, condensed; None where there is none."""
+        return None if self.grounds is None else self.grounds.memory.condensed()
 
     def record(self, change: WeightChange) -> None:
         """Record a change that another part made."""
@@ -110,7 +118,7 @@ class TerrainNoise:
 
     def begin(self, t_ns: int) -> None:
         """Start the clock; the first noise is a change from the policy's fixed one."""
-        self._next_ns = t_ns + WINDOW_NS
+        self._next_ns, self._updated_ns = t_ns + WINDOW_NS, t_ns
         self._recorded = self.policy.fixed
         self._apply_labels(t_ns)
         self._reweight(t_ns)
@@ -145,12 +153,20 @@ class TerrainNoise:
         self._source = "external source"
         self._reweight(t_ns)
 
-    def update(self, state: State, imu: ImuStream, wheels: WheelStream) -> None:
+    def update(
+        self, state: State, imu: ImuStream, wheels: WheelStream, friction: FrictionBank | None = None
+    ) -> None:
         """Evaluate the last second, twice a second."""
         if state.t_ns < self._next_ns:
             return
+        before_ns, self._updated_ns = self._updated_ns, state.t_ns
         self._next_ns = state.t_ns + UPDATE_NS
-        self.detector.update(self._window(state, imu, wheels))
+        window = self._window(state, imu, wheels)
+        self.detector.update(window)
+        if self.grounds is not None:
+            rolled = wheels.travelled(before_ns, state.t_ns)
+            rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
+            self.grounds.update(window, state, rolled_m, self._learned, friction)
         self._source = "detector"
         self._apply_labels(state.t_ns)
         self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
@@ -210,18 +226,37 @@ class TerrainNoise:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.noise = self.policy.blend(self._shares, self._grade)
+        self.noise = self._blended()
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = dataclasses.asdict(self._recorded), dataclasses.asdict(self.noise)
-        best = int(p.argmax())
-        why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
+        why = self._reason(p)
         for name, (sensor, unit) in _RECORDED.items():
             scale = max(abs(before[name]), 0.02)
             if abs(now[name] - before[name]) > NOTEWORTHY * scale:
                 reason = f"{name}: {why}"
                 self.changes.append(WeightChange(t_ns, sensor, before[name], now[name], unit, reason))
                 self._recorded = dataclasses.replace(self._recorded, **{name: now[name]})
+
+
+    def _blended(self) -> SensorNoise:
+        """The policy's noise by the shares of the classes; unknown ground is that of the ground memory."""
+        if self.grounds is not None:
+            memory = self.grounds.memory
+            rows = {str(i): row for i, row in enumerate(memory.table(self._learned))}
+            own = dataclasses.replace(self.policy, classes=rows).blend(memory.shares(), self._grade)
+            if self._shares[self.detector.classes.index(UNKNOWN)] == 1.0:
+                return own
+            self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: own})
+        return self.policy.blend(self._shares, self._grade)
+
+    def _reason(self, p: Array) -> str:
+        best = int(p.argmax())
+        if self.grounds is not None and self.detector.classes[best] == UNKNOWN:
+            ground, probability = self.grounds.best()
+            if ground is not None:
+                return f"{ground.name} p = {probability:.2f} ({ground.stretches:.0f} stretches in memory)"
+        return f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
 
 
 def _weighting_for(config: EstimatorConfig, noise: NoiseInForce) -> Weighting:

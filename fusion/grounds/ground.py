@@ -1,0 +1,202 @@
+"""One ground as one robot knows it: its signature, and what it does to wheels, heading and path."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.grounds.signature import SIGNATURE
+from terrafusion.fusion.noise.policy import SensorNoise, within_ranges
+
+YAW_SLIP = SIGNATURE.index("yaw_slip")
+SPREAD = np.array([0.15] * 7 + [0.05, 0.5, 0.15, 0.2])
+"""Spread on one ground of the mean signature of 4 s, before any is known (learn runs of
+tests/studies/ground_split.yaml)."""
+WINDOW_VARIANCE = 4.0
+"""Variance of single windows about that mean, in its own (learn runs)."""
+SPREAD_WINDOWS = 40.0
+"""Windows that `SPREAD` counts for."""
+MOST_WINDOWS = 2000.0
+"""Windows and stretches that are remembered: an older one fades, so that a ground may change."""
+FREEDOM = 8.0
+"""Degrees of freedom of Student's t for signatures: some are outliers (kerbs, stones)."""
+SHRINK = 4.0
+"""Stretches that the tuned fixed noise counts for beside those of a ground (assumed)."""
+SHRINK_FRICTION = 20.0
+"""Windows that the prior of friction counts for (assumed)."""
+LEAST_SLIP_SPREAD, LEAST_SIDE_SPREAD = 0.015, 0.005
+SLIDES = 0.5
+"""Probability of slippery friction from which wheels say nothing of the speed."""
+FRICTION_MODELS = 10
+"""Friction limits of the bank and, last, rolling (`estimator.friction`)."""
+SLIPPERY_MODELS = 6
+"""The first ones: limits of ice, wet and snowy ground."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tally:
+    """Count, mean and mean square deviation of a number (or of several, (d,)), weighted.
+
+    Older entries fade beyond `MOST_WINDOWS`.
+    """
+
+    count: Array
+    mean: Array
+    square: Array
+
+    @classmethod
+    def empty(cls, size: int) -> Tally:
+        """Of `size` numbers, none seen yet."""
+        return cls(np.zeros(size), np.zeros(size), np.zeros(size))
+
+    def plus(self, values: Array, weight: float = 1.0, noise: float = 0.0) -> Tally:
+        """With one more entry (d,); NaN is skipped. `noise` is the variance of its measurement."""
+        seen = np.isfinite(values)
+        count = np.minimum(self.count, MOST_WINDOWS) + weight * seen
+        gain = np.where(seen, weight, 0.0) / np.maximum(count, 1e-12)
+        off = np.where(seen, values, self.mean) - self.mean
+        square = (1.0 - gain) * (self.square + gain * off**2) - gain * noise
+        return Tally(count, self.mean + gain * off, np.where(seen, square, self.square))
+
+    def merged(self, other: Tally) -> Tally:
+        """Of both together."""
+        count = self.count + other.count
+        share = np.where(count > 0.0, other.count / np.maximum(count, 1e-12), 0.0)
+        off = other.mean - self.mean
+        square = (1.0 - share) * self.square + share * other.square + share * (1.0 - share) * off**2
+        return Tally(count, self.mean + share * off, square)
+
+
+@dataclass(frozen=True, eq=False)
+class Ground:
+    """A ground of one robot, or of robots of one type.
+
+    Attributes:
+        name: given by its user, else "ground 1" and so on.
+        signature: of `SIGNATURE`, by windows of half a second.
+        motion: slip and side-slip (2,), by stretches of several metres with good fixes.
+        friction: (10,) probabilities of the friction limits of `estimator.friction` and of rolling.
+        friction_windows: windows that gave them.
+        evidence: log Bayes factor of the ground's slip against the tuned fixed noise, recent stretches.
+        first, last: dates (YYYY-MM-DD) of the first and the last drive on it, "" where not known.
+    """
+
+    name: str
+    signature: Tally
+    motion: Tally
+    friction: Array
+    friction_windows: float = 0.0
+    evidence: float = 0.0
+    first: str = ""
+    last: str = ""
+
+    @classmethod
+    def new(cls, name: str) -> Ground:
+        """Nothing is known of it."""
+        even = np.full(FRICTION_MODELS, 1.0 / FRICTION_MODELS)
+        return cls(name, Tally.empty(len(SIGNATURE)), Tally.empty(2), even)
+
+    @property
+    def windows(self) -> float:
+        """Windows on this ground."""
+        return float(self.signature.count.max())
+
+    @property
+    def stretches(self) -> float:
+        """Stretches in which slip was measured."""
+        return float(self.motion.count[0])
+
+    @property
+    def say(self) -> float:
+        """Weight in (0, 1] of this ground against the fixed noise: below 1 where it predicted worse."""
+        return math.exp(min(self.evidence, 0.0))
+
+    def variance(self) -> Array:
+        """(11,) of a window's signature, shrunk to `SPREAD`."""
+        n = self.signature.count
+        known = np.maximum(self.signature.square, 0.0)
+        return np.asarray((SPREAD_WINDOWS * SPREAD**2 + n * known) / (SPREAD_WINDOWS + n))
+
+    def log_likelihood(self, signature: Array) -> float:
+        """Of a window's signature by Student's t; numbers that ground or window lack say nothing."""
+        n = self.signature.count
+        variance = self.variance() * (1.0 + 1.0 / np.maximum(n, 1.0))
+        return student_t(signature, self.signature.mean, variance, n > 0.0)
+
+    def seen(self, signature: Array, weight: float, date: str) -> Ground:
+        """With one more window."""
+        first = self.first or date
+        return dataclasses.replace(
+            self, signature=self.signature.plus(signature, weight), first=first, last=date or self.last
+        )
+
+    def slid(self, friction: Array, weight: float) -> Ground:
+        """With friction probabilities (10,) of one more window."""
+        n = min(self.friction_windows, MOST_WINDOWS) + weight
+        mean = self.friction + weight / n * (friction - self.friction)
+        return dataclasses.replace(self, friction=mean, friction_windows=n)
+
+    def friction_prior(self, prior: Array) -> Array:
+        """Probabilities (10,) of friction limits, shrunk to `prior`."""
+        n = self.friction_windows
+        return np.asarray((SHRINK_FRICTION * prior + n * self.friction) / (SHRINK_FRICTION + n))
+
+    @property
+    def slides(self) -> bool:
+        """Whether wheels skid on it, so that friction predicts the motion and slip does not."""
+        return (
+            self.friction_windows > SHRINK_FRICTION
+            and float(self.friction[:SLIPPERY_MODELS].sum()) > SLIDES
+        )
+
+    def noise(self, fixed: SensorNoise) -> SensorNoise:
+        """Noise on this ground: slip, yaw scale and side-slip, each shrunk to `fixed` by evidence.
+
+        Normal and inverse-gamma posterior of mean and variance, with `SHRINK` prior entries (Gelman et al.
+        2013, Bayesian Data Analysis, sec. 3.3); without entries it is `fixed`.
+        """
+        if self.slides:
+            return fixed
+        slip = self._shrunk(0, fixed.slip_mean, fixed.slip_sigma, LEAST_SLIP_SPREAD)
+        n, square = self.motion.count[1], self.motion.square[1] + self.motion.mean[1] ** 2
+        across = (SHRINK * fixed.side_slip_sigma**2 + n * max(float(square), LEAST_SIDE_SPREAD**2)) / (SHRINK + n)
+        return within_ranges(
+            dataclasses.replace(
+                fixed, slip_mean=slip[0], slip_sigma=slip[1], side_slip_sigma=math.sqrt(across)
+            )
+        )
+
+    def _shrunk(self, i: int, mean: float, sigma: float, least: float) -> tuple[float, float]:
+        n, own = float(self.motion.count[i]), float(self.motion.mean[i])
+        square = max(float(self.motion.square[i]), least**2)
+        total = SHRINK + n
+        spread = (SHRINK * sigma**2 + n * square + SHRINK * n / total * (own - mean) ** 2) / total
+        return (SHRINK * mean + n * own) / total, math.sqrt(spread)
+
+    def merged(self, other: Ground) -> Ground:
+        """This ground with what `other` knows of the same one."""
+        windows = self.friction_windows + other.friction_windows
+        share = other.friction_windows / windows if windows else 0.0
+        named = self.name if not self.name.startswith("ground ") else other.name
+        dates = [d for d in (self.first, other.first, self.last, other.last) if d]
+        return Ground(
+            named if not named.startswith("ground ") else self.name,
+            self.signature.merged(other.signature),
+            self.motion.merged(other.motion),
+            (1.0 - share) * self.friction + share * other.friction,
+            windows,
+            min(self.evidence, other.evidence),
+            min(dates, default=""),
+            max(dates, default=""),
+        )
+
+
+def student_t(values: Array, mean: Array, variance: Array, known: Array) -> float:
+    """Log density of independent Student's t with `FREEDOM`, up to a constant, where `known` and finite."""
+    seen = known & np.isfinite(values)
+    square = (values[seen] - mean[seen]) ** 2 / variance[seen]
+    return float(np.sum(-0.5 * (FREEDOM + 1.0) * np.log1p(square / FREEDOM) - 0.5 * np.log(variance[seen])))

@@ -1,0 +1,202 @@
+"""The grounds of one robot: recognised from signatures, learned without labels, never with positions.
+
+A filter over the known grounds and *new ground* follows the drive (`terrain.sequence`). Windows that no ground
+explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and Jordan 2012, ICML); grounds that came to
+look alike are merged.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
+from terrafusion.fusion.noise.policy import SensorNoise
+
+PATCH_M = 25.0
+"""Expected length of a patch, as of the detector."""
+NOVEL = 5.0
+"""Log-likelihood by which new ground is less likely than the middle of a known one (chosen on learn runs)."""
+SLOW, FAST = 8, 2
+"""Windows whose mean is compared with the grounds, and newest ones that raise the alarm of a change."""
+ALARM = 6.0
+"""Mean squared distance of the newest windows to those before, in spreads of a mean, that is a change."""
+NEW_SHARE = 0.1
+"""Prior probability that a new patch is ground never met."""
+TEMPER = 0.6
+"""Exponent on likelihoods: windows overlap, and bands are correlated (chosen on learn runs)."""
+DWELL = 8
+"""Windows in a row that new ground takes: 4 s."""
+MOST_GROUNDS = 12
+ALIKE = 0.5
+"""Mean squared distance of two signatures, in their spreads, below which they are one ground."""
+LEAST_WINDOWS = 30.0
+"""Windows from which a ground may be compared with others."""
+
+
+class GroundMemory:
+    """Grounds of a robot, and the belief which of them it is on.
+
+    Attributes:
+        grounds: in the order in which they were met.
+        robot: name or type of the robot, "" where not known.
+        belief: (1 + K,) probability of new ground, then of each ground.
+    """
+
+    def __init__(self, grounds: Sequence[Ground] = (), robot: str = "") -> None:
+        self.grounds: list[Ground] = list(grounds)
+        self.robot = robot
+        self.belief = self._prior()
+        self._recent: deque[Array] = deque(maxlen=SLOW)
+        self._waiting: list[Array] = []
+
+    def __len__(self) -> int:
+        return len(self.grounds)
+
+    def copy(self) -> GroundMemory:
+        """The same grounds, at the begin of a drive."""
+        return GroundMemory(self.grounds, self.robot)
+
+    def _prior(self) -> Array:
+        k = len(self.grounds)
+        return np.array([NEW_SHARE if k else 1.0, *[(1.0 - NEW_SHARE) / max(k, 1)] * k])
+
+    def recognise(self, signature: Array, distance_m: float) -> Array:
+        """Belief (1 + K,) after one more window (10,), `distance_m` after the last."""
+        signature = self._mean(signature)
+        drawn = -math.expm1(-distance_m / PATCH_M)
+        belief = (1.0 - drawn) * self.belief + drawn * self._prior()
+        if self.grounds and np.isfinite(signature).any():
+            log_p = self._log_likelihoods(signature)
+            belief = belief * np.exp(TEMPER * (log_p - log_p.max()))
+        self.belief = np.asarray(np.maximum(belief, 1e-4) / np.maximum(belief, 1e-4).sum())
+        return self.belief
+
+    def _mean(self, signature: Array) -> Array:
+        """Mean signature of the newest windows, of fewer after a change of ground."""
+        self._recent.append(signature)
+        if len(self._recent) > 2 * FAST:
+            all_of = list(self._recent)
+            off = nan_mean(all_of[-FAST:]) - nan_mean(all_of[:-FAST])
+            square = (off / SPREAD) ** 2 / (1.0 + WINDOW_VARIANCE / FAST)
+            if np.isfinite(square).any() and float(np.nanmean(square)) > ALARM:
+                self._recent = deque(all_of[-FAST:], maxlen=SLOW)
+        return nan_mean(list(self._recent))
+
+    def _log_likelihoods(self, signature: Array) -> Array:
+        """(1 + K,) of new ground, then of each; new ground is what lies `NOVEL` from all others.
+
+        Its own spread is that of any ground: what makes it new is its distance, as in DP-means.
+        """
+        found = np.array([g.log_likelihood(signature) for g in self.grounds])
+        best = max(g.log_likelihood(np.where(np.isfinite(signature), g.signature.mean, np.nan)) for g in self.grounds)
+        return np.append(best - NOVEL, found)
+
+    def learn(self, date: str) -> None:
+        """Add the newest windows to the ground they belong to; a new one where none explains them long enough."""
+        if not self._recent:
+            return
+        signature = nan_mean(list(self._recent))
+        best = int(self.belief.argmax())
+        if best == 0 and len(self.grounds) < MOST_GROUNDS:
+            self._waiting.append(signature)
+            if len(self._waiting) >= DWELL:
+                self._found(date)
+            return
+        self._waiting.clear()
+        if best:
+            weight = float(self.belief[best])
+            self.grounds[best - 1] = self.grounds[best - 1].seen(signature, weight, date)
+
+    def _found(self, date: str) -> None:
+        names = {g.name for g in self.grounds}
+        name = next(f"ground {i}" for i in range(1, MOST_GROUNDS + 2) if f"ground {i}" not in names)
+        ground = Ground.new(name)
+        for signature in self._waiting:
+            ground = ground.seen(signature, 1.0, date)
+        self._waiting.clear()
+        self.grounds.append(ground)
+        self.belief = np.append(self.belief, self.belief[0])
+        self.belief[0] = NEW_SHARE * self.belief[-1]
+        self.belief /= self.belief.sum()
+
+    def shares(self) -> Array:
+        """Weight (1 + K,) of the fixed noise, then of each ground: its probability times its say."""
+        out = self.belief.copy()
+        for i, ground in enumerate(self.grounds, 1):
+            out[i] *= ground.say
+        out[0] = 1.0 - out[1:].sum()
+        return out
+
+    def table(self, fixed: SensorNoise) -> list[SensorNoise]:
+        """Noise of new ground, which is `fixed`, and of each ground."""
+        return [fixed, *(g.noise(fixed) for g in self.grounds)]
+
+    def friction_prior(self, prior: Array) -> Array:
+        """Probabilities (10,) of friction limits and rolling by the belief; `prior` on new ground."""
+        shares = self.shares()
+        out = shares[0] * prior
+        for share, ground in zip(shares[1:], self.grounds, strict=True):
+            out = out + share * ground.friction_prior(prior)
+        return np.asarray(out / out.sum())
+
+    def named(self, names: dict[str, str]) -> GroundMemory:
+        """With grounds renamed: old name -> new name; two of one name become one ground."""
+        found: dict[str, Ground] = {}
+        for ground in self.grounds:
+            name = names.get(ground.name, ground.name)
+            other = Ground(**{**vars(ground), "name": name})
+            found[name] = found[name].merged(other) if name in found else other
+        return GroundMemory(list(found.values()), self.robot)
+
+    def condensed(self) -> GroundMemory:
+        """With grounds merged that look alike, and those left out of which too little was seen."""
+        kept: list[Ground] = []
+        for ground in sorted(self.grounds, key=lambda g: -g.windows):
+            if ground.windows < LEAST_WINDOWS:
+                continue
+            twin = next((i for i, other in enumerate(kept) if alike(ground, other)), None)
+            if twin is None:
+                kept.append(ground)
+            else:
+                kept[twin] = kept[twin].merged(ground)
+        return GroundMemory(kept, self.robot)
+
+
+def merged(memories: Iterable[GroundMemory]) -> GroundMemory:
+    """The grounds of several robots of one type as one memory; those that look alike become one."""
+    found = list(memories)
+    grounds, names = [], set[str]()
+    for memory in found:
+        for ground in memory.grounds:
+            name, i = ground.name, 1
+            while name in names and name.startswith("ground "):
+                name, i = f"ground {i}", i + 1
+            names.add(name)
+            grounds.append(Ground(**{**vars(ground), "name": name}))
+    return GroundMemory(grounds, next((m.robot for m in found if m.robot), "")).named({}).condensed()
+
+
+def alike(a: Ground, b: Ground) -> bool:
+    """Whether two signatures are those of one ground; two that were named differently never are."""
+    named = [g.name for g in (a, b) if not g.name.startswith("ground ")]
+    if len(set(named)) == 2:
+        return False
+    both = (a.signature.count > 0.0) & (b.signature.count > 0.0)
+    if not both.any():
+        return False
+    square = (a.signature.mean - b.signature.mean)[both] ** 2 / (a.variance() + b.variance())[both]
+    return float(square.mean()) < ALIKE
+
+
+def nan_mean(rows: Sequence[Array]) -> Array:
+    """Mean (d,) of rows (n, d) without their gaps."""
+    stacked = np.array(rows)
+    seen = np.isfinite(stacked)
+    count = seen.sum(axis=0)
+    total = np.where(seen, stacked, 0.0).sum(axis=0)
+    return np.where(count > 0, total / np.maximum(count, 1), np.nan)
