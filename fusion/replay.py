@@ -108,7 +108,9 @@ def replay(
     noise = policy if isinstance(policy, Policy) else load_policy(policy)
     inputs = sensor_config_of(recording, used)
     given = with_usable_samples(recording, inputs, used, magnetometer)
-    config = EstimatorConfig(params.rig(), params.name, mode, noise, inputs=inputs, grounds=grounds, **(settings or {}))
+    config = EstimatorConfig(
+        params.rig(), params.name, mode, noise, inputs=inputs, grounds=grounds, **(settings or {})
+    )
 
     # Feed it as live; for a batch, then smooth the whole run.
     run = _run_estimator(config, given, used, batch, progress)

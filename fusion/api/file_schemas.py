@@ -15,6 +15,7 @@ from terrafusion.datasets.core.config import schema
 from terrafusion.datasets.core.robot import RobotFile
 from terrafusion.datasets.readers.log_meta import MetaFile
 from terrafusion.datasets.readers.text.column_map import ColumnMapFile
+from terrafusion.fusion.grounds.file import GroundsFile
 from terrafusion.fusion.noise.modes import ModesFile
 from terrafusion.fusion.noise.policy import PolicyFile
 from terrafusion.twin.model.soil import SoilParams
@@ -29,6 +30,7 @@ KINDS: dict[str, Any] = {
     "sweep": SweepFile,
     "policy": PolicyFile,
     "modes": ModesFile,
+    "grounds": GroundsFile,
     "meta": MetaFile,
     "column_map": ColumnMapFile,
     "catalog": dict[str, SetFile],

@@ -9,6 +9,8 @@ from typing import Any
 
 from terrafusion.datasets.core.display import text_html
 from terrafusion.fusion.api.logs import Log, opened
+from terrafusion.fusion.grounds.file import read_grounds
+from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.metrics.scores import Outage
 from terrafusion.fusion.noise.policy import Policy
 from terrafusion.fusion.outputs.replay_files import metrics_of
@@ -71,6 +73,7 @@ def replay(
     magnetometer: bool = False,
     calibrate: bool = False,
     lag_s: float = 5.0,
+    grounds: str | Path | GroundMemory | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Estimate a recorded drive and score it against its truth, or against fixes that are held out.
@@ -85,6 +88,8 @@ def replay(
         magnetometer: use the log's magnetometer.
         calibrate: also estimate wheel radius, antenna, IMU rotation and delays.
         lag_s: length of the smoothing window.
+        grounds: what the robot learned of its grounds on earlier drives (a file need not exist yet);
+            `result.grounds` holds it with what this drive adds.
         progress: called with the share done, 0 to 1.
 
     Raises:
@@ -108,5 +113,6 @@ def replay(
         progress=progress,
         magnetometer=magnetometer,
         settings={"calibrate": calibrate, "lag_s": lag_s},
+        grounds=read_grounds(Path(grounds)) if isinstance(grounds, (str, Path)) else grounds,
     )
     return Replay(**vars(result))

@@ -69,6 +69,13 @@ RerunOption = Annotated[
 MagnetometerOption = Annotated[
     bool, typer.Option("--magnetometer", help="Use the log's magnetometer; a barometer is always used.")
 ]
+GroundsOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE.yaml",
+        help="What the robot learned of its grounds: read if it is there, and written after the drive.",
+    ),
+]
 DeclinationOption = Annotated[
     float | None,
     typer.Option(
@@ -93,6 +100,7 @@ def replay(
     gnss_outage: OutageOption = None,
     magnetometer: MagnetometerOption = False,
     declination: DeclinationOption = None,
+    grounds: GroundsOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
@@ -111,6 +119,7 @@ def replay(
     from terrafusion.datasets.core.files import check_folder
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config.estimator_config import MODES
+    from terrafusion.fusion.grounds.file import read_grounds, save_grounds
     from terrafusion.fusion.metrics.scores import parse_outage
     from terrafusion.fusion.replay import replay as run
     from terrafusion.fusion.reports.replay import write_replay
@@ -122,6 +131,7 @@ def replay(
         require_rerun()
     turned = None if declination is None else math.radians(declination)
     outages = [parse_outage(text) for text in gnss_outage or []]
+    memory = None if grounds is None else read_grounds(grounds)
     rig = load_rig(vehicle)
     recording = open_recording(log, **reading(rig, topic, stamps, columns, repair_clock))
     if repair_clock:
@@ -139,8 +149,11 @@ def replay(
             progress=progress,
             magnetometer=magnetometer or declination is not None,
             settings={"calibrate": calibrate, "declination_rad": turned},
+            grounds=memory,
             findings=findings,
         )
+    if grounds is not None and result.grounds is not None:
+        save_grounds(result.grounds, grounds)
     write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
     if mcap:
         _write_bag(result, out / "estimate.mcap")

@@ -63,8 +63,8 @@ class EstimatorConfig:
         declination_rad: magnetic north, east of true north; with it a magnetometer measures the
             heading, without it it holds that of GNSS or the start.
         labels: the ground over time, in place of the detector; None: it detects.
-        grounds: what the robot learned of its grounds on earlier drives; with it, and on robots that the
-            terrain model does not know, grounds are recognised by `grounds.memory`.
+        grounds: what the robot learned of its grounds on earlier drives; with it grounds are recognised by
+            `grounds.memory` and learned.
     """
 
     rig: Rig

@@ -7,13 +7,13 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.grounds.signature import SIGNATURE
-from terrafusion.fusion.noise.policy import SensorNoise, within_ranges
 
 YAW_SLIP = SIGNATURE.index("yaw_slip")
-SPREAD = np.array([0.15] * 7 + [0.05, 0.5, 0.15, 0.2])
+SPREAD = np.array([0.15] * 7 + [0.05, 0.5, 0.2])
 """Spread on one ground of the mean signature of 4 s, before any is known (learn runs of
 tests/studies/ground_split.yaml)."""
 WINDOW_VARIANCE = 4.0
@@ -24,13 +24,8 @@ MOST_WINDOWS = 2000.0
 """Windows and stretches that are remembered: an older one fades, so that a ground may change."""
 FREEDOM = 8.0
 """Degrees of freedom of Student's t for signatures: some are outliers (kerbs, stones)."""
-SHRINK = 4.0
-"""Stretches that the tuned fixed noise counts for beside those of a ground (assumed)."""
 SHRINK_FRICTION = 20.0
 """Windows that the prior of friction counts for (assumed)."""
-LEAST_SLIP_SPREAD, LEAST_SIDE_SPREAD = 0.015, 0.005
-SLIDES = 0.5
-"""Probability of slippery friction from which wheels say nothing of the speed."""
 FRICTION_MODELS = 10
 """Friction limits of the bank and, last, rolling (`estimator.friction`)."""
 SLIPPERY_MODELS = 6
@@ -81,7 +76,7 @@ class Ground:
         motion: slip and side-slip (2,), by stretches of several metres with good fixes.
         friction: (10,) probabilities of the friction limits of `estimator.friction` and of rolling.
         friction_windows: windows that gave them.
-        evidence: log Bayes factor of the ground's slip against the tuned fixed noise, recent stretches.
+        evidence: log Bayes factor of its friction against none remembered, recent windows.
         first, last: dates (YYYY-MM-DD) of the first and the last drive on it, "" where not known.
     """
 
@@ -112,19 +107,22 @@ class Ground:
 
     @property
     def say(self) -> float:
-        """Weight in (0, 1] of this ground against the fixed noise: below 1 where it predicted worse."""
+        """Weight in (0, 1] of what is remembered: below 1 where it predicted worse than nothing."""
         return math.exp(min(self.evidence, 0.0))
 
     def variance(self) -> Array:
-        """(11,) of a window's signature, shrunk to `SPREAD`."""
+        """(10,) of a window's signature, shrunk to `SPREAD`."""
         n = self.signature.count
         known = np.maximum(self.signature.square, 0.0)
         return np.asarray((SPREAD_WINDOWS * SPREAD**2 + n * known) / (SPREAD_WINDOWS + n))
 
-    def log_likelihood(self, signature: Array) -> float:
-        """Of a window's signature by Student's t; numbers that ground or window lack say nothing."""
+    def log_likelihood(self, signature: Array, wider: float = 1.0) -> float:
+        """Of a mean signature by Student's t, its variance `wider` times that of 4 s.
+
+        Numbers that ground or signature lack say nothing.
+        """
         n = self.signature.count
-        variance = self.variance() * (1.0 + 1.0 / np.maximum(n, 1.0))
+        variance = self.variance() * (wider + 1.0 / np.maximum(n, 1.0))
         return student_t(signature, self.signature.mean, variance, n > 0.0)
 
     def seen(self, signature: Array, weight: float, date: str) -> Ground:
@@ -145,38 +143,6 @@ class Ground:
         n = self.friction_windows
         return np.asarray((SHRINK_FRICTION * prior + n * self.friction) / (SHRINK_FRICTION + n))
 
-    @property
-    def slides(self) -> bool:
-        """Whether wheels skid on it, so that friction predicts the motion and slip does not."""
-        return (
-            self.friction_windows > SHRINK_FRICTION
-            and float(self.friction[:SLIPPERY_MODELS].sum()) > SLIDES
-        )
-
-    def noise(self, fixed: SensorNoise) -> SensorNoise:
-        """Noise on this ground: slip, yaw scale and side-slip, each shrunk to `fixed` by evidence.
-
-        Normal and inverse-gamma posterior of mean and variance, with `SHRINK` prior entries (Gelman et al.
-        2013, Bayesian Data Analysis, sec. 3.3); without entries it is `fixed`.
-        """
-        if self.slides:
-            return fixed
-        slip = self._shrunk(0, fixed.slip_mean, fixed.slip_sigma, LEAST_SLIP_SPREAD)
-        n, square = self.motion.count[1], self.motion.square[1] + self.motion.mean[1] ** 2
-        across = (SHRINK * fixed.side_slip_sigma**2 + n * max(float(square), LEAST_SIDE_SPREAD**2)) / (SHRINK + n)
-        return within_ranges(
-            dataclasses.replace(
-                fixed, slip_mean=slip[0], slip_sigma=slip[1], side_slip_sigma=math.sqrt(across)
-            )
-        )
-
-    def _shrunk(self, i: int, mean: float, sigma: float, least: float) -> tuple[float, float]:
-        n, own = float(self.motion.count[i]), float(self.motion.mean[i])
-        square = max(float(self.motion.square[i]), least**2)
-        total = SHRINK + n
-        spread = (SHRINK * sigma**2 + n * square + SHRINK * n / total * (own - mean) ** 2) / total
-        return (SHRINK * mean + n * own) / total, math.sqrt(spread)
-
     def merged(self, other: Ground) -> Ground:
         """This ground with what `other` knows of the same one."""
         windows = self.friction_windows + other.friction_windows
@@ -195,7 +161,7 @@ class Ground:
         )
 
 
-def student_t(values: Array, mean: Array, variance: Array, known: Array) -> float:
+def student_t(values: Array, mean: Array, variance: Array, known: NDArray[np.bool_]) -> float:
     """Log density of independent Student's t with `FREEDOM`, up to a constant, where `known` and finite."""
     seen = known & np.isfinite(values)
     square = (values[seen] - mean[seen]) ** 2 / variance[seen]

@@ -15,14 +15,13 @@ from terrafusion.fusion.grounds.ground import SLIPPERY_MODELS, Ground
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.grounds.signature import SignatureExtractor
 from terrafusion.fusion.grounds.stretches import Stretch, StretchMeter
-from terrafusion.fusion.noise.policy import SensorNoise
 from terrafusion.fusion.terrain.features import Window
 
 SURE = 0.5
 """Least mean belief in one ground for a stretch to count for it."""
-FADES, MOST_EVIDENCE, LEAST_EVIDENCE = 0.95, 2.0, -8.0
-"""Share of a ground's evidence left after a stretch, and its bounds: a stale ground is dropped within a few
-stretches, and may win its say back."""
+FADES, COUNTS, MOST_EVIDENCE, LEAST_EVIDENCE = 0.98, 0.05, 2.0, -8.0
+"""Evidence left after a window, what a window counts for as fixes of 30 s are scored together, and bounds: a
+stale ground loses its say within some seconds, and may win it back."""
 USABLE = 0.1
 """Most uncertain slip of a stretch that is used."""
 CLOCKED_NS = 946_684_800_000_000_000
@@ -63,46 +62,45 @@ class GroundLearner:
         window: Window,
         state: State,
         rolled_m: float,
-        fixed: SensorNoise,
         friction: FrictionBank | None,
-        current_a: float = math.nan,
     ) -> None:
         """One window that ends at `state`, in which the wheels rolled `rolled_m` since the last one."""
         memory, good = self.memory, state.status == "running"
         slide = math.nan
         if friction is not None and good:
             slide = float(friction.scored()[:SLIPPERY_MODELS].sum())
-        signature = self._extractor.extract(window, current_a, slide)
+        signature = self._extractor.extract(window, slide)
         moved = window.ground_speed_mps() * max(window.dt_s, 0.0)
         if np.isfinite(signature).any():
             memory.recognise(signature, moved)
             if good:
                 memory.learn(_date(state.t_ns))
         if good:
-            self._learn_motion(state, rolled_m, fixed, friction, bool(np.isfinite(signature).any()))
+            self._learn_motion(state, rolled_m, friction, bool(np.isfinite(signature).any()))
         else:
             self._forget_stretch()
         if friction is not None:
             friction.expect(memory.friction_prior(friction.base()))
 
     def _learn_motion(
-        self, state: State, rolled_m: float, fixed: SensorNoise, friction: FrictionBank | None, moves: bool
+        self, state: State, rolled_m: float, friction: FrictionBank | None, moves: bool
     ) -> None:
         if friction is not None and moves:
             scored, belief = friction.scored(), self.memory.belief
             best = int(belief[1:].argmax()) if len(belief) > 1 else -1
             if best >= 0 and belief[1 + best] > SURE:
-                self._replace(best, self.memory.grounds[best].slid(scored, float(belief[1 + best])))
+                ground = with_evidence(self.memory.grounds[best], scored, friction.base())
+                self._replace(best, ground.slid(scored, float(belief[1 + best])))
         if friction is not None and friction.leads:  # wheels that skid measure no slip of the ground
             self._forget_stretch()
             return
         self._passed.append(self.memory.belief)
         stretch = self._meter.add(state, rolled_m)
         if stretch is not None:
-            self._learn_stretch(stretch, fixed)
+            self._learn_stretch(stretch)
             self._passed.clear()
 
-    def _learn_stretch(self, stretch: Stretch, fixed: SensorNoise) -> None:
+    def _learn_stretch(self, stretch: Stretch) -> None:
         k = len(self.memory.grounds)
         padded = [np.pad(b, (0, 1 + k - len(b))) for b in self._passed]
         belief = np.mean(padded, axis=0)
@@ -112,10 +110,6 @@ class GroundLearner:
         if belief[1 + best] < SURE:
             return
         ground = self.memory.grounds[best]
-        if ground.stretches >= 1.0:
-            gained = log_density(stretch, ground.noise(fixed)) - log_density(stretch, fixed)
-            evidence = min(max(FADES * ground.evidence + gained, LEAST_EVIDENCE), MOST_EVIDENCE)
-            ground = dataclasses.replace(ground, evidence=evidence)
         entry = np.array([stretch.slip, stretch.side])
         self._replace(
             best,
@@ -137,11 +131,14 @@ class GroundLearner:
         return (self.memory.grounds[i - 1] if i else None), float(self.memory.belief[i])
 
 
-def log_density(stretch: Stretch, noise: SensorNoise) -> float:
-    """Log density of a stretch's slip (Student's t, four degrees of freedom) on the ground of `noise`."""
-    variance = noise.slip_sigma**2 + stretch.sigma**2
-    square = (stretch.slip - noise.slip_mean) ** 2 / variance
-    return -2.5 * math.log1p(square / 4.0) - 0.5 * math.log(variance)
+def with_evidence(ground: Ground, scored: Array, base: Array) -> Ground:
+    """The ground with the evidence of one more window: its friction against that of no memory.
+
+    `scored` (10,) are probabilities by fixes and `base` (10,) alone, so their ratio is the fixes' likelihood.
+    """
+    gained = math.log(max(float(ground.friction_prior(base) @ (scored / base)), 1e-6))
+    evidence = min(max(FADES * ground.evidence + COUNTS * gained, LEAST_EVIDENCE), MOST_EVIDENCE)
+    return dataclasses.replace(ground, evidence=evidence)
 
 
 def _date(t_ns: int) -> str:

@@ -1,8 +1,8 @@
 """The grounds of one robot: recognised from signatures, learned without labels, never with positions.
 
-A filter over the known grounds and *new ground* follows the drive (`terrain.sequence`). Windows that no ground
-explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and Jordan 2012, ICML); grounds that came to
-look alike are merged.
+A filter over the known grounds and *new ground* follows the drive, as `terrain.sequence` does. Windows that
+no ground explains, `DWELL` in a row, make a new one, as in DP-means (Kulis and Jordan 2012, ICML); grounds
+that came to look alike are merged.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import numpy as np
 
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.grounds.ground import SPREAD, WINDOW_VARIANCE, Ground
-from terrafusion.fusion.noise.policy import SensorNoise
 
 PATCH_M = 25.0
 """Expected length of a patch, as of the detector."""
@@ -23,7 +22,7 @@ NOVEL = 5.0
 """Log-likelihood by which new ground is less likely than the middle of a known one (chosen on learn runs)."""
 SLOW, FAST = 8, 2
 """Windows whose mean is compared with the grounds, and newest ones that raise the alarm of a change."""
-ALARM = 6.0
+ALARM = 3.0
 """Mean squared distance of the newest windows to those before, in spreads of a mean, that is a change."""
 NEW_SHARE = 0.1
 """Prior probability that a new patch is ground never met."""
@@ -44,18 +43,26 @@ class GroundMemory:
     Attributes:
         grounds: in the order in which they were met.
         robot: name or type of the robot, "" where not known.
-        belief: (1 + K,) probability of new ground, then of each ground.
     """
 
     def __init__(self, grounds: Sequence[Ground] = (), robot: str = "") -> None:
         self.grounds: list[Ground] = list(grounds)
         self.robot = robot
-        self.belief = self._prior()
+        self._belief: list[float] = self._prior().tolist()
         self._recent: deque[Array] = deque(maxlen=SLOW)
         self._waiting: list[Array] = []
 
     def __len__(self) -> int:
         return len(self.grounds)
+
+    @property
+    def belief(self) -> Array:
+        """(1 + K,) probability of new ground, then of each ground."""
+        return np.array(self._belief)
+
+    @belief.setter
+    def belief(self, probabilities: Array) -> None:
+        self._belief = probabilities.tolist()
 
     def copy(self) -> GroundMemory:
         """The same grounds, at the begin of a drive."""
@@ -85,6 +92,7 @@ class GroundMemory:
             square = (off / SPREAD) ** 2 / (1.0 + WINDOW_VARIANCE / FAST)
             if np.isfinite(square).any() and float(np.nanmean(square)) > ALARM:
                 self._recent = deque(all_of[-FAST:], maxlen=SLOW)
+                self._waiting.clear()
         return nan_mean(list(self._recent))
 
     def _log_likelihoods(self, signature: Array) -> Array:
@@ -92,12 +100,15 @@ class GroundMemory:
 
         Its own spread is that of any ground: what makes it new is its distance, as in DP-means.
         """
-        found = np.array([g.log_likelihood(signature) for g in self.grounds])
-        best = max(g.log_likelihood(np.where(np.isfinite(signature), g.signature.mean, np.nan)) for g in self.grounds)
+        wider = 1.0 + WINDOW_VARIANCE * (1.0 / len(self._recent) - 1.0 / SLOW)
+        found = np.array([g.log_likelihood(signature, wider) for g in self.grounds])
+        seen = np.isfinite(signature)
+        middles = [np.where(seen, g.signature.mean, np.nan) for g in self.grounds]
+        best = max(g.log_likelihood(m, wider) for g, m in zip(self.grounds, middles, strict=True))
         return np.append(best - NOVEL, found)
 
     def learn(self, date: str) -> None:
-        """Add the newest windows to the ground they belong to; a new one where none explains them long enough."""
+        """Add the newest windows to their ground; to a new one where none explains them for long enough."""
         if not self._recent:
             return
         signature = nan_mean(list(self._recent))
@@ -120,21 +131,17 @@ class GroundMemory:
             ground = ground.seen(signature, 1.0, date)
         self._waiting.clear()
         self.grounds.append(ground)
-        self.belief = np.append(self.belief, self.belief[0])
-        self.belief[0] = NEW_SHARE * self.belief[-1]
-        self.belief /= self.belief.sum()
+        belief = np.append(self.belief, self.belief[0])
+        belief[0] = NEW_SHARE * belief[-1]
+        self.belief = belief / belief.sum()
 
     def shares(self) -> Array:
-        """Weight (1 + K,) of the fixed noise, then of each ground: its probability times its say."""
+        """Weight (1 + K,) of no memory, then of each ground: its probability times its say."""
         out = self.belief.copy()
         for i, ground in enumerate(self.grounds, 1):
             out[i] *= ground.say
         out[0] = 1.0 - out[1:].sum()
         return out
-
-    def table(self, fixed: SensorNoise) -> list[SensorNoise]:
-        """Noise of new ground, which is `fixed`, and of each ground."""
-        return [fixed, *(g.noise(fixed) for g in self.grounds)]
 
     def friction_prior(self, prior: Array) -> Array:
         """Probabilities (10,) of friction limits and rolling by the belief; `prior` on new ground."""

@@ -1,8 +1,7 @@
 """What a robot feels of its ground in a second: numbers relative to the robot itself.
 
 Vibration bands are normalised by speed (`terrain.features`) and by the robot's own quiet baseline; gyro and
-accelerometer are compared with the wheels, the motor current with the speed. A number that the sensors do not
-give is NaN.
+accelerometer are compared with the wheels. A number that the sensors do not give is NaN.
 """
 
 from __future__ import annotations
@@ -14,11 +13,11 @@ import numpy as np
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.fusion.terrain.features import MIN_SPEED_MPS, Window, periodogram, sample_rate_hz
 
-SIGNATURE = ("z_low", "z_mid", "z_high", "xy_low", "xy_mid", "tilt_low", "tilt_mid", "yaw_slip", "surge", "current",
-             "slide")
-"""log10 of band RMS over the baseline at 1 m/s (vertical, horizontal, roll and pitch), then 1 - yaw rate of the
-gyro over that of the wheels, acceleration of the body over that of the wheels, log10 of current at 1 m/s. `slide` is the probability of
-slippery friction by fixes: it tells grounds apart that are learned, and is missing in an outage."""
+VIBRATION = ("z_low", "z_mid", "z_high", "xy_low", "xy_mid", "tilt_low", "tilt_mid")
+SIGNATURE = (*VIBRATION, "yaw_slip", "surge", "slide")
+"""log10 of band RMS over the baseline at 1 m/s (vertical, horizontal, roll and pitch); 1 - yaw rate of the
+gyro over that of the wheels; acceleration of the body over that of the wheels; probability of slippery
+friction by fixes, which tells grounds apart that are learned and is missing in an outage."""
 
 BANDS_HZ = ((3.0, 8.0), (8.0, 14.0), (14.0, 45.0))
 LEAST_YAW_RADPS, LEAST_SURGE_MPS2 = 0.15, 0.3
@@ -36,8 +35,8 @@ class SignatureExtractor:
     def __init__(self) -> None:
         self._quiet = np.full(len(FLOORS), np.nan)
 
-    def extract(self, window: Window, current_a: float = math.nan, slide: float = math.nan) -> Array:
-        """Signature (11,); all NaN while the robot stands."""
+    def extract(self, window: Window, slide: float = math.nan) -> Array:
+        """Signature (10,); all NaN while the robot stands."""
         powers = _band_powers(window)
         speed = window.ground_speed_mps()
         if not speed > MIN_SPEED_MPS:
@@ -50,8 +49,7 @@ class SignatureExtractor:
         out[:7] -= 0.5 * math.log10(speed)
         out[7] = _yaw_slip(window)
         out[8] = _surge_share(window)
-        out[9] = math.log10(max(current_a, 1e-3) / speed) if math.isfinite(current_a) else math.nan
-        out[10] = slide
+        out[9] = slide
         return out
 
 

@@ -1,4 +1,4 @@
-"""Slip and side-slip over stretches of several metres, by the wheels against the estimate under good fixes."""
+"""Slip and side-slip over stretches of several metres, wheels against the estimate under good fixes."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from terrafusion.datasets.core.frames import quaternion_to_matrix
 from terrafusion.fusion.estimate.estimate import State
 
-LEAST_M, SIGMAS, MOST_M, MOST_S = 4.0, 20.0, 40.0, 30.0
-"""A stretch ends after 4 m and twenty sigma of the position, at most 40 m; one longer than 30 s is dropped."""
+LEAST_M, SIGMAS, MOST_M, MOST_S = 4.0, 20.0, 40.0, 60.0
+"""A stretch ends after 4 m and twenty sigma of the position, at most 40 m; one of 60 s is dropped."""
 MOST_SLIP = 1.0
 
 

@@ -14,9 +14,6 @@ from terrafusion.fusion.terrain.sequence import PatchFilter
 __all__ = ["TerrainDetector", "Window"]
 
 
-FOREIGN_UNKNOWN, PATCH_M = 0.96, 25.0
-"""Of a robot that no model knows: prior probability that its ground is none of the classes, and length of a
-patch (assumed)."""
 EXTERNAL_TRUST = 0.3
 """Exponent on the evidence of an external source: its frames repeat one another as windows do."""
 EXTERNAL_ERROR = 0.1
@@ -27,8 +24,7 @@ class TerrainDetector:
     """Filters the terrain class along a run.
 
     Args:
-        model: densities and patch length; None for a robot that it does not know, for which external
-            sources alone are evidence, and `unknown` is `FOREIGN_UNKNOWN` before any.
+        model: densities and patch length; `TerrainModel.for_vehicle` adapts it to a robot.
         classes: the classes, `unknown` among them, in the order of all probabilities given and
             returned (`Policy.names()`).
 
@@ -36,16 +32,15 @@ class TerrainDetector:
         ConfigError: `classes` has no `unknown`, or a name twice.
     """
 
-    def __init__(self, model: TerrainModel | None, classes: tuple[str, ...]) -> None:
+    def __init__(self, model: TerrainModel, classes: tuple[str, ...]) -> None:
         if UNKNOWN not in classes or len(set(classes)) != len(classes):
             raise ConfigError(
                 f"terrain classes {', '.join(classes)} must differ and hold '{UNKNOWN}'",
                 remedy="mend the policy",
             )
         self.classes = classes
-        self._table = None if model is None else LikelihoodTable(model, classes)
-        patch_m = PATCH_M if model is None else model.patch_length_m
-        self._filter = PatchFilter(len(classes), patch_m, None if model else _foreign_prior(classes))
+        self._table = LikelihoodTable(model, classes)
+        self._filter = PatchFilter(len(classes), model.patch_length_m, model.prior(classes))
 
     @property
     def probabilities(self) -> Array:
@@ -57,8 +52,7 @@ class TerrainDetector:
         speed = window.ground_speed_mps()
         if speed > MIN_SPEED_MPS:
             self._filter.predict(speed * max(window.dt_s, 0.0))
-            if self._table is not None:
-                self._filter.update(self._table.evaluate(*extract(window)))
+            self._filter.update(self._table.evaluate(*extract(window)))
         return self.probabilities
 
     def fuse(self, probabilities: ArrayLike) -> Array:
@@ -81,11 +75,3 @@ class TerrainDetector:
         q = (1.0 - EXTERNAL_ERROR) * q / q.sum() + EXTERNAL_ERROR / k
         self._filter.update(EXTERNAL_TRUST * np.log(q))
         return self.probabilities
-
-
-def _foreign_prior(classes: tuple[str, ...]) -> Array | None:
-    k = len(classes)
-    if k == 1:
-        return None
-    others = (1.0 - FOREIGN_UNKNOWN) / (k - 1)
-    return np.array([FOREIGN_UNKNOWN if name == UNKNOWN else others for name in classes])

@@ -59,12 +59,12 @@ class TerrainNoise:
         self.adaptive = config.mode == "adaptive"
         model = load_terrain_model().for_vehicle(config.vehicle)
         self.grounds = None if config.grounds is None else GroundLearner(config.grounds)
-        self.detector = TerrainDetector(model if self.grounds is None else None, config.policy.names())
+        self.detector = TerrainDetector(model, config.policy.names())
         self._labels = config.labels
         self._label_probabilities: Array | None = None
         fixed = config.tuning.fixed.applied(config.policy.fixed)
-        self._pooled = self._learned = fixed
-        self._starts_pooled = model.slip_only or self.grounds is not None
+        self._pooled = fixed
+        self._starts_pooled = model.slip_only
         if self._starts_pooled:
             # Such a robot is usually on `unknown` ground: it gets the pooled noise, not the wider one.
             classes = {**self.policy.classes, UNKNOWN: fixed}
@@ -88,7 +88,6 @@ class TerrainNoise:
         if not self.adaptive:
             self.noise = dataclasses.replace(self.noise, slip_mean=mean, slip_sigma=sigma)
         elif self._starts_pooled:
-            self._learned = learned
             classes = {**self.policy.classes, UNKNOWN: learned}
             self.policy = dataclasses.replace(self.policy, classes=classes)
             self._reweight(t_ns)
@@ -166,7 +165,7 @@ class TerrainNoise:
         if self.grounds is not None:
             rolled = wheels.travelled(before_ns, state.t_ns)
             rolled_m = np.nan if rolled is None else 0.5 * (rolled[0] + rolled[1])
-            self.grounds.update(window, state, rolled_m, self._learned, friction)
+            self.grounds.update(window, state, rolled_m, friction)
         self._source = "detector"
         self._apply_labels(state.t_ns)
         self._grade = float(quaternion_to_matrix(state.quaternion)[2, 0])
@@ -226,37 +225,18 @@ class TerrainNoise:
         if not self.adaptive:
             return
         p = self._probabilities
-        self.noise = self._blended()
+        self.noise = self.policy.blend(self._shares, self._grade)
         if self._recorded is None:  # not started yet: nothing to change from
             return
         before, now = dataclasses.asdict(self._recorded), dataclasses.asdict(self.noise)
-        why = self._reason(p)
+        best = int(p.argmax())
+        why = f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
         for name, (sensor, unit) in _RECORDED.items():
             scale = max(abs(before[name]), 0.02)
             if abs(now[name] - before[name]) > NOTEWORTHY * scale:
                 reason = f"{name}: {why}"
                 self.changes.append(WeightChange(t_ns, sensor, before[name], now[name], unit, reason))
                 self._recorded = dataclasses.replace(self._recorded, **{name: now[name]})
-
-
-    def _blended(self) -> SensorNoise:
-        """The policy's noise by the shares of the classes; unknown ground is that of the ground memory."""
-        if self.grounds is not None:
-            memory = self.grounds.memory
-            rows = {str(i): row for i, row in enumerate(memory.table(self._learned))}
-            own = dataclasses.replace(self.policy, classes=rows).blend(memory.shares(), self._grade)
-            if self._shares[self.detector.classes.index(UNKNOWN)] == 1.0:
-                return own
-            self.policy = dataclasses.replace(self.policy, classes={**self.policy.classes, UNKNOWN: own})
-        return self.policy.blend(self._shares, self._grade)
-
-    def _reason(self, p: Array) -> str:
-        best = int(p.argmax())
-        if self.grounds is not None and self.detector.classes[best] == UNKNOWN:
-            ground, probability = self.grounds.best()
-            if ground is not None:
-                return f"{ground.name} p = {probability:.2f} ({ground.stretches:.0f} stretches in memory)"
-        return f"terrain {self.detector.classes[best]} p = {p[best]:.2f} ({self._source})"
 
 
 def _weighting_for(config: EstimatorConfig, noise: NoiseInForce) -> Weighting:

@@ -40,7 +40,7 @@ class Study:
 
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "outage_terms", "known_changes",
+    "outage_terms", "known_changes", "grounds",
 )  # fmt: skip
 
 
@@ -185,6 +185,17 @@ STUDIES = (
         "Which term of dead reckoning are errors after 10 s without fixes made of?",
         _module("opponents.decompose"),
         5,
+    ),
+    Study(
+        "grounds",
+        "What do adaptive mode and ground memory gain in outages on the field logs of one robot?",
+        _module("grounds"),
+        8,
+        {
+            f"{group}_{method.replace(' ', '_')}": rf"{group}, {method} over fixed: ([\d.]+) "
+            for group in ("slipping", "firm", "all", "ice", "loose_sand", "gravel", "grass")
+            for method in ("no memory", "memory", "shuffled")
+        },
     ),
     Study(
         "known_changes",

@@ -1,0 +1,64 @@
+"""Ground memory in a drive: learned, carried to the next one, live, dumped; fixed mode does not change."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import terrafusion as tf
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.benchmark.outage_plan import until
+from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.grounds.file import save_grounds
+from terrafusion.fusion.grounds.memory import GroundMemory
+from terrafusion.twin.model.vehicle import as_vehicle
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    """A drive of a robot that the terrain model does not know."""
+    run = tf.simulate("figure_eight", vehicle="husky", terrain="asphalt", seed=3)
+    return until(run, 30.0)
+
+
+def test_a_drive_adds_to_the_memory_and_the_next_one_goes_on(drive: Recording, tmp_path: Path) -> None:
+    path = tmp_path / "grounds.yaml"
+    first = tf.replay(drive, grounds=path).grounds
+    assert first is not None
+    assert len(first) == 1
+    save_grounds(first, path)
+    second = tf.replay(drive, grounds=path).grounds
+    assert second is not None
+    assert len(second) == 1
+    assert second.grounds[0].windows > 1.5 * first.grounds[0].windows
+
+
+def test_memory_of_rolling_grounds_changes_no_bit(drive: Recording) -> None:
+    memory = tf.replay(drive, grounds=GroundMemory()).grounds
+    plain, remembered = (tf.replay(drive, grounds=g) for g in (None, memory))
+    np.testing.assert_array_equal(
+        plain.estimate.trajectory.position_m, remembered.estimate.trajectory.position_m
+    )
+    assert plain.grounds is None
+
+
+def test_a_dump_goes_on_with_the_same_memory(drive: Recording) -> None:
+    config = EstimatorConfig(as_vehicle("husky").rig(), "husky", grounds=GroundMemory())
+    whole, part = Estimator(config), Estimator(config)
+    messages = list(drive.messages())
+    for message in messages:
+        whole.add(message)
+    half = len(messages) // 2
+    for message in messages[:half]:
+        part.add(message)
+    rest = Estimator.restore(config, part.dump())
+    for message in messages[half:]:
+        rest.add(message)
+    own, other = whole.weights.learned_grounds(), rest.weights.learned_grounds()
+    assert own is not None
+    assert other is not None
+    assert [g.windows for g in own.grounds] == [g.windows for g in other.grounds]
+    np.testing.assert_array_equal(own.grounds[0].signature.mean, other.grounds[0].signature.mean)
