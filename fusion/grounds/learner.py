@@ -14,7 +14,7 @@ from terrafusion.fusion.estimate.estimate import State
 from terrafusion.fusion.grounds.ground import SLIPPERY_MODELS, Ground
 from terrafusion.fusion.grounds.memory import GroundMemory
 from terrafusion.fusion.grounds.signature import SignatureExtractor
-from terrafusion.fusion.grounds.stretches import Stretch, StretchMeter
+from terrafusion.fusion.grounds.stretches import SlipStretch, StretchMeter
 from terrafusion.fusion.terrain.features import Window
 
 SURE = 0.5
@@ -100,7 +100,7 @@ class GroundLearner:
             self._learn_stretch(stretch)
             self._passed.clear()
 
-    def _learn_stretch(self, stretch: Stretch) -> None:
+    def _learn_stretch(self, stretch: SlipStretch) -> None:
         k = len(self.memory.grounds)
         padded = [np.pad(b, (0, 1 + k - len(b))) for b in self._passed]
         belief = np.mean(padded, axis=0)

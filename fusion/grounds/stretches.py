@@ -14,7 +14,7 @@ MOST_SLIP = 1.0
 
 
 @dataclass(frozen=True)
-class Stretch:
+class SlipStretch:
     """Slip, side-slip (lateral over forward distance) and their 1 sigma."""
 
     slip: float
@@ -37,7 +37,7 @@ class StretchMeter:
         self._before = None
         self._begin()
 
-    def add(self, state: State, rolled_m: float) -> Stretch | None:
+    def add(self, state: State, rolled_m: float) -> SlipStretch | None:
         """The motion up to `state`, in which the wheels rolled `rolled_m`."""
         before, self._before = self._before, state
         if before is None or not math.isfinite(rolled_m):
@@ -61,4 +61,4 @@ class StretchMeter:
         self._begin()
         if abs(slip) > MOST_SLIP or abs(side) > MOST_SLIP:
             return None
-        return Stretch(slip, side, sigma)
+        return SlipStretch(slip, side, sigma)

@@ -25,8 +25,14 @@ PLACES = {
     "catalog": ("datasets.catalog", "catalog.yaml"),
 }
 GYRO = {"imu": {"gyro_z_radps": {"column": "wz", "sign": "-"}, "gyro_x_radps": 3}}
+TALLY = {"mean": 0.1, "spread": 0.02, "count": 12.0}
+GROUND: dict[str, Any] = {
+    "name": "lawn", "signature": {"z_low": TALLY}, "slip": TALLY, "side_slip": TALLY, "friction": [0.1] * 10,
+    "friction_windows": 0.0, "evidence": 0.0, "first": "2026-05-01", "last": "2026-05-02",
+}  # fmt: skip
 WRITTEN: dict[str, dict[str, Any]] = {
     "meta": {"start_ns": 5, "vehicle": "husky", "antenna_m": [0, 0, 1], "datum": [60.1, 24.8, 10]},
+    "grounds": {"schema": "terrafusion.grounds/1", "robot": "husky", "grounds": [GROUND]},
     "column_map": {"time": "t", "channels": GYRO, "track_m": 0.5},
 }
 
