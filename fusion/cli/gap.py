@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -41,6 +41,26 @@ ReferenceOption = Annotated[
 ]
 
 
+def _explained(effect: str | None) -> None:
+    """Print what an effect is, and stop."""
+    if effect is None:
+        return
+    from terrafusion.fusion.reports.explain_effect import explanation
+
+    for line in explanation(effect):
+        print(line)
+    raise typer.Exit
+
+
+ExplainOption = Annotated[
+    str | None,
+    typer.Option(
+        "--explain", metavar="EFFECT", callback=_explained, is_eager=True,
+        help="Say what an effect is and how to check it on the robot, and stop.",
+    ),
+]  # fmt: skip
+
+
 def gap(
     runs: RunsArgument,
     out: Annotated[Path, typer.Option("--out", help="Folder for diagnosis.json and report.html.")],
@@ -67,6 +87,7 @@ def gap(
         bool, typer.Option("--judge", help="Also compare the estimator on these logs and on the twin's.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
+    explain: ExplainOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
@@ -85,8 +106,8 @@ def gap(
     from terrafusion.twin.model.vehicle import load_vehicle
 
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-    judged = opened(runs, options, repair_clock)
-    normal = opened(reference or [], options, repair_clock)
+    judged = _opened_by_name(runs, options, repair_clock)
+    normal = _opened_by_name(reference or [], options, repair_clock)
     for target in (out, *([write_vehicle.parent] if write_vehicle else [])):
         check_folder(target)
     with progress_bar("comparing") as progress:
@@ -105,6 +126,18 @@ def gap(
         for line in write_corrected(found, vehicle, write_vehicle):
             print(line)
     print(f"written to {out} ({found.elapsed_s:.1f} s)")
+
+
+def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
+    """The logs, each called as it was given: drives of one scenario share the name in their files."""
+    import dataclasses
+
+    found = list[Recording]()
+    for name in names:
+        logs = opened([name], options, repair_clock)
+        called = [name] if len(logs) == 1 else [f"{name}#{i}" for i in range(len(logs))]
+        found += [dataclasses.replace(log, name=own) for log, own in zip(logs, called, strict=True)]
+    return found
 
 
 def _estimator_gap(

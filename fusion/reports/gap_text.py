@@ -4,19 +4,22 @@ from __future__ import annotations
 
 import math
 
+from terrafusion.fusion.reports.explain_effect import effect_words
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
 from terrafusion.twin.gap.answer.verdict import Cause
 from terrafusion.twin.gap.answer.where import LEAST_REFERENCES
 
 MOST_LISTED = 4
+MOSTLY_COVERED = 0.8
+"""Share of the judged time that references must cover for the drives not to be mentioned."""
 
 
 def sentences(d: GapDiagnosis) -> list[str]:
     """The answer in sentences."""
     lines = [_detection(d)]
     if d.detected:
-        lines += [_cause(d), _place(d), _shrink(d)]
+        lines += [_cause(d), *_checks(d), _place(d), _shrink(d), _drives(d)]
     if d.next_run is not None:
         what = d.next_run.scenario
         lines.append(f"Next, {what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}.")
@@ -60,6 +63,22 @@ def _cause(d: GapDiagnosis) -> str:
     return (
         f"The most probable cause is {first.effect} "
         f"(probability {100.0 * first.probability:.0f} %){share} ({numbers(d)})."
+    )
+
+
+def _checks(d: GapDiagnosis) -> list[str]:
+    """What each named effect is, and how to check it on the robot."""
+    words = effect_words()
+    return [f"{name}: {' To check: '.join(words[name])}" for name in d.verdict.named if name in words]
+
+
+def _drives(d: GapDiagnosis) -> str:
+    if d.drives is None or d.drives.covered >= MOSTLY_COVERED:
+        return ""
+    return (
+        f"Your drives differ from your references: these cover {100.0 * d.drives.covered:.0f} % of the time "
+        f"and lack {'; '.join(d.drives.missing)}. Make references of such drives: until then the gap may "
+        "come from the drives and not from the robot."
     )
 
 

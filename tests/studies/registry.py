@@ -72,6 +72,17 @@ STUDIES = (
         },
     ),
     Study(
+        "gap_other_drives",
+        "Does the diagnosis hold on drives that its references did not make?",
+        _module("gap_other_drives"),
+        6,
+        {
+            "alarms": r"false alarms (\d+ of \d+)",
+            "detected": r"detected (\d+ of \d+)",
+            "named": r"right effect in a named class (\d+ of \d+)",
+        },
+    ),
+    Study(
         "engine_accuracy",
         "How accurate is the twin's integrator at its own step?",
         _module("engine_accuracy"),

@@ -17,6 +17,7 @@ from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.twin.calibrate.inputs import check_source
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
+from terrafusion.twin.gap.answer.drives import drive_coverage
 from terrafusion.twin.gap.answer.effect_search import EffectSearch
 from terrafusion.twin.gap.answer.next_run import next_run
 from terrafusion.twin.gap.answer.shrinkage import shrinkage
@@ -131,11 +132,12 @@ def diagnose_evidence(
     shrunk = shrinkage(evidence, scores, sigma, null, verdict.fit)
     where = gap_map(evidence, sigma, null, seed)
     following = next_run(evidence, sigma, verdict)
+    drives = drive_coverage(runs, evidence.references, evidence.model)
     notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
     if verdict.fit is not None and verdict.fit.failure:
         notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")
     return GapDiagnosis(
-        vehicle, detection, significance, uncalibrated, where, posterior, verdict, shrunk, following,
+        vehicle, detection, significance, uncalibrated, where, posterior, verdict, shrunk, following, drives,
         by_effect, evidence, tuple(notes), time.perf_counter() - began,
     )  # fmt: skip
 

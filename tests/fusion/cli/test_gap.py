@@ -32,12 +32,22 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     answer = json.loads((tmp_path / "out/diagnosis.json").read_text("utf-8"))
     jsonschema.validate(answer, SCHEMA)
     assert answer["named"] == ["wheel_radius"]
+    assert answer["runs"] == [str(logs / "run300"), str(logs / "run301")]
+    assert answer["reference_runs"] == [str(logs / f"run{100 + i}") for i in range(6)]
     page = (tmp_path / "out/report.html").read_text("utf-8")
     assert "wheel_radius" in page
     assert "Before and after" in page
     assert "wheel_radius" in done.out
     assert "wheel.radius_m" in done.out
     assert (tmp_path / "corrected.yaml").is_file()
+
+
+def test_gap_explains_an_effect(terrafusion) -> None:
+    done = terrafusion("gap", "--explain", "dead_time")
+    assert done.status == 0, done.err
+    assert "check:" in done.out
+    assert "dead_time/transport" in done.out
+    assert terrafusion("gap", "--explain", "dead_tim").refused("there is no effect 'dead_tim'", "dead_time")
 
 
 def test_gap_refuses_an_unknown_effect_in_one_line(logs: Path, tmp_path: Path, terrafusion) -> None:

@@ -16,10 +16,11 @@ from terrafusion.fusion.reports.gap_text import sentences
 from terrafusion.fusion.reports.plots.gap import plot_shrink
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES
+from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES, LIFTED, _forecast, separation
 from terrafusion.twin.gap.answer.verdict import LAW_SIGMA_MOTION, UNKNOWN
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.diagnose import diagnose
+from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from tests.twin.gap.runs import runs
 
@@ -179,6 +180,37 @@ def _swinging(run: Recording) -> Recording:
     gyro = run.imu.gyro_radps.copy()
     gyro[:, 2] += 0.05 * np.sin(2.0 * np.pi * 0.4 * 1e-9 * (run.imu.t_ns - run.start_ns))
     return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
+
+
+def test_sets_and_drives_of_an_answer(wide: GapDiagnosis) -> None:
+    answer = checked(wide)
+    assert set(answer["sets"][0]["effects"]) == {"wheel_radius", "grousers"}
+    assert answer["sets"][0]["named"]
+    assert answer["drives"] == {
+        "covered": pytest.approx(1.0),
+        "missing": [],
+    }  # references made the same drive
+
+
+def test_lifted_wheels_carry_no_load(wide: GapDiagnosis) -> None:
+    e = wide.evidence
+    columns = [e.candidates.keys.index(f"motion_resistance/{form}") for form in ("in_motion", "with_speed")]
+    strength = {
+        name: np.abs(_forecast(e, name, {"motion_resistance"}).by_parameter[:, columns]).max()
+        for name in (LIFTED, "speed staircase")
+    }
+    assert strength[LIFTED] == 0.0
+    assert strength["speed staircase"] > 0.1
+
+
+def test_lifted_wheels_tell_a_gear_from_the_ground(wide: GapDiagnosis) -> None:
+    e, by_name = wide.evidence, {c.effect: c for c in wide.verdict.causes}
+    gear, ground = by_name["drivetrain_friction"], by_name["motion_resistance"]
+    gear, ground = (dataclasses.replace(c, value=np.ones(len(c.columns))) for c in (gear, ground))
+    sigma = initial_state_sigma(e.candidates)
+    assert separation(e, sigma, LIFTED, gear, ground) > 3.0
+    other = dataclasses.replace(by_name["grousers"], value=np.ones(len(by_name["grousers"].columns)))
+    assert separation(e, sigma, LIFTED, ground, other) == 0.0  # neither shows in the air
 
 
 def test_the_gap_shrinks_on_runs_left_out(wide: GapDiagnosis) -> None:

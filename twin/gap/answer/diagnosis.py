@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass
 from typing import Any
 
+from terrafusion.twin.gap.answer.credible_sets import credible_sets
+from terrafusion.twin.gap.answer.drives import DriveCoverage
 from terrafusion.twin.gap.answer.next_run import NextRun
 from terrafusion.twin.gap.answer.shrinkage import METRIC, Shrinkage
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
@@ -32,6 +34,7 @@ class GapDiagnosis:
         verdict: causes and the judgement.
         shrinkage: how far the gap shrinks on runs left out.
         next_run: drive that would separate look-alikes.
+        drives: how far references cover the judged drives; None without references.
         refits: by effect, failures included.
         evidence: for plots.
         notes: assumptions, in sentences.
@@ -47,6 +50,7 @@ class GapDiagnosis:
     verdict: GapVerdict
     shrinkage: Shrinkage
     next_run: NextRun | None
+    drives: DriveCoverage | None
     refits: dict[str, Refit]
     evidence: GapEvidence
     notes: tuple[str, ...]
@@ -95,6 +99,13 @@ class GapDiagnosis:
             "verdict": verdict.kind,
             "causes": [_cause(self.evidence, c) for c in verdict.causes],
             "named": list(verdict.named),
+            "sets": [
+                {"effects": list(s.effects), "probability": s.probability, "named": s.named}
+                for s in credible_sets(verdict)
+            ],
+            "drives": None
+            if self.drives is None
+            else {"covered": self.drives.covered, "missing": list(self.drives.missing)},
             "p_unknown": verdict.p_unknown,
             "p_null": verdict.p_null,
             "shrink": _shrink(self.shrinkage),

@@ -13,7 +13,9 @@ from numpy.typing import NDArray
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.twin.calibrate.inputs import DT_S
 from terrafusion.twin.calibrate.log import PreparedLog
+from terrafusion.twin.calibrate.model import Model
 from terrafusion.twin.calibrate.observations import Observed
+from terrafusion.twin.effects.terrain import FORMS as GROUND_FORMS
 from terrafusion.twin.gap.answer.look_alikes import SEPARABLE_SIGMAS, unlike_square
 from terrafusion.twin.gap.answer.verdict import Cause, GapVerdict
 from terrafusion.twin.gap.data.logs import WINDOW_S
@@ -32,6 +34,7 @@ Array = NDArray[np.float64]
 BY_HAND = "measurement by hand"
 MOST_REPEATS = 10  # if the best drive would have to be repeated more often, none is suggested
 LIFTED = "wheels lifted"
+STAND_MASS_KG = 1.0  # what a twin on a stand puts on its wheels: next to nothing
 HALF_TURN_S, QUARTER_TURN_S = math.pi / 0.6, 0.5 * math.pi / 0.6
 
 
@@ -100,7 +103,10 @@ def propose(evidence: GapEvidence, sigma: Array, one: Cause, other: Cause) -> Ne
 
 
 def separation(evidence: GapEvidence, sigma: Array, name: str, one: Cause, other: Cause) -> float:
-    """Sigmas by which a drive separates two causes, whichever is true; 0 where the twin diverges on it."""
+    """Sigmas by which a drive separates two causes, whichever is true; 0 where the twin diverges on it.
+
+    With lifted wheels nothing of the ground acts.
+    """
     try:
         run = _forecast(evidence, name, {one.effect, other.effect})
     except TerrafusionError:
@@ -109,10 +115,23 @@ def separation(evidence: GapEvidence, sigma: Array, name: str, one: Cause, other
     zero = np.zeros(len(own.b))
     covariance = own.fisher + JITTER * np.eye(len(zero))
     pooled = PooledScores.of([dataclasses.replace(own, b=zero)], Null(zero, zero, covariance, 1))
+    if name == LIFTED and (_of_ground(one) or _of_ground(other)):
+        # an effect of the ground cannot show in the air: what the other one shows there tells them apart
+        return max((_sigmas(pooled, cause) for cause in (one, other) if not _of_ground(cause)), default=0.0)
     return min(
         _remaining_sigmas(pooled, evidence, one, other.effect),
         _remaining_sigmas(pooled, evidence, other, one.effect),
     )
+
+
+def _sigmas(pooled: PooledScores, cause: Cause) -> float:
+    """Sigmas by which a cause shows at all."""
+    at = np.asarray(cause.columns)
+    return math.sqrt(max(float(cause.value @ pooled.information[np.ix_(at, at)] @ cause.value), 0.0))
+
+
+def _of_ground(cause: Cause) -> bool:
+    return cause.effect in {form.effect for form in GROUND_FORMS}
 
 
 def _remaining_sigmas(pooled: PooledScores, evidence: GapEvidence, true: Cause, other: str) -> float:
@@ -128,7 +147,7 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
     template, model, segments = evidence.runs[0].log, evidence.model, DRIVES[name]
     label = template.labels[0]
     if name == LIFTED:
-        model = dataclasses.replace(model, soils={**model.soils, label: _no_ground()})
+        model = _lifted(model, label)
     scenario = Scenario(name, sum(s.duration_s for s in segments), drive=segments)
     t_s = DT_S * np.arange(round(scenario.duration_s / DT_S) + 1.0)
     prompt = dataclasses.replace(model.vehicle.drive, dead_time_s=0.0)  # the log's commands have none either
@@ -140,17 +159,26 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
         np.zeros((len(windows), 3)), tuple(_empty(o, end) for o in template.observed), True, (),
     )  # fmt: skip
     candidates = evidence.candidates
+    if name == LIFTED:
+        effects = effects - {form.effect for form in GROUND_FORMS}
     keys = {k for k in candidates.keys if k.split("/")[0] in effects or k in SOIL_SIGMAS}
     found = channel_sensitivities(log, linearise(log, model, candidates, log.start, keys))
     return whitened(residuals_from(log, found, model, candidates, evidence.channels), evidence.noise)
 
 
+def _lifted(model: Model, label: str) -> Model:
+    """The twin with its wheels in the air: the stand carries the body, so that the wheels have no load."""
+    body = dataclasses.replace(model.vehicle.body, mass_kg=STAND_MASS_KG)
+    vehicle = dataclasses.replace(model.vehicle, body=body)
+    return dataclasses.replace(model, vehicle=vehicle, soils={**model.soils, label: _no_ground()})
+
+
 def _no_ground() -> SoilParams:
-    """Contact of lifted wheels: next to no friction."""
+    """Contact of lifted wheels: no friction."""
     firm = load_soil("asphalt")
     return dataclasses.replace(
         firm,
-        shear=dataclasses.replace(firm.shear, friction_angle_rad=0.01, friction_cap=0.01),
+        shear=dataclasses.replace(firm.shear, friction_angle_rad=1e-6, friction_cap=1e-6),
         resistance=dataclasses.replace(firm.resistance, rolling=0.0),
     )
 

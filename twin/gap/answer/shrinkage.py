@@ -33,8 +33,9 @@ class Shrinkage:
     """Mean squared errors before and after.
 
     Attributes:
-        before, after, floor: without and with the effect, and of the references.
-        share, interval: of the gap above the floor that the effect removes, with its 95 % interval.
+        before, after, floor: without and with the effect, and of the references; after is at least the floor,
+            or before where that is less.
+        share, interval: of the gap above the floor that the effect removes, with its 95 % interval, 0 to 1.
         recalibrated: error with theta alone fitted more freely.
         channels: root mean squares (before, after, floor) by channel.
         errors_after, errors_before: whitened errors of each run.
@@ -77,14 +78,15 @@ def shrinkage(
     floor = float(np.mean(squares)) if squares else None
     spread = float(np.std(squares, ddof=1)) if len(squares) > 1 else None
     share, interval = _share(np.array(before), np.array(after), floor, spread)
+    least = min(floor, float(np.mean(before))) if floor is not None else 0.0
     channels = {}
     for name in dict.fromkeys(CHANNEL_NAMES[c] for c in evidence.channels):
         mine = [i for i, c in enumerate(evidence.channels) if CHANNEL_NAMES[c] == name]
         first, second = (_rms(runs, arm, mine) for arm in arms)
         channels[name] = (first or 0.0, second or 0.0, _rms(references, floors, mine))
     return Shrinkage(
-        float(np.mean(before)), float(np.mean(after)), floor, share, interval, float(np.mean(free)),
-        channels, now, was,
+        float(np.mean(before)), max(float(np.mean(after)), least), floor, share, interval,
+        float(np.mean(free)), channels, now, was,
     )  # fmt: skip
 
 
@@ -124,11 +126,13 @@ def _share(
         return None, None
     if before.mean() - floor <= ABOVE_FLOOR * spread / np.sqrt(len(before)):
         return None, None
-    share = float((before.mean() - after.mean()) / (before.mean() - floor))
+    share = float(np.clip((before.mean() - after.mean()) / (before.mean() - floor), 0.0, 1.0))
     if len(before) < 2:
         return share, None
     from scipy.special import stdtrit
 
     each = (before - after) / (before.mean() - floor)
     half = float(stdtrit(len(each) - 1, 0.975) * each.std(ddof=1) / np.sqrt(len(each)))
-    return share, (share - half, share + half)
+    middle = float(each.mean())
+    low, high = (float(np.clip(x, 0.0, 1.0)) for x in (middle - half, middle + half))
+    return share, (low, high)

@@ -1,0 +1,32 @@
+"""How far references cover the judged drives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.calibrate.inputs import DT_S
+from terrafusion.twin.gap.answer.drives import coverage
+
+
+def steady(speed: float, turn: float, seconds: float) -> np.ndarray:
+    return np.tile([speed, turn], (round(seconds / DT_S), 1))
+
+
+def test_the_same_drive_is_covered() -> None:
+    drive = steady(0.8, 0.4, 20.0)
+    found = coverage([drive], [drive, drive])
+    assert found.covered == pytest.approx(1.0)
+    assert found.missing == ()
+
+
+def test_what_references_never_drove_is_named_with_its_time() -> None:
+    judged = np.concatenate([steady(0.6, 0.0, 30.0), steady(1.2, -0.6, 10.0)])
+    found = coverage([judged], [steady(0.6, 0.0, 60.0)])
+    assert found.covered == pytest.approx(0.75, abs=0.03)
+    assert found.missing[0].startswith("1.2 m/s, turning -0.6 rad/s, steady (10 s")
+
+
+def test_a_moment_does_not_cover() -> None:
+    found = coverage([steady(0.9, 0.0, 10.0)], [steady(0.9, 0.0, 0.5)])
+    assert found.covered == pytest.approx(0.0)

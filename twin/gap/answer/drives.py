@@ -1,0 +1,89 @@
+"""How far the judged drives leave what the references drove.
+
+References teach errors of the twin, scatter of the ground and noise for the drives that they made. The time
+of the judged runs is counted by cell of commanded speed, turn rate and acceleration; a cell is covered where
+the references spent at least a second in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from terrafusion.twin.calibrate.inputs import DT_S
+from terrafusion.twin.calibrate.model import Model
+from terrafusion.twin.gap.rollout.nuisance import commanded_twist
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun
+
+Array = NDArray[np.float64]
+
+SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2 = 0.3, 0.3, 0.6
+"""Width of a cell; the middle one is centred on zero."""
+SMOOTH_SAMPLES = 51  # grid samples over which the acceleration is averaged: half a second
+LEAST_S = 1.0  # time of all references in a cell from which it counts as covered
+MOST_LISTED = 4
+LEAST_MISSING = 0.02  # share of the judged time from which a cell is listed
+
+Cell = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class DriveCoverage:
+    """Share of the judged time that references cover, 0 to 1, and what they lack, longest first."""
+
+    covered: float
+    missing: tuple[str, ...]
+
+
+def time_by_cell(twist: Array) -> dict[Cell, float]:
+    """Seconds by cell of commanded speed, turn rate and acceleration; `twist` is (N, 2), m/s and rad/s."""
+    kernel = np.ones(SMOOTH_SAMPLES) / SMOOTH_SAMPLES
+    rate = np.pad(np.gradient(twist[:, 0], DT_S), SMOOTH_SAMPLES // 2, mode="edge")
+    columns = np.stack([twist[:, 0], twist[:, 1], np.convolve(rate, kernel, mode="valid")], axis=1)
+    index = np.round(columns / [SPEED_MPS, TURN_RADPS, ACCELERATION_MPS2]).astype(np.int64)
+    cells, count = np.unique(index, axis=0, return_counts=True)
+    return {(int(c[0]), int(c[1]), int(c[2])): DT_S * float(n) for c, n in zip(cells, count, strict=True)}
+
+
+def drive_coverage(
+    runs: Sequence[WhitenedRun], references: Sequence[WhitenedRun], model: Model
+) -> DriveCoverage | None:
+    """Coverage of the judged runs by the references; None without references."""
+    if not references:
+        return None
+    return coverage(
+        [commanded_twist(r.log, model)[1] for r in runs],
+        [commanded_twist(r.log, model)[1] for r in references],
+    )
+
+
+def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverage:
+    """Coverage of commanded twists (N, 2) each, by those of references."""
+    known, judged = _summed(references), _summed(runs)
+    total = sum(judged.values())
+    lacking = {c: s for c, s in judged.items() if known.get(c, 0.0) < LEAST_S}
+    words = dict[str, float]()
+    for cell, seconds in lacking.items():
+        name = _words(cell)
+        words[name] = words.get(name, 0.0) + seconds
+    order = sorted(words, key=lambda name: (-words[name], name))
+    listed = [f"{name} ({words[name]:.0f} s)" for name in order if words[name] >= LEAST_MISSING * total]
+    return DriveCoverage(1.0 - sum(lacking.values()) / max(total, 1e-9), tuple(listed[:MOST_LISTED]))
+
+
+def _summed(twists: Sequence[Array]) -> dict[Cell, float]:
+    out = dict[Cell, float]()
+    for twist in twists:
+        for cell, seconds in time_by_cell(twist).items():
+            out[cell] = out.get(cell, 0.0) + seconds
+    return out
+
+
+def _words(cell: Cell) -> str:
+    speed, turn, acceleration = cell[0] * SPEED_MPS, cell[1] * TURN_RADPS, cell[2]
+    how = "steady" if acceleration == 0 else "speeding up" if acceleration * (cell[0] or 1) > 0 else "braking"
+    where = "straight" if cell[1] == 0 else f"turning {turn:+.1f} rad/s"
+    return f"{speed:.1f} m/s, {where}, {how}"
