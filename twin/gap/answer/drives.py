@@ -2,7 +2,7 @@
 
 References teach errors of the twin, scatter of the ground and noise for the drives that they made. The time
 of the judged runs is counted by cell of commanded speed, turn rate and acceleration; a cell is covered where
-the references spent at least a second in it.
+the references spent at least a second in it, or as long as the judged runs.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ def coverage(runs: Sequence[Array], references: Sequence[Array]) -> DriveCoverag
     """Coverage of commanded twists (N, 2) each, by those of references."""
     known, judged = _summed(references), _summed(runs)
     total = sum(judged.values())
-    lacking = {c: s for c, s in judged.items() if known.get(c, 0.0) < LEAST_S}
+    lacking = {c: s for c, s in judged.items() if known.get(c, 0.0) < min(LEAST_S, s)}
     words = dict[str, float]()
     for cell, seconds in lacking.items():
         name = _words(cell)
