@@ -132,7 +132,7 @@ def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: boo
     """The logs, each called as it was given: drives of one scenario share the name in their files."""
     import dataclasses
 
-    found = list[Recording]()
+    found: list[Recording] = []
     for name in names:
         logs = opened([name], options, repair_clock)
         called = [name] if len(logs) == 1 else [f"{name}#{i}" for i in range(len(logs))]
