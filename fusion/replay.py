@@ -126,7 +126,7 @@ def replay(
         recording,
         held_out=held_out,
         outages=outages,
-        antenna_m=tuple(estimator.gnss.antenna_m.tolist()),
+        antenna_m=estimator.gnss.antenna_places,
         aligned=estimator.gnss.local,
     )
 

@@ -12,6 +12,7 @@ from scipy.stats import chi2
 from terrafusion.datasets.core.arrays import Array
 from terrafusion.datasets.core.channels import Fix
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
+from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Innovation
 from terrafusion.fusion.estimator.dead_reckoning import DeadReckoning, FixPair
 from terrafusion.fusion.estimator.fix_keyframe import AntennaMotion, cut_past, keyframe_of
@@ -80,6 +81,7 @@ class GnssUpdater:
         self.weighting = weighting or Weighting()
         self.antenna_m = np.array(config.rig.sensors.gnss.antenna_m)
         self.nominal_antenna_m = self.antenna_m.copy()
+        self.antenna_places = AntennaPlaces.fixed(tuple(self.antenna_m.tolist()))
         self.delay_s = 0.0
         self.gate = GnssGate(float(chi2.ppf(config.gnss_gate, 2)))
         self.height_gate = GnssGate(float(chi2.ppf(config.gnss_gate, 1)))
@@ -126,9 +128,10 @@ class GnssUpdater:
         if len(self.waiting) > 1 and fix.t_ns < self.waiting[-2].t_ns:
             self.waiting.sort(key=lambda f: f.t_ns)
 
-    def correct(self, antenna_m: Array, delay_s: float) -> None:
-        """Take over a correction (2,) of the lever arm, body x and y, and the lateness of the stamps."""
+    def correct(self, t_ns: int, antenna_m: Array, delay_s: float) -> None:
+        """Correct the lever arm, body x and y (2,), from `t_ns` on, and the lateness of the stamps."""
         self.antenna_m = self.nominal_antenna_m + np.append(antenna_m, 0.0)
+        self.antenna_places = self.antenna_places.then(t_ns, tuple(self.antenna_m.tolist()))
         self.track.lever = complex(self.antenna_m[0], self.antenna_m[1])
         self.delay_s = delay_s
 

@@ -207,7 +207,7 @@ class LearnedNumbers:
     def _apply(self, known: Knowledge, t_ns: int, slip: bool = True) -> None:
         turn_scale, x_m, y_m, delay_s = self._corrections(known).tolist()
         self._imu.turn_scale = turn_scale
-        self._gnss.correct(np.array([x_m, y_m]), delay_s)
+        self._gnss.correct(t_ns, np.array([x_m, y_m]), delay_s)
         if not slip:
             return
         doubt = math.hypot(known.slip_spread, float(known.sigma[WHEEL_SCALE]))

@@ -85,7 +85,7 @@ def verdict_of(estimator: Estimator, history: History, recording: Recording) -> 
     rig, local = estimator.config.rig, estimator.gnss.local
     antenna_m = rig.sensors.gnss.antenna_m
     estimate = history.estimate(estimator.weights.detector.classes, [], ())
-    scores = score(estimate, recording, antenna_m=antenna_m, aligned=local)
+    scores = score(estimate, recording, antenna_m=estimator.gnss.antenna_places, aligned=local)
     rivals = baselines(
         recording, estimate, scores, recording.gnss, wheel_radius_m=rig.wheel_radius_m, track_m=rig.track_m,
         antenna_m=antenna_m, aligned=local,

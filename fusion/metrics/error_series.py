@@ -17,8 +17,10 @@ from terrafusion.datasets.core.frames import quaternion_to_matrix, wrap_angle, y
 from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Estimate
 
+Lever = tuple[float, ...] | AntennaPlaces
 MIN_STEP_M = 0.1
 """Shorter displacements of a reference do not count as distance: they may be its noise at rest."""
 
@@ -81,7 +83,7 @@ class Errors:
 
 
 def errors_against_truth(
-    estimate: Estimate, recording: Recording, antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    estimate: Estimate, recording: Recording, antenna_m: Lever = (0.0, 0.0, 0.0)
 ) -> Errors | None:
     """The error series against the truth, or None if nothing can be compared.
 
@@ -120,7 +122,7 @@ def errors_against_truth(
 
 
 def errors_against_fixes(
-    estimate: Estimate, held_out: Gnss | None, antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0)
+    estimate: Estimate, held_out: Gnss | None, antenna_m: Lever = (0.0, 0.0, 0.0)
 ) -> Errors | None:
     """The error series of the antenna against GNSS fixes, or None if no fix lies within the estimate."""
     if held_out is None or len(estimate.trajectory) < 2:
@@ -201,7 +203,7 @@ def known_keyframes(estimate: Estimate) -> tuple[Estimate, tuple[str, ...]]:
 
 
 def _point_at(
-    estimate: Estimate, t_ns: TimesNs, lever_m: tuple[float, ...]
+    estimate: Estimate, t_ns: TimesNs, lever_m: Lever
 ) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Position (M, 2), world velocity (M, 3) and position covariance (M, 2, 2) of a body-fixed point;
     yaw and its sigma (M,) and rotation to the world (M, 3, 3) of the body."""
@@ -212,10 +214,11 @@ def _point_at(
     covariance = np.full((len(t_ns), 2, 2), np.nan)
     yaw_sigma = np.full(len(t_ns), np.nan)
     R = quaternion_to_matrix(quaternion)
-    lever = np.asarray(lever_m, dtype=float)
+    places = lever_m if isinstance(lever_m, AntennaPlaces) else AntennaPlaces.fixed(lever_m)
+    lever = places.at(t_ns)
     arm = np.zeros((len(t_ns), 3))
     if lever.any():
-        arm = R @ lever
+        arm = np.einsum("nij,nj->ni", R, lever)
         if path.twist_body is not None:
             spin = np.nan_to_num(_interpolate(t_ns, path.t_ns, path.twist_body[:, 3:]))
             velocity = velocity + np.einsum("nij,nj->ni", R, np.cross(spin, lever))

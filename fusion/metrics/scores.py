@@ -26,6 +26,7 @@ from terrafusion.datasets.core.arrays import Array, TimesNs
 from terrafusion.datasets.core.channels import Gnss
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.estimate.estimate import Estimate
 from terrafusion.fusion.metrics.consistency import (
     Consistency,
@@ -139,7 +140,7 @@ def score(
     *,
     held_out: Gnss | None = None,
     outages: Sequence[Outage] = (),
-    antenna_m: tuple[float, ...] = (0.0, 0.0, 0.0),
+    antenna_m: tuple[float, ...] | AntennaPlaces = (0.0, 0.0, 0.0),
     aligned: bool = False,
 ) -> Scores:
     """Score `estimate` against the truth of `recording`, else against the held-out fixes.
@@ -147,7 +148,8 @@ def score(
     Args:
         held_out: fixes not given to the estimator.
         outages: spans that are also scored separately.
-        antenna_m: (3,) antenna in the body frame, the point of fixes and of a truth of the antenna.
+        antenna_m: (3,) antenna in the body frame, or its places over the drive: the point of fixes and of a
+            truth of the antenna.
         aligned: start and heading of the estimate are arbitrary (a run without GNSS) and fitted once to the
             start of the reference.
     """

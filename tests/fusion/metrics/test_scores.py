@@ -15,6 +15,7 @@ from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.frames import rpy_to_quaternion
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.core.trajectory import Trajectory
+from terrafusion.fusion.estimate.antenna import AntennaPlaces
 from terrafusion.fusion.metrics.error_series import Errors, travelled_m
 from terrafusion.fusion.metrics.scores import (
     Outage,
@@ -258,6 +259,26 @@ def test_held_out_fixes_are_compared_at_the_antenna(drive):
     assert plain.yaw_rmse_rad is None
     armed = score(d.estimate, without_truth(d.recording), held_out=ahead, antenna_m=(0.4, 0.0, 0.3))
     assert armed.held_out.p95_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_an_antenna_learned_on_the_way_is_where_it_was_taken_to_be(drive):
+    """Fixes of the second half lie 0.4 m ahead: so does the antenna, for the estimator, from then on."""
+    d = drive(turn_radps=0.0)
+    half = int(d.fixes.t_ns[len(d.fixes) // 2])
+    ahead = np.outer(d.fixes.t_ns >= half, [0.4, 0.0, 0.0])
+    moved = dataclasses.replace(d.fixes, enu_m=d.fixes.enu_m + ahead)
+    places = AntennaPlaces.fixed((0.0, 0.0, 0.3)).then(half, (0.4, 0.0, 0.3))
+    for antenna, expected in ((places, 0.0), ((0.4, 0.0, 0.3), 0.4)):
+        s = score(d.estimate, without_truth(d.recording), held_out=moved, antenna_m=antenna)
+        assert s.held_out.p95_m == pytest.approx(expected, abs=1e-9)
+
+
+def test_places_of_the_antenna_follow_each_other() -> None:
+    first = AntennaPlaces.fixed((0.0, 0.0, 0.0)).then(100, (1.0, 0.0, 0.0))
+    assert first.then(150, (1.0, 0.0, 0.0)) is first
+    both = first.then(200, (2.0, 0.0, 0.0))
+    assert both.at(np.array([-5, 99, 100, 199, 200, 300]))[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+    assert both.then(100, (3.0, 0.0, 0.0)).at(np.array([250]))[0, 0] == 3.0, "a later thought replaces"
 
 
 def test_truth_of_the_antenna_is_compared_at_the_antenna(drive):
