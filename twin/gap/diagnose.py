@@ -30,6 +30,7 @@ from terrafusion.twin.gap.infer.channels import ChannelTable
 from terrafusion.twin.gap.infer.detect import detect
 from terrafusion.twin.gap.infer.discrepancy import discrepancy_of
 from terrafusion.twin.gap.infer.nonlinear_refit import NonlinearRefit
+from terrafusion.twin.gap.infer.other_drives import FEWEST, learn_offsets, p_value_of_drive
 from terrafusion.twin.gap.infer.posterior import PooledScores
 from terrafusion.twin.gap.null.evidence import GapEvidence, gather_evidence
 from terrafusion.twin.gap.null.null import learn_null
@@ -117,6 +118,11 @@ def diagnose_evidence(
     null = learn_null(normal, len(scores))
     # infer: is there a gap, and what remains of it with each effect in the twin
     detection = detect(scores, normal, candidates, seed, evidence.jobs)
+    if detection.p_value <= significance and len(evidence.references) >= FEWEST:
+        # A drive that no reference made is always the odd one out: it must be unusual for the robot, too.
+        offsets = learn_offsets([score(run, sigma) for run in evidence.references], len(candidates.keys))
+        unusual = p_value_of_drive(scores, offsets, candidates, seed)
+        detection = dataclasses.replace(detection, p_value=max(detection.p_value, unusual))
     pooled = PooledScores.of(scores, null).with_scatter(detection.typical, detection.scatter)
     keys = len(candidates.keys)
     table = ChannelTable.of(runs, evidence.references, normal, sigma, keys, evidence.jobs)

@@ -1,0 +1,99 @@
+"""The p-value on drives that no reference made: uniform without a gap, small with one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from terrafusion.twin.gap.blind.rates import Rate
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.infer.detect import detect
+from terrafusion.twin.gap.infer.other_drives import (
+    CANDIDATE_SCATTER,
+    NUISANCE_SCATTER,
+    learn_offsets,
+    p_value_of_drive,
+)
+from terrafusion.twin.gap.null.score import Score
+
+CANDIDATES = Candidates.of(["gyro_bias", "gyro_scale", "encoder_scale", "wheel_radius_asymmetry", "slope"])
+P = len(CANDIDATES.keys) + 4
+ROWS, COLUMN, TRIALS = 200, 2, 200
+SCATTER = np.where(np.arange(P) < len(CANDIDATES.keys), CANDIDATE_SCATTER, NUISANCE_SCATTER)
+"""As the prior has it: what references hardly excite, they cannot say."""
+DRIVES = {
+    name: np.random.default_rng(i).standard_normal((ROWS, P)) * np.geomspace(*range_, P)
+    for i, (name, range_) in enumerate({"reference": (1.0, 0.1), "other": (0.1, 1.0)}.items())
+}
+"""Sensitivities of a drive: the other one shows best what the references hardly excite."""
+
+
+def scores(rng: np.random.Generator, count: int, drive: str, robot: np.ndarray) -> list[Score]:
+    """Runs of a robot with its offsets (P,), scatter from run to run, and noise."""
+    J, out = DRIVES[drive], []
+    for _ in range(count):
+        error = rng.standard_normal(ROWS) + J @ (robot + SCATTER * rng.standard_normal(P))
+        out.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+    return out
+
+
+def trial(seed: int, drive: str, effect: float = 0.0, judged: int = 1) -> tuple[list[Score], list[Score]]:
+    """References, and judged runs of the same robot with an effect."""
+    rng = np.random.default_rng(seed)
+    robot = rng.standard_normal(P)
+    changed = robot + effect * (np.arange(P) == COLUMN)
+    return scores(rng, 12, "reference", robot), scores(rng, judged, drive, changed)
+
+
+def p_value(seed: int, drive: str, effect: float = 0.0, judged: int = 1) -> float:
+    references, runs = trial(seed, drive, effect, judged)
+    offsets = learn_offsets(references, len(CANDIDATES.keys))
+    return p_value_of_drive(runs, offsets, CANDIDATES, seed)
+
+
+@pytest.mark.parametrize("judged", [1, 3])
+@pytest.mark.parametrize("drive", ["reference", "other"])
+def test_without_a_gap_p_values_are_uniform(drive: str, judged: int) -> None:
+    from scipy.stats import kstest
+
+    found = np.array([p_value(i, drive, judged=judged) for i in range(TRIALS)])
+    alarms = Rate(int((found <= 0.05).sum()), TRIALS)
+    assert alarms.interval()[0] <= 0.05
+    assert kstest(found, "uniform", alternative="greater").pvalue > 0.001, "smaller than uniform: alarms"
+
+
+def test_ranks_among_runs_alarm_on_another_drive() -> None:
+    """Why ranks alone do not do: nothing has changed, and nearly every run is the odd one out."""
+    alarms = 0
+    for seed in range(20):
+        references, runs = trial(seed, "other")
+        more = scores(np.random.default_rng(1000 + seed), 12, "reference", np.zeros(P))
+        alarms += detect(runs, [*references, *more], CANDIDATES, seed).p_value <= 0.05
+    assert alarms >= 10
+
+
+@pytest.mark.parametrize("drive", ["reference", "other"])
+def test_an_effect_is_seen_on_either_drive(drive: str) -> None:
+    found = [p_value(i, drive, effect=3.0) for i in range(20)]
+    assert sum(p <= 0.05 for p in found) >= 17
+
+
+def test_what_references_do_not_show_counts_as_unknown() -> None:
+    """An offset that only the other drive can show is no gap, as large as its prior allows."""
+    hidden = P - 1
+    rng = np.random.default_rng(5)
+    robot = np.zeros(P)
+    J = DRIVES["reference"].copy()
+    J[:, hidden] = 0.0
+    references = []
+    for _ in range(12):
+        error = rng.standard_normal(ROWS) + J @ (SCATTER * rng.standard_normal(P))
+        references.append(Score(J.T @ error, J.T @ J, float(error @ error), ROWS))
+    offsets = learn_offsets(references, len(CANDIDATES.keys))
+    assert offsets.covariance[hidden, hidden] == pytest.approx(1.0)
+    robot[hidden] = 1.0
+    assert p_value_of_drive(scores(rng, 1, "other", robot), offsets, CANDIDATES, 0) > 0.05
+
+
+def test_the_same_seed_gives_the_same_bits() -> None:
+    assert p_value(3, "other") == p_value(3, "other")

@@ -1,0 +1,119 @@
+"""Is a judged drive unusual for the robot that the references show: a p-value that holds on other drives.
+
+Ranks among runs are exact while all runs make the same kind of drive; a drive that no reference made is
+always the odd one out. Here the columns of a run are random effects, phi_run ~ N(phi_robot, Omega) and
+phi_robot ~ N(0, 1), in typical sizes, learned from the references by expectation-maximisation (Laird and Ware
+1982). For the judged drive with the information A that gives scores b ~ N(A m, A (V + Omega) A + A): what the
+references know of a column travels to any drive, and what they do not know counts as unknown. Replicates of
+the judged drive have the same distribution, and the p-value is the rank among them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import Array
+from terrafusion.twin.gap.data.candidates import Candidates
+from terrafusion.twin.gap.infer.posterior import UNKNOWN_SIZES, WIDE
+from terrafusion.twin.gap.null.null import JITTER
+from terrafusion.twin.gap.null.score import Score
+
+CANDIDATE_SCATTER, NUISANCE_SCATTER, PRIOR_RUNS = 0.15, 0.05, 4.0
+"""Prior 1 sigma from run to run of an effect and of a column of the nuisance basis, in their units, and its
+weight in runs (set on the twin's own runs on other drives than the study's)."""
+EM_STEPS = 8
+FEWEST = 3  # references from which a scatter can be learned
+REPLICATES = 1000
+LEAST_SQUARE = 1.5  # least typical square of a deviation
+
+
+@dataclass(frozen=True, eq=False)
+class RobotOffsets:
+    """What the references know of the robot.
+
+    Attributes:
+        mean, covariance: (P,) and (P, P) of the columns that all its runs share.
+        scatter: (P,) variance from run to run.
+        references: number of them.
+    """
+
+    mean: Array
+    covariance: Array
+    scatter: Array
+    references: int
+
+
+def learn_offsets(references: Sequence[Score], candidates: int) -> RobotOffsets:
+    """From at least `FEWEST` references; the first `candidates` columns are those of effects."""
+    P, count = len(references[0].b), len(references)
+    first = np.where(np.arange(P) < candidates, CANDIDATE_SCATTER, NUISANCE_SCATTER) ** 2
+    scatter = first
+    for _ in range(EM_STEPS):
+        within = [np.linalg.inv(r.A + np.diag(1.0 / scatter)) for r in references]
+        moved = [H @ r.A for r, H in zip(references, within, strict=True)]
+        known = [r.A - r.A @ m for r, m in zip(references, moved, strict=True)]
+        gain = [r.b - r.A @ (H @ r.b) for r, H in zip(references, within, strict=True)]
+        covariance: Array = np.asarray(np.linalg.inv(np.eye(P) + sum(known)))
+        mean = covariance @ np.sum(gain, axis=0)
+        square = np.zeros(P)
+        for r, H, m in zip(references, within, moved, strict=True):
+            own = H @ (r.b - r.A @ mean)
+            square += own**2 + np.diag(H) + np.einsum("ij,ij->i", m @ covariance, m)
+        scatter = (PRIOR_RUNS * first + square) / (PRIOR_RUNS + count)
+    return RobotOffsets(mean, covariance, scatter, count)
+
+
+def p_value_of_drive(
+    runs: Sequence[Score], offsets: RobotOffsets, candidates: Candidates, seed: int
+) -> float:
+    """Share of replicates of the judged runs, taken together, that deviate as much from the robot."""
+    A = np.sum([r.A for r in runs], axis=0)
+    spread = A @ offsets.covariance @ A + A + sum((r.A * offsets.scatter) @ r.A for r in runs)
+    squares = _deviations(A, spread, candidates)
+    others = squares(_replicates(runs, A, offsets, np.random.default_rng(seed)))
+    typical = np.maximum(others.mean(axis=0), LEAST_SQUARE)
+    greatest = (others / typical).max(axis=1)
+    found = (squares((np.sum([r.b for r in runs], axis=0) - A @ offsets.mean)[None]) / typical).max()
+    return float((1 + np.count_nonzero(greatest >= found)) / (1 + len(greatest)))
+
+
+def _replicates(runs: Sequence[Score], A: Array, offsets: RobotOffsets, rng: np.random.Generator) -> Array:
+    """Pooled scores (R, P) less their mean; the scatter from run to run is itself known from few runs."""
+    P, size = len(A), (REPLICATES, len(A))
+    robot = rng.standard_normal(size) @ np.linalg.cholesky(offsets.covariance + 1e-12 * np.eye(P)).T
+    values, vectors = np.linalg.eigh(A)
+    noise = rng.standard_normal(size) @ (vectors * np.sqrt(np.maximum(values, 0.0))).T
+    freedom = float(offsets.references)
+    wider = np.sqrt(freedom / rng.chisquare(freedom, (REPLICATES, 1)) * offsets.scatter)
+    return robot @ A + noise + sum((wider * rng.standard_normal(size)) @ r.A for r in runs)
+
+
+def _deviations(A: Array, spread: Array, candidates: Candidates) -> Callable[[Array], Array]:
+    """Squares (R, D) of deviations of scores (R, P): of each column by its own score, of each form jointly
+    with all others, and twice the log Bayes factor of an unknown cause."""
+    root = 1.0 / np.sqrt(np.diag(A) + 1.0)
+    covariance = root[:, None] * spread * root + JITTER * np.eye(len(A))
+    U = root[:, None] * A
+    weighted = np.linalg.solve(covariance, U)
+    information = U.T @ weighted
+    forms = [list(h.columns) for h in candidates.hypotheses]
+    inner = [np.linalg.inv(information[np.ix_(c, c)] + np.eye(len(c)) / WIDE**2) for c in forms]
+    nuisance = slice(len(candidates.keys), len(A))
+    values, vectors = np.linalg.eigh(information[nuisance, nuisance])
+    sizes = np.square(UNKNOWN_SIZES)[:, None, None]
+    grown = 1.0 + sizes * np.maximum(values, 0.0)
+
+    def squares(scores: Array) -> Array:
+        x = scores * root
+        gain = x @ weighted
+        own = x**2 / np.diag(covariance)
+        joint = [((gain[:, c] @ H) * gain[:, c]).sum(axis=1) for c, H in zip(forms, inner, strict=True)]
+        turned = gain[:, nuisance] @ vectors
+        each = 0.5 * (sizes * turned**2 / grown - np.log(grown)).sum(axis=2)
+        unknown = 2.0 * (np.logaddexp.reduce(each, axis=0) - np.log(len(each)))
+        return np.maximum(np.column_stack([own, *joint, unknown]), 0.0)
+
+    return squares
