@@ -378,3 +378,10 @@ def test_held_out_share_is_of_what_runs_have_in_common() -> None:
     )
     assert explained_held_out(pools[0], [3]) > 0.8 * PooledScores.of(shared, null).fit([3])[2]
     assert explained_held_out(pools[1], [3]) < 0.0
+
+
+def test_what_a_vehicle_is_built_like_is_no_cause() -> None:
+    """The Husky's coupled wheels are in its twin, not among what may be missing from it."""
+    husky = load_vehicle("husky")
+    assert husky.effects
+    assert Candidates.of(None, husky.effects).keys == Candidates.of(None).keys

@@ -70,7 +70,8 @@ class Candidates:
         in_twin = {lookup(key)[0].key for key in present}
 
         def included(form: Form) -> bool:
-            return form.key in in_twin or (form.candidate if wanted is None else form.effect in wanted)
+            present = form.key in in_twin and form.candidate
+            return present or (form.candidate if wanted is None else form.effect in wanted)
 
         known = {k: v for k, v in parameters().items() if included(v[0])}
         keys = tuple(known)

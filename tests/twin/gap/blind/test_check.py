@@ -31,7 +31,7 @@ from tests.studies.blind.power import half_power_multiple
 from tests.studies.blind.severity import Observer, size_for
 from tests.twin.gap.blind import blind_answers as fake
 
-BUILT_IN = tuple(dict.fromkeys(form.effect for form in built_in().values()))
+BUILT_IN = tuple(dict.fromkeys(form.effect for form in built_in().values() if form.candidate))
 TINY = CheckSize(nulls=2, effects=1, outside=1, pairs=1, runs=1, references=1, severities=(4.0,))
 
 
