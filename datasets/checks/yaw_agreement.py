@@ -218,7 +218,7 @@ def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
         return reflection(context.recording)
     gyro_sign = partial(apply, conventions=Conventions(gyro_z_sign=-1.0))
     command_sign = scaled("command", -1.0, "yaw_rate_radps")
-    return {
+    remedies: dict[str, tuple[str, Repair | None]] = {
         "gyro": ("change the sign of gyro z (left turn positive)", gyro_sign),
         "wheels": ("swap left and right wheels", _swap_sides),
         "truth": ("check the truth's frame: its yaw must grow to the left", None),
@@ -227,7 +227,8 @@ def _remedy(context: CheckContext, name: str) -> tuple[str, Repair | None]:
             "check the accelerometer's axes: x, y and z must make a right-handed frame",
             None,
         ),
-    }[name]
+    }
+    return remedies[name]
 
 
 def _swap_sides(recording: Recording) -> Recording:

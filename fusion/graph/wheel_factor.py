@@ -124,7 +124,8 @@ def _linearised(
     R_i: Array, p_i: Array, R_j: Array, p_j: Array, linear: Array, wheels: WheelIncrement
 ) -> tuple[Array, Array, Array, Array]:
     moved, T = R_i.T @ (p_j - p_i), R_i.T @ R_j
-    (x, y, z), (c, _, e), (s, g, h), (a, _, _) = moved.tolist(), *T.tolist()
+    x, y, z = moved.tolist()
+    (c, _, e), (s, g, h), (a, _, _) = T.tolist()
     state = linear.tolist()
     slip, radius = 1.0 - state[_S], 1.0 + state[_R]
     rolled = wheels.displacement_m.copy()

@@ -40,7 +40,7 @@ def _tilted(q: Quantities, pitch: Any, roll: Any) -> dict[str, Any]:
 
 def _coupled(q: Quantities, share: Any) -> dict[str, Any]:
     """Front and rear wheel of a side accelerate as one."""
-    out = {}
+    out: dict[str, Any] = {}
     for side in ("left", "right"):
         own = {name: q[f"d_wheel_speed_{name}"] for name in WHEELS if name.endswith(side)}
         mean = 0.5 * sum(own.values())

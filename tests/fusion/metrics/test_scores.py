@@ -273,14 +273,6 @@ def test_an_antenna_learned_on_the_way_is_where_it_was_taken_to_be(drive):
         assert s.held_out.p95_m == pytest.approx(expected, abs=1e-9)
 
 
-def test_places_of_the_antenna_follow_each_other() -> None:
-    first = AntennaPlaces.fixed((0.0, 0.0, 0.0)).then(100, (1.0, 0.0, 0.0))
-    assert first.then(150, (1.0, 0.0, 0.0)) is first
-    both = first.then(200, (2.0, 0.0, 0.0))
-    assert both.at(np.array([-5, 99, 100, 199, 200, 300]))[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
-    assert both.then(100, (3.0, 0.0, 0.0)).at(np.array([250]))[0, 0] == 3.0, "a later thought replaces"
-
-
 def test_truth_of_the_antenna_is_compared_at_the_antenna(drive):
     d = drive()
     lever = (0.3, -0.2, 0.35)

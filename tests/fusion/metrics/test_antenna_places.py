@@ -1,0 +1,15 @@
+"""Where the antenna was taken to be over a drive."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from terrafusion.fusion.estimate.antenna import AntennaPlaces
+
+
+def test_places_of_the_antenna_follow_each_other() -> None:
+    first = AntennaPlaces.fixed((0.0, 0.0, 0.0)).then(100, (1.0, 0.0, 0.0))
+    assert first.then(150, (1.0, 0.0, 0.0)) is first
+    both = first.then(200, (2.0, 0.0, 0.0))
+    assert both.at(np.array([-5, 99, 100, 199, 200, 300]))[:, 0].tolist() == [0.0, 0.0, 1.0, 1.0, 2.0, 2.0]
+    assert both.then(100, (3.0, 0.0, 0.0)).at(np.array([250]))[0, 0] == 3.0, "a later thought replaces"
