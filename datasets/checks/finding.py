@@ -29,6 +29,7 @@ class Finding:
         evidence: the numbers behind it.
         fix: what to do about it.
         repair: function that does so; None where the correct numbers cannot be inferred.
+        imu_axes: where the whole IMU is mounted otherwise, its axes along body x, y, z; else ().
     """
 
     code: str
@@ -38,6 +39,7 @@ class Finding:
     evidence: str
     fix: str
     repair: Repair | None = field(default=None, repr=False, compare=False)
+    imu_axes: tuple[str, ...] = ()
 
     def to_dict(self) -> dict[str, str | bool]:
         """The fields by name, for JSON; `repairable` stands for the repair."""

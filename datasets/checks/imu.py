@@ -293,14 +293,15 @@ def check_axes(context: CheckContext) -> Iterator[Finding]:
         yield from _check_forward(context)
         return
     evidence, repair = _mean_force(mean), None
+    axes: Axes = ()
     if np.abs(mean).max() < MOST_TILT * np.linalg.norm(mean):
         what, fix = "gravity lies between the axes", "rotate the IMU to x forward, y left, z up"
     else:
         up = nearest_axis(mean)
         what = f"gravity stands on {up}, not on +z"
-        more, fix, repair = _uprighted(context, imu, up)
+        more, fix, repair, axes = _uprighted(context, imu, up)
         evidence += more
-    yield Finding("imu-axes", "error", "imu", what, evidence, fix, repair)
+    yield Finding("imu-axes", "error", "imu", what, evidence, fix, repair, axes)
 
 
 def _check_forward(context: CheckContext) -> Iterator[Finding]:
@@ -331,6 +332,7 @@ def _check_forward(context: CheckContext) -> Iterator[Finding]:
         f"by change of speed and speed times yaw rate it is turned by {np.degrees(angle):.0f}{interval} deg",
         fix,
         repair,
+        axes if near else (),
     )  # fmt: skip
 
 
@@ -352,8 +354,8 @@ def _pointing(sensor: str, axes: Axes) -> str:
     return f"turn the {sensor} so that {', '.join(axes)} point forward, left, up"
 
 
-def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repair]:
-    """Further evidence of the mounting, what to do, and the repair."""
+def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repair, Axes]:
+    """Further evidence of the mounting, what to do, the repair, and the axes of the whole IMU."""
     turning = turning_axis(context)
     alone = turning == "+z"  # the gyro is right as it is: the accelerometer has other axes
     if alone and up == "-z":
@@ -361,12 +363,14 @@ def _uprighted(context: CheckContext, imu: Imu, up: str) -> tuple[str, str, Repa
             "; gyro z turns with the wheels",
             "change the sign of the specific force",
             scaled("imu", -1.0, "accel_mps2"),
+            (),
         )
     axes, evidence = _axes_for(context, imu, up, alone)
     if turning is not None:
         evidence = f"; the gyro turns with the wheels about {turning}{evidence}"
     fix = _pointing("accelerometer" if alone else "IMU", axes)
-    return evidence, fix, lambda recording: _turned(recording, axes, gyro=not alone)
+    turned = partial(_turned, axes=axes, gyro=not alone)
+    return evidence, fix, turned, () if alone else axes
 
 
 def _axes_for(context: CheckContext, imu: Imu, up: str, alone: bool) -> tuple[Axes, str]:

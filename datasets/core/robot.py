@@ -152,7 +152,10 @@ class SensorNumbers:
 
 @dataclass(frozen=True)
 class Robot(SensorNumbers):
-    """Section `robot`: what differs from the vehicle that it `extends`, a name or a file beside this one."""
+    """Section `robot`: what differs from the vehicle that it `extends`, a name or a file beside this one.
+
+    `imu_axes` are the sensor axes along body x, y, z; they turn the messages of a bag in the frame `imu_frame`.
+    """
 
     extends: str = "generic"
     name: str | None = None
@@ -161,7 +164,10 @@ class Robot(SensorNumbers):
     wheel_radius_m: Annotated[KnownNumber, Known(Quantity("m", 0.02, 2.0))] | None = None
     track_m: Annotated[KnownNumber, Known(Quantity("m", 0.05, 5.0))] | None = None
     wheelbase_m: Annotated[KnownNumber, Known(Quantity("m", 0.05, 5.0))] | None = None
+    mass_kg: Annotated[KnownNumber, Known(Quantity("kg", 1.0, 5000.0))] | None = None
     imu_m: Place | None = None
+    imu_axes: tuple[str, ...] | None = None
+    imu_frame: str | None = None
     topics: dict[str, str] = field(default_factory=dict)
 
 

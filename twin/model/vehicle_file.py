@@ -19,6 +19,7 @@ PLACES = {
     "track_m": (("odometry", "track_m"), ("body", "track_m")),
     "wheelbase_m": (("body", "wheelbase_m"),),
     "antenna_m": (ANTENNA,),
+    "mass_kg": (("body", "mass_kg"),),
     "imu_m": (IMU,),
 }
 """Numbers of the short form and their places in a complete file; the last one is the body's own."""
@@ -79,6 +80,13 @@ def _completed(robot: Robot, raw: dict[str, Any], file: str, above: tuple[str, .
         if robot.drive not in STEERED_DRIVES:
             out.pop("steering", None)
     out["topics"] = {**out.get("topics", {}), **robot.topics}
+    imu = out["sensors"]["imu"]
+    imu |= {} if robot.imu_axes is None else {"axes": list(robot.imu_axes)}
+    imu |= {} if robot.imu_frame is None else {"frame_id": robot.imu_frame}
+    if robot.mass_kg is not None:
+        inertia = out["body"]["yaw_inertia_kgm2"]
+        scaled = inertia["value"] * robot.mass_kg.number / out["body"]["mass_kg"]["value"]
+        inertia |= {"value": scaled, "source": f"derived: radius of gyration of '{robot.extends}'"}
     for name, places in PLACES.items():
         number = getattr(robot, name)
         if number is not None:

@@ -135,3 +135,17 @@ def test_a_complete_file_says_in_its_source_that_the_antenna_is_measured(tmp_pat
         assert (number and number.known) == known
     # A shipped file is for any robot of its make, wherever that has its antenna.
     assert load_vehicle("husky").robot.antenna_m is None
+
+
+def test_a_file_tells_how_the_imu_is_mounted_and_what_the_robot_weighs(tmp_path: Path) -> None:
+    text = (
+        "robot:\n  imu_axes: ['-z', '-x', '+y']\n  imu_frame: front_imu\n"
+        "  mass_kg: {value: 80.0, known: measured, sigma: 1.0}\n"
+    )
+    own, generic = load_vehicle(written(tmp_path / "own.yaml", text)), load_vehicle("generic")
+    assert (own.sensors.imu.axes, own.sensors.imu.frame_id) == (("-z", "-x", "+y"), "front_imu")
+    assert own.body.mass_kg == 80.0
+    per_kg = generic.body.yaw_inertia_kgm2 / generic.body.mass_kg
+    assert own.body.yaw_inertia_kgm2 == pytest.approx(80.0 * per_kg)
+    with pytest.raises(ConfigError, match="not a rotation"):
+        load_vehicle(written(tmp_path / "bad.yaml", "robot: {imu_axes: ['+x', '+y', '-z']}\n"))
