@@ -9,7 +9,7 @@ from pathlib import Path
 from terrafusion.datasets.core.display import text_html
 from terrafusion.fusion.api.logs import Log, opened
 from terrafusion.fusion.reports.gap import write_diagnosis
-from terrafusion.fusion.reports.gap_text import sentences
+from terrafusion.fusion.reports.gap_text import answer
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.diagnose import diagnose as run
 from terrafusion.twin.model.soil import SoilParams
@@ -23,8 +23,8 @@ class Diagnosis(GapDiagnosis):
     """A diagnosis: `summary`, `to_json` and `report`."""
 
     def summary(self) -> str:
-        """The answer in a few sentences that say only what the numbers carry."""
-        return " ".join(sentences(self))
+        """The answer on one screen, as `terrafusion gap` prints it: the verdict in words first."""
+        return repr(self)
 
     def report(self, out: str | Path) -> Path:
         """Writes diagnosis.json and report.html into a folder and returns the page.
@@ -36,16 +36,7 @@ class Diagnosis(GapDiagnosis):
         return Path(out) / "report.html"
 
     def __repr__(self) -> str:
-        named = ", ".join(self.verdict.named) or "none"
-        lines = [
-            f"Diagnosis of {len(self.runs)} run(s) against {len(self.references)} reference run(s), "
-            f"{self.vehicle}",
-            f"  gap detected: {'yes' if self.detected else 'no'} (p = {self.detection.p_value:.3g})",
-            f"  verdict: {self.verdict.kind}; named: {named}",
-        ]
-        for cause in self.verdict.causes[:4] if self.detected else ():
-            lines.append(f"  {cause.effect}: probability {cause.probability:.2f}")
-        return "\n".join(lines)
+        return "\n".join(answer(self))
 
     def _repr_html_(self) -> str:
         return text_html(repr(self))

@@ -87,6 +87,9 @@ def gap(
         bool, typer.Option("--judge", help="Also compare the estimator on these logs and on the twin's.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Also print all places, causes and assumptions.")
+    ] = False,
     explain: ExplainOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
@@ -101,7 +104,8 @@ def gap(
     """
     from terrafusion.datasets.core.files import check_folder
     from terrafusion.fusion.reports.gap import write_diagnosis
-    from terrafusion.fusion.reports.gap_text import sentences
+    from terrafusion.fusion.reports.gap_text import answer, details
+    from terrafusion.twin.gap.answer.corrected import write_corrected
     from terrafusion.twin.gap.diagnose import diagnose
     from terrafusion.twin.model.vehicle import load_vehicle
 
@@ -118,14 +122,12 @@ def gap(
         )  # fmt: skip
     scores = _estimator_gap(found, judged, normal, vehicle, seed) if judge else None
     write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])}, scores)
-    for line in sentences(found):
+    changes = [] if write_vehicle is None else write_corrected(found, vehicle, write_vehicle)
+    written = write_vehicle if changes and found.verdict.named else None
+    for line in answer(found, out, written):
         print(line)
-    if write_vehicle is not None:
-        from terrafusion.twin.gap.answer.corrected import write_corrected
-
-        for line in write_corrected(found, vehicle, write_vehicle):
-            print(line)
-    print(f"written to {out} ({found.elapsed_s:.1f} s)")
+    for line in [*changes, *details(found)] if verbose else changes[:0]:
+        print(line)
 
 
 def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from terrafusion.fusion.benchmark.estimator_gap import Compared
-from terrafusion.fusion.reports.gap_text import sentences
+from terrafusion.fusion.reports.gap_text import answer
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import gap as plots
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
@@ -42,7 +42,7 @@ def write_diagnosis(
     shrink = d.shrinkage is not None
     write_page(
         out / "report.html", "gap.html.j2", f"Gap between {d.vehicle} and its twin",
-        lead=" ".join(sentences(d)), provenance=provenance, packages=TWIN_LIBRARIES,
+        lead=" ".join(answer(d)), provenance=provenance, packages=TWIN_LIBRARIES,
         where=_where(d), causes=_causes(d), notes=d.notes,
         figures={
             "map": plots.plot_map(d) if d.where else None,

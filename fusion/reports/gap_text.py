@@ -1,97 +1,95 @@
-"""A diagnosis in sentences."""
+"""A diagnosis in words: one screen with the verdict first, and the details behind it."""
 
 from __future__ import annotations
 
 import math
+import textwrap
+from pathlib import Path
 
 from terrafusion.fusion.reports.explain_effect import effect_words
+from terrafusion.twin.gap.answer.credible_sets import CredibleSet, credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 from terrafusion.twin.gap.answer.next_run import BY_HAND
 from terrafusion.twin.gap.answer.verdict import Cause
-from terrafusion.twin.gap.answer.where import LEAST_REFERENCES
+from terrafusion.twin.gap.answer.where import LEAST_REFERENCES, GapCell
+from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 
-MOST_LISTED = 4
-MOSTLY_COVERED = 0.8
-"""Share of the judged time that references must cover for the drives not to be mentioned."""
-
-
-def sentences(d: GapDiagnosis) -> list[str]:
-    """The answer in sentences."""
-    lines = [_detection(d)]
-    if d.detected:
-        lines += [_cause(d), *_checks(d), _place(d), _shrink(d), _drives(d)]
-    if d.next_run is not None:
-        what = d.next_run.scenario
-        lines.append(f"Next, {what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}.")
-    if d.uncalibrated:
-        lines.append(
-            "The threshold is uncalibrated: there are too few reference runs, so replicates of the twin "
-            "take their place."
-        )
-    return [line for line in lines if line]
+WIDTH, LINES = 100, 24
+"""Columns and lines of the screen that `answer` fits."""
+MOST_PLACES, MOST_NAMES, MOST_LISTED = 3, 4, 12
+TITLE = 9  # columns of a section's title
 
 
-def _detection(d: GapDiagnosis) -> str:
-    p, runs = d.detection.p_value, f"{len(d.runs)} run(s), {d.seconds:.0f} s"
-    against = f"{len(d.references)} reference run(s)" if d.references else "the twin's own replicates"
-    if not d.detected:
-        return (
-            f"No gap was detected: {runs} differ from {against} no more than these among themselves "
-            f"(p = {p:.3g}, threshold {d.significance:g}). A small gap may remain undetected."
-        )
-    return f"There is a gap: {runs} differ from {against} (p = {p:.3g}, threshold {d.significance:g})."
+def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = None) -> list[str]:
+    """Lines of one screen, at most `LINES` of `WIDTH`: verdict, where, which, how far it shrinks, what next.
+
+    Args:
+        out: folder of the files.
+        corrected: vehicle file that was written.
+    """
+    for most in range(MOST_PLACES, 0, -1):
+        lines = _screen(d, out, corrected, most)
+        if len(lines) <= LINES:
+            break
+    return lines[:LINES]
 
 
-def _cause(d: GapDiagnosis) -> str:
-    verdict, first = d.verdict, d.verdict.causes[0]
-    share = "" if first.share is None else f", which explains {100.0 * first.share:.0f} % of it"
+def _screen(d: GapDiagnosis, out: Path | None, corrected: Path | None, most: int) -> list[str]:
+    """The lines with at most so many places, explained effects and channels."""
+    next_run = [] if d.next_run is None else [_next(d)]
+    files = [] if out is None else [f"{out / 'report.html'}, {out / 'diagnosis.json'}; here with --verbose"]
+    sections = [
+        ("", [verdict_line(d)]), ("Where", _places(d, most)), ("Which", _which(d, most)),
+        ("Shrinks", _shrinks(d, most)), ("Next", [*_drives(d), *next_run, *_too_few(d)]),
+        ("Load", _load(d, corrected)), ("Details", files),
+    ]  # fmt: skip
+    lines: list[str] = []
+    for title, sentences in sections:
+        indent = " " * TITLE if title else ""
+        for i, sentence in enumerate(sentences):
+            first = title.ljust(len(indent)) if i == 0 else indent
+            lines += textwrap.wrap(
+                sentence, WIDTH, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
+            )
+    return lines
+
+
+def verdict_line(d: GapDiagnosis) -> str:
+    """The verdict in words, with its certainty."""
+    verdict, sets = d.verdict, named_sets(d)
+    if verdict.kind == "no_gap":
+        if d.detection.p_value <= d.significance:
+            return f"Undecided: the runs differ from the references, and so do the drives ({_test(d)})."
+        return f"No gap: the runs differ no more than the references among themselves ({_test(d)})."
     if verdict.kind == "unknown":
-        return (
-            f"No candidate explains it: the best, {first.effect}, leaves too large a residual. "
-            "The cause is probably not in the catalogue of effects."
-        )
+        certain = f"{_percent(verdict.p_unknown)} certain"
+        return f"Gap of unknown cause: no effect of the catalogue explains it ({certain})."
+    certain = f"{_percent(sets[0].probability)} certain" if sets else "not certain"
     if verdict.kind == "parameters":
-        return f"The soil parameters differ; no structural effect is missing ({numbers(d)})."
-    if len(verdict.named) > 1:
-        several = [cause for name in verdict.named for cause in verdict.causes if cause.effect == name]
-        listed = "; and ".join(f"{_class_of(cause)} ({numbers(d, cause)})" for cause in several)
-        total = 100.0 * sum(cause.probability for cause in several)
-        return f"The most probable causes act together (probability {total:.0f} %): {listed}."
-    if verdict.kind == "ambiguous":
-        listed = ", ".join(first.members)
-        return f"Its cause is one of {listed}, which these runs cannot distinguish{share} ({numbers(d)})."
+        return f"Gap caused by the ground, which has changed; no effect is missing ({certain})."
+    if len(sets) > 1:
+        both = "; and ".join(map(_either, sets))
+        return f"Gap caused by {len(sets)} effects together ({certain}): {both}."
+    return f"Gap caused by {_either(sets[0], certain)}."
+
+
+def named_sets(d: GapDiagnosis) -> list[CredibleSet]:
+    """Credible sets of the named effects."""
+    return [s for s in credible_sets(d.verdict) if s.named]
+
+
+def place_words(cell: GapCell) -> str:
+    """A place of the gap in physical units: "yaw_rate while turning, slow, ..."."""
+    unit = CHANNEL_UNITS[cell.channel]
     return (
-        f"The most probable cause is {first.effect} "
-        f"(probability {100.0 * first.probability:.0f} %){share} ({numbers(d)})."
+        f"{cell.channel} while {cell.regime}, {cell.band}: {cell.error:.2g} {unit} RMS "
+        f"({cell.sigmas:.1f} sigma), references {cell.reference:.2g} {unit}"
     )
 
 
-def _checks(d: GapDiagnosis) -> list[str]:
-    """What each named effect is, and how to check it on the robot."""
-    words = effect_words()
-    return [f"{name}: {' To check: '.join(words[name])}" for name in d.verdict.named if name in words]
-
-
-def _drives(d: GapDiagnosis) -> str:
-    if d.drives is None or d.drives.covered >= MOSTLY_COVERED:
-        return ""
-    return (
-        f"Your drives differ from your references: these cover {100.0 * d.drives.covered:.0f} % of the time "
-        f"and lack {'; '.join(d.drives.missing)}. Make references of such drives: until then the gap may "
-        "come from the drives and not from the robot."
-    )
-
-
-def _class_of(cause: Cause) -> str:
-    if len(cause.members) == 1:
-        return cause.effect
-    return f"one of {', '.join(cause.members)}, which these runs cannot distinguish"
-
-
-def numbers(d: GapDiagnosis, cause: Cause | None = None) -> str:
-    """A cause's parameters with one sigma; None: the first one's."""
-    cause, c = cause or d.verdict.causes[0], d.evidence.candidates
-    parts = []
+def numbers(d: GapDiagnosis, cause: Cause) -> str:
+    """A cause's parameters with one sigma."""
+    c, parts = d.evidence.candidates, []
     for i, value, sigma in zip(cause.columns, cause.value, cause.sigma, strict=True):
         unit = f" {c.units[i]}" if c.units[i] else ""
         within = (
@@ -101,33 +99,125 @@ def numbers(d: GapDiagnosis, cause: Cause | None = None) -> str:
     return ", ".join(parts)
 
 
-def _place(d: GapDiagnosis) -> str:
-    if len(d.references) < LEAST_REFERENCES:
-        return f"The channel and regime are unknown: that takes {LEAST_REFERENCES} references."
-    significant = [c for c in d.where if c.p_value <= d.significance][:MOST_LISTED]
-    if not significant:
-        return "It is significant in no single channel and regime."
-    listed = "; ".join(
-        f"{c.channel} while {c.regime}, {c.band} ({100.0 * c.share:.0f} %)" for c in significant
-    )
-    return f"It is significant in: {listed}. A channel in which a gap is significant is not its cause."
-
-
-def _shrink(d: GapDiagnosis) -> str:
+def details(d: GapDiagnosis) -> list[str]:
+    """What the screen leaves out: more places and ranked causes, the test, and assumptions."""
+    lines = [f"{len(d.runs)} run(s), {d.seconds:.0f} s; {len(d.references)} reference run(s); {_test(d)}"]
+    lines += [
+        f"where: {place_words(c)}; {_percent(c.share)} of the gap (p = {c.p_value:.2g})"
+        for c in significant_places(d)[:MOST_LISTED]
+    ]
+    for cause in d.verdict.causes[:MOST_LISTED]:
+        share = "" if cause.share is None else f", explains {_percent(cause.share)}"
+        lines.append(f"cause: {cause.effect}, {_percent(cause.probability)}{share} ({numbers(d, cause)})")
     s = d.shrinkage
-    if s is None or not d.verdict.named:
-        return ""
-    if s.share is None:
-        return (
-            f"The squared error goes from {s.before:.3g} to {s.after:.3g} noise variances; the gap is too "
-            "little above its floor to state a share."
-        )
-    interval = (
-        "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
+    floor = "" if s.floor is None else f", references {s.floor:.3g}"
+    lines.append(
+        f"mean squared error in noise variances: before {s.before:.3g}, after {s.after:.3g}{floor}, with "
+        f"ground and sensor offsets refitted instead {s.recalibrated:.3g}"
     )
-    data = "on runs held out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
+    return [*lines, *(f"note: {note}" for note in d.notes)]
+
+
+def significant_places(d: GapDiagnosis) -> list[GapCell]:
+    """Cells of the gap map that are significant, most important first."""
+    return [c for c in d.where if c.p_value <= d.significance]
+
+
+def _percent(share: float) -> str:
+    """As "97 %", never 0 or 100 %."""
+    return "over 99 %" if share > 0.995 else "under 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
+
+
+def _test(d: GapDiagnosis) -> str:
+    return f"p = {d.detection.p_value:.2g}, threshold {d.significance:g}"
+
+
+def _either(s: CredibleSet, certain: str = "") -> str:
+    more = len(s.effects) - MOST_NAMES
+    names = [*s.effects[:MOST_NAMES], *([f"{more} more"] if more > 0 else [])]
+    after = f" ({certain})" if certain else ""
+    if len(names) == 1:
+        return names[0] + after
+    return f"{', '.join(names[:-1])} or {names[-1]}{after}, which these drives cannot tell apart"
+
+
+def _places(d: GapDiagnosis, most: int) -> list[str]:
+    if not d.detected:
+        return []
+    if len(d.references) < LEAST_REFERENCES:
+        return [f"unknown: that takes {LEAST_REFERENCES} references"]
+    places: dict[tuple[str, str], GapCell] = {}
+    for cell in significant_places(d):  # the more important band of each
+        places.setdefault((cell.channel, cell.regime), cell)
+    if not places:
+        return ["in no single channel and regime significant"]
+    return [place_words(cell) for cell in [*places.values()][:most]]
+
+
+def _which(d: GapDiagnosis, most: int) -> list[str]:
+    """Sizes of the named effects; what they and their look-alikes are, and how to check them."""
+    by_name = {cause.effect: cause for cause in d.verdict.causes}
+    lines = [numbers(d, by_name[name]) for name in d.verdict.named]
+    words = effect_words()
+    names = list(dict.fromkeys(n for s in named_sets(d) for n in s.effects if n in words))
+    lines += [f"{n}: {words[n][0]} To check: {words[n][1]}" for n in names[:most]]
+    if len(names) > most:
+        lines.append("the others: terrafusion gap --explain EFFECT")
+    if d.verdict.kind == "unknown" and d.verdict.causes:
+        first = d.verdict.causes[0]
+        lines.append(f"nearest is {first.effect} ({numbers(d, first)}), which leaves too large a residual")
+    return lines
+
+
+def _shrinks(d: GapDiagnosis, most: int) -> list[str]:
+    s = d.shrinkage
+    if not d.verdict.named:
+        return []
+    if s.floor is None:
+        how = "by an unknown share: there are no references to compare with"
+    elif s.share is None:
+        how = "by an unknown share: the gap is too little above what references have themselves"
+    else:
+        interval = (
+            "" if s.interval is None else f" (95 %: {100 * s.interval[0]:.0f} to {100 * s.interval[1]:.0f} %)"
+        )
+        data = "on runs held out of the fit" if len(d.runs) > 1 else "on the run it was fitted to"
+        how = f"by {100.0 * s.share:.0f} %{interval} with it in the twin, {data}"
+    order = sorted(s.physical, key=lambda name: -abs(s.channels[name][0] - s.channels[name][1]))
+    parts = []
+    for name in order[:most]:
+        before, after, floor = s.physical[name]
+        base = "" if floor is None else f", references {floor:.2g}"
+        parts.append(f"{name} {before:.2g} -> {after:.2g} {CHANNEL_UNITS[name]}{base}")
+    return [how, "; ".join(parts)]
+
+
+def _drives(d: GapDiagnosis) -> list[str]:
+    if d.drives is None or not d.drives.limits() or d.detection.p_value > d.significance:
+        return []
+    return [
+        f"Your drives differ from your references (these cover {_percent(d.drives.covered)} of the time) in: "
+        f"{'; '.join(d.drives.missing)}. Make these references and diagnose again."
+    ]
+
+
+def _next(d: GapDiagnosis) -> str:
+    assert d.next_run is not None
+    what = d.next_run.scenario
+    return f"{what if what == BY_HAND else f'drive {what!r}'}: {d.next_run.why}"
+
+
+def _too_few(d: GapDiagnosis) -> list[str]:
+    if not d.uncalibrated:
+        return []
+    return ["drive more references: there are too few to calibrate the test, and twin replicates stand in"]
+
+
+def _load(d: GapDiagnosis, corrected: Path | None) -> list[str]:
+    if corrected is not None and d.verdict.named:
+        return [f"terrafusion gap RUN... --vehicle {corrected} judges further runs with it in the twin"]
     return (
-        f"With the effect in the twin, {100.0 * s.share:.0f} % of the gap above its floor disappears "
-        f"{data}{interval}: {s.before:.3g} before, {s.after:.3g} after, {s.floor or 0.0:.3g} in the "
-        f"references; refitting soil and sensor offsets alone leaves {s.recalibrated:.3g}."
+        ["--write-vehicle FILE writes the vehicle file with it; load it with --vehicle FILE"]
+        if (d.verdict.named)
+        else []
     )

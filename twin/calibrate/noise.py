@@ -60,6 +60,12 @@ class ResidualNoise:
         solved = dtrsm(1.0, lower, flat.T, side=1, lower=1, trans_a=1).T
         return np.asarray(solved.reshape(n, g, k).transpose(1, 0, 2))
 
+    def unwhiten_alike(self, slots: Rows, sigma: Array, white: Array) -> Array:
+        """Inverse of `whiten_alike` for one column: white values (g, n) in the channel's unit."""
+        steps = tuple((slots[1:] - slots[:-1]).tolist())
+        coloured = white if len(self.rho) == 1 else white @ _factor(self.rho, steps).T
+        return np.asarray(coloured * self.scale * sigma)
+
 
 @functools.lru_cache(maxsize=4096)
 def _factor(rho: tuple[float, ...], steps: tuple[int, ...]) -> Array:

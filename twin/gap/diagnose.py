@@ -137,8 +137,11 @@ def diagnose_evidence(
         progress(0.9)
     shrunk = shrinkage(evidence, scores, sigma, null, verdict.fit)
     where = gap_map(evidence, sigma, null, seed)
-    following = next_run(evidence, sigma, verdict)
     drives = drive_coverage(runs, evidence.references, evidence.model)
+    if verdict.kind == "unknown" and drives is not None and drives.limits():
+        # Undecided: what no effect explains may come from drives that no reference made.
+        verdict = dataclasses.replace(verdict, kind="no_gap")
+    following = next_run(evidence, sigma, verdict)
     notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
     if verdict.fit is not None and verdict.fit.failure:
         notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")

@@ -10,6 +10,7 @@ import jsonschema
 import pytest
 
 from terrafusion.datasets.writers.log_folder import write_log_folder
+from terrafusion.fusion.reports.explain_effect import effect_words
 from tests.twin.gap.runs import runs
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
@@ -37,9 +38,28 @@ def test_gap_writes_answer_report_and_corrected_vehicle(logs: Path, tmp_path: Pa
     page = (tmp_path / "out/report.html").read_text("utf-8")
     assert "wheel_radius" in page
     assert "Before and after" in page
-    assert "wheel_radius" in done.out
-    assert "wheel.radius_m" in done.out
+    lines = done.out.splitlines()
+    assert lines[0].startswith("Gap caused by wheel_radius or grousers (9")
+    assert len(lines) <= 24
+    assert max(map(len, lines)) <= 100
+    titles = [line.split()[0] for line in lines[1:] if not line.startswith(" ")]
+    assert [t for t in titles if t[0].isupper()] == ["Where", "Which", "Shrinks", "Next", "Load", "Details"]
+    assert " m RMS (" in done.out
+    assert "Push the robot ten turns" in " ".join(done.out.split())
+    assert f"--vehicle {tmp_path / 'corrected.yaml'}" in " ".join(done.out.split())
+    assert "wheel.radius_m" not in done.out
+    verbose = terrafusion(*arguments, "--write-vehicle", str(tmp_path / "corrected.yaml"), "--verbose")
+    assert "wheel.radius_m" in verbose.out
+    assert "cause: mass" in verbose.out
     assert (tmp_path / "corrected.yaml").is_file()
+
+
+def test_every_effect_has_one_sentence_what_it_is_and_one_how_to_check_it() -> None:
+    words = effect_words()
+    assert set(words) >= {"wheel_radius", "encoder_dropout", "torque_limit"}
+    for name, sentences in words.items():
+        assert len(sentences) == 2, name
+        assert all(s.endswith(".") for s in sentences), name
 
 
 def test_gap_explains_an_effect(terrafusion) -> None:

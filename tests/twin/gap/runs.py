@@ -26,14 +26,14 @@ MOVING = (*GROUND, "wheel_radius/scale", "track_width/scale")
 ABSENT = 1e-12
 
 
-def run(number: int, effects: Mapping[str, float] | None = None) -> Recording:
+def run(number: int, effects: Mapping[str, float] | None = None, drive: Scenario = DRIVE) -> Recording:
     """A run without a truth channel; the ground's strength varies from run to run."""
     rng = np.random.default_rng(number)
     own = dict.fromkeys(MOVING, ABSENT)
     own.update({key: SPREAD * float(rng.standard_normal()) for key in GROUND})
     for key, value in (effects or {}).items():
         own[key] = own.get(key, 0.0) + value
-    recording = simulate(DRIVE, seed=number, effects=own)
+    recording = simulate(drive, seed=number, effects=own)
     return dataclasses.replace(recording, name=f"run{number}", truth=None, truth_channels=())
 
 

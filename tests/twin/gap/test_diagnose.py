@@ -12,7 +12,7 @@ import pytest
 
 from terrafusion.datasets.core.errors import ConfigError, DataError
 from terrafusion.datasets.core.recording import Overrides, Recording
-from terrafusion.fusion.reports.gap_text import sentences
+from terrafusion.fusion.reports.gap_text import answer as screen
 from terrafusion.fusion.reports.plots.gap import plot_shrink
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
@@ -22,7 +22,8 @@ from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.diagnose import diagnose
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
-from tests.twin.gap.runs import runs
+from terrafusion.twin.scenario.scenario import DriveSegment
+from tests.twin.gap.runs import DRIVE, run, runs
 
 SCHEMA = json.loads((Path(__file__).parents[3] / "docs/schemas/diagnosis.schema.json").read_text("utf-8"))
 VEHICLE = load_vehicle("elevate")
@@ -113,8 +114,8 @@ def test_a_small_effect_is_named_beside_a_large_one(references: list[Recording])
     found = diagnose(runs(740, 2, both), references, VEHICLE)
     answer = checked(found)
     assert answer["named"] == ["wheel_radius", "imu_yaw_misalignment"]
-    said = " ".join(sentences(found))
-    assert "The most probable causes act together (probability 9" in said
+    said = " ".join(" ".join(screen(found)).split())
+    assert said.startswith("Gap caused by 2 effects together (9")
     assert all(key in said for key in both)
     values = {k: v for c in answer["causes"][:2] for k, v in c["parameters"].items()}
     for key, value in both.items():
@@ -182,6 +183,22 @@ def _swinging(run: Recording) -> Recording:
     return dataclasses.replace(run, imu=dataclasses.replace(run.imu, gyro_radps=gyro))
 
 
+def test_undecided_where_drives_differ_and_nothing_explains_the_gap(references: list[Recording]) -> None:
+    """Clean runs, half of them slow turns that no reference made."""
+    segments = ((6.0, 0.8, 0.4), (6.0, 1.2, -0.5), (6.0, 0.4, 0.9), (6.0, 0.3, -0.9))
+    drive = dataclasses.replace(DRIVE, duration_s=24.0, drive=tuple(DriveSegment(*s) for s in segments))
+    found = diagnose([run(i, drive=drive) for i in (610, 611)], references, VEHICLE)
+    answer = checked(found)
+    assert answer["gap"]["p_value"] <= 0.05
+    assert answer["verdict"] == "no_gap"
+    assert not answer["gap"]["detected"]
+    assert answer["p_unknown"] > UNKNOWN
+    said = " ".join(" ".join(screen(found)).split())
+    assert said.startswith("Undecided: the runs differ from the references, and so do the drives")
+    assert "Your drives differ from your references" in said
+    assert "turning -0.9 rad/s" in said
+
+
 def test_sets_and_drives_of_an_answer(wide: GapDiagnosis) -> None:
     answer = checked(wide)
     assert set(answer["sets"][0]["effects"]) == {"wheel_radius", "grousers"}
@@ -190,6 +207,18 @@ def test_sets_and_drives_of_an_answer(wide: GapDiagnosis) -> None:
         "covered": pytest.approx(1.0),
         "missing": [],
     }  # references made the same drive
+
+
+def test_where_and_shrink_in_units_of_the_channels(wide: GapDiagnosis) -> None:
+    """Speed, and so position in a window of 10 s, is 3 % off: a decimetre or so of 10 m after the fit."""
+    cell = next(c for c in wide.where if c.channel == "gnss_position")
+    assert cell.p_value <= 0.05
+    assert 0.02 < cell.error < 0.3
+    assert cell.reference < 0.5 * cell.error
+    before, after, floor = wide.shrinkage.physical["gnss_position"]
+    assert floor is not None
+    assert before > 3.0 * floor
+    assert after < 1.5 * floor
 
 
 def test_lifted_wheels_carry_no_load(wide: GapDiagnosis) -> None:
@@ -245,7 +274,7 @@ def test_without_references_it_answers_and_says_that_it_is_uncalibrated(unreferr
     assert answer["gap"]["detected"]
     assert answer["reference_runs"] == []
     assert answer["where"] == []
-    assert any("that takes 2 references" in sentence for sentence in sentences(unreferred))
+    assert any("that takes 2 references" in line for line in screen(unreferred))
     assert answer["shrink"]["floor"] is None
     assert answer["causes"][0]["effect"] in ("wheel_radius", "encoder_scale", "grousers")
 

@@ -73,8 +73,8 @@ class GapDiagnosis:
 
     @property
     def detected(self) -> bool:
-        """Whether there is a gap at this significance."""
-        return self.detection.p_value <= self.significance
+        """Whether there is a gap at this significance, and not in the drives alone."""
+        return self.detection.p_value <= self.significance and self.verdict.kind != "no_gap"
 
     def to_json(self) -> dict[str, Any]:
         """The answer as `docs/schemas/diagnosis.schema.json` has it; unknown values are null."""

@@ -26,6 +26,8 @@ SMOOTH_SAMPLES = 51  # grid samples over which the acceleration is averaged: hal
 LEAST_S = 1.0  # time of all references in a cell from which it counts as covered
 MOST_LISTED = 4
 LEAST_MISSING = 0.02  # share of the judged time from which a cell is listed
+MOSTLY_COVERED = 0.8
+"""Share of the judged time from which the drives do not limit the answer."""
 
 Cell = tuple[int, int, int]
 
@@ -36,6 +38,10 @@ class DriveCoverage:
 
     covered: float
     missing: tuple[str, ...]
+
+    def limits(self) -> bool:
+        """Whether a gap that nothing explains may come from the drives."""
+        return self.covered < MOSTLY_COVERED
 
 
 def time_by_cell(twist: Array) -> dict[Cell, float]:

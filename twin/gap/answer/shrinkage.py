@@ -19,7 +19,7 @@ from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.null import Null
 from terrafusion.twin.gap.null.score import Score
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
-from terrafusion.twin.gap.rollout.residuals import WhitenedRun
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 Array = NDArray[np.float64]
 
@@ -38,6 +38,7 @@ class Shrinkage:
         share, interval: of the gap above the floor that the effect removes, with its 95 % interval, 0 to 1.
         recalibrated: error with theta alone fitted more freely.
         channels: root mean squares (before, after, floor) by channel.
+        physical: the same in the unit of each channel (`CHANNEL_UNITS`).
         errors_after, errors_before: whitened errors of each run.
     """
 
@@ -48,6 +49,7 @@ class Shrinkage:
     interval: tuple[float, float] | None
     recalibrated: float
     channels: dict[str, tuple[float, float, float | None]]
+    physical: dict[str, tuple[float, float, float | None]]
     errors_after: list[Array]
     errors_before: list[Array]
 
@@ -79,19 +81,31 @@ def shrinkage(
     spread = float(np.std(squares, ddof=1)) if len(squares) > 1 else None
     share, interval = _share(np.array(before), np.array(after), floor, spread)
     least = min(floor, float(np.mean(before))) if floor is not None else 0.0
-    channels = {}
-    for name in dict.fromkeys(CHANNEL_NAMES[c] for c in evidence.channels):
-        mine = [i for i, c in enumerate(evidence.channels) if CHANNEL_NAMES[c] == name]
-        first, second = (_rms(runs, arm, mine) for arm in arms)
-        channels[name] = (first or 0.0, second or 0.0, _rms(references, floors, mine))
+    physical = [
+        [physical_error(r, evidence.noise, e) for r, e in zip(some, errors, strict=True)]
+        for some, errors in ((runs, arms[0]), (runs, arms[1]), (references, floors))
+    ]
     return Shrinkage(
         float(np.mean(before)), max(float(np.mean(after)), least), floor, share, interval,
-        float(np.mean(free)), channels, now, was,
+        float(np.mean(free)), _by_channel(evidence, arms[0], arms[1], floors),
+        _by_channel(evidence, physical[0], physical[1], physical[2]), now, was,
     )  # fmt: skip
 
 
 def _mean_square(error: Array) -> float:
     return float(error @ error) / max(len(error), 1)
+
+
+def _by_channel(
+    evidence: GapEvidence, before: Sequence[Array], after: Sequence[Array], floors: Sequence[Array]
+) -> dict[str, tuple[float, float, float | None]]:
+    """Root mean squares of errors of the judged runs, before and after, and of the references."""
+    out = {}
+    for name in dict.fromkeys(CHANNEL_NAMES[c] for c in evidence.channels):
+        mine = [i for i, c in enumerate(evidence.channels) if CHANNEL_NAMES[c] == name]
+        first, second = (_rms(evidence.runs, errors, mine) or 0.0 for errors in (before, after))
+        out[name] = (first, second, _rms(evidence.references, floors, mine))
+    return out
 
 
 def _rms(runs: Sequence[WhitenedRun], errors: Sequence[Array], channels: Sequence[int]) -> float | None:

@@ -18,7 +18,7 @@ from terrafusion.twin.gap.infer.detect import permutations
 from terrafusion.twin.gap.null.evidence import GapEvidence
 from terrafusion.twin.gap.null.null import Null
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, commanded_twist
-from terrafusion.twin.gap.rollout.residuals import WhitenedRun
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 Array = NDArray[np.float64]
 
@@ -41,14 +41,25 @@ LEAST_REFERENCES = 2  # fewer have no scatter from run to run
 
 @dataclass(frozen=True)
 class GapCell:
-    """One cell of the gap map."""
+    """One cell of the gap map.
+
+    Attributes:
+        channel, regime, band: its place.
+        share: of the excess of squared errors over the references'.
+        p_value: of that excess, for all cells together.
+        error, reference: root mean square of the judged runs' errors and of the references', in the channel's
+            unit (`CHANNEL_UNITS`).
+        sigmas: the same of the judged runs, in sigmas of the noise.
+    """
 
     channel: str
     regime: str
     band: str
     share: float
     p_value: float
-    rms: float
+    error: float
+    reference: float
+    sigmas: float
 
 
 def regimes(run: WhitenedRun, model: Model) -> NDArray[np.int64]:
@@ -64,9 +75,9 @@ def regimes(run: WhitenedRun, model: Model) -> NDArray[np.int64]:
     return out
 
 
-def cells(run: WhitenedRun, model: Model, errors: Array) -> dict[tuple[str, int, int], tuple[float, float]]:
-    """Sum of squares and effective count of each cell of a run (channel, regime, band)."""
-    regime, out = regimes(run, model), dict[tuple[str, int, int], tuple[float, float]]()
+def cells(run: WhitenedRun, model: Model, errors: Array) -> dict[tuple[str, int, int], Array]:
+    """Sum of squares, effective and whole count (3,) of each cell of a run (channel, regime, band)."""
+    regime, out = regimes(run, model), dict[tuple[str, int, int], Array]()
     for i, observed in enumerate(run.log.observed):
         name = CHANNEL_NAMES[observed.channel]
         rows = np.flatnonzero(run.channel == i)
@@ -81,8 +92,8 @@ def cells(run: WhitenedRun, model: Model, errors: Array) -> dict[tuple[str, int,
             square = values**2 * (1.0 / count[group] if band == 0 else 1.0)
             for k in range(len(REGIMES)):
                 mine = regime[rows] == k
-                old = out.get((name, k, band), (0.0, 0.0))
-                out[name, k, band] = (old[0] + float(square[mine].sum()), old[1] + float(weight[mine].sum()))
+                more = np.array([square[mine].sum(), weight[mine].sum(), mine.sum()])
+                out[name, k, band] = out.get((name, k, band), np.zeros(3)) + more
     return out
 
 
@@ -110,11 +121,19 @@ def gap_map(evidence: GapEvidence, sigma: Array, null: Null, seed: int) -> list[
     floor = square[count_runs:].sum(axis=0) / np.maximum(count[count_runs:].sum(axis=0), 1e-9)
     over = np.maximum(square[own].sum(axis=0) - floor * count[own].sum(axis=0), 0.0)
     share = over / max(float(over.sum()), 1e-12)
-    rms = np.sqrt(square[own].sum(axis=0) / np.maximum(count[own].sum(axis=0), 1e-9))
+    sigmas = np.sqrt(square[own].sum(axis=0) / np.maximum(count[own].sum(axis=0), 1e-9))
+    physical = [physical_error(run, evidence.noise, e) for run, e in zip(runs, errors, strict=True)]
+    table = [cells(run, evidence.model, e) for run, e in zip(runs, physical, strict=True)]
+    sums = np.array([[t[k] for k in keys] for t in table])
+    judged, normal = (
+        np.sqrt(some[:, :, 0].sum(axis=0) / np.maximum(some[:, :, 2].sum(axis=0), 1.0))
+        for some in (sums[:count_runs], sums[count_runs:])
+    )
     found = [
         GapCell(
             channel, REGIMES[regime][0], BANDS[band], float(share[i]),
-            (1.0 + sum(t >= excess[i] for t in tops)) / (1.0 + len(tops)), float(rms[i]),
+            (1.0 + sum(t >= excess[i] for t in tops)) / (1.0 + len(tops)),
+            float(judged[i]), float(normal[i]), float(sigmas[i]),
         )
         for i, (channel, regime, band) in enumerate(keys)
     ]  # fmt: skip

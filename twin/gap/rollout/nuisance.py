@@ -33,6 +33,12 @@ CHANNEL_NAMES = {
 }  # fmt: skip
 """Name in `diagnosis.json` of the channel that each observed one belongs to."""
 
+CHANNEL_UNITS = {
+    "wheel_left": "rad/s", "wheel_right": "rad/s", "yaw_rate": "rad/s", "accel_x": "m/s2", "accel_y": "m/s2",
+    "gnss_position": "m", "gnss_velocity": "m/s", "motor_current": "A",
+}  # fmt: skip
+"""Unit of each of those."""
+
 
 def commanded_twist(log: PreparedLog, model: Model) -> tuple[Array, Array]:
     """Times (N,) of the log's grid, and commanded forward speed and turn rate (N, 2), m/s and rad/s."""

@@ -234,6 +234,17 @@ def whitened_columns(log: PreparedLog, noise: Mapping[str, ResidualNoise], colum
     return out
 
 
+def physical_error(run: WhitenedRun, noise: Mapping[str, ResidualNoise], error: Array) -> Array:
+    """A whitened error (n,) in the units of the channels."""
+    out = np.empty(len(error))
+    for i, rows, places in sample_map(run.log).equally_spaced:
+        observed = run.log.observed[i]
+        out[places] = noise[observed.channel].unwhiten_alike(
+            observed.slot[rows[0]], observed.sigma[rows], error[places]
+        )
+    return out
+
+
 def whitened(run: RunResiduals, noise: Mapping[str, ResidualNoise]) -> WhitenedRun:
     """The run in units and axes in which its noise is white."""
     return projected(run, whitened_columns(run.log, noise, run.stacked()))
