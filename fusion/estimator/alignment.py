@@ -16,6 +16,7 @@ from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
+from terrafusion.fusion.inputs.door import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers, beyond
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -143,7 +144,11 @@ def checked_start(
     Raises:
         DataError: not three finite coordinates and a finite heading with positive sigmas.
     """
-    position = np.asarray(position_m, dtype=float)
+    position = as_numbers(position_m, "start", "start")
+    yaw_rad, position_sigma_m, yaw_sigma_rad = (
+        as_number(value, "yaw or sigma of the start", "start")
+        for value in (yaw_rad, position_sigma_m, yaw_sigma_rad)
+    )
     if position.shape != (3,) or not np.isfinite(position.sum() + yaw_rad):
         raise DataError(
             f"start at {position.tolist()} with yaw {yaw_rad} is no pose", remedy="give x, y, z and yaw"
@@ -153,7 +158,11 @@ def checked_start(
             f"sigmas {position_sigma_m} m, {yaw_sigma_rad} rad of the start are not positive",
             remedy="give 1 sigma",
         )
-    return KnownStart(position, float(yaw_rad), position_sigma_m, yaw_sigma_rad)
+    if beyond(position[:2], MOST_AWAY_M) or abs(position[2]) > MOST_HEIGHT_M:
+        raise DataError(
+            f"start at {position.tolist()} m lies beyond the earth", remedy="give metres east and north"
+        )
+    return KnownStart(position, yaw_rad, position_sigma_m, yaw_sigma_rad)
 
 
 def heading_from_motion(

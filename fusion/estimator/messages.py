@@ -24,6 +24,7 @@ from terrafusion.datasets.core.messages import (
 )
 from terrafusion.fusion.config.estimator_config import EstimatorConfig
 from terrafusion.fusion.estimator.steering import front_ratio
+from terrafusion.fusion.inputs.door import as_number, as_numbers
 from terrafusion.fusion.terrain.external import TRUE_SOURCES, known_probabilities
 
 
@@ -65,12 +66,10 @@ def add_message(estimator: Inlets, message: Message) -> None:
     elif isinstance(message, WheelSample):
         _wheels(estimator, message)
     elif isinstance(message, GnssSample):
-        if message.fix and np.isfinite(message.enu_m[:2].sum() + message.sigma_enu_m[:2].sum()):
-            m = message
-            estimator.add_gnss(m.t_ns, m.enu_m, m.sigma_enu_m, m.velocity_enu_mps, m.sigma_v_mps, m.fix)
+        _gnss(estimator, message)
     elif isinstance(message, CommandSample):
-        if np.isfinite(message.v_mps):
-            estimator.add_command(message.t_ns, message.v_mps)
+        if math.isfinite(v_mps := as_number(message.v_mps, "speed", "command")):
+            estimator.add_command(message.t_ns, v_mps)
     elif isinstance(message, SteeringSample):
         _steering(estimator, message)
     elif isinstance(message, BarometerSample):
@@ -89,30 +88,53 @@ def add_message(estimator: Inlets, message: Message) -> None:
 
 def _imu(estimator: Inlets, message: ImuSample) -> None:
     kind = estimator.config.inputs.imu
-    needed = message.gyro_radps[2]
-    if kind == "six_axis":
-        needed = sum(message.gyro_radps.tolist()) + sum(message.accel_mps2.tolist())
+    gyro = _vector(message.gyro_radps, 3, "gyro", "imu")
+    accel = _vector(message.accel_mps2, 3, "accel", "imu")
+    needed = sum(gyro.tolist()) + sum(accel.tolist()) if kind == "six_axis" else gyro[2]
     if kind != "none" and math.isfinite(needed):
-        estimator.add_imu(*message)
+        estimator.add_imu(message.t_ns, gyro, accel)
+
+
+def _gnss(estimator: Inlets, message: GnssSample) -> None:
+    m = message
+    if m.fix:
+        enu = _vector(m.enu_m, 3, "position", "gnss")
+        sigma = _vector(m.sigma_enu_m, 3, "sigma", "gnss")
+        if np.isfinite(enu[:2].sum() + sigma[:2].sum()):
+            estimator.add_gnss(m.t_ns, enu, sigma, m.velocity_enu_mps, m.sigma_v_mps, m.fix)
 
 
 def _steering(estimator: Inlets, message: SteeringSample) -> None:
     rig = estimator.config.rig
-    if rig.steering is not None and np.isfinite(message.angle_rad).all():
-        front, rear = axles(message.angle_rad[None], message.names, front_ratio(rig))[0].tolist()
+    if rig.steering is None:
+        return
+    angle = _vector(message.angle_rad, len(message.names), "steering angle", "steering")
+    if np.isfinite(angle).all():
+        front, rear = axles(angle[None], message.names, front_ratio(rig))[0].tolist()
         estimator.add_steering(message.t_ns, front, rear)
 
 
 def _wheels(estimator: Inlets, message: WheelSample) -> None:
-    radius_m = estimator.config.rig.wheel_radius_m
-    left, right = _sides(message.speed, 1.0 if message.unit == "mps" else radius_m, message.names)
+    radius_m, names = estimator.config.rig.wheel_radius_m, message.names
+    speed = _vector(message.speed, len(names), "wheel speed", "wheels")
+    left, right = _sides(speed, 1.0 if message.unit == "mps" else radius_m, names)
     if not math.isfinite(left + right):
         return
     travel: tuple[float | None, float | None] = (None, None)
     if message.angle_rad is not None:
-        turned = _sides(message.angle_rad, radius_m, message.names)
+        turned = _sides(_vector(message.angle_rad, len(names), "wheel angle", "wheels"), radius_m, names)
         travel = turned if math.isfinite(turned[0] + turned[1]) else travel
     estimator.add_wheels(message.t_ns, left, right, *travel)
+
+
+def _vector(values: ArrayLike | None, count: int, what: str, channel: str) -> Array:
+    """Values (count,) of a message as floats."""
+    vector = as_numbers(values, what, channel)
+    if vector.shape != (count,):
+        raise DataError(
+            f"{what} has the shape {vector.shape}", channel=channel, remedy=f"give {count} numbers"
+        )
+    return vector
 
 
 def _sides(values: Array, factor: float, names: tuple[str, ...]) -> tuple[float, float]:
@@ -121,11 +143,15 @@ def _sides(values: Array, factor: float, names: tuple[str, ...]) -> tuple[float,
     if len(scaled) == 1:
         return scaled[0], scaled[0]
     left, right = _places(names)
+    if not left or not right:
+        raise DataError(
+            f"wheels named {', '.join(map(str, names))}", channel="wheels", remedy="name them left and right"
+        )
     return sum([scaled[i] for i in left]) / len(left), sum([scaled[i] for i in right]) / len(right)
 
 
 @functools.lru_cache(maxsize=16)
 def _places(names: tuple[str, ...]) -> tuple[list[int], list[int]]:
     """Which values are of the left and of the right side."""
-    left = [i for i, name in enumerate(names) if name.endswith("left")]
-    return left, [i for i, name in enumerate(names) if name.endswith("right")]
+    left = [i for i, name in enumerate(names) if str(name).endswith("left")]
+    return left, [i for i, name in enumerate(names) if str(name).endswith("right")]

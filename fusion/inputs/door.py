@@ -7,6 +7,7 @@ no run.
 
 from __future__ import annotations
 
+from collections import deque
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -27,8 +28,10 @@ MOST_AWAY_M, MOST_HEIGHT_M = 2e7, 1e5
 LEAST_CLAIM_M, MOST_CLAIM_M = 1e-3, 1e3
 """Reported sigmas outside this range are replaced by that of the class of fix; without a class the smaller
 ones are raised to it."""
-LEAP_NS = 10_000_000_000
-"""A sample this much newer than all others is no next sample, unless others confirm its time."""
+LEAP_NS, LONGEST_LEAP_NS, LEAP_STEPS = 1_000_000_000, 10_000_000_000, 10
+"""A sample this much newer than all others, and by so many of the steps before, is no next sample, unless
+others confirm its time; beyond the longest always."""
+STEPS_SEEN = 8
 CONFIRMED = 3
 """Samples that show that time has leapt."""
 
@@ -52,15 +55,29 @@ class GnssFix:
 class Newest:
     """Time of the newest sample of IMU and wheels; None before the first.
 
-    `refused` counts, by channel, samples far ahead of it.
+    `refused` counts, by channel, samples far ahead of it; `steps_ns` has the last steps of time.
     """
 
     t_ns: int | None = None
     refused: dict[str, int] = field(default_factory=dict)
+    steps_ns: deque[int] = field(default_factory=lambda: deque(maxlen=STEPS_SEEN))
+
+    def advance(self, t_ns: int) -> None:
+        """Take the time of a sample that is used."""
+        if self.t_ns is None or t_ns > self.t_ns:
+            if self.t_ns is not None:
+                self.steps_ns.append(t_ns - self.t_ns)
+            self.t_ns = t_ns
 
     def leaps(self, t_ns: int) -> bool:
         """Whether a time lies far ahead of all samples."""
-        return self.t_ns is not None and t_ns - self.t_ns > LEAP_NS
+        return self.t_ns is not None and t_ns - self.t_ns > LEAP_NS and t_ns - self.t_ns > self.leap_ns()
+
+    def leap_ns(self) -> int:
+        """Step of time that is a leap."""
+        if len(self.steps_ns) < STEPS_SEEN:
+            return LONGEST_LEAP_NS
+        return min(max(LEAP_NS, LEAP_STEPS * max(self.steps_ns)), LONGEST_LEAP_NS)
 
     def admitted(self, t_ns: Any, channel: str) -> int | None:
         """The time of a sample of another channel, ns; None, and counted, where it lies far ahead.
@@ -69,7 +86,7 @@ class Newest:
             DataError: the time is none.
         """
         t_ns = checked_time(t_ns, channel)
-        if not self.leaps(t_ns):
+        if self.t_ns is None or t_ns - self.t_ns <= LONGEST_LEAP_NS:
             return t_ns
         self.refused[channel] = self.refused.get(channel, 0) + 1
         return None
@@ -95,7 +112,9 @@ class Leap:
         if self.held and not self.newest.leaps(self.held[-1][0]):  # another stream has confirmed them
             before = self.held[:]
             self.held.clear()
-        if self.held and not (self.newest.leaps(t_ns) and abs(t_ns - self.held[-1][0]) <= LEAP_NS):
+        if self.held and not (
+            self.newest.leaps(t_ns) and abs(t_ns - self.held[-1][0]) <= self.newest.leap_ns()
+        ):
             self.dropped += len(self.held)
             self.held.clear()
         samples = [*before, sample]
@@ -105,8 +124,8 @@ class Leap:
                 return []
             samples = sorted(self.held, key=lambda one: one[0])
             self.held.clear()
-        last_ns = samples[-1][0]
-        self.newest.t_ns = last_ns if self.newest.t_ns is None else max(self.newest.t_ns, last_ns)
+        for one in samples:
+            self.newest.advance(one[0])
         return samples
 
 

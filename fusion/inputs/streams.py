@@ -93,7 +93,7 @@ class Lateness:
     before it is then too late.
 
     Attributes:
-        wait_ns: longest lateness so far, at most `LONGEST_WAIT_S`.
+        wait_ns: longest lateness so far, of those up to `LONGEST_WAIT_S`.
         used_ns: end of what the keyframes have used.
         too_late: number of samples left out because their keyframe had been made.
         leap: samples that come far ahead.
@@ -131,7 +131,8 @@ class Lateness:
                 channel=self.channel,
                 remedy=f"more than {MOST_LATE_S:g} s is no late message: start anew where a clock jumps",
             )
-        self.wait_ns = max(self.wait_ns, min(late_ns, round(LONGEST_WAIT_S * 1e9)))
+        if late_ns <= LONGEST_WAIT_S * 1e9:  # no waiting would have helped a later one
+            self.wait_ns = max(self.wait_ns, late_ns)
         if self.used_ns is not None and t_ns <= self.used_ns:
             self.too_late += 1
             return None

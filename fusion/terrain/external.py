@@ -16,7 +16,12 @@ def known_probabilities(
     probabilities: Mapping[str, float], known: tuple[str, ...]
 ) -> dict[str, float] | None:
     """Probabilities of the classes `known`, all others as `unknown`; None where they are no probabilities."""
-    p = np.fromiter(probabilities.values(), dtype=float)
+    if not isinstance(probabilities, Mapping):
+        return None
+    try:
+        p = np.fromiter(probabilities.values(), dtype=float)
+    except (TypeError, ValueError):
+        return None
     if not np.isfinite(p).all() or (p < 0.0).any() or not p.sum() > 0.0:
         return None
     named = dict.fromkeys(known, 0.0)

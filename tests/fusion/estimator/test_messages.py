@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
 
 from terrafusion.datasets.core.errors import DataError
-from terrafusion.datasets.core.messages import GnssSample, ImuSample
+from terrafusion.datasets.core.messages import (
+    CommandSample,
+    GnssSample,
+    ImuSample,
+    Message,
+    SteeringSample,
+    TerrainSample,
+    WheelSample,
+)
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.fusion.estimator.estimator import Estimator
 from terrafusion.fusion.replay import replay
@@ -43,3 +52,43 @@ def test_rows_with_missing_values_are_left_out(drive: Recording) -> None:
 def test_what_is_no_message_is_refused(drive: Recording) -> None:
     with pytest.raises(DataError, match="no message"):
         Estimator.for_vehicle("elevate").add(dataclasses)  # type: ignore[arg-type]
+
+
+SIDES = ("left", "right")
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        ImuSample(0, None, None),  # type: ignore[arg-type]
+        ImuSample(0, np.zeros(1), np.zeros(1)),
+        GnssSample(0, np.zeros(2), np.ones(3), 4, None, np.nan),
+        WheelSample(0, np.ones(2), ("a", "b"), "mps", None),
+        WheelSample(0, np.ones(1), SIDES, "mps", None),
+        WheelSample(0, np.ones(2), SIDES, "radps", np.ones(1)),
+        CommandSample(0, [], 0.0),  # type: ignore[arg-type]
+    ],
+    ids=lambda m: type(m).__name__,
+)
+def test_a_message_that_holds_something_else_is_refused(message: Message) -> None:
+    with pytest.raises(DataError):
+        Estimator.for_vehicle("elevate").add(message)
+
+
+def test_lists_will_do_and_odd_probabilities_are_none() -> None:
+    estimator = Estimator.for_vehicle("elevate")
+    estimator.add(ImuSample(0, [0.0, 0.0, 0.0], [0.0, 0.0, 9.8]))  # type: ignore[arg-type]
+    estimator.add(WheelSample(0, [1.0, 1.0], SIDES, "mps", None))  # type: ignore[arg-type]
+    estimator.add(TerrainSample(0, "mud", "camera", 3))  # type: ignore[arg-type]
+    estimator.add(TerrainSample(0, "mud", "camera", {"mud": None}))  # type: ignore[dict-item]
+    estimator.add(SteeringSample(0, None, ("front",)))  # type: ignore[arg-type]
+    assert len(estimator.imu.t_ns) == len(estimator.wheels.t_ns) == 1
+
+
+@pytest.mark.parametrize(
+    "start",
+    [("x", 0.0, 0.1, 0.1), (None, 0.0, 0.1, 0.1), ([0.0] * 3, 0.0, None, 0.1), ([1e300] * 3, 0.0, 1.0, 1.0)],
+)
+def test_a_start_that_is_none_is_refused(start: tuple[Any, ...]) -> None:
+    with pytest.raises(DataError):
+        Estimator.for_vehicle("elevate").set_start(*start)

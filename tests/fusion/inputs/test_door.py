@@ -109,6 +109,30 @@ def test_a_stamp_far_ahead_is_left_out_and_the_stream_goes_on(
     assert any(f"samples of {channel}" in note and "left out" in note for note in notes_of(estimator))
 
 
+@pytest.mark.parametrize("ahead_s", [1.5, 4.0, 6.0, 9.0])
+@pytest.mark.parametrize("channel", ["imu", "wheels"])
+def test_a_stamp_some_seconds_ahead_costs_nothing(running: Running, channel: str, ahead_s: float) -> None:
+    estimator, t = running.again(), running.now_ns + round(ahead_s * 1e9)
+    if channel == "imu":
+        estimator.add_imu(t, np.zeros(3), G)
+    else:
+        estimator.add_wheels(t, 1.0, 1.0)
+    assert finished(running, estimator) < 1e-9
+    assert any(f"1 samples of {channel} lay more than" in note for note in notes_of(estimator))
+
+
+def test_one_sample_that_is_seconds_old_delays_nothing(running: Running) -> None:
+    estimator = running.again()
+    estimator.add_imu(running.now_ns - 4 * 10**9, np.zeros(3), G)
+    assert finished(running, estimator) < 1e-9
+
+
+def test_a_slow_stream_has_no_leaps() -> None:
+    """Samples 2 s apart, as of the only sensor of a log, are each used when they come."""
+    leap = Leap(Newest())
+    assert all(leap.admitted((i * 2 * 10**9,)) for i in range(30))
+
+
 def test_a_pause_of_an_hour_takes_no_longer_than_a_second_and_its_sigma_covers_it(running: Running) -> None:
     estimator = running.again()
     widest, slowest, count = 0.0, 0.0, 0
