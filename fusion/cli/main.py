@@ -31,11 +31,13 @@ from terrafusion.fusion.cli import (
     sweep,
     terrain,
 )
+from terrafusion.fusion.cli.usage import CommandGroup, UsageError, usage_line
 
 app = typer.Typer(
     name="terrafusion",
     help="Terrain-aware localisation of ground robots, and diagnosis of the gap to their twins.",
-    no_args_is_help=True,
+    cls=CommandGroup,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     add_completion=False,
 )
@@ -80,7 +82,10 @@ app.add_typer(policy.app, name="policy")
 def main() -> None:
     """Run the command line: exit status 0 done, 1 a known error in one line, 2 wrong usage."""
     try:
-        app()
+        sys.exit(app(prog_name="terrafusion", standalone_mode=False))
+    except UsageError as error:
+        print(f"error: {usage_line(error)}", file=sys.stderr)
+        sys.exit(2)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)

@@ -7,7 +7,9 @@ from typing import Annotated
 
 import typer
 
-app = typer.Typer(help="The weighting policy: noise of each sensor by ground.", no_args_is_help=True)
+from terrafusion.fusion.cli.usage import CommandGroup
+
+app = typer.Typer(help="The weighting policy: noise of each sensor by ground.", cls=CommandGroup)
 
 
 @app.callback()

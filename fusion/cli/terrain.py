@@ -13,11 +13,12 @@ import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.usage import CommandGroup
 
 if TYPE_CHECKING:
     from terrafusion.fusion.training.detector_scores import DetectorScores
 
-app = typer.Typer(help="The terrain detector: train its model, score it.", no_args_is_help=True)
+app = typer.Typer(help="The terrain detector: train its model, score it.", cls=CommandGroup)
 
 
 @app.command("train")

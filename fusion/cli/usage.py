@@ -1,0 +1,49 @@
+"""Wrong usage of the command line, told in one line with the nearest match."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+from typing import Any
+
+import typer
+from typer.core import TyperGroup
+
+UsageError: Any = typer.BadParameter.__base__
+"""What typer raises for wrong usage; which module it comes from depends on typer's version."""
+
+
+class CommandGroup(TyperGroup):
+    """A group of commands that shows its help without words, and the nearest name for an unknown one."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Words before the command; without any, `--help`."""
+        return super().parse_args(ctx, args or ["--help"])
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command of the first word; wrong usage where there is none of that name."""
+        name = args[0]
+        if not name.startswith("-") and self.get_command(ctx, name) is None:
+            names = self.list_commands(ctx)
+            meant = nearest(name, names) or f": one of {', '.join(names)}"
+            ctx.fail(f"there is no command '{name}'{meant}")
+        return super().resolve_command(ctx, args)
+
+
+def nearest(word: str, known: Iterable[str]) -> str:
+    """`; did you mean ...?` with the known word most like `word`; empty where none is like it."""
+    found = difflib.get_close_matches(word, list(known), 1, 0.5)
+    return f"; did you mean {found[0]}?" if found else ""
+
+
+def usage_line(error: Any) -> str:
+    """The error of wrong usage in one line."""
+    context = error.ctx
+    if context is None:
+        return str(error.format_message())
+    text = error.format_message()
+    if type(error).__name__ == "NoSuchOption":
+        parameters = context.command.get_params(context)
+        known = [name for one in parameters for name in (*one.opts, *one.secondary_opts) if name[0] == "-"]
+        text = f"there is no option {error.option_name}{nearest(error.option_name, known)}"
+    return f"{' '.join(text.split())} (see `{context.command_path} --help`)"
