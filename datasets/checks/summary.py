@@ -67,14 +67,14 @@ def summarise_all(
 def _channels(recording: Recording) -> dict[str, dict[str, Any]]:
     start_ns = recording.start_ns
     found = {
-        name: _clock(start_ns, channel.t_ns) | {"ranges": _ranges(channel)}
+        name: clock(start_ns, channel.t_ns) | {"ranges": _ranges(channel)}
         for name, channel in recording.channels().items()
     }
     truth = recording.truth
     if truth is not None and len(truth):
         with np.errstate(over="ignore"):  # huge numbers are a finding
             path_m = truth.path_length_m()
-        found["truth"] = _clock(start_ns, truth.t_ns) | {
+        found["truth"] = clock(start_ns, truth.t_ns) | {
             "holds": list(recording.truth_channels),
             "frame": recording.truth_frame,
             "path_m": path_m if np.isfinite(path_m) and np.isfinite(truth.position_m[:, 0]).any() else None,
@@ -82,7 +82,8 @@ def _channels(recording: Recording) -> dict[str, dict[str, Any]]:
     return found
 
 
-def _clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
+def clock(start_ns: int, t_ns: TimesNs) -> dict[str, Any]:
+    """Samples, rate, span and gaps of times (N,) of a channel, N at least 1."""
     dt = np.diff(t_ns) * 1e-9
     period = float(np.median(dt)) if len(dt) else 0.0
     return {

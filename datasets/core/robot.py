@@ -154,7 +154,7 @@ class SensorNumbers:
 class Robot(SensorNumbers):
     """Section `robot`: what differs from the vehicle that it `extends`, a name or a file beside this one.
 
-    `imu_axes` are the sensor axes along body x, y, z; they turn the messages of a bag in the frame `imu_frame`.
+    `imu_axes` are the sensor axes along body x, y, z; they turn a bag's messages in the frame `imu_frame`.
     """
 
     extends: str = "generic"

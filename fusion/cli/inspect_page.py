@@ -34,13 +34,13 @@ def page_lines(page: dict[str, Any]) -> Iterator[Line]:
     """The whole page."""
     yield from _title(page)
     yield from _channels(page["channels"])
-    measured = list(_measured(page["measured"]))
+    measured = list(measured_texts(page["measured"]))
     if measured:
         yield "", ""
     for name, text in measured:
-        yield from _entry(name, "", text)
+        yield from entry(name, "", text)
     for note in page["notes"]:
-        yield from _entry("note", "dim", _note(note, page["recordings"]))
+        yield from entry("note", "dim", _note(note, page["recordings"]))
     yield from _findings(page)
 
 
@@ -62,8 +62,16 @@ def _title(page: dict[str, Any]) -> Iterator[Line]:
 
 
 def _channels(channels: dict[str, Any]) -> Iterator[Line]:
+    yield from clock_table(channels)
+    yield "", ""
+    for name, c in channels.items():
+        yield from entry(name, "", _ranges(c))
+
+
+def clock_table(channels: dict[str, Any], head: str = "channel") -> Iterator[Line]:
+    """Samples, rates and gaps of channels (or of topics), a row each."""
     pooled = any("recordings" in c for c in channels.values())
-    heads = ["channel", "samples", "rate Hz", "recordings" if pooled else "span s", "gaps", "longest s"]
+    heads = [head, "samples", "rate Hz", "recordings" if pooled else "span s", "gaps", "longest s"]
     rows = [heads]
     for name, c in channels.items():
         rate, gap = c["rate_hz"], c["longest_gap_s"]
@@ -82,9 +90,6 @@ def _channels(channels: dict[str, Any]) -> Iterator[Line]:
         cells = [row[0].ljust(max(widths[0], INDENT - 2))]
         cells += [cell.rjust(width) for cell, width in zip(row[1:], widths[1:], strict=True)]
         yield ("bold" if number == 0 else ""), "  ".join(cells).rstrip()
-    yield "", ""
-    for name, c in channels.items():
-        yield from _entry(name, "", _ranges(c))
 
 
 def _ranges(channel: dict[str, Any]) -> str:
@@ -109,7 +114,8 @@ def _words(counts: dict[str, int]) -> str:
     return ", ".join([*words, *([f"{omitted} more"] if omitted else [])])
 
 
-def _measured(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def measured_texts(measured: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    """What is measured between the channels: a word and a text each."""
     gravity, yaw, sigma = measured["gravity"], measured["yaw"], measured["sigma_m"]
     if gravity:
         vector = ", ".join(f"{value:.2f}" for value in gravity["mean_mps2"])
@@ -149,15 +155,16 @@ def _findings(page: dict[str, Any]) -> Iterator[Line]:
         yield "green", "no findings"
     for f in page["findings"]:
         style = "red" if f["severity"] == "error" else "yellow"
-        yield from _entry(f["severity"], style, f"{f['channel']}: {f['what']} [{f['code']}]")
+        yield from entry(f["severity"], style, f"{f['channel']}: {f['what']} [{f['code']}]")
         if "recordings" in f:
-            yield from _entry("", "", f"in {f['recordings']} of {page['recordings']}, first in #{f['first']}")
-        yield from _entry("", "", f["evidence"])
+            yield from entry("", "", f"in {f['recordings']} of {page['recordings']}, first in #{f['first']}")
+        yield from entry("", "", f["evidence"])
         remedy = "convert --apply-fixes" if f["repairable"] else "to do"
-        yield from _entry("", "", f"{_glued(remedy)}: {f['fix']}")
+        yield from entry("", "", f"{_glued(remedy)}: {f['fix']}")
 
 
-def _entry(name: str, style: str, text: str) -> Iterator[Line]:
+def entry(name: str, style: str, text: str) -> Iterator[Line]:
+    """A word in a style of its own, and its text beside it."""
     yield from _wrapped(name.ljust(INDENT - 1), style, f" {text}", INDENT)
 
 

@@ -22,6 +22,7 @@ from terrafusion.fusion.cli import (
     fetch,
     gap,
     gap_blind,
+    init,
     inspect,
     live,
     policy,
@@ -62,6 +63,7 @@ def options(
 
 
 app.command("demo")(demo.demo)
+app.command("init")(init.init)
 app.command("inspect")(inspect.inspect)
 app.command("fetch")(fetch.fetch)
 app.command("convert")(convert.convert)

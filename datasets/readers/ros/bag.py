@@ -59,17 +59,24 @@ def read_bag(request: Request, open_container: Callable[[Path], BagContainer], r
         raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None
 
 
-def chosen_topics(container: BagContainer, request: Request) -> tuple[dict[str, BagTopic], list[str]]:
-    """The topic of each channel, and notes; raises as `choose_topics` does."""
+def chosen_topics(
+    container: BagContainer,
+    request: Request,
+    decide: Callable[[str, list[BagTopic]], BagTopic] | None = None,
+) -> tuple[dict[str, BagTopic], list[str]]:
+    """The topic of each channel, and notes; raises as `choose_topics` does.
+
+    `decide` is asked about several sensors of one kind with data; without it they are an error.
+    """
     path, rig = request.path, request.rig
     joints = joints_given(request.topics)
     return choose_topics(
-        _topics_of(container),
+        topics_of(container),
         file=path,
         user=request.topics,
         usual=rig.topics if rig else None,
         is_wheel_joints=lambda topic: bool(wheel_joints(_joints(container, topic), joints)),
-        one_of=functools.partial(_one_sensor, container, path, rig),
+        one_of=functools.partial(_one_sensor, container, path, rig, decide),
         is_steering_joints=lambda topic: bool(steering_joints(_joints(container, topic))),
     )
 
@@ -94,7 +101,7 @@ def recording_of(container: BagContainer, request: Request) -> Recording:
     if "gnss" not in streams:
         streams.pop("gnss_velocity", None)
     if not set(streams) - {"datum", "gnss_velocity"}:
-        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in _topics_of(container)) or "none"
+        seen = ", ".join(f"{t.name} ({t.msgtype})" for t in topics_of(container)) or "none"
         raise DataError(
             f"no topic of a type this library uses; topics here: {seen}",
             file=path,
@@ -156,7 +163,8 @@ def _usual_frame(stream: Stream) -> str:
     return str(names.most_common(1)[0][0]) if names else ""
 
 
-def _topics_of(container: BagContainer) -> list[BagTopic]:
+def topics_of(container: BagContainer) -> list[BagTopic]:
+    """The topics with messages, by name."""
     counts: Counter[tuple[str, str]] = Counter()
     for source in container.sources:
         counts[source.topic, source.msgtype] += source.count
@@ -171,7 +179,12 @@ def _joints(container: BagContainer, topic: str) -> list[str]:
 
 
 def _one_sensor(
-    container: BagContainer, path: Path, rig: Rig | None, kind: str, rivals: list[BagTopic]
+    container: BagContainer,
+    path: Path,
+    rig: Rig | None,
+    decide: Callable[[str, list[BagTopic]], BagTopic] | None,
+    kind: str,
+    rivals: list[BagTopic],
 ) -> BagTopic:
     """The topic of a sensor among several of one type: the one with data, else that in the robot's frame.
 
@@ -187,6 +200,8 @@ def _one_sensor(
         found = mounted if len(mounted) == 1 else found
     if len(found) == 1:
         return found[0]
+    if decide is not None and found:
+        return decide(kind, found)
     listed = ", ".join(f"{topic.name} ({_rate(streams[keys[topic.name]])})" for topic in rivals)
     raise DataError(
         f"{len(rivals)} sensors of one kind: {listed}",

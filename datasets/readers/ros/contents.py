@@ -1,0 +1,90 @@
+"""Topics of a bag whose robot is not known yet, and between which of them only the user can choose."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from terrafusion.datasets.core.arrays import TimesNs
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.readers.formats import Request, format_of
+from terrafusion.datasets.readers.open import find_log
+from terrafusion.datasets.readers.ros import ros1, ros2
+from terrafusion.datasets.readers.ros.bag import chosen_topics, topics_of
+from terrafusion.datasets.readers.ros.raw import BagContainer, BagError
+from terrafusion.datasets.readers.ros.streams import foreign, read_streams
+from terrafusion.datasets.readers.ros.topics import TYPES, BagTopic
+
+
+@dataclass(frozen=True)
+class TopicContents:
+    """A topic of a type that is read, and the times (N,) of its messages in order: stamps, else receipt."""
+
+    name: str
+    msgtype: str
+    t_ns: TimesNs
+
+
+@dataclass(frozen=True)
+class BagContents:
+    """Topics of a bag, and by channel those sensors with data between which only the user can choose.
+
+    `unused` are name and type of the topics that no channel is made of.
+    """
+
+    topics: tuple[TopicContents, ...]
+    unused: tuple[str, ...]
+    rivals: dict[str, tuple[str, ...]]
+
+
+def bag_contents(log: str, topics: Mapping[str, str] | None = None) -> BagContents | None:
+    """Contents of a bag; None for a log of another format.
+
+    Args:
+        log: path or catalogue name.
+        topics: what the user has chosen, by channel.
+
+    Raises:
+        DataError: no such log, a broken bag, or a topic asked for that is not there.
+    """
+    path, _ = find_log(log)
+    form = format_of(path).name
+    if form not in ("ros1", "ros2"):
+        return None
+    rivals: dict[str, tuple[str, ...]] = {}
+
+    def open_to_the_user(kind: str, found: list[BagTopic]) -> BagTopic:
+        rivals[kind] = tuple(topic.name for topic in found)
+        return found[0]
+
+    with _opened(path, form == "ros1") as container:
+        there = topics_of(container)
+        chosen_topics(container, Request(path, topics=topics), open_to_the_user)
+        usable = [topic for topic in there if any(topic.msgtype in types for types in TYPES.values())]
+        streams = read_streams(container, {(t.name, t.msgtype): ("header.stamp",) for t in usable})
+    contents = []
+    for topic in usable:
+        stream = streams[topic.name, topic.msgtype]
+        t_ns = stream.receipt_ns if stream.header_ns is None else stream.header_ns
+        contents.append(TopicContents(topic.name, topic.msgtype, np.sort(t_ns)))
+    unused = tuple(f"{topic.name} ({topic.msgtype})" for topic in there if topic not in usable)
+    return BagContents(tuple(contents), unused, rivals)
+
+
+@contextmanager
+def _opened(path: Path, ros1_bag: bool) -> Iterator[BagContainer]:
+    remedy = ros1.REMEDY if ros1_bag else ros2.REMEDY
+    try:
+        with foreign():
+            container = ros1.Ros1File(path) if ros1_bag else ros2.open_container(path)
+        try:
+            yield container
+        finally:
+            container.close()
+    except BagError as error:
+        what = f"cannot be read as a ROS bag: {error}"
+        raise DataError(what, file=path, channel=error.topic, remedy=remedy) from None

@@ -1,0 +1,173 @@
+"""`terrafusion init LOG`: from the first log of a robot to its vehicle file and a first verdict."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from terrafusion.fusion.cli.common import (
+    ColumnsOption,
+    LogArgument,
+    RepairClockOption,
+    StampsOption,
+    TopicOption,
+    clock_accepted,
+    parse_topics,
+    progress_bar,
+    reading,
+)
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.core.recording import Recording
+    from terrafusion.datasets.core.sensors import Rig
+    from terrafusion.fusion.init.vehicle import FirstVehicle
+
+NumberOption = str | None
+
+
+def _number(flag: str, what: str, metavar: str = "METRES") -> Any:
+    return typer.Option(flag, metavar=metavar, help=what)
+
+
+def init(
+    log: LogArgument,
+    out: Annotated[Path, typer.Option("--out", help="The vehicle file to write.")] = Path("my_robot.yaml"),
+    vehicle_name: Annotated[
+        str | None, typer.Option("--vehicle-name", help="Name of the robot. Default: that of the file.")
+    ] = None,
+    drive: Annotated[
+        str | None,
+        typer.Option(help="differential, skid_steer, tracked, ackermann or four_wheel_steer."),
+    ] = None,
+    wheel_radius: Annotated[
+        NumberOption, _number("--wheel-radius", "Wheel radius; without it the fixes give it.")
+    ] = None,
+    track: Annotated[NumberOption, _number("--track", "Distance of left and right wheels.")] = None,
+    wheelbase: Annotated[NumberOption, _number("--wheelbase", "Distance of the axles, if it steers.")] = None,
+    antenna: Annotated[
+        NumberOption, _number("--antenna", "GNSS antenna from the middle of the wheels' contacts.", "X,Y,Z")
+    ] = None,
+    imu_position: Annotated[NumberOption, _number("--imu-position", "IMU, likewise.", "X,Y,Z")] = None,
+    mass: Annotated[NumberOption, _number("--mass", "Mass; only the twin uses it.", "KG")] = None,
+    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
+    no_verdict: Annotated[
+        bool, typer.Option("--no-verdict", help="Write the file only; do not replay the log with it.")
+    ] = False,
+    topic: TopicOption = None,
+    stamps: StampsOption = "header",
+    columns: ColumnsOption = None,
+    repair_clock: RepairClockOption = False,
+) -> None:
+    """Write the vehicle file of a robot from its first log, and replay the log with it.
+
+    Lists what the log holds; measures mounting of the IMU, wheel radius, effective track, delays and
+    antenna where the log shows them; asks for the rest on a terminal. What nobody knows is assumed as of the
+    generic vehicle, and every assumption is printed. Numbers are taken as measured; 0.4:data_sheet says
+    where one is from.
+
+    Example: terrafusion init drive.mcap --out my_robot.yaml
+
+    Example: terrafusion init drive.mcap --topic imu=/front/imu --drive tracked --track 0.62
+    """
+    from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines
+    from terrafusion.fusion.cli.inspect_page import print_lines
+    from terrafusion.fusion.init.answers import Answers
+    from terrafusion.fusion.init.vehicle import first_vehicle
+
+    _check_out(out, force)
+    texts = {
+        "drive": drive,
+        "wheel_radius_m": wheel_radius,
+        "track_m": track,
+        "wheelbase_m": wheelbase,
+        "antenna_m": antenna,
+        "imu_m": imu_position,
+        "mass_kg": mass,
+    }
+    given: dict[str, Any] = {name: _parsed(text, name) for name, text in texts.items() if text is not None}
+    answers = Answers(vehicle_name or out.stem, **given)
+    reading(None, topic, stamps, columns, repair_clock)  # reports wrong usage before anything is read
+    topics = choose_sensors(log, parse_topics(topic))
+
+    def open_log(rig: Rig | None) -> Recording:
+        from terrafusion.datasets.readers import open_recording
+
+        entries = [f"{channel}={name}" for channel, name in topics.items()]
+        recording = open_recording(log, **reading(rig, entries, stamps, columns, repair_clock))
+        return clock_accepted(recording) if repair_clock else recording
+
+    print_lines(contents_lines(open_log(None)))
+    answers = ask(answers, topics)
+    with progress_bar("calibrating the sensors") as progress:
+        found = first_vehicle(open_log, answers, progress)
+    _write(out, log, found)
+    print_lines(result_lines(found, out))
+    if not no_verdict:
+        print()
+        for line in _verdict(found, out):
+            print(line)
+    print()
+    again = _options(topics, stamps, columns, repair_clock)
+    command = f"terrafusion replay {shlex.quote(log)} --vehicle {shlex.quote(str(out))}{again} --out results"
+    if found.repaired:
+        fixed = f"{Path(log).stem}_fixed"
+        convert = f"terrafusion convert {shlex.quote(log)} {shlex.quote(fixed)} --apply-fixes"
+        print(f"next: {convert} --vehicle {shlex.quote(str(out))}{again}")
+        command = f"terrafusion replay {shlex.quote(fixed)} --vehicle {shlex.quote(str(out))} --out results"
+    print(f"{'then' if found.repaired else 'next'}: {command}")
+
+
+def _parsed(text: str, name: str) -> Any:
+    """An answer; a malformed one is wrong usage (exit status 2)."""
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.fusion.init.answers import parse
+    from terrafusion.fusion.init.geometry import FLAGS
+
+    try:
+        return parse(text, name)
+    except ConfigError as error:
+        raise typer.BadParameter(str(error), param_hint=FLAGS[name]) from None
+
+
+def _check_out(out: Path, force: bool) -> None:
+    """Refuse an unusable file before anything is read."""
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.datasets.core.files import check_folder
+
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
+    if out.is_dir():
+        raise ConfigError("is a folder", file=out, remedy="give the name of a file")
+    if out.exists() and not force:
+        raise ConfigError("exists already", file=out, remedy="give another --out, or --force to overwrite it")
+    check_folder(out.parent)
+
+
+def _write(out: Path, log: str, found: FirstVehicle) -> None:
+    from terrafusion.fusion.init.draft import write_draft
+
+    command = " ".join(["terrafusion", *map(shlex.quote, sys.argv[1:])])
+    write_draft(out, found.draft, f"Vehicle file of the log '{found.recording.name}', written by: {command}")
+
+
+def _options(topics: dict[str, str], stamps: str, columns: Path | None, repair_clock: bool) -> str:
+    """The options by which another command reads the log alike; the file holds most topics itself."""
+    words = [f"--topic {shlex.quote(f'{k}={v}')}" for k, v in topics.items() if k.startswith("joint.")]
+    words += [f"--stamps {stamps}"] if stamps != "header" else []
+    words += [f"--columns {shlex.quote(str(columns))}"] if columns is not None else []
+    words += ["--repair-clock"] if repair_clock else []
+    return "".join(f" {word}" for word in words)
+
+
+def _verdict(found: FirstVehicle, out: Path) -> list[str]:
+    """The verdict on a replay of the log with the file."""
+    from terrafusion.datasets.core.errors import errors_of
+    from terrafusion.fusion.replay import replay
+
+    with progress_bar("replaying") as progress, errors_of(found.recording.name):
+        result = replay(found.recording, vehicle=out, findings=found.findings, progress=progress)
+    return result.verdict.lines()

@@ -1,0 +1,141 @@
+"""What `terrafusion init` shows and asks."""
+
+from __future__ import annotations
+
+import dataclasses
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+import typer
+
+from terrafusion.fusion.cli.inspect_page import Line, clock_table, entry, measured_texts, print_lines
+
+if TYPE_CHECKING:
+    from terrafusion.datasets.core.recording import Recording
+    from terrafusion.fusion.init.answers import Answers
+    from terrafusion.fusion.init.vehicle import FirstVehicle
+
+QUESTIONS = {
+    "drive": "how it turns: differential, skid_steer, tracked, ackermann or four_wheel_steer",
+    "track_m": "distance of left and right wheels, m",
+    "antenna_m": "GNSS antenna from the middle of the wheels' contacts: forward,left,up in m",
+    "mass_kg": "mass, kg",
+}
+"""Asked on a terminal, in this order, where no option gives the answer."""
+
+
+def interactive() -> bool:
+    """Whether somebody can answer."""
+    return sys.stdin.isatty() and sys.stdout.isatty()
+
+
+def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
+    """List the topics of a bag, and let the user choose among several sensors of a kind.
+
+    Returns:
+        topic by channel, as given and as chosen.
+
+    Raises:
+        DataError: several of a kind, and nobody to ask.
+    """
+    from terrafusion.datasets.checks.summary import clock
+    from terrafusion.datasets.core.errors import DataError
+    from terrafusion.datasets.readers.ros.contents import bag_contents
+
+    contents = bag_contents(log, topics)
+    if contents is None:
+        return topics
+    start_ns = min((int(topic.t_ns[0]) for topic in contents.topics), default=0)
+    clocks = {topic.name: clock(start_ns, topic.t_ns) for topic in contents.topics}
+    print_lines(clock_table(clocks, "topic"))
+    if contents.unused:
+        print_lines(entry("not used", "dim", ", ".join(contents.unused)))
+    chosen = dict(topics)
+    for kind, names in contents.rivals.items():
+        rates = [f"{name} ({clocks[name]['rate_hz'] or 0.0:.3g} Hz)" for name in names]
+        if not interactive():
+            raise DataError(
+                f"{len(names)} sensors of one kind: {', '.join(rates)}",
+                file=log,
+                channel=kind,
+                remedy=f"choose with --topic {kind}={names[0]}",
+            )
+        print(f"{kind}: which of these?")
+        for number, shown in enumerate(rates, 1):
+            print(f"  {number}  {shown}")
+        chosen[kind] = names[typer.prompt("number", type=click.IntRange(1, len(names))) - 1]
+    return chosen
+
+
+def contents_lines(recording: Recording) -> Iterator[Line]:
+    """Channels with rates and gaps, and what the reader noted."""
+    from terrafusion.datasets.checks.measures import Measures
+    from terrafusion.datasets.checks.summary import summarise
+
+    page = summarise(recording, Measures(), [])
+    yield from clock_table(page["channels"])
+    yield "", ""
+    for note in page["notes"]:
+        yield from entry("note", "dim", note)
+
+
+def ask(answers: Answers, topics: dict[str, str]) -> Answers:
+    """The answers, completed on a terminal; Enter leaves a number to the assumption."""
+    held = {kind: name for kind, name in topics.items() if not kind.startswith("joint.")}
+    found: dict[str, Any] = {"topics": held}
+    if interactive():
+        print(
+            "What the log cannot tell (Enter: not known, assumed as of the generic vehicle; add :data_sheet"
+        )
+        print("to a number that is not measured):")
+    for name, question in QUESTIONS.items() if interactive() else ():
+        if getattr(answers, name) is None:
+            answer = _asked(name, question)
+            found |= {} if answer is None else {name: answer}
+    return dataclasses.replace(answers, **found)
+
+
+def _asked(name: str, question: str) -> Any:
+    """The answer, asked for again while it is malformed; None for none."""
+    from terrafusion.datasets.core.errors import ConfigError
+    from terrafusion.fusion.init.answers import parse
+
+    while text := typer.prompt(f"  {question}", default="", show_default=False).strip():
+        try:
+            return parse(text, name)
+        except ConfigError as error:
+            print(f"  {error}")
+    return None
+
+
+def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
+    """What was measured, repaired and assumed, and the file."""
+    from terrafusion.datasets.core.json_text import finite
+    from terrafusion.fusion.init.geometry import assumed_lines
+
+    for name, text in measured_texts(finite(dataclasses.asdict(found.measured))):
+        yield from entry(name, "", text)
+    if found.calibration is not None:
+        missing = [n for n in found.calibration.unobserved() if n not in found.draft]
+        if missing:
+            yield from entry(
+                "not seen", "dim", f"{', '.join(missing)}: taken as usual, learned while driving"
+            )
+    for note in found.notes:
+        yield from entry("note", "dim", note)
+    for finding in found.repaired:
+        yield from entry("repaired", "yellow", f"{finding.channel}: {finding.what}; {finding.fix}")
+    for finding in found.findings:
+        yield from entry(
+            finding.severity, "yellow", f"{finding.channel}: {finding.what} ({finding.evidence})"
+        )
+    for text in assumed_lines(found.draft):
+        yield from entry("assumed", "yellow", text)
+    yield "", ""
+    for line in out.read_text(encoding="utf-8").splitlines():
+        yield "", line
+    yield "", ""
+    yield "", f"written to {out}"

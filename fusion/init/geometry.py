@@ -1,0 +1,172 @@
+"""Lines of a vehicle file for a robot's geometry: given by the user, by the log, measured, or assumed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+from terrafusion.datasets.checks.measures import Measures, SpeedRatio, YawFit
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.datasets.core.sensors import STEERED_DRIVES
+from terrafusion.fusion.config.assumptions import NUMBERS
+from terrafusion.fusion.config.sensor_config import imu_kind
+from terrafusion.fusion.init.answers import Answers
+from terrafusion.fusion.init.draft import Draft, DraftLine
+from terrafusion.twin.model.vehicle import VehicleParams
+
+LEAST_RADIUS_SIGMA, LEAST_TRACK_SIGMA = 0.005, 0.03
+"""Relative 1 sigma: slip of firm ground, and of the track that a robot seems to have on it (assumed)."""
+LEAST_RADIUS_M, MOST_RADIUS_M = 0.03, 1.0
+"""Wheels of ground robots; a radius beyond is a unit other than rad/s."""
+LEAST_FACTOR, MOST_FACTOR = 0.05, 2.0
+"""A yaw factor beyond shows a wrong track or swapped sides, of which the log checks tell."""
+FLAGS = {
+    "wheel_radius_m": "--wheel-radius",
+    "track_m": "--track",
+    "wheelbase_m": "--wheelbase",
+    "antenna_m": "--antenna",
+    "imu_m": "--imu-position",
+    "mass_kg": "--mass",
+    "drive": "--drive",
+}
+
+
+def geometry_lines(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
+    """The lines of drive, wheels, track, sensors' places and mass.
+
+    Args:
+        recording: the log.
+        measured: with the rig of `base` and the radius of `answers`.
+        answers: what the user said.
+        base: the vehicle that the file extends.
+
+    Raises:
+        DataError: the radius that fits the fixes is none of a wheel.
+    """
+    drive = _drive(recording, answers, base)
+    lines = {"drive": drive}
+    lines |= _radius(recording, measured, answers, base)
+    lines |= _track(recording, measured.yaw, answers, base, str(drive.value))
+    if drive.value in STEERED_DRIVES:
+        lines["wheelbase_m"] = _given(
+            "wheelbase_m",
+            answers.wheelbase_m,
+            recording.overrides.wheelbase_m,
+            base.body.wheelbase_m,
+            "m",
+            base,
+        )
+    if recording.gnss is not None:
+        place = base.sensors.gnss.antenna_m
+        lines["antenna_m"] = _given(
+            "antenna_m", answers.antenna_m, recording.overrides.antenna_m, place, "m", base
+        )
+    if imu_kind(recording.imu) == "six_axis":
+        place = base.sensors.imu.position_m
+        lines["imu_m"] = _given("imu_m", answers.imu_m, recording.overrides.imu_m, place, "m", base)
+    lines["mass_kg"] = _given("mass_kg", answers.mass_kg, None, base.body.mass_kg, "kg", base)
+    return lines
+
+
+def _drive(recording: Recording, answers: Answers, base: VehicleParams) -> DraftLine:
+    if answers.drive is not None:
+        return DraftLine(answers.drive, "given")
+    if recording.overrides.drive is not None:
+        return DraftLine(recording.overrides.drive, "as the log states")
+    if recording.steering is not None:
+        rear = bool(recording.steering.axle_angles_rad()[:, 1].any())
+        return DraftLine("four_wheel_steer" if rear else "ackermann", "the log has steering angles")
+    return DraftLine(base.drive.type, f"assumed, as of '{base.name}'; else give {FLAGS['drive']}")
+
+
+def _radius(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
+    """The radius; the fixes give it where neither user nor log does. None for wheels in m/s."""
+    name, wheels, stated = "wheel_radius_m", recording.wheels, recording.overrides.wheel_radius_m
+    given = answers.wheel_radius_m
+    if wheels is None or (wheels.unit == "mps" and given is None):
+        return {}
+    fit = best_ratio(measured)
+    if given is None and stated is None and fit is not None:
+        source, ratio = fit
+        radius = ratio.ratio * base.odometry.wheel_radius_m
+        if not LEAST_RADIUS_M < radius < MOST_RADIUS_M:
+            raise DataError(
+                f"a wheel radius of {radius:.4g} m would fit the {source}",
+                file=recording.name,
+                channel="wheels",
+                remedy="are its speeds in rad/s? else give --wheel-radius: the log checks then name the unit",
+            )
+        sigma = max(0.5 * (ratio.high - ratio.low) / 1.96, LEAST_RADIUS_SIGMA * ratio.ratio)
+        number = KnownNumber(
+            round(radius, 4), "calibrated", round(sigma * base.odometry.wheel_radius_m, 4), (recording.name,)
+        )
+        return {
+            name: DraftLine(number, f"m; path of the {source} over that of the wheels, usual slip included")
+        }
+    return {name: _given(name, given, stated, base.odometry.wheel_radius_m, "m", base)}
+
+
+def best_ratio(measured: Measures) -> tuple[str, SpeedRatio] | None:
+    """Path over ground over path by wheels: by the fixes, else by the truth; the source first."""
+    for source in ("gnss", "truth"):
+        if source in measured.speed_ratio:
+            return source, measured.speed_ratio[source]
+    return None
+
+
+def _track(
+    recording: Recording, yaw: YawFit | None, answers: Answers, base: VehicleParams, drive: str
+) -> Draft:
+    """The track; and the yaw factor, where the gyro shows the effective one."""
+    stated = recording.overrides.track_m
+    effective = yaw.effective_track_m if yaw is not None and drive not in STEERED_DRIVES else None
+    if effective is None or yaw is None:
+        return {"track_m": _given("track_m", answers.track_m, stated, base.odometry.track_m, "m", base)}
+    windows = max(yaw.seconds / 0.5 - 2.0, 1.0)
+    share = max(math.sqrt((1.0 / yaw.r**2 - 1.0) / windows), LEAST_TRACK_SIGMA)
+    logs = (recording.name,)
+    if answers.track_m is None and stated is None and drive == "differential":
+        number = KnownNumber(round(effective, 4), "calibrated", round(share * effective, 4), logs)
+        line = DraftLine(number, "m; side speeds against the gyro")
+    else:
+        line = _given("track_m", answers.track_m, stated, base.odometry.track_m, "m", base)
+    assert isinstance(line.value, KnownNumber)
+    factor = line.value.number / effective
+    if not LEAST_FACTOR < factor < MOST_FACTOR:
+        return {"track_m": line}
+    known = KnownNumber(round(factor, 4), "calibrated", round(share * factor, 4), logs)
+    comment = f"true over geometric yaw rate: effective track {effective:.3f} m by the gyro"
+    return {"track_m": line, "yaw_factor": DraftLine(known, comment)}
+
+
+def _given(
+    name: str,
+    answer: KnownNumber | None,
+    stated: float | tuple[float, ...] | None,
+    usual: float | tuple[float, ...],
+    unit: str,
+    base: VehicleParams,
+) -> DraftLine:
+    """The line of a number by the first who knows it: the log, the user; else the assumption."""
+    axes = "; forward, left, up" if isinstance(usual, tuple) else ""
+    if answer is not None:
+        other = (
+            f"; the log states {stated}, which counts for it" if stated not in (None, answer.value) else ""
+        )
+        return DraftLine(answer, f"{unit}{axes}; given{other}")
+    if stated is not None:
+        return DraftLine(KnownNumber(stated, "assumed"), f"{unit}{axes}; as the log states")
+    spread = f" +- {NUMBERS[name].sigma:g}" if name in NUMBERS else ""
+    words = f"{unit}{axes}; assumed{spread}, as of '{base.name}'; else give {FLAGS[name]}"
+    return DraftLine(KnownNumber(usual, "assumed"), words + ("; only the twin uses it" * (name == "mass_kg")))
+
+
+def assumed_lines(draft: Draft) -> Iterator[str]:
+    """What the file assumes, in a sentence each."""
+    for name, line in draft.items():
+        if line.assumed or line.comment.startswith("assumed"):
+            value = line.value.value if isinstance(line.value, KnownNumber) else line.value
+            shown = list(value) if isinstance(value, tuple) else value
+            yield f"{name} = {shown} ({line.comment})"

@@ -1,0 +1,173 @@
+"""A vehicle file for a robot that the library has never seen, from one log of it.
+
+    open the log -> geometry -> mounting of the IMU -> calibrate its sensors -> lines of the file
+
+Each step opens or replays the log with the file as it is by then, so that what is written is what was used.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from terrafusion.datasets.checks import Finding, repair, run_checks
+from terrafusion.datasets.checks.measures import Measures, measure
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber
+from terrafusion.datasets.core.sensors import Rig
+from terrafusion.fusion.init.answers import Answers
+from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
+from terrafusion.fusion.init.geometry import geometry_lines
+from terrafusion.fusion.sensor_calibration import SensorCalibration, calibrate_sensors
+from terrafusion.twin.model.library import is_named
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
+
+Open = Callable[[Rig | None], Recording]
+"""Reads the log with the geometry of a robot."""
+COMMENTS = {
+    "antenna_m": "m; forward, left, up; found from the fixes",
+    "gyro_scale": "true yaw rate over that of the gyro, less one",
+    "gyro_bias_radps": "rad/s; reading of gyro z at rest",
+    "yaw_factor": "true over geometric yaw rate of the wheels",
+    "wheel_scale": "true distance over that of the wheels, less one; usual slip included",
+    "gnss_delay_s": "s; lateness of the stamps of the fixes",
+    "wheel_delay_s": "s; lateness of the stamps of the wheels",
+    "imu_yaw_rad": "rad; angle of the IMU about z, to the left",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FirstVehicle:
+    """The file, and the log as it was used.
+
+    Attributes:
+        draft: lines of the file.
+        recording: the log read with them, repaired where `repaired` is not empty.
+        repaired: findings that the file cannot hold; `terrafusion convert --apply-fixes` repairs them.
+        findings: what the log checks still find.
+        measured: between the channels of the log as it was first read.
+        calibration: of the sensors; None where the log does not allow one.
+        notes: what was not measured, and why.
+    """
+
+    draft: Draft
+    recording: Recording
+    repaired: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
+    measured: Measures
+    calibration: SensorCalibration | None
+    notes: tuple[str, ...]
+
+
+def base_of(recording: Recording) -> VehicleParams:
+    """The vehicle that the file extends: the one that the log names, where it is known, else the generic."""
+    named = recording.vehicle and is_named("vehicles", recording.vehicle)
+    return load_vehicle(str(recording.vehicle) if named else "generic")
+
+
+def first_vehicle(
+    open_log: Open,
+    answers: Answers,
+    progress: Callable[[float], None] | None = None,
+) -> FirstVehicle:
+    """Measure what the log shows, and lay out the file.
+
+    Raises:
+        DataError: the log cannot be read, or is wrong in a way that no repair removes.
+        ConfigError: an answer is out of range.
+    """
+    recording = open_log(load_vehicle("generic").rig())
+    base = base_of(recording)
+    rig = _with_radius(base.rig(), answers)
+    recording = open_log(rig)
+    measured = measure([recording], rig)
+    named = DraftLine(base.name, "what is not below is as of this vehicle")
+    draft: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
+    draft |= geometry_lines(recording, measured, answers, base)
+    if answers.topics:
+        draft["topics"] = DraftLine(answers.topics, "chosen among several sensors of a kind")
+    with tempfile.TemporaryDirectory(prefix="terrafusion-") as folder:
+        file = Path(folder) / "vehicle.yaml"
+        recording, repaired, findings = _mounted(open_log, draft, file)
+        calibration, notes = _calibrated(recording, write_draft(file, draft, "draft"), progress)
+    if calibration is not None:
+        draft |= _learned_lines(calibration, draft)
+    return FirstVehicle(draft, recording, repaired, findings, measured, calibration, notes)
+
+
+def _with_radius(rig: Rig, answers: Answers) -> Rig:
+    radius, track = answers.wheel_radius_m, answers.track_m
+    return dataclasses.replace(
+        rig,
+        wheel_radius_m=rig.wheel_radius_m if radius is None else radius.number,
+        track_m=rig.track_m if track is None else track.number,
+    )
+
+
+def _mounted(
+    open_log: Open, draft: Draft, file: Path
+) -> tuple[Recording, tuple[Finding, ...], tuple[Finding, ...]]:
+    """The log read with the draft, which gets the axes of the IMU; else repaired. Errors are gone after it.
+
+    Raises:
+        DataError: one that no repair removes.
+    """
+    recording, rig = _read(open_log, draft, file)
+    findings = run_checks(recording, rig)
+    axes = next((finding for finding in findings if finding.imu_axes), None)
+    if axes is not None:
+        turned = dict(draft)
+        turned["imu_axes"] = DraftLine(axes.imu_axes, f"its axes along body x, y, z; {axes.evidence}")
+        turned["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the messages that this turns")
+        recording_turned, rig = _read(open_log, turned, file)
+        found = run_checks(recording_turned, rig)
+        if not any(finding.imu_axes for finding in found):  # the reader of the log turns by the file
+            draft |= turned
+            recording, findings = recording_turned, found
+    repaired: list[Finding] = []
+    if any(finding.severity == "error" for finding in findings):
+        recording, repaired = repair(recording, rig)
+        findings = run_checks(recording, rig)
+    for finding in findings:
+        if finding.severity == "error":
+            raise DataError(
+                f"{finding.what} ({finding.evidence})",
+                file=recording.name,
+                channel=finding.channel,
+                remedy=f"{finding.fix}; then run this again",
+            )
+    return recording, tuple(repaired), tuple(findings)
+
+
+def _read(open_log: Open, draft: Draft, file: Path) -> tuple[Recording, Rig]:
+    rig = load_vehicle(write_draft(file, draft, "draft")).rig()
+    return open_log(rig), rig
+
+
+def _calibrated(
+    recording: Recording, file: Path, progress: Callable[[float], None] | None
+) -> tuple[SensorCalibration | None, tuple[str, ...]]:
+    """What the log tells of its sensors, and notes."""
+    if recording.gnss is None or not len(recording.gnss):
+        return None, ("no fixes: wheel scale, antenna, gyro scale and delays are not measured",)
+    try:
+        return calibrate_sensors([recording], file, progress=progress), ()
+    except DataError as error:
+        return None, (f"the sensors are not calibrated: {error.what}",)
+
+
+def _learned_lines(calibration: SensorCalibration, draft: Draft) -> Draft:
+    """Lines of the numbers that the log tells; the user's own and those measured directly stay."""
+    found: Draft = {}
+    for name, number in vars(calibration.known()).items():
+        if number is None or number.known != "calibrated":
+            continue
+        before = draft.get(name)
+        if before is not None and isinstance(before.value, KnownNumber) and not before.assumed:
+            continue
+        found[name] = DraftLine(dataclasses.replace(number, gained_nats=None), COMMENTS[name])
+    return found

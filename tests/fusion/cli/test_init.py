@@ -1,0 +1,158 @@
+"""`terrafusion init`: the first log of a robot gives its vehicle file, or one line that says why not."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+from ruamel.yaml import YAML
+from typer.testing import CliRunner, Result
+
+from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.sensors import axes_matrix
+from terrafusion.datasets.writers import write_log_folder
+from terrafusion.fusion.cli.main import app
+from terrafusion.twin.model.vehicle import load_vehicle
+from terrafusion.twin.simulate import simulate
+from tests.datasets.ros_bags import MAKE2, Message, write_ros2
+
+HUSKY = ("-z", "-x", "+y")
+RADIUS_M = 0.175
+FIX = "sensor_msgs/msg/NavSatFix"
+
+
+def run(*words: str | Path) -> Result:
+    return CliRunner().invoke(app, ["init", *map(str, words)])
+
+
+def file_of(path: Path) -> dict[str, dict[str, object]]:
+    found: dict[str, dict[str, object]] = YAML(typ="safe", pure=True).load(path)["robot"]
+    return found
+
+
+@pytest.fixture(scope="module")
+def drive() -> Recording:
+    """A drive of the nominal platform with changes of speed, under a name that nobody knows."""
+    found = simulate("chirp", terrain="asphalt", seed=3)
+    return dataclasses.replace(found, vehicle="rover_9", truth=None)
+
+
+def sensor_frame(recording: Recording, axes: tuple[str, ...]) -> Recording:
+    """The recording as an IMU gives it whose `axes` lie along body x, y, z."""
+    imu = recording.imu
+    assert imu is not None
+    R = axes_matrix(axes)
+    turned = dataclasses.replace(imu, gyro_radps=imu.gyro_radps @ R, accel_mps2=imu.accel_mps2 @ R)
+    return dataclasses.replace(recording, imu=turned)
+
+
+def namespaced_bag(path: Path, recording: Recording) -> Path:
+    """A bag of a robot `/rover` with two IMUs: one mounted as on the husky, one along the body."""
+    turned = sensor_frame(recording, HUSKY).imu
+    imu, wheels, gnss = recording.imu, recording.wheels, recording.gnss
+    assert imu is not None
+    assert turned is not None
+    assert wheels is not None
+    assert gnss is not None
+    messages: list[Message] = []
+    for topic, one in (("/rover/front/imu", turned), ("/rover/rear/imu", imu)):
+        frame = f"{topic.split('/')[2]}_imu"
+        for t, gyro, accel in zip(one.t_ns.tolist(), one.gyro_radps, one.accel_mps2, strict=True):
+            messages.append((topic, "sensor_msgs/msg/Imu", t, MAKE2.imu(t, gyro, accel, frame)))
+    names = [f"{name}_wheel_joint" for name in wheels.names]
+    for t, speed in zip(wheels.t_ns.tolist(), wheels.speed, strict=True):
+        message = MAKE2.joints(t, names, [], speed.tolist())
+        messages.append(("/rover/joint_states", "sensor_msgs/msg/JointState", t, message))
+    for t, (east, north, up) in zip(gnss.t_ns.tolist(), gnss.enu_m, strict=True):
+        lat, lon = (
+            48.0 + np.degrees(north / 6.37e6),
+            11.0 + np.degrees(east / 6.37e6 / np.cos(np.radians(48))),
+        )
+        messages.append(("/rover/fix", FIX, t, MAKE2.fix(t, lat, lon, 500.0 + up)))
+    messages.sort(key=lambda message: message[2])
+    write_ros2(path, messages)
+    return path
+
+
+@pytest.fixture(scope="module")
+def bag(drive: Recording, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return namespaced_bag(tmp_path_factory.mktemp("bag") / "first_drive", drive)
+
+
+def test_two_imus_are_listed_and_one_must_be_chosen(bag: Path, tmp_path: Path) -> None:
+    done = run(bag, "--out", tmp_path / "own.yaml")
+    assert done.exit_code == 1
+    error = str(done.exception)
+    assert "2 sensors of one kind: /rover/front/imu (100 Hz), /rover/rear/imu (100 Hz)" in error
+    assert "--topic imu=/rover/front/imu" in error
+    assert not (tmp_path / "own.yaml").exists()
+
+
+def test_mounting_and_radius_of_an_unknown_robot_in_a_bag(bag: Path, tmp_path: Path) -> None:
+    out = tmp_path / "own.yaml"
+    done = run(bag, "--topic", "imu=/rover/front/imu", "--track", "0.51", "--mass", "32", "--out", out)
+    assert done.exit_code == 0, done.exception
+    robot = file_of(out)
+    assert robot["imu_axes"] == list(HUSKY)
+    assert robot["imu_frame"] == "front_imu"
+    assert robot["topics"] == {"imu": "/rover/front/imu"}
+    radius = robot["wheel_radius_m"]
+    assert radius["known"] == "calibrated"
+    assert radius["value"] == pytest.approx(RADIUS_M, rel=0.03)
+    assert robot["track_m"] == {"value": 0.51, "known": "measured"}
+    assert all("  # " in line for line in out.read_text().splitlines()[2:])
+    vehicle = load_vehicle(out)
+    assert (vehicle.name, vehicle.body.mass_kg, vehicle.sensors.imu.axes) == ("own", 32.0, HUSKY)
+    assert "assumed   drive = skid_steer" in done.output
+    assert "verdict: " in done.output
+    assert done.output.splitlines()[-1].startswith(f"next: terrafusion replay {bag} --vehicle {out}")
+
+
+def test_a_wrong_mounting_in_a_log_folder_is_repaired_by_a_command(drive: Recording, tmp_path: Path) -> None:
+    log = write_log_folder(sensor_frame(drive, HUSKY), tmp_path / "log")
+    out = tmp_path / "own.yaml"
+    done = run(log, "--out", out, "--wheel-radius", "0.2", "--no-verdict")
+    assert done.exit_code == 0, done.exception
+    robot = file_of(out)
+    assert "imu_axes" not in robot  # the columns of a log folder are in body axes by contract
+    assert robot["wheel_radius_m"] == {"value": 0.2, "known": "measured"}
+    assert robot["wheel_scale"]["value"] == pytest.approx(RADIUS_M / 0.2 - 1.0, abs=0.03)
+    assert "gravity stands on" in done.output
+    lines = done.output.splitlines()
+    assert lines[-2].startswith("next: terrafusion convert")
+    assert lines[-1].startswith("then: terrafusion replay log_fixed")
+    convert = CliRunner().invoke(
+        app, ["convert", str(log), str(tmp_path / "fixed"), "--apply-fixes", "--vehicle", str(out)]
+    )
+    assert convert.exit_code == 0
+    assert "imu-axes" in convert.output
+
+
+def test_what_is_wrong_is_one_line(drive: Recording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    log = write_log_folder(drive, tmp_path / "log")
+    (tmp_path / "there.yaml").write_text("robot: {}\n")
+    (tmp_path / "file").write_text("")
+    for words, expected in (
+        (("nowhere.bag", "--out", "a.yaml"), "no such file or folder"),
+        ((log, "--out", "there.yaml"), "--force"),
+        ((log, "--out", "a.json"), "no YAML file"),
+        ((log, "--out", "file/a.yaml"), "cannot be written"),
+    ):
+        done = run(*words)
+        assert done.exit_code == 1, words
+        assert expected in str(done.exception), words
+        assert "\n" not in str(done.exception)
+    for flag, text, expected in (
+        ("--drive", "skid", "skid_steer"),
+        ("--track", "51cm", "0.12:data_sheet"),
+        ("--antenna", "0.1,0.2", "0.1,0,0.6"),
+        ("--track", "51", "[0.05, 5]"),
+    ):
+        done = run(log, flag, text)
+        assert done.exit_code == 2, flag
+        assert expected in done.output
+    assert (tmp_path / "there.yaml").read_text() == "robot: {}\n"
+    assert not (tmp_path / "my_robot.yaml").exists()
