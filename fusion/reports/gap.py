@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from terrafusion.fusion.benchmark.estimator_gap import Compared
-from terrafusion.fusion.reports.gap_text import answer
+from terrafusion.fusion.reports.gap_text import either, numbers, percent, sections, verdict_line
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import gap as plots
+from terrafusion.twin.gap.answer.credible_sets import LEAST_PROBABILITY, credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
+from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 
 MOST_RUNS = 3
 """Runs beyond these have no plots of their own."""
@@ -39,43 +40,50 @@ def write_diagnosis(
     if judged is not None:
         rows = [dataclasses.asdict(score) for score in scores]
         write_text(out / "judge.json", json.dumps(rows, indent=1, allow_nan=False) + "\n")
-    shrink = d.shrinkage is not None
     write_page(
         out / "report.html", "gap.html.j2", f"Gap between {d.vehicle} and its twin",
-        lead=" ".join(answer(d)), provenance=provenance, packages=TWIN_LIBRARIES,
-        where=_where(d), causes=_causes(d), notes=d.notes,
+        lead=verdict_line(d), sections=sections(d), provenance=provenance, packages=TWIN_LIBRARIES,
+        where=_where(d), causes=_causes(d), sets=_sets(d), drives=_drives(d), notes=d.notes,
         figures={
+            "path": plots.plot_path(d, MOST_RUNS) if d.detected else None,
             "map": plots.plot_map(d) if d.where else None,
-            "causes": plots.plot_causes(d),
-            "shrink": plots.plot_shrink(d) if shrink else None,
+            "causes": plots.plot_causes(d) if d.detected else None,
+            "shrink": plots.plot_shrink(d),
         },
-        errors={name: plots.plot_errors(d, i) for i, name in enumerate(d.runs[:MOST_RUNS]) if shrink},
+        errors={name: plots.plot_errors(d, i) for i, name in enumerate(d.runs[:MOST_RUNS])},
         estimator_gap=_estimator_gap(scores), failed=[f"left out: {line}" for line in failed],
     )  # fmt: skip
 
 
 def _where(d: GapDiagnosis) -> list[list[str]]:
     return [
-        [c.channel, c.regime, c.band, f"{100.0 * c.share:.1f}", f"{c.p_value:.3g}"]
+        [
+            c.channel, c.regime, c.band, f"{c.error:.2g} {CHANNEL_UNITS[c.channel]}",
+            f"{c.reference:.2g} {CHANNEL_UNITS[c.channel]}", f"{c.sigmas:.1f}", percent(c.share),
+            f"{c.p_value:.2g}",
+        ]
         for c in d.where[:MOST_PLACES]
-    ]
+    ]  # fmt: skip
 
 
 def _causes(d: GapDiagnosis) -> list[list[str]]:
-    c, rows = d.evidence.candidates, []
-    for cause in d.verdict.causes[:MOST_CAUSES]:
-        parameters = "; ".join(
-            f"{c.keys[i]} = {v * c.scale[i]:.3g} {_within(s * c.scale[i])} {c.units[i]}"
-            for i, v, s in zip(cause.columns, cause.value, cause.sigma, strict=True)
-        )
-        share = "" if cause.share is None else f"{100.0 * cause.share:.0f}"
-        others = ", ".join(cause.members[1:])
-        rows.append([cause.effect, f"{100.0 * cause.probability:.1f}", share, parameters, others])
-    return rows
+    """Causes that are possible; none without a gap."""
+    possible = [c for c in d.verdict.causes if c.probability >= LEAST_PROBABILITY][:MOST_CAUSES]
+    return [
+        [c.effect, percent(c.probability), "" if c.share is None else percent(c.share), numbers(d, c)]
+        for c in (possible if d.detected else [])
+    ]
 
 
-def _within(sigma: float) -> str:
-    return f"± {sigma:.2g}" if math.isfinite(sigma) else "(fit failed)"
+def _sets(d: GapDiagnosis) -> list[list[str]]:
+    return [[either(s), percent(s.probability), "yes" if s.named else "no"] for s in credible_sets(d.verdict)]
+
+
+def _drives(d: GapDiagnosis) -> list[str]:
+    if d.drives is None:
+        return ["There are no references to compare the drives with."]
+    covered = f"The references cover {percent(d.drives.covered)} of the time of these drives."
+    return [covered, *(f"They lack: {what}" for what in d.drives.missing)]
 
 
 def _estimator_gap(scores: Sequence[Compared]) -> list[list[str]]:

@@ -34,22 +34,26 @@ def answer(d: GapDiagnosis, out: Path | None = None, corrected: Path | None = No
     return lines[:LINES]
 
 
-def _screen(d: GapDiagnosis, out: Path | None, corrected: Path | None, most: int) -> list[str]:
-    """The lines with at most so many places, explained effects and channels."""
+def sections(d: GapDiagnosis, corrected: Path | None = None, most: int = MOST_PLACES) -> dict[str, list[str]]:
+    """Sentences by title, none without any; at most so many places, explained effects and channels."""
     next_run = [] if d.next_run is None else [_next(d)]
-    files = [] if out is None else [f"{out / 'report.html'}, {out / 'diagnosis.json'}; here with --verbose"]
-    sections = [
-        ("", [verdict_line(d)]), ("Where", _places(d, most)), ("Which", _which(d, most)),
-        ("Shrinks", _shrinks(d, most)), ("Next", [*_drives(d), *next_run, *_too_few(d)]),
-        ("Load", _load(d, corrected)), ("Details", files),
-    ]  # fmt: skip
-    lines: list[str] = []
-    for title, sentences in sections:
-        indent = " " * TITLE if title else ""
+    found = {
+        "Where": _places(d, most), "Which": _which(d, most), "Shrinks": _shrinks(d, most),
+        "Next": [*_drives(d), *next_run, *_too_few(d)], "Load": _load(d, corrected),
+    }  # fmt: skip
+    return {title: sentences for title, sentences in found.items() if sentences}
+
+
+def _screen(d: GapDiagnosis, out: Path | None, corrected: Path | None, most: int) -> list[str]:
+    found = sections(d, corrected, most)
+    if out is not None:
+        found["Details"] = [f"{out / 'report.html'}, {out / 'diagnosis.json'}; here with --verbose"]
+    lines = textwrap.wrap(verdict_line(d), WIDTH, break_on_hyphens=False)
+    for title, sentences in found.items():
         for i, sentence in enumerate(sentences):
-            first = title.ljust(len(indent)) if i == 0 else indent
+            first = (title if i == 0 else "").ljust(TITLE)
             lines += textwrap.wrap(
-                sentence, WIDTH, initial_indent=first, subsequent_indent=indent, break_on_hyphens=False
+                sentence, WIDTH, initial_indent=first, subsequent_indent=" " * TITLE, break_on_hyphens=False
             )
     return lines
 
@@ -62,15 +66,15 @@ def verdict_line(d: GapDiagnosis) -> str:
             return f"Undecided: the runs differ from the references, and so do the drives ({_test(d)})."
         return f"No gap: the runs differ no more than the references among themselves ({_test(d)})."
     if verdict.kind == "unknown":
-        certain = f"{_percent(verdict.p_unknown)} certain"
+        certain = f"{percent(verdict.p_unknown)} certain"
         return f"Gap of unknown cause: no effect of the catalogue explains it ({certain})."
-    certain = f"{_percent(sets[0].probability)} certain" if sets else "not certain"
+    certain = f"{percent(sets[0].probability)} certain" if sets else "not certain"
     if verdict.kind == "parameters":
         return f"Gap caused by the ground, which has changed; no effect is missing ({certain})."
     if len(sets) > 1:
-        both = "; and ".join(map(_either, sets))
+        both = "; and ".join(map(either, sets))
         return f"Gap caused by {len(sets)} effects together ({certain}): {both}."
-    return f"Gap caused by {_either(sets[0], certain)}."
+    return f"Gap caused by {either(sets[0], certain)}."
 
 
 def named_sets(d: GapDiagnosis) -> list[CredibleSet]:
@@ -79,10 +83,10 @@ def named_sets(d: GapDiagnosis) -> list[CredibleSet]:
 
 
 def place_words(cell: GapCell) -> str:
-    """A place of the gap in physical units: "yaw_rate while turning, slow, ..."."""
+    """A place of the gap, root mean squares in physical units: "yaw_rate while turning, slow, ..."."""
     unit = CHANNEL_UNITS[cell.channel]
     return (
-        f"{cell.channel} while {cell.regime}, {cell.band}: {cell.error:.2g} {unit} RMS "
+        f"{cell.channel} while {cell.regime}, {cell.band}: {cell.error:.2g} {unit} "
         f"({cell.sigmas:.1f} sigma), references {cell.reference:.2g} {unit}"
     )
 
@@ -103,12 +107,12 @@ def details(d: GapDiagnosis) -> list[str]:
     """What the screen leaves out: more places and ranked causes, the test, and assumptions."""
     lines = [f"{len(d.runs)} run(s), {d.seconds:.0f} s; {len(d.references)} reference run(s); {_test(d)}"]
     lines += [
-        f"where: {place_words(c)}; {_percent(c.share)} of the gap (p = {c.p_value:.2g})"
+        f"where: {place_words(c)}; {percent(c.share)} of the gap (p = {c.p_value:.2g})"
         for c in significant_places(d)[:MOST_LISTED]
     ]
     for cause in d.verdict.causes[:MOST_LISTED]:
-        share = "" if cause.share is None else f", explains {_percent(cause.share)}"
-        lines.append(f"cause: {cause.effect}, {_percent(cause.probability)}{share} ({numbers(d, cause)})")
+        share = "" if cause.share is None else f", explains {percent(cause.share)}"
+        lines.append(f"cause: {cause.effect}, {percent(cause.probability)}{share} ({numbers(d, cause)})")
     s = d.shrinkage
     floor = "" if s.floor is None else f", references {s.floor:.3g}"
     lines.append(
@@ -123,8 +127,8 @@ def significant_places(d: GapDiagnosis) -> list[GapCell]:
     return [c for c in d.where if c.p_value <= d.significance]
 
 
-def _percent(share: float) -> str:
-    """As "97 %", never 0 or 100 %."""
+def percent(share: float) -> str:
+    """A share as "97 %", never as 0 or 100 %."""
     return "over 99 %" if share > 0.995 else "under 1 %" if share < 0.005 else f"{100.0 * share:.0f} %"
 
 
@@ -132,7 +136,8 @@ def _test(d: GapDiagnosis) -> str:
     return f"p = {d.detection.p_value:.2g}, threshold {d.significance:g}"
 
 
-def _either(s: CredibleSet, certain: str = "") -> str:
+def either(s: CredibleSet, certain: str = "") -> str:
+    """ "A, B or C, which these drives cannot tell apart"."""
     more = len(s.effects) - MOST_NAMES
     names = [*s.effects[:MOST_NAMES], *([f"{more} more"] if more > 0 else [])]
     after = f" ({certain})" if certain else ""
@@ -196,7 +201,7 @@ def _drives(d: GapDiagnosis) -> list[str]:
     if d.drives is None or not d.drives.limits() or d.detection.p_value > d.significance:
         return []
     return [
-        f"Your drives differ from your references (these cover {_percent(d.drives.covered)} of the time) in: "
+        f"Your drives differ from your references (these cover {percent(d.drives.covered)} of the time) in: "
         f"{'; '.join(d.drives.missing)}. Make these references and diagnose again."
     ]
 

@@ -1,20 +1,29 @@
-"""Plots of a diagnosis: the gap map, ranked causes, errors before and after the effect is added."""
+"""Plots of a diagnosis: paths, the gap map, ranked causes, errors before and after the effect is added."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from terrafusion.fusion.reports.plots import style
+from terrafusion.twin.gap.answer.credible_sets import credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.gap.answer.where import BANDS, REGIMES
-from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES
+from terrafusion.twin.gap.answer.where import BANDS, REGIMES, regimes
+from terrafusion.twin.gap.rollout.nuisance import CHANNEL_NAMES, CHANNEL_UNITS, commanded_twist
+from terrafusion.twin.gap.rollout.residuals import WhitenedRun, physical_error
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+Array = NDArray[np.float64]
+
 MOST_CAUSES = 8
+PLACE_S = 0.5
+"""Interval of a path that is drawn as one point."""
+ALIKE = "#9ecae1"
 
 
 def plot_map(d: GapDiagnosis) -> Figure:
@@ -37,53 +46,111 @@ def plot_map(d: GapDiagnosis) -> Figure:
 
 
 def plot_causes(d: GapDiagnosis) -> Figure:
-    """Probability of the first causes, of an unknown one and of none."""
-    rows = [(c.effect, c.probability) for c in d.verdict.causes[:MOST_CAUSES]]
-    rows += [("unknown cause", d.verdict.p_unknown), ("no gap", d.verdict.p_null)]
-    fig, ax = style.canvas(None, (8.0, 1.0 + 0.32 * len(rows)))
-    at = np.arange(len(rows))[::-1]
-    colours = [style.AFTER if name in d.verdict.named else style.NEUTRAL for name, _ in rows]
-    ax.barh(at, [100.0 * p for _, p in rows], color=colours, height=0.7)
-    for y, (_, p) in zip(at, rows, strict=True):
-        ax.text(100.0 * p + 1.0, y, f"{100.0 * p:.0f} %", va="center", fontsize=8)
-    ax.set_yticks(at, [name for name, _ in rows])
-    ax.set_xlim(0.0, 112.0)
-    style.format_axes(ax, x="probability, %")
+    """Share of the gap that each of the first causes explains by itself; its probability beside it."""
+    causes = [c for c in d.verdict.causes if c.share is not None][:MOST_CAUSES]
+    fig, ax = style.canvas(None, (8.0, 1.0 + 0.32 * len(causes)))
+    alike = {name for s in credible_sets(d.verdict) if s.named for name in s.effects}
+    at = np.arange(len(causes))[::-1]
+    shares = [100.0 * float(np.clip(c.share or 0.0, 0.0, 1.0)) for c in causes]
+    colours = [
+        style.AFTER if c.effect in d.verdict.named else ALIKE if c.effect in alike else style.NEUTRAL
+        for c in causes
+    ]
+    ax.barh(at, shares, color=colours, height=0.7)
+    for y, share, c in zip(at, shares, causes, strict=True):
+        ax.text(share + 1.0, y, f"probability {100.0 * c.probability:.1f} %", va="center", fontsize=8)
+    ax.set_yticks(at, [c.effect for c in causes])
+    ax.set_xlim(0.0, 130.0)
+    ax.set_xticks(range(0, 101, 20))
+    style.format_axes(ax, x="share of the gap that it explains by itself, %")
     return fig
 
 
+def plot_path(d: GapDiagnosis, most: int) -> Figure:
+    """Path of each judged run, coloured by the error of the first place's channel, its regime ringed."""
+    place, runs = next(iter(d.where), None), d.evidence.runs[:most]
+    fig, axes = style.canvases(1, (3.4 * len(runs) + 1.2, 3.8), len(runs), sharex=False)
+    name = place.channel if place is not None else CHANNEL_NAMES[d.evidence.channels[0]]
+    drawn = [_place_errors(d, i, name) for i in range(len(runs))]
+    top = max((float(np.quantile(e, 0.98)) for _, _, e in drawn if len(e)), default=1.0)
+    for ax, run, (at, t_s, error) in zip(axes, runs, drawn, strict=True):
+        ax.plot(at[:, 0], at[:, 1], "-", color=style.EXPECTED, linewidth=1.0)
+        if place is not None:
+            index = [r for r, _ in REGIMES].index(place.regime)
+            known = np.interp(t_s, run.time_s[np.argsort(run.time_s)], _in_regime(d, run, index)) > 0.5
+            ax.plot(at[known, 0], at[known, 1], "o", color=style.TRUTH, markersize=7, fillstyle="none")
+        points = ax.scatter(at[:, 0], at[:, 1], c=error, s=14, cmap="YlOrRd", vmin=0.0, vmax=top, zorder=3)
+        ax.set_aspect("equal", adjustable="box")
+        style.format_axes(ax, x="x, m", y="y, m", title=Path(run.name).name)
+    fig.colorbar(points, ax=axes, label=f"{name}: RMS error of {PLACE_S:g} s, {CHANNEL_UNITS[name]}")
+    return fig
+
+
+def _in_regime(d: GapDiagnosis, run: WhitenedRun, index: int) -> Array:
+    return (regimes(run, d.evidence.model) == index).astype(float)[np.argsort(run.time_s)]
+
+
+def _place_errors(d: GapDiagnosis, i: int, name: str) -> tuple[Array, Array, Array]:
+    """Positions (n, 2), times (n,) and root mean squares (n,) of a channel's error by interval of a run."""
+    run = d.evidence.runs[i]
+    error = physical_error(run, d.evidence.noise, d.shrinkage.errors_before[i])
+    mine = np.isin(run.channel, [k for k, c in enumerate(d.evidence.channels) if CHANNEL_NAMES[c] == name])
+    _, group = np.unique(np.floor(run.time_s[mine] / PLACE_S), return_inverse=True)
+    count = np.maximum(np.bincount(group), 1)
+    t_s = np.bincount(group, run.time_s[mine]) / count
+    return _positions(d, run, t_s), t_s, np.sqrt(np.bincount(group, error[mine] ** 2) / count)
+
+
+def _positions(d: GapDiagnosis, run: WhitenedRun, t_s: Array) -> Array:
+    """Positions (n, 2) at times: fixes; without any, the commands integrated."""
+    fixes = {o.channel: o for o in run.log.observed if o.channel in ("gnss_east_m", "gnss_north_m")}
+    if len(fixes) == 2:
+        return np.stack([np.interp(t_s, o.end_s, o.value - o.value[0]) for o in fixes.values()], axis=1)
+    grid, twist = commanded_twist(run.log, d.evidence.model)
+    step = float(grid[1] - grid[0])
+    yaw = np.cumsum(twist[:, 1]) * step
+    path = [np.cumsum(twist[:, 0] * f(yaw)) * step for f in (np.cos, np.sin)]
+    return np.stack([np.interp(t_s, grid, x) for x in path], axis=1)
+
+
 def plot_shrink(d: GapDiagnosis) -> Figure:
-    """Whitened error of every channel before and after, and in the references."""
-    assert d.shrinkage is not None
+    """Error of every channel before and after, and in the references, in sigmas and in its unit."""
     names, rows = list(d.shrinkage.channels), list(d.shrinkage.channels.values())
-    fig, ax = style.canvas(None, (8.0, 1.2 + 0.42 * len(names)))
+    fig, ax = style.canvas(None, (9.0, 1.2 + 0.42 * len(names)))
     at = np.arange(len(names))[::-1]
     for shift, colour, label, k in ((0.2, style.BEFORE, "before", 0), (-0.2, style.AFTER, "after", 1)):
         ax.barh(at + shift, [row[k] or 0.0 for row in rows], height=0.38, color=colour, label=label)
-    for y, row in zip(at, rows, strict=True):
+    for y, name, row in zip(at, names, rows, strict=True):
+        before, after, _ = d.shrinkage.physical[name]
+        text = f"{before:.2g} \u2192 {after:.2g} {CHANNEL_UNITS[name]}"
+        ax.text(max(x or 0.0 for x in row), y, f"  {text}", va="center", fontsize=8)
         if row[2] is not None:
             ax.plot([row[2], row[2]], [y - 0.42, y + 0.42], color=style.TRUTH, linewidth=1.5)
     if d.references:
         ax.plot([], [], color=style.TRUTH, linewidth=1.5, label="references")
     ax.set_yticks(at, names)
-    ax.legend(fontsize=8, frameon=False)
-    style.format_axes(ax, x="root mean square error, in sigmas of its noise")
+    ax.set_xlim(0.0, 1.3 * max(x or 0.0 for row in rows for x in row))
+    ax.legend(fontsize=8, frameon=False, loc="lower right")
+    style.format_axes(ax, x="root mean square error, in sigmas of its noise; numbers: in its unit")
     return fig
 
 
 def plot_errors(d: GapDiagnosis, run: int) -> Figure:
-    """Whitened errors of one run over time, channel by channel, before and after."""
-    assert d.shrinkage is not None
+    """Errors of one run over time in the units of the channels, before and after."""
     evidence, channels = d.evidence.runs[run], d.evidence.channels
     fig, axes = style.channel_grid(len(channels), 1.5, 1.2)
+    arms = [
+        (label, colour, physical_error(evidence, d.evidence.noise, errors[run]))
+        for label, colour, errors in (
+            ("before", style.BEFORE, d.shrinkage.errors_before),
+            ("after", style.AFTER, d.shrinkage.errors_after),
+        )
+    ]
     for i, (ax, channel) in enumerate(zip(axes, channels, strict=True)):
         mine = np.flatnonzero(evidence.channel == i)
         mine = mine[:: max(1, len(mine) // style.MAX_POINTS)]
-        t_s = evidence.time_s[mine]
-        ax.plot(
-            t_s, d.shrinkage.errors_before[run][mine], ".", color=style.BEFORE, markersize=2, label="before"
-        )
-        ax.plot(t_s, d.shrinkage.errors_after[run][mine], ".", color=style.AFTER, markersize=2, label="after")
-        style.format_axes(ax, title=f"{CHANNEL_NAMES[channel]} ({channel})")
+        for label, colour, error in arms:
+            ax.plot(evidence.time_s[mine], error[mine], ".", color=colour, markersize=2, label=label)
+        style.format_axes(ax, title=f"{channel.rsplit('_', 1)[0]}, {CHANNEL_UNITS[CHANNEL_NAMES[channel]]}")
     style.finish_grid(fig, axes)
     return fig
