@@ -20,11 +20,11 @@ def known_probabilities(
         return None
     try:
         p = np.fromiter(probabilities.values(), dtype=float)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     if not np.isfinite(p).all() or (p < 0.0).any() or not p.sum() > 0.0:
         return None
     named = dict.fromkeys(known, 0.0)
-    for name, value in probabilities.items():
+    for name, value in zip(probabilities, p.tolist(), strict=True):
         named[name if name in named else UNKNOWN] += value
     return named
