@@ -141,7 +141,7 @@ def diagnose_evidence(
     if verdict.kind == "unknown" and drives is not None and drives.limits():
         # Undecided: what no effect explains may come from drives that no reference made.
         verdict = dataclasses.replace(verdict, kind="no_gap")
-    following = next_run(evidence, sigma, verdict)
+    following = next_run(evidence, sigma, pooled, verdict)
     notes += [f"{law.effect} ({law.form}): {fit.failure}" for law, fit in failed.items()]
     if verdict.fit is not None and verdict.fit.failure:
         notes.append(f"{', '.join(verdict.named)}: {verdict.fit.failure}")

@@ -16,10 +16,21 @@ from terrafusion.fusion.reports.gap_text import answer as screen
 from terrafusion.fusion.reports.plots.gap import plot_shrink
 from terrafusion.twin.gap.answer.corrected import values_of, write_corrected
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
-from terrafusion.twin.gap.answer.next_run import BY_HAND, DRIVES, LIFTED, _forecast, separation
+from terrafusion.twin.gap.answer.next_run import (
+    BY_HAND,
+    DRIVES,
+    LIFTED,
+    PAYLOAD,
+    _forecast,
+    forecast,
+    separation,
+)
 from terrafusion.twin.gap.answer.verdict import LAW_SIGMA_MOTION, UNKNOWN
 from terrafusion.twin.gap.data.candidates import Candidates
 from terrafusion.twin.gap.diagnose import diagnose
+from terrafusion.twin.gap.infer.posterior import PooledScores
+from terrafusion.twin.gap.null.null import learn_null
+from terrafusion.twin.gap.null.score import score
 from terrafusion.twin.gap.rollout.residuals import initial_state_sigma
 from terrafusion.twin.model.vehicle import load_vehicle, with_overrides
 from terrafusion.twin.scenario.scenario import DriveSegment
@@ -232,14 +243,32 @@ def test_lifted_wheels_carry_no_load(wide: GapDiagnosis) -> None:
     assert strength["speed staircase"] > 0.1
 
 
+def _separations(d: GapDiagnosis, one: str, other: str, *names: str) -> list[float]:
+    """Sigmas that two effects of typical size differ by with each drive beside the judged runs; "": none."""
+    e, sigma = d.evidence, initial_state_sigma(d.evidence.candidates)
+    null = learn_null([score(r, sigma) for r in e.references], 2)
+    pooled = PooledScores.of([score(r, sigma) for r in e.runs], null)
+    by_name = {c.effect: c for c in d.verdict.causes}
+    causes = [dataclasses.replace(by_name[n], value=np.ones(len(by_name[n].columns))) for n in (one, other)]
+    more = [forecast(e, sigma, n, {one, other}) if n else 0.0 for n in names]
+    return [separation(pooled, e, causes[0], causes[1], m) for m in more]
+
+
 def test_lifted_wheels_tell_a_gear_from_the_ground(wide: GapDiagnosis) -> None:
-    e, by_name = wide.evidence, {c.effect: c for c in wide.verdict.causes}
-    gear, ground = by_name["drivetrain_friction"], by_name["motion_resistance"]
-    gear, ground = (dataclasses.replace(c, value=np.ones(len(c.columns))) for c in (gear, ground))
-    sigma = initial_state_sigma(e.candidates)
-    assert separation(e, sigma, LIFTED, gear, ground) > 3.0
-    other = dataclasses.replace(by_name["grousers"], value=np.ones(len(by_name["grousers"].columns)))
-    assert separation(e, sigma, LIFTED, ground, other) == 0.0  # neither shows in the air
+    before, after = _separations(wide, "drivetrain_friction", "motion_resistance", "", LIFTED)
+    assert before < 1.0
+    assert after > 3.0
+    before, after = _separations(wide, "motion_resistance", "grousers", "", LIFTED)
+    assert after == pytest.approx(before)  # neither shows in the air
+
+
+def test_a_payload_tells_what_scales_with_the_load(wide: GapDiagnosis) -> None:
+    name = "spins, then straight"
+    pair = ("drivetrain_friction", "motion_resistance")
+    before, plain, loaded = _separations(wide, *pair, "", name, name + PAYLOAD)
+    assert before <= plain
+    assert loaded > 1.5 * plain
+    assert "four headings" in DRIVES
 
 
 def test_the_gap_shrinks_on_runs_left_out(wide: GapDiagnosis) -> None:

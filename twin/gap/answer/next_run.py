@@ -1,10 +1,13 @@
 """Suggests a drive that would distinguish two look-alikes: the twin simulates each of a small catalogue and
-counts by how many standard deviations the two effects, at the sizes found, would differ there."""
+counts by how many standard deviations the two effects, at the size found, would differ there and in the
+judged runs together. Together, since the size of an effect is the same in both: an effect that scales with
+the load and one that does not differ as soon as the load changes."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +37,9 @@ Array = NDArray[np.float64]
 BY_HAND = "measurement by hand"
 MOST_REPEATS = 10  # if the best drive would have to be repeated more often, none is suggested
 LIFTED = "wheels lifted"
+PAYLOAD = ", with payload"
+PAYLOAD_SHARE = 0.25  # of the robot's mass, at its centre of gravity
+GROUND = frozenset(form.effect for form in GROUND_FORMS)
 STAND_MASS_KG = 1.0  # what a twin on a stand puts on its wheels: next to nothing
 HALF_TURN_S, QUARTER_TURN_S = math.pi / 0.6, 0.5 * math.pi / 0.6
 
@@ -42,13 +48,14 @@ def _sequence(*segments: tuple[float, float, float]) -> tuple[DriveSegment, ...]
     return tuple(DriveSegment(*s) for s in ((1.0, 0.0, 0.0), *segments, (1.0, 0.0, 0.0)))
 
 
+_SPINS = _sequence((7.0, 0.0, 0.8), (7.0, 0.0, -0.8), (1.0, 0.0, 0.0), (7.0, 1.2, 0.0), (6.0, 0.6, 0.0))
+_STAIRS = _sequence(*((5.0, v, 0.0) for v in (0.3, 0.6, 0.9, 1.2, 1.5)))
 DRIVES: dict[str, tuple[DriveSegment, ...]] = {
     "same lane both ways": _sequence(
         (9.0, 1.0, 0.0), (1.0, 0.0, 0.0), (HALF_TURN_S, 0.0, 0.6), (1.0, 0.0, 0.0), (9.0, 1.0, 0.0)
     ),
-    "spins, then straight": _sequence(
-        (7.0, 0.0, 0.8), (7.0, 0.0, -0.8), (1.0, 0.0, 0.0), (7.0, 1.2, 0.0), (6.0, 0.6, 0.0)
-    ),
+    "spins, then straight": _SPINS,
+    "spins, then straight" + PAYLOAD: _SPINS,
     "four headings": _sequence(*(((4.5, 0.8, 0.0), (QUARTER_TURN_S, 0.0, 0.6)) * 4)),
     LIFTED: _sequence((6.0, 0.4, 0.0), (6.0, 0.8, 0.0), (6.0, 1.4, 0.0), (5.0, -0.6, 0.0), (5.0, 0.0, 0.8)),
     "chirp, 0.2 to 3 Hz": (
@@ -57,7 +64,8 @@ DRIVES: dict[str, tuple[DriveSegment, ...]] = {
         DriveSegment(2.0),
         DriveSegment(13.0, v_mps=0.8, yaw_rate_amplitude_radps=0.5, period_s=5.0, end_period_s=1.0 / 3.0),
     ),
-    "speed staircase": _sequence(*((5.0, v, 0.0) for v in (0.3, 0.6, 0.9, 1.2, 1.5))),
+    "speed staircase": _STAIRS,
+    "speed staircase" + PAYLOAD: _STAIRS,
     "figure of eight": _sequence((14.0, 0.8, 0.45), (14.0, 0.8, -0.45)),
 }
 """Drives that are tried, by name: about 30 s each, level, on the soil of the runs."""
@@ -73,65 +81,65 @@ class NextRun:
     why: str
 
 
-def next_run(evidence: GapEvidence, sigma: Array, verdict: GapVerdict) -> NextRun | None:
-    """For the first named cause with look-alikes and the most probable of these; None without one."""
+def next_run(
+    evidence: GapEvidence, sigma: Array, pooled: PooledScores, verdict: GapVerdict
+) -> NextRun | None:
+    """For the first named cause with look-alikes and the most probable of these; None without one.
+
+    Args:
+        pooled: scores of the judged runs.
+    """
     first = verdict.ambiguous() if verdict.kind == "ambiguous" else None
     if first is None:
         return None
     other = next(c for c in verdict.causes if c.effect == first.members[1])
-    return propose(evidence, sigma, first, other)
+    return propose(evidence, sigma, pooled, first, other)
 
 
-def propose(evidence: GapEvidence, sigma: Array, one: Cause, other: Cause) -> NextRun:
+def propose(evidence: GapEvidence, sigma: Array, pooled: PooledScores, one: Cause, other: Cause) -> NextRun:
     """The drive on which two causes differ most; a direct measurement where none separates them."""
-    found = {name: separation(evidence, sigma, name, one, other) for name in DRIVES}
-    best = max(found, key=lambda name: found[name])
-    sigmas, pair = found[best], (one.effect, other.effect)
-    repeats = math.inf if sigmas <= 0.0 else math.ceil((SEPARABLE_SIGMAS / sigmas) ** 2)
-    if repeats > MOST_REPEATS:
+    effects = {one.effect, other.effect}
+    with ThreadPoolExecutor(evidence.jobs) as threads:
+        forecasts = threads.map(lambda name: forecast(evidence, sigma, name, effects), DRIVES)
+        found = dict(zip(DRIVES, forecasts, strict=True))
+
+    def sigmas(name: str, repeats: int = 1) -> float:
+        return separation(pooled, evidence, one, other, repeats * found[name])
+
+    best = max(found, key=sigmas)
+    pair = (one.effect, other.effect)
+    enough = (n for n in range(1, MOST_REPEATS + 1) if sigmas(best, n) >= SEPARABLE_SIGMAS)
+    repeats = next(enough, None)
+    if repeats is None:
         why = (
-            f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by {sigmas:.1f} "
-            "sigma in the twin): measure one of the two directly"
+            f"no drive of those tried tells {pair[0]} from {pair[1]} (the best, '{best}', by "
+            f"{sigmas(best):.1f} sigma in the twin): measure one of the two directly"
         )
-        return NextRun(BY_HAND, pair, sigmas, why)
+        return NextRun(BY_HAND, pair, sigmas(best), why)
     often = "once" if repeats == 1 else f"{repeats} times"
+    mass = PAYLOAD_SHARE * evidence.model.vehicle.body.mass_kg
+    load = f" ({mass:.2g} kg more, as near the centre of gravity as possible)" if PAYLOAD in best else ""
     why = (
-        f"of {len(DRIVES)} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by {sigmas:.1f} "
-        f"sigma a drive at the size found; {often} should do"
+        f"of {len(DRIVES)} drives tried in the twin it tells {pair[0]} from {pair[1]} best, by "
+        f"{sigmas(best):.1f} sigma with these runs at the size found; {often} should do{load}"
     )
-    return NextRun(best, pair, sigmas, why)
+    return NextRun(best, pair, sigmas(best), why)
 
 
-def separation(evidence: GapEvidence, sigma: Array, name: str, one: Cause, other: Cause) -> float:
-    """Sigmas by which a drive separates two causes, whichever is true; 0 where the twin diverges on it.
+def separation(
+    pooled: PooledScores, evidence: GapEvidence, one: Cause, other: Cause, more: Array | float = 0.0
+) -> float:
+    """Sigmas by which runs separate two causes, whichever is true.
 
-    With lifted wheels nothing of the ground acts.
+    Args:
+        more: (P, P) information of further runs, from `forecast`.
     """
-    try:
-        run = _forecast(evidence, name, {one.effect, other.effect})
-    except TerrafusionError:
-        return 0.0
-    own = score(run, sigma)
-    zero = np.zeros(len(own.b))
-    covariance = own.fisher + JITTER * np.eye(len(zero))
-    pooled = PooledScores.of([dataclasses.replace(own, b=zero)], Null(zero, zero, covariance, 1))
-    if name == LIFTED and (_of_ground(one) or _of_ground(other)):
-        # an effect of the ground cannot show in the air: what the other one shows there tells them apart
-        return max((_sigmas(pooled, cause) for cause in (one, other) if not _of_ground(cause)), default=0.0)
+    plain = pooled.without_discrepancy()
+    every = dataclasses.replace(plain, information=plain.information + more)
     return min(
-        _remaining_sigmas(pooled, evidence, one, other.effect),
-        _remaining_sigmas(pooled, evidence, other, one.effect),
+        _remaining_sigmas(every, evidence, one, other.effect),
+        _remaining_sigmas(every, evidence, other, one.effect),
     )
-
-
-def _sigmas(pooled: PooledScores, cause: Cause) -> float:
-    """Sigmas by which a cause shows at all."""
-    at = np.asarray(cause.columns)
-    return math.sqrt(max(float(cause.value @ pooled.information[np.ix_(at, at)] @ cause.value), 0.0))
-
-
-def _of_ground(cause: Cause) -> bool:
-    return cause.effect in {form.effect for form in GROUND_FORMS}
 
 
 def _remaining_sigmas(pooled: PooledScores, evidence: GapEvidence, true: Cause, other: str) -> float:
@@ -142,12 +150,30 @@ def _remaining_sigmas(pooled: PooledScores, evidence: GapEvidence, true: Cause, 
     return math.sqrt(max(unlike_square(pooled, evidence.candidates, signal, square, other)[1], 0.0))
 
 
+def forecast(evidence: GapEvidence, sigma: Array, name: str, effects: set[str]) -> Array:
+    """Information (P, P) of a drive on some effects; zero where the twin diverges on it."""
+    P = evidence.runs[0].by_parameter.shape[1]
+    try:
+        own = score(_forecast(evidence, name, effects), sigma)
+    except TerrafusionError:
+        return np.zeros((P, P))
+    zero = np.zeros(P)
+    null = Null(zero, zero, own.fisher + JITTER * np.eye(P), 1)
+    information = PooledScores.of([dataclasses.replace(own, b=zero)], null).information
+    if name == LIFTED:  # nothing of the ground acts in the air, its strength as a state included
+        ground = [i for i, key in enumerate(evidence.candidates.keys) if key.split("/")[0] in GROUND]
+        information[ground, :] = information[:, ground] = 0.0
+    return information
+
+
 def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRun:
     """Sensitivities of a drive that has not been driven: its errors are zero."""
     template, model, segments = evidence.runs[0].log, evidence.model, DRIVES[name]
     label = template.labels[0]
     if name == LIFTED:
         model = _lifted(model, label)
+    elif PAYLOAD in name:
+        model = _with_mass(model, (1.0 + PAYLOAD_SHARE) * model.vehicle.body.mass_kg)
     scenario = Scenario(name, sum(s.duration_s for s in segments), drive=segments)
     t_s = DT_S * np.arange(round(scenario.duration_s / DT_S) + 1.0)
     prompt = dataclasses.replace(model.vehicle.drive, dead_time_s=0.0)  # the log's commands have none either
@@ -160,7 +186,7 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
     )  # fmt: skip
     candidates = evidence.candidates
     if name == LIFTED:
-        effects = effects - {form.effect for form in GROUND_FORMS}
+        effects = effects - GROUND
     keys = {k for k in candidates.keys if k.split("/")[0] in effects or k in SOIL_SIGMAS}
     found = channel_sensitivities(log, linearise(log, model, candidates, log.start, keys))
     return whitened(residuals_from(log, found, model, candidates, evidence.channels), evidence.noise)
@@ -168,9 +194,13 @@ def _forecast(evidence: GapEvidence, name: str, effects: set[str]) -> WhitenedRu
 
 def _lifted(model: Model, label: str) -> Model:
     """The twin with its wheels in the air: the stand carries the body, so that the wheels have no load."""
-    body = dataclasses.replace(model.vehicle.body, mass_kg=STAND_MASS_KG)
-    vehicle = dataclasses.replace(model.vehicle, body=body)
-    return dataclasses.replace(model, vehicle=vehicle, soils={**model.soils, label: _no_ground()})
+    model = _with_mass(model, STAND_MASS_KG)
+    return dataclasses.replace(model, soils={**model.soils, label: _no_ground()})
+
+
+def _with_mass(model: Model, mass_kg: float) -> Model:
+    body = dataclasses.replace(model.vehicle.body, mass_kg=mass_kg)
+    return dataclasses.replace(model, vehicle=dataclasses.replace(model.vehicle, body=body))
 
 
 def _no_ground() -> SoilParams:
