@@ -8,7 +8,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
 import typer
 
 from terrafusion.fusion.cli.inspect_page import Line, clock_table, entry, measured_texts, print_lines
@@ -66,8 +65,15 @@ def choose_sensors(log: str, topics: dict[str, str]) -> dict[str, str]:
         print(f"{kind}: which of these?")
         for number, shown in enumerate(rates, 1):
             print(f"  {number}  {shown}")
-        chosen[kind] = names[typer.prompt("number", type=click.IntRange(1, len(names))) - 1]
+        chosen[kind] = names[_number_to(len(names)) - 1]
     return chosen
+
+
+def _number_to(last: int) -> int:
+    """A number from 1 to the last, asked for until it is one."""
+    while not (1 <= (number := typer.prompt("number", type=int)) <= last):
+        print(f"  give a number from 1 to {last}")
+    return int(number)
 
 
 def contents_lines(recording: Recording) -> Iterator[Line]:

@@ -91,7 +91,7 @@ def main() -> None:
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:
+    except (KeyboardInterrupt, typer.Abort):
         print("error: interrupted; results already written are kept", file=sys.stderr)
         sys.exit(1)
     except BrokenPipeError:

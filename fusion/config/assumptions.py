@@ -105,7 +105,7 @@ def _of_the_vehicle(
             value = functools.reduce(getattr, number.section, vehicle)
             yield Assumption(name, value, number.sigma, number.unit)
     bias = ("sensors", "imu", "gyro_bias_sigma_radps")
-    if inputs.imu != "none" and _is_assumed(sources, bias):
+    if inputs.imu != "none" and vehicle.robot.gyro_bias_radps is None and _is_assumed(sources, bias):
         sigma = vehicle.sensors.imu.gyro_bias_sigma_radps
         yield Assumption("gyro_bias_radps", 0.0, sigma, "rad/s")
 

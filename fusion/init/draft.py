@@ -24,8 +24,9 @@ class DraftLine:
 
     @property
     def assumed(self) -> bool:
-        """Whether nobody knows the number."""
-        return isinstance(self.value, KnownNumber) and self.value.known == "assumed"
+        """Whether nobody knows it."""
+        word = self.comment.startswith("assumed")
+        return word or (isinstance(self.value, KnownNumber) and self.value.known == "assumed")
 
     def raw(self) -> Any:
         """The value as the YAML reader gives it."""

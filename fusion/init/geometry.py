@@ -166,7 +166,8 @@ def _given(
 def assumed_lines(draft: Draft) -> Iterator[str]:
     """What the file assumes, in a sentence each."""
     for name, line in draft.items():
-        if line.assumed or line.comment.startswith("assumed"):
+        if line.assumed:
             value = line.value.value if isinstance(line.value, KnownNumber) else line.value
             shown = list(value) if isinstance(value, tuple) else value
-            yield f"{name} = {shown} ({line.comment})"
+            words = line.comment.replace("assumed, ", "").replace("assumed +-", "+-")
+            yield f"{name} = {shown} ({words})"

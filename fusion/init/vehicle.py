@@ -85,9 +85,14 @@ def first_vehicle(
     rig = _with_radius(base.rig(), answers)
     recording = open_log(rig)
     measured = measure([recording], rig)
+    unmeasured: tuple[str, ...] = ()
     named = DraftLine(base.name, "what is not below is as of this vehicle")
     draft: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
     draft |= geometry_lines(recording, measured, answers, base)
+    if base.name != "generic":  # what nobody measured here is better known in its own file
+        draft = {name: line for name, line in draft.items() if not line.assumed}
+        known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
+        unmeasured += (known,)
     if answers.topics:
         draft["topics"] = DraftLine(answers.topics, "chosen among several sensors of a kind")
     with tempfile.TemporaryDirectory(prefix="terrafusion-") as folder:
@@ -96,6 +101,7 @@ def first_vehicle(
         calibration, notes = _calibrated(recording, write_draft(file, draft, "draft"), progress)
     if calibration is not None:
         draft |= _learned_lines(calibration, draft)
+    notes = (*unmeasured, *notes)
     return FirstVehicle(draft, recording, repaired, findings, measured, calibration, notes)
 
 

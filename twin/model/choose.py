@@ -54,8 +54,8 @@ def choose_vehicle(
         raise DataError(
             f"{which}, and the log lacks its {' and '.join(missing)}",
             file=recording.name,
-            remedy=f"give {' and '.join(missing)} in meta.yaml, or --vehicle with a YAML file or one of "
-            + ", ".join(vehicle_names()),
+            remedy=f"give {' and '.join(missing)} in meta.yaml, or --vehicle with one of "
+            f"{', '.join(vehicle_names())} or a YAML file: `terrafusion init LOG` writes one",
         )
     steered, wheelbase_m = overrides.drive in STEERED_DRIVES, overrides.wheelbase_m
     track_m = overrides.track_m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +11,9 @@ import pytest
 from ruamel.yaml import YAML
 from typer.testing import CliRunner, Result
 
-from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.recording import Overrides, Recording
 from terrafusion.datasets.core.sensors import axes_matrix
+from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
 from terrafusion.fusion.cli.main import app
 from terrafusion.twin.model.vehicle import load_vehicle
@@ -156,3 +158,35 @@ def test_what_is_wrong_is_one_line(drive: Recording, tmp_path: Path, monkeypatch
         assert expected in done.output
     assert (tmp_path / "there.yaml").read_text() == "robot: {}\n"
     assert not (tmp_path / "my_robot.yaml").exists()
+
+
+def test_a_field_log_of_a_robot_by_another_name(tmp_path: Path) -> None:
+    """A husky on a car park, whose log is read as if nobody had heard of it."""
+    data = os.environ.get("TERRAFUSION_DATA")
+    if not data:
+        pytest.skip("TERRAFUSION_DATA is not set")
+    recording = open_recording(Path(data) / "husky_parkinglot" / "test1.bag")
+    unknown = dataclasses.replace(recording, vehicle="rover_9", overrides=Overrides())
+    log = write_log_folder(unknown, tmp_path / "log")
+    out = tmp_path / "own.yaml"
+    done = run(log, "--out", out, "--antenna", "0.25,0,0.22")
+    assert done.exit_code == 0, done.exception
+    robot = file_of(out)
+    assert robot["antenna_m"]["known"] == "measured"
+    assert robot["wheel_scale"]["known"] == "calibrated"
+    assert robot["track_m"] == {"value": 0.55, "known": "assumed"}
+    assert "verdict: good" in done.output
+
+
+def test_the_user_is_asked_on_a_terminal(bag: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("terrafusion.fusion.cli.init_page.interactive", lambda: True)
+    out = tmp_path / "own.yaml"
+    answers = "3\n2\ntracked\n51 cm\n0.51:data_sheet\n\n\n"
+    done = CliRunner().invoke(app, ["init", str(bag), "--out", str(out), "--no-verdict"], input=answers)
+    assert done.exit_code == 0, done.exception
+    robot = file_of(out)
+    assert robot["topics"] == {"imu": "/rover/rear/imu"}
+    assert "imu_axes" not in robot
+    assert (robot["drive"], robot["track_m"]) == ("tracked", {"value": 0.51, "known": "data_sheet"})
+    assert robot["mass_kg"] == {"value": 40.0, "known": "assumed"}
+    assert "verdict" not in done.output
