@@ -6,6 +6,8 @@ from typing import Annotated
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
+
 SubjectsArgument = Annotated[
     list[str] | None,
     typer.Argument(
@@ -15,7 +17,7 @@ SubjectsArgument = Annotated[
 ]
 
 
-def allan(subjects: SubjectsArgument = None) -> None:
+def allan(subjects: SubjectsArgument = None) -> Result:
     """Allan deviation of IMUs at rest, and the noise parameters read from it (IEEE Std 952-1997).
 
     Without an argument: the simulated IMU of the vehicle elevate, beside the parameters it was made from.
@@ -30,9 +32,11 @@ def allan(subjects: SubjectsArgument = None) -> None:
     from terrafusion.twin.analysis.allan import recording_lines, vehicle_lines
     from terrafusion.twin.model.vehicle import vehicle_names
 
+    lines: list[str] = []
     for subject in subjects or ["elevate"]:
         if subject in vehicle_names() or subject.endswith((".yaml", ".yml")):
-            print("\n".join(vehicle_lines(subject)))
+            lines += vehicle_lines(subject)
             continue
         for recording in opened([subject], reading(None, None, "header", None, False), False):
-            print("\n".join(recording_lines(recording)))
+            lines += recording_lines(recording)
+    return Result(lines)

@@ -7,13 +7,20 @@ from typing import Annotated
 
 import typer
 
-from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import progress_bar, read_json
+from terrafusion.fusion.cli.outputs import Output
+
+OUTPUT = Output(
+    "Folder for the results; an interrupted benchmark continues.",
+    ("parts", "benchmark.json", "benchmark.md", "ratios.png", "report.html"),
+    ("parts",),
+    goes_on=True,
+)
 
 
 def benchmark(
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for the results; an interrupted benchmark continues.")
-    ],
+    out: Path,
     quick: Annotated[bool, typer.Option("--quick", help="Few runs: two minutes on two processors.")] = False,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes; by default one a processor.", show_default=False)
@@ -32,7 +39,7 @@ def benchmark(
         Path | None,
         typer.Option(metavar="FILE", help="Put the tables into a document that has the mark line."),
     ] = None,
-) -> None:
+) -> Result:
     """Compare weighting methods on the same runs: twin, perturbed soils, other terramechanics, field logs.
 
     Methods: data sheet, fixed (tuned), robust, innovation, adaptive, and adaptive with true, shuffled and
@@ -66,6 +73,5 @@ def benchmark(
     made = write_benchmark(out, result, origin)
     if docs is not None:
         write_document(docs, made, result, origin)
-    for table in made[:3]:
-        print("\n".join([*table.markdown(), ""]))
-    print(f"report: {out / 'report.html'}")
+    lines = [line for table in made[:3] for line in [*table.markdown(), ""]]
+    return Result(lines, f"report: {out / 'report.html'}", read_json(out / "benchmark.json"))

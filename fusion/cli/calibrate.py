@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
     RepairClockOption,
     StampsOption,
     TopicOption,
+    command_line,
     load_rig,
     opened,
     progress_bar,
+    read_json,
     reading,
     refuse_impossible,
 )
+from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.twin.calibrate.coordinates import Prior
@@ -32,12 +35,12 @@ LogsArgument = Annotated[
         "LOG@60-105 is a segment of one, LOG@/45 all of its segments of 45 s.",
     ),
 ]
-OutOption = Annotated[
-    Path,
-    typer.Option(
-        "--out", help="Folder for calibration.json, YAML files, report.html; with --sensors a YAML file."
-    ),
-]
+OUTPUT = Output(
+    "Folder for calibration.json, YAML files, report.html; with --sensors a YAML file.",
+    ("calibration.json", "vehicle.yaml", "soil*.yaml", "report.html"),
+    ("calibration.json",),
+)
+SENSORS_OUTPUT = Output("A vehicle file.", suffix=".yaml", mark="known: calibrated")
 TerrainOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -53,7 +56,7 @@ PriorOption = Annotated[
 
 def calibrate(
     logs: LogsArgument,
-    out: OutOption,
+    out: Path,
     vehicle: Annotated[
         str | None,
         typer.Option(
@@ -91,7 +94,7 @@ def calibrate(
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
-) -> None:
+) -> Result:
     """Fit soil and vehicle parameters to logs, with their sigma and what the logs cannot identify.
 
     Writes calibration.json, vehicle.yaml and soil.yaml with the new numbers, and report.html.
@@ -104,8 +107,7 @@ def calibrate(
         if terrain or parameters or prior or suggest or truth or channels or robust:
             raise typer.BadParameter("does not go with options of the twin", param_hint="--sensors")
         options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
-        _sensors(logs, vehicle, options, out, repair_clock)
-        return
+        return _sensors(logs, vehicle, options, out, repair_clock)
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
@@ -124,27 +126,24 @@ def calibrate(
             truth=truth, robust=robust, channels=split(channels) or None, window_s=window_s,
             slope_deg=slope_deg, aspect_deg=aspect_deg, payload_kg=payload_kg, progress=progress,
         )  # fmt: skip
-    command = " ".join(["terrafusion", *sys.argv[1:]])
-    write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command})
-    _print_result(found, suggest)
-    print(f"written to {out}")
+    write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command_line()})
+    lines = [*summary(found), *(_suggested(found) if suggest else [])]
+    return Result(lines, f"written to {out}", read_json(out / "calibration.json"))
 
 
-def _print_result(found: Calibration, suggest: bool) -> None:
-    """Print the fitted numbers, then, where asked for, the manoeuvres that would identify the rest."""
-    for line in summary(found):
-        print(line)
-    if suggest:
-        from terrafusion.twin.calibrate.suggest import suggest as suggestions
+def _suggested(found: Calibration) -> list[str]:
+    """The manoeuvres that would identify the rest."""
+    from terrafusion.twin.calibrate.suggest import suggest as suggestions
 
-        for suggestion in suggestions(found):
-            print(suggestion.sentence())
+    return [suggestion.sentence() for suggestion in suggestions(found)]
 
 
 def _sensors(
     logs: list[str], vehicle: str | None, options: dict[str, Any], out: Path, repair_clock: bool
-) -> None:
+) -> Result:
     """Learn the sensor numbers of a robot, and write its file."""
+    import dataclasses
+
     from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.outputs.robot_file import write_robot
     from terrafusion.fusion.sensor_calibration import calibrate_sensors
@@ -157,9 +156,8 @@ def _sensors(
     with progress_bar("calibrating") as progress:
         found = calibrate_sensors(recordings, vehicle, progress=progress)
     write_robot(out, found)
-    for line in repr(found).splitlines():
-        print(line)
-    print(f"written to {out}")
+    numbers = {name: one and dataclasses.asdict(one) for name, one in vars(found.known()).items()}
+    return Result(repr(found).splitlines(), f"written to {out}", {"out": str(out), "robot": numbers})
 
 
 def split(text: str | None) -> tuple[str, ...]:

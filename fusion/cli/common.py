@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -167,6 +168,16 @@ def _refuse(log: str, findings: list[Finding]) -> None:
     if more:
         remedy += f" (`terrafusion inspect` lists {more} more)"
     raise DataError(f"{first.what} ({first.evidence})", file=log, channel=first.channel, remedy=remedy)
+
+
+def command_line() -> str:
+    """The command as it was typed."""
+    return shlex.join(["terrafusion", *sys.argv[1:]])
+
+
+def read_json(path: Path) -> Any:
+    """The document in a file that was just written."""
+    return json.loads(path.read_text(encoding="utf-8"))
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
     LogArgument,
@@ -20,11 +21,14 @@ from terrafusion.fusion.cli.common import (
     refuse_impossible,
     rig_of,
 )
+from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
     from terrafusion.datasets.checks import Finding
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.datasets.core.sensors import Rig
+
+OUTPUT = Output("A name ending in .mcap, or a folder.", LOG_FILES, mark=None)
 
 
 def convert(
@@ -39,8 +43,7 @@ def convert(
         bool,
         typer.Option("--apply-fixes", help="Apply the repairs that `inspect` offers, and list them."),
     ] = False,
-    overwrite: Annotated[bool, typer.Option("--overwrite", help="Replace an .mcap that exists.")] = False,
-) -> None:
+) -> Result:
     """Convert a log to a log folder, or to a ROS 2 MCAP file when OUT ends in .mcap.
 
     Numbers are unchanged unless `--apply-fixes` requests the repairs of the
@@ -67,24 +70,26 @@ def convert(
     rig = rig_of(recording, rig)
     if vehicle is not None:
         recording = dataclasses.replace(recording, vehicle=vehicle)
-    for note in recording.notes:
-        print(f"note: {note}")
+    lines = [f"note: {note}" for note in recording.notes]
+    repaired: list[Finding] = []
     if apply_fixes:
         recording, repaired = repair(recording, rig)
-        for finding in repaired:
-            print(f"repaired: {_line(finding)}")
-    for part in _write(log, recording, rig, out, overwrite):
-        print(f"not in standard messages: {part}")
-    for finding in run_checks(recording, rig):
-        if apply_fixes or finding.severity == "error":
-            print(f"{finding.severity}: {_line(finding)}{_why_left(finding, apply_fixes)}")
+        lines += [f"repaired: {_line(finding)}" for finding in repaired]
+    unseen = _write(log, recording, rig, out)
+    lines += [f"not in standard messages: {part}" for part in unseen]
+    left = [one for one in run_checks(recording, rig) if apply_fixes or one.severity == "error"]
+    lines += [f"{one.severity}: {_line(one)}{_why_left(one, apply_fixes)}" for one in left]
     rows = {name: len(channel) for name, channel in recording.channels().items()}
     if recording.truth is not None:
         rows["truth"] = len(recording.truth)
-    print(f"{out}: {', '.join(f'{name} {count}' for name, count in rows.items())}")
+    document = {
+        "out": str(out), "samples": rows, "notes": list(recording.notes), "not_in_standard_messages": unseen,
+        "repaired": [_line(one) for one in repaired], "findings": [_line(one) for one in left],
+    }  # fmt: skip
+    return Result(lines, f"{out}: {', '.join(f'{name} {count}' for name, count in rows.items())}", document)
 
 
-def _write(log: str, recording: Recording, rig: Rig | None, out: Path, overwrite: bool) -> list[str]:
+def _write(log: str, recording: Recording, rig: Rig | None, out: Path) -> list[str]:
     """Write the log; returns what ROS has no standard message for."""
     from terrafusion.datasets.writers import write_log_folder, write_mcap
 
@@ -92,7 +97,7 @@ def _write(log: str, recording: Recording, rig: Rig | None, out: Path, overwrite
         write_log_folder(recording, out)
         return []
     refuse_impossible(log, recording)  # their latitudes would be nonsense
-    return list(write_mcap(recording, out, rig=rig, overwrite=overwrite))
+    return list(write_mcap(recording, out, rig=rig, overwrite=True))
 
 
 def _line(finding: Finding) -> str:

@@ -9,22 +9,27 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from terrafusion.datasets.core.tables import text_table
-from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import progress_bar, read_json
+from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.fusion.replay import ReplayResult
 
+OUTPUT = Output(
+    "Folder for the log, the results and report.html.",
+    ("log", "fixed", "adaptive", "report.html"),
+    ("log/meta.yaml", "fixed/metrics.json"),
+)
 OUTAGE_START_S, OUTAGE_S = 75.0, 60.0
 """GNSS is lost on loose sand and comes back on mud."""
 TITLE = "Firm ground, loose sand and mud: fixed against adaptive weights"
 
 
 def demo(
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for the log, the results and report.html.")
-    ] = Path("demo-out"),
+    out: Path,
     seed: Annotated[int, typer.Option(help="Seed of the simulated sensors.")] = 0,
-) -> None:
+) -> Result:
     """Simulate a drive over firm ground, loose sand and mud, and localise it with fixed and adaptive weights.
 
     One GNSS outage covers the change of terrain. Prints the comparison and writes report.html.
@@ -49,9 +54,8 @@ def demo(
             write_replay(out / mode, result)
             results.append(result)
         write_comparison(out / "report.html", TITLE, results)
-    for line in _comparison(results):
-        print(line)
-    print(f"report: {out / 'report.html'}")
+    document = {result.mode: read_json(out / result.mode / "metrics.json") for result in results}
+    return Result(_comparison(results), f"report: {out / 'report.html'}", document)
 
 
 def _comparison(results: list[ReplayResult]) -> list[str]:

@@ -10,6 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.inspect_page import styled_lines
+
 if TYPE_CHECKING:
     from terrafusion.datasets.catalog.catalog import Catalog, CatalogFile
 
@@ -25,8 +28,7 @@ def fetch(
         Path | None, typer.Option("--to", help="Folder for the files; the user's cache folder otherwise.")
     ] = None,
     offline: Annotated[bool, typer.Option("--offline", help="Use local files only.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON instead of a table.")] = False,
-) -> None:
+) -> Result:
     """Show the catalogue of public recordings, or download from it.
 
     Every file is checked against its SHA-256. Files in TERRAFUSION_DATA or in the cache are not downloaded
@@ -40,19 +42,13 @@ def fetch(
 
       terrafusion fetch borealtc/SNOW/00 wvu_pathfinder/s5t1 --to fieldlogs
     """
-    import json
-
     from terrafusion.datasets.catalog.catalog import load_catalog
 
     catalog = load_catalog()
     if not names:
         rows = [_row(catalog, name) for name in catalog.sets]
-        if as_json:
-            print(json.dumps(rows, indent=2))
-        else:
-            _print_catalog(rows)
-        return
-    _download(catalog, names, to, offline, as_json)
+        return Result(_catalog_lines(rows), "", rows)
+    return _download(catalog, names, to, offline)
 
 
 def _row(catalog: Catalog, name: str) -> dict[str, Any]:
@@ -75,27 +71,21 @@ def _row(catalog: Catalog, name: str) -> dict[str, Any]:
     }
 
 
-def _print_catalog(rows: list[dict[str, Any]]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
-
-    console = Console(highlight=False)
+def _catalog_lines(rows: list[dict[str, Any]]) -> list[str]:
+    lines: list[tuple[str, str]] = []
     for row in rows:
         count = len(row["recordings"])
-        console.print(
-            f"[bold]{escape(row['name'])}[/bold]  {count} recording{'s' if count > 1 else ''}, "
-            f"{row['bytes'] / 1e6:.1f} MB, {escape(row['licence'])}, "
-            f"{row['files_here']} of {row['files']} files here"
+        about = (
+            f"{row['name']}  {count} recording{'s' if count > 1 else ''}, {row['bytes'] / 1e6:.1f} MB, "
+            f"{row['licence']}, {row['files_here']} of {row['files']} files here"
         )
-        for key in ("title", "holds", "citation", "homepage"):
-            console.print(f"    {escape(row[key])}", soft_wrap=True)
         names = ", ".join(row["recordings"][:4]) + (f", ... ({count})" if count > 4 else "")
-        console.print(f"    {escape(names)}", style="dim", soft_wrap=True)
+        texts = [*(row[key] for key in ("title", "holds", "citation", "homepage")), names]
+        lines += [("bold", about), *(("", f"    {text}") for text in texts)]
+    return styled_lines(lines)
 
 
-def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool, as_json: bool) -> None:
-    import json
-
+def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool) -> Result:
     from terrafusion.datasets.catalog.fetch import entries_of, fetch
 
     wanted = {entry.file: entry for name in names for entry in entries_of(catalog, name)}
@@ -104,15 +94,13 @@ def _download(catalog: Catalog, names: list[str], to: Path | None, offline: bool
         for got in fetch(names, to, offline=offline, progress=advance):
             done.append(got)
             advance(got.entry, got.entry.bytes)
-            if not as_json:
-                print(f"{'fetched' if got.downloaded else 'here   '}  {got.path}")
+            print(f"{'fetched' if got.downloaded else 'here   '}  {got.path}")
     sets = [catalog.sets[name] for name in dict.fromkeys(got.entry.set_name for got in done)]
-    if as_json:
-        files = [{"file": g.entry.file, "path": str(g.path), "downloaded": g.downloaded} for g in done]
-        print(json.dumps({"files": files, "licences": {s.name: s.licence for s in sets}}, indent=2))
-        return
-    for known in sets:
-        print(f"{known.name}: {known.licence}; please cite: {known.citation} ({known.homepage})")
+    files = [{"file": g.entry.file, "path": str(g.path), "downloaded": g.downloaded} for g in done]
+    cited = [
+        f"{known.name}: {known.licence}; please cite: {known.citation} ({known.homepage})" for known in sets
+    ]
+    return Result(cited, "", {"files": files, "licences": {s.name: s.licence for s in sets}})
 
 
 @contextmanager

@@ -2,29 +2,37 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from terrafusion.fusion.cli.calibrate import parse_terrain, split
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
     RepairClockOption,
     StampsOption,
     TopicOption,
+    command_line,
     load_rig,
     opened,
     progress_bar,
+    read_json,
     reading,
 )
+from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.datasets.core.recording import Recording
     from terrafusion.fusion.benchmark.estimator_gap import Compared
     from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
 
+OUTPUT = Output(
+    "Folder for diagnosis.json and report.html.",
+    ("diagnosis.json", "judge.json", "report.html"),
+    ("diagnosis.json",),
+)
 RunsArgument = Annotated[
     list[str],
     typer.Argument(
@@ -63,7 +71,7 @@ ExplainOption = Annotated[
 
 def gap(
     runs: RunsArgument,
-    out: Annotated[Path, typer.Option("--out", help="Folder for diagnosis.json and report.html.")],
+    out: Path,
     reference: ReferenceOption = None,
     vehicle: Annotated[str, typer.Option(help="The twin's vehicle, by name or YAML file.")] = "elevate",
     terrain: Annotated[
@@ -87,22 +95,18 @@ def gap(
         bool, typer.Option("--judge", help="Also compare the estimator on these logs and on the twin's.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, help="Of permutations and replicates.")] = 0,
-    verbose: Annotated[
-        bool, typer.Option("--verbose", help="Also print all places, causes and assumptions.")
-    ] = False,
     explain: ExplainOption = None,
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
-) -> None:
+) -> Result:
     """Diagnose where runs differ from reference runs, which effect causes it, and how far the gap shrinks.
 
     Writes diagnosis.json and report.html. No truth channel is read.
 
     Example: terrafusion gap today/a today/b --reference may/1 --reference may/2 --vehicle elevate --out gap
     """
-    from terrafusion.datasets.core.files import check_folder
     from terrafusion.fusion.reports.gap import write_diagnosis
     from terrafusion.fusion.reports.gap_text import answer, details
     from terrafusion.twin.gap.answer.corrected import write_corrected
@@ -112,8 +116,6 @@ def gap(
     options = reading(load_rig(vehicle), topic, stamps, columns, repair_clock)
     judged = _opened_by_name(runs, options, repair_clock)
     normal = _opened_by_name(reference or [], options, repair_clock)
-    for target in (out, *([write_vehicle.parent] if write_vehicle else [])):
-        check_folder(target)
     with progress_bar("comparing") as progress:
         found = diagnose(
             judged, normal, load_vehicle(vehicle), parse_terrain(terrain),
@@ -121,13 +123,13 @@ def gap(
             seed=seed, progress=progress,
         )  # fmt: skip
     scores = _estimator_gap(found, judged, normal, vehicle, seed) if judge else None
-    write_diagnosis(out, found, {"command": " ".join(["terrafusion", *sys.argv[1:]])}, scores)
+    compared = [] if scores is None else [_line(score) for score in scores[0]]
+    write_diagnosis(out, found, {"command": command_line()}, scores)
     changes = [] if write_vehicle is None else write_corrected(found, vehicle, write_vehicle)
     written = write_vehicle if changes and found.verdict.named else None
-    for line in answer(found, out, written):
-        print(line)
-    for line in [*changes, *details(found)] if verbose else changes[:0]:
-        print(line)
+    told = answer(found, out, written)
+    document = read_json(out / "diagnosis.json")
+    return Result([*compared, *told[:-1]], told[-1], document, details=[*changes, *details(found)])
 
 
 def _opened_by_name(names: list[str], options: dict[str, Any], repair_clock: bool) -> list[Recording]:
@@ -147,12 +149,13 @@ def _estimator_gap(
 ) -> tuple[list[Compared], list[str]]:
     from terrafusion.fusion.benchmark.estimator_gap import estimator_gap, estimator_scorer
 
-    scores, failed = estimator_gap(found, runs, references, estimator_scorer(vehicle), seed)
-    for score in scores:
-        values = {
-            "references": score.references, "runs": score.runs, "their twin": score.twin,
-            "twin with the effect": score.corrected,
-        }  # fmt: skip
-        listed = [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
-        print(f"{score.mark}: {', '.join(listed)}")
-    return scores, failed
+    return estimator_gap(found, runs, references, estimator_scorer(vehicle), seed)
+
+
+def _line(score: Compared) -> str:
+    values = {
+        "references": score.references, "runs": score.runs, "their twin": score.twin,
+        "twin with the effect": score.corrected,
+    }  # fmt: skip
+    listed = [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
+    return f"{score.mark}: {', '.join(listed)}"

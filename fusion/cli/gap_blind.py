@@ -2,28 +2,33 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import command_line, progress_bar, read_json
+from terrafusion.fusion.cli.outputs import Output
+
+OUTPUT = Output(
+    "Folder for blind.json, report.html and the sealed labels.",
+    ("labels.*", "commitment.json", "answers.*", "oracle.jsonl", "blind.json", "sheet.png", "report.html"),
+    ("labels.sealed",),
+    goes_on=True,
+)
 
 
 def gap_blind(
-    out: Annotated[
-        Path, typer.Option("--out", help="Folder for blind.json, report.html and the sealed labels.")
-    ],
+    out: Path,
     quick: Annotated[bool, typer.Option("--quick", help="A small subset: every family, few trials.")] = False,
     share: Annotated[
         float, typer.Option(min=0.01, max=1.0, help="Of the trials of every family in the full check.")
     ] = 1.0,
     jobs: Annotated[int, typer.Option(min=1, help="Processes that diagnose.")] = 1,
     seed: Annotated[int, typer.Option(min=0, help="Of the trials; the same seed makes the same ones.")] = 0,
-) -> None:
+) -> Result:
     """Judge the gap diagnosis on trials whose truth is sealed until all answers are given.
 
     The trials come from a plant with laws and integrator of its own. Stopped, the same command continues.
@@ -35,7 +40,6 @@ def gap_blind(
 
       terrafusion gap-blind --share 0.2 --jobs 2 --out blind
     """
-    from terrafusion.datasets.core.files import check_folder
     from terrafusion.fusion.reports.blind import summary, write_blind
     from terrafusion.twin.gap import diagnose
     from terrafusion.twin.gap.blind.check import run_blind_check
@@ -43,7 +47,6 @@ def gap_blind(
 
     if quick and share < 1.0:
         raise typer.BadParameter("a quick check has its own size", param_hint="--share")
-    check_folder(out)
     judged = partial(diagnose, jobs=1) if jobs > 1 else diagnose  # processes, or threads inside
     with progress_bar("diagnosing") as progress:
         scores = run_blind_check(
@@ -56,7 +59,5 @@ def gap_blind(
             progress=progress,
             oracle=judged,
         )
-    write_blind(out, scores, {"command": shlex.join(["terrafusion", *sys.argv[1:]])})
-    for line in summary(scores):
-        print(line)
-    print(f"written to {out}")
+    write_blind(out, scores, {"command": command_line()})
+    return Result(summary(scores), f"written to {out}", read_json(out / "blind.json"))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
     LogArgument,
@@ -16,6 +16,7 @@ from terrafusion.fusion.cli.common import (
     StampsOption,
     TopicOption,
     clock_accepted,
+    command_line,
     parse_topics,
     progress_bar,
     reading,
@@ -53,7 +54,6 @@ def init(
     ] = None,
     imu_position: Annotated[NumberOption, _number("--imu-position", "IMU, likewise.", "X,Y,Z")] = None,
     mass: Annotated[NumberOption, _number("--mass", "Mass; only the twin uses it.", "KG")] = None,
-    force: Annotated[bool, typer.Option("--force", help="Overwrite the file if it exists.")] = False,
     no_verdict: Annotated[
         bool, typer.Option("--no-verdict", help="Write the file only; do not replay the log with it.")
     ] = False,
@@ -61,7 +61,7 @@ def init(
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
-) -> None:
+) -> Result:
     """Write the vehicle file of a robot from its first log, and replay the log with it.
 
     Lists what the log holds; measures mounting of the IMU, wheel radius, effective track, delays and
@@ -73,12 +73,14 @@ def init(
 
     Example: terrafusion init drive.mcap --topic imu=/front/imu --drive tracked --track 0.62
     """
+    from terrafusion.datasets.core.errors import ConfigError
     from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines
     from terrafusion.fusion.cli.inspect_page import print_lines
     from terrafusion.fusion.init.answers import Answers
     from terrafusion.fusion.init.vehicle import first_vehicle
 
-    _check_out(out, force)
+    if out.suffix not in (".yaml", ".yml"):
+        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
     texts = {
         "drive": drive,
         "wheel_radius_m": wheel_radius,
@@ -106,19 +108,15 @@ def init(
         found = first_vehicle(open_log, answers, progress)
     _write(out, log, found)
     print_lines(result_lines(found, out))
-    if not no_verdict:
-        print()
-        for line in _verdict(found, out):
-            print(line)
-    print()
+    lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]
     again = _options(topics, stamps, columns, repair_clock)
     command = f"terrafusion replay {shlex.quote(log)} --vehicle {shlex.quote(str(out))}{again} --out results"
     if found.repaired:
         fixed = f"{Path(log).stem}_fixed"
         convert = f"terrafusion convert {shlex.quote(log)} {shlex.quote(fixed)} --apply-fixes"
-        print(f"next: {convert} --vehicle {shlex.quote(str(out))}{again}")
+        lines.append(f"next: {convert} --vehicle {shlex.quote(str(out))}{again}")
         command = f"terrafusion replay {shlex.quote(fixed)} --vehicle {shlex.quote(str(out))} --out results"
-    print(f"{'then' if found.repaired else 'next'}: {command}")
+    return Result(lines, f"{'then' if found.repaired else 'next'}: {command}", short=f"written to {out}")
 
 
 def _parsed(text: str, name: str) -> Any:
@@ -133,25 +131,11 @@ def _parsed(text: str, name: str) -> Any:
         raise typer.BadParameter(str(error), param_hint=FLAGS[name]) from None
 
 
-def _check_out(out: Path, force: bool) -> None:
-    """Refuse an unusable file before anything is read."""
-    from terrafusion.datasets.core.errors import ConfigError
-    from terrafusion.datasets.core.files import check_folder
-
-    if out.suffix not in (".yaml", ".yml"):
-        raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
-    if out.is_dir():
-        raise ConfigError("is a folder", file=out, remedy="give the name of a file")
-    if out.exists() and not force:
-        raise ConfigError("exists already", file=out, remedy="give another --out, or --force to overwrite it")
-    check_folder(out.parent)
-
-
 def _write(out: Path, log: str, found: FirstVehicle) -> None:
     from terrafusion.fusion.init.draft import write_draft
 
-    command = " ".join(["terrafusion", *map(shlex.quote, sys.argv[1:])])
-    write_draft(out, found.draft, f"Vehicle file of the log '{found.recording.name}', written by: {command}")
+    about = f"Vehicle file of the log '{found.recording.name}', written by: {command_line()}"
+    write_draft(out, found.draft, about)
 
 
 def _options(topics: dict[str, str], stamps: str, columns: Path | None, repair_clock: bool) -> str:

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
-
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
     LogArgument,
@@ -26,18 +24,13 @@ def inspect(
     topic: TopicOption = None,
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
-    as_json: Annotated[
-        bool,
-        typer.Option(
-            "--json", help="Print JSON instead of a page; its keys are in docs/reference/conventions.md."
-        ),
-    ] = False,
-) -> None:
+) -> Result:
     """Show the contents of a log, measures between its channels, and the findings of the log checks.
 
     Changes nothing; `terrafusion convert --apply-fixes` applies the repairs.
-    Clock steps are findings, too. Several recordings in one file are
-    summarised; LOG#0 shows the first alone.
+    The keys of `--json` are in docs/reference/conventions.md. Clock steps are
+    findings, too. Several recordings in one file are summarised; LOG#0 shows
+    the first alone.
 
     Examples:
 
@@ -49,17 +42,14 @@ def inspect(
 
       terrafusion inspect my_log_folder --json
     """
-    from terrafusion.fusion.cli.inspect_page import page_lines, print_lines
+    from terrafusion.fusion.cli.inspect_page import page_lines, styled_lines
     from terrafusion.fusion.cli.single_wheel_page import trials_lines, trials_of
 
     load_rig(vehicle)
     reading(None, topic, stamps, columns, repair_clock=True)  # reports wrong usage for any kind of log
     trials = trials_of(log) if columns is None else None
     page = trials or inspected(log, vehicle, topic, stamps, columns)
-    if as_json:
-        print(json.dumps(page, indent=2, allow_nan=False))
-    else:
-        print_lines(trials_lines(page) if trials else page_lines(page))
+    return Result(styled_lines(trials_lines(page) if trials else page_lines(page)), "", page)
 
 
 def inspected(

@@ -19,15 +19,23 @@ Line = tuple[str, str]
 
 def print_lines(lines: Iterable[Line]) -> None:
     """Print, in colour where standard output is a terminal."""
+    print("\n".join(styled_lines(lines)))
+
+
+def styled_lines(lines: Iterable[Line]) -> list[str]:
+    """The lines, in colour where standard output is a terminal."""
     from rich.console import Console
     from rich.text import Text
 
-    console = Console(highlight=False, soft_wrap=True)
+    console, styled = Console(highlight=False, soft_wrap=True), []
     for style, line in lines:
         text = Text(line)
         if style:
             text.stylize(style, 0, len(line.split(" ", 1)[0]))
-        console.print(text)
+        with console.capture() as captured:
+            console.print(text)
+        styled.append(captured.get().removesuffix("\n"))
+    return styled
 
 
 def page_lines(page: dict[str, Any]) -> Iterator[Line]:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import StampsOption, TopicOption, VehicleOption, check_stamps, parse_topics
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ def live(
     wait: WaitOption = 0.02,
     seconds: SecondsOption = None,
     foxglove: FoxgloveOption = None,
-) -> None:
+) -> Result:
     """Run the estimator beside a ROS 2 robot, without ROS: it speaks DDS itself.
 
     Finds IMU, wheels and GNSS by type and name; publishes /odometry, /odometry/map, /tf, slip, ground and
@@ -78,7 +79,7 @@ def live(
     """
     if log is not None:
         _run_log(log, vehicle, realtime)
-        return
+        return Result()
     from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.live.node import LiveOptions
 
@@ -89,6 +90,7 @@ def live(
         wait_s=wait, use_sim_time=use_sim_time, prefix=namespace.rstrip("/"),
     )  # fmt: skip
     _run_robot(options, _domain(domain), loopback, reliable, seconds, foxglove)
+    return Result()
 
 
 def _run_robot(

@@ -32,6 +32,7 @@ from terrafusion.fusion.cli import (
     sweep,
     terrain,
 )
+from terrafusion.fusion.cli.command import add_command
 from terrafusion.fusion.cli.usage import CommandGroup, UsageError, usage_line
 
 app = typer.Typer(
@@ -62,27 +63,30 @@ def options(
     """Options of the program itself."""
 
 
-app.command("demo")(demo.demo)
-app.command("init")(init.init)
-app.command("inspect")(inspect.inspect)
-app.command("fetch")(fetch.fetch)
-app.command("convert")(convert.convert)
-app.command("simulate")(simulate.simulate)
-app.command("sweep")(sweep.sweep)
-app.command("benchmark")(benchmark.benchmark)
-app.command("calibrate")(calibrate.calibrate)
-app.command("gap")(gap.gap)
-app.command("gap-blind")(gap_blind.gap_blind)
-app.command("allan")(allan.allan)
-app.command("study")(study.study)
-app.command("replay")(replay.replay)
-app.command("live")(live.live)
+add_command(app, "demo", demo.demo, output=demo.OUTPUT)
+add_command(app, "init", init.init, files={"out": None}, as_json=False)
+add_command(app, "inspect", inspect.inspect)
+add_command(app, "fetch", fetch.fetch)
+add_command(app, "convert", convert.convert, output=convert.OUTPUT)
+add_command(app, "simulate", simulate.simulate, output=simulate.OUTPUT)
+add_command(app, "sweep", sweep.sweep, output=sweep.OUTPUT)
+add_command(app, "benchmark", benchmark.benchmark, output=benchmark.OUTPUT)
+add_command(
+    app, "calibrate", calibrate.calibrate, output=calibrate.OUTPUT,
+    instead=("sensors", calibrate.SENSORS_OUTPUT),
+)  # fmt: skip
+add_command(app, "gap", gap.gap, output=gap.OUTPUT, files={"write_vehicle": "gap diagnosis:"})
+add_command(app, "gap-blind", gap_blind.gap_blind, output=gap_blind.OUTPUT)
+add_command(app, "allan", allan.allan, as_json=False)
+add_command(app, "study", study.study, output=study.OUTPUT)
+add_command(app, "replay", replay.replay, output=replay.OUTPUT, files={"rerun": None})
+add_command(app, "live", live.live, as_json=False)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")
 
 
 def main() -> None:
-    """Run the command line: exit status 0 done, 1 a known error in one line, 2 wrong usage."""
+    """Run the command line: 0 done, 1 a known error in one line, 2 wrong usage, 130 Ctrl-C."""
     try:
         sys.exit(app(prog_name="terrafusion", standalone_mode=False))
     except UsageError as error:
@@ -90,9 +94,6 @@ def main() -> None:
         sys.exit(2)
     except TerrafusionError as error:
         print(f"error: {error}", file=sys.stderr)
-        sys.exit(1)
-    except (KeyboardInterrupt, typer.Abort):
-        print("error: interrupted; results already written are kept", file=sys.stderr)
         sys.exit(1)
     except BrokenPipeError:
         sys.exit(1)

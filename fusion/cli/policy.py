@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from terrafusion.fusion.cli.command import Result, add_command
+from terrafusion.fusion.cli.outputs import Output
 from terrafusion.fusion.cli.usage import CommandGroup
 
 app = typer.Typer(help="The weighting policy: noise of each sensor by ground.", cls=CommandGroup)
@@ -17,9 +19,8 @@ def policy() -> None:
     """The weighting policy: noise of each sensor by ground."""
 
 
-@app.command("fit")
 def fit(
-    out: Annotated[Path, typer.Option("--out", help="Policy file (YAML) to write.")],
+    out: Path,
     logs: Annotated[
         list[str] | None,
         typer.Argument(help="Labelled logs with a truth; they update the noise fitted to simulated runs."),
@@ -37,7 +38,7 @@ def fit(
             help="Simulated vehicle of the library (elevate), and the vehicle of logs that name none."
         ),
     ] = None,
-) -> None:
+) -> Result:
     """Drive the twin over soils, slopes, payloads and speeds, and fit each sensor's noise on each ground.
 
     The noise `fixed` is fitted to the same runs, all grounds pooled. The same
@@ -46,28 +47,39 @@ def fit(
     Example: terrafusion policy fit --out policy.yaml
     Example: terrafusion policy fit --out mine.yaml drive1.bag drive2.bag
     """
-    from terrafusion.fusion.cli.terrain import checked_output, progress
+    import dataclasses
+
+    from terrafusion.fusion.cli.terrain import progress
     from terrafusion.fusion.training.policy_fit import LoggedSamples, default_grid, fit_policy, write_policy
     from terrafusion.fusion.training.policy_logs import read_logs
     from terrafusion.fusion.training.simulated_runs import GROUNDS
 
-    checked_output(out)
     grounds = chosen("soils", "soil", tuple(dict.fromkeys(ground or GROUNDS)))
     grid = default_grid(seeds, grounds, *chosen("vehicles", "vehicle", (vehicle or "elevate",)))
     logged = read_logs(logs, vehicle) if logs else LoggedSamples()
     with progress("runs", len(grid.conditions())) as tick:
         fitted = fit_policy(grid, tick, logged)
     write_policy(fitted, out, made_by=made_by(seeds, ground, vehicle, logs))
-    print(f"{'':12s} slip           a grade   time   wheel  side-slip  gyro   yaw  accel  GNSS")
-    print(f"{'':12s}                             s     m/s             x     x      x     x")
-    for name, row in {**fitted.classes, "fixed": fitted.fixed}.items():
-        print(
-            f"{name:12s} {row.slip_mean:.3f} ± {row.slip_sigma:.3f} {row.slip_per_grade:8.2f}"
-            f"  {row.slip_time_s:5.1f}  {row.wheel_sigma_mps:.4f}     {row.side_slip_sigma:.4f}"
-            f"  {row.gyro_inflation:4.1f}  {row.gyro_yaw_inflation:4.1f}  {row.accel_inflation:5.1f}"
-            f"  {row.gnss_inflation:4.2f}"
-        )
-    print(f"inputs {fitted.inputs_sha256[:16]}; written to {out}")
+    lines = [
+        f"{'':12s} slip           a grade   time   wheel  side-slip  gyro   yaw  accel  GNSS",
+        f"{'':12s}                             s     m/s             x     x      x     x",
+    ]
+    rows = {**fitted.classes, "fixed": fitted.fixed}
+    lines += [
+        f"{name:12s} {row.slip_mean:.3f} ± {row.slip_sigma:.3f} {row.slip_per_grade:8.2f}"
+        f"  {row.slip_time_s:5.1f}  {row.wheel_sigma_mps:.4f}     {row.side_slip_sigma:.4f}"
+        f"  {row.gyro_inflation:4.1f}  {row.gyro_yaw_inflation:4.1f}  {row.accel_inflation:5.1f}"
+        f"  {row.gnss_inflation:4.2f}"
+        for name, row in rows.items()
+    ]
+    document = {name: dataclasses.asdict(row) for name, row in rows.items()}
+    done = f"inputs {fitted.inputs_sha256[:16]}; written to {out}"
+    return Result(lines, done, {"out": str(out), "inputs_sha256": fitted.inputs_sha256, "rows": document})
+
+
+add_command(
+    app, "fit", fit, output=Output("Policy file (YAML) to write.", suffix=".yaml", mark="terrafusion.policy/")
+)
 
 
 def chosen(folder: str, kind: str, names: tuple[str, ...]) -> tuple[str, ...]:

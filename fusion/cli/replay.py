@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.common import (
     ColumnsOption,
     LogArgument,
@@ -18,17 +18,25 @@ from terrafusion.fusion.cli.common import (
     TopicOption,
     VehicleOption,
     clock_accepted,
+    command_line,
     load_rig,
     progress_bar,
+    read_json,
     reading,
     refuse_errors,
 )
+from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.fusion.metrics.baselines import Baselines
     from terrafusion.fusion.replay import ReplayResult
 
-OutOption = Annotated[Path, typer.Option("--out", help="Folder for the results and report.html.")]
+OUTPUT = Output(
+    "Folder for the results and report.html.",
+    ("metrics.json", "estimate.csv", "trajectory.tum", "weights.jsonl", "report.html", "estimate.mcap"),
+    ("metrics.json",),
+    mark="terrafusion.replay/",
+)
 OutageOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -89,7 +97,7 @@ DeclinationOption = Annotated[
 
 def replay(
     log: LogArgument,
-    out: OutOption,
+    out: Path,
     mode: ModeOption = "adaptive",
     vehicle: VehicleOption = None,
     policy: PolicyOption = None,
@@ -105,7 +113,7 @@ def replay(
     stamps: StampsOption = "header",
     columns: ColumnsOption = None,
     repair_clock: RepairClockOption = False,
-) -> None:
+) -> Result:
     """Estimate a recorded drive as it would have run live, and score it.
 
     Scored against the log's truth; without one, against every fifth GNSS fix, held out of the
@@ -116,7 +124,6 @@ def replay(
     Example: terrafusion replay drive.bag --vehicle husky --calibrate --batch --out calibrated
     """
     from terrafusion.datasets.core.errors import errors_of
-    from terrafusion.datasets.core.files import check_folder
     from terrafusion.datasets.readers import open_recording
     from terrafusion.fusion.config.estimator_config import MODES
     from terrafusion.fusion.grounds.file import read_grounds, save_grounds
@@ -137,7 +144,6 @@ def replay(
     if repair_clock:
         recording = clock_accepted(recording)
     findings = refuse_errors(log, recording, rig)
-    check_folder(out)
     with progress_bar(f"{mode} {recording.name}") as progress, errors_of(log):
         result = run(
             recording,
@@ -154,25 +160,24 @@ def replay(
         )
     if grounds is not None and result.grounds is not None:
         save_grounds(result.grounds, grounds)
-    write_replay(out, result, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
-    if mcap:
-        _write_bag(result, out / "estimate.mcap")
+    write_replay(out, result, {"command": command_line()})
+    unseen = _write_bag(result, out / "estimate.mcap") if mcap else []
     if rerun is not None:
         write_rerun(result, rerun)
     warnings = [f"log check, {f.channel}: {f.what} ({f.evidence}); {f.fix}" for f in findings]
-    for line in [*summary(result), *assumed_and_noted(result, warnings)]:
-        print(line)
-    print(f"written to {out}")
+    lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
+    done = f"written to {out}"
+    return Result(lines, done, read_json(out / "metrics.json"), short=f"{result.verdict.lines()[0]}; {done}")
 
 
-def _write_bag(result: ReplayResult, path: Path) -> None:
-    """The log and the estimate in one bag; prints what is not in standard messages."""
+def _write_bag(result: ReplayResult, path: Path) -> list[str]:
+    """The log and the estimate in one bag; returns lines on what is not in standard messages."""
     from terrafusion.datasets.writers.mcap import write_mcap
     from terrafusion.fusion.outputs.ros_estimate import written_estimate
 
     written = written_estimate(result.estimate)
-    for part in write_mcap(result.recording, path, written, rig=result.vehicle.rig(), overwrite=True):
-        print(f"not in standard messages: {part}")
+    unseen = write_mcap(result.recording, path, written, rig=result.vehicle.rig(), overwrite=True)
+    return [f"not in standard messages: {part}" for part in unseen]
 
 
 def assumed_and_noted(result: ReplayResult, warnings: Sequence[str]) -> list[str]:

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from terrafusion.fusion.cli.command import Result
 from terrafusion.fusion.cli.effects import effect_values, listed
+from terrafusion.fusion.cli.outputs import LOG_FILES, Output
 
 if TYPE_CHECKING:
     from terrafusion.twin.analysis.summary import RunSummary
     from terrafusion.twin.simulate import SimulatedRun
 
+OUTPUT = Output(
+    "Log folder, or a file ending in .mcap.", LOG_FILES, ("meta.yaml",), mark='source: "terrafusion twin"'
+)
+
 
 def simulate(
     scenario: Annotated[str, typer.Argument(help="Name of a built-in scenario, or a YAML file.")],
-    out: Annotated[Path, typer.Option("--out", help="Log folder, or a file ending in .mcap.")],
+    out: Path,
     vehicle: Annotated[str, typer.Option(help="Name of a vehicle, or a YAML file.")] = "elevate",
     terrain: Annotated[
         str | None, typer.Option(help="One ground for the whole route, instead of the scenario's.")
@@ -49,7 +55,7 @@ def simulate(
             is_eager=True,
         ),
     ] = None,
-) -> None:
+) -> Result:
     """Simulate one drive with its ground truth, and write it as a log folder or an MCAP bag.
 
     Built-in scenarios: paper_profile, straight, circle, figure_eight, spin, staircase, chirp, waypoints,
@@ -81,14 +87,27 @@ def simulate(
     if out.suffix == ".mcap":
         from terrafusion.datasets.writers.mcap import write_mcap
 
-        write_mcap(run.recording, out)
+        write_mcap(run.recording, out, overwrite=True)
     else:
         from terrafusion.datasets.writers.log_folder import write_log_folder
 
         write_log_folder(run.recording, out)
-    for line in summary_lines(run):
-        print(line)
-    print(f"written to {out}")
+    return Result(summary_lines(run), f"written to {out}", document(run, out))
+
+
+def document(run: SimulatedRun, out: Path) -> dict[str, Any]:
+    """The run as `--json` prints it; unknown numbers are null."""
+    import dataclasses
+
+    from terrafusion.datasets.core.json_text import finite
+
+    recording = run.recording
+    rows = {name: len(channel) for name, channel in recording.channels().items()}
+    made: dict[str, Any] = finite(dataclasses.asdict(run.summary))
+    return {
+        "out": str(out), "description": recording.description, "samples": rows,
+        "notes": list(recording.notes), "summary": made,
+    }  # fmt: skip
 
 
 def _place(text: str) -> tuple[float, float, float]:

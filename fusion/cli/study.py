@@ -7,11 +7,20 @@ from typing import Annotated
 
 import typer
 
-from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import progress_bar, read_json
+from terrafusion.fusion.cli.outputs import Output
+
+OUTPUT = Output(
+    "Folder for the tables, metrics.json and report.html.",
+    ("plan.json", "agreement.*", "metrics.json", "batch.csv", "report.html", "*.mcap"),
+    ("plan.json",),
+    mark='"quick"',
+)
 
 
 def study(
-    out: Annotated[Path, typer.Option("--out", help="Folder for the tables, metrics.json and report.html.")],
+    out: Path,
     quick: Annotated[bool, typer.Option("--quick", help="Two seeds and a small batch.")] = False,
     seeds: Annotated[
         int | None, typer.Option(help="Seeds a case (10; 2 when quick).", show_default=False)
@@ -22,7 +31,7 @@ def study(
     bags: Annotated[
         bool, typer.Option("--bags", help="Also write the three runs as ROS 2 bags (MCAP).")
     ] = False,
-) -> None:
+) -> Result:
     """Reproduce the study this project starts from, and judge the twin against it, statement by statement.
 
     Runs mud, loose and medium sand, the batch over friction, slope and payload, and a drive like the field
@@ -44,6 +53,4 @@ def study(
     write_study(out, found, {"command": command})
     if bags:
         write_bags(out)
-    for line in study_lines(found):
-        print(line)
-    print(f"report: {out / 'report.html'}")
+    return Result(study_lines(found), f"report: {out / 'report.html'}", read_json(out / "metrics.json"))

@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import command_line, progress_bar, read_json
+from terrafusion.fusion.cli.outputs import Output
 
 if TYPE_CHECKING:
     from terrafusion.twin.sweep.plan import Sweep
 
+OUTPUT = Output(
+    "Folder for the results; an unfinished one goes on.",
+    ("sweep.json", "runs.parquet", "parts", "recordings", "report.html", "*.png"),
+    ("sweep.json",),
+    goes_on=True,
+)
 RecordingsOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -24,7 +31,7 @@ RecordingsOption = Annotated[
 
 def sweep(
     sweep: Annotated[str, typer.Argument(help="Name of a built-in sweep, or a YAML file.")],
-    out: Annotated[Path, typer.Option("--out", help="Folder for the results; an unfinished one goes on.")],
+    out: Path,
     jobs: Annotated[
         int | None, typer.Option(min=1, help="Processes on this machine; by default one a processor.")
     ] = None,
@@ -36,7 +43,7 @@ def sweep(
     plots: Annotated[bool, typer.Option("--plots/--no-plots", help="Write report.html and plots.")] = True,
     recordings: RecordingsOption = None,
     recordings_format: Annotated[str, typer.Option(help="folder: log folders; mcap: ROS 2 bags.")] = "folder",
-) -> None:
+) -> Result:
     """Run a scenario over friction, terrain, slope, payload, speed and seeds.
 
     Writes runs.parquet (a row a run), sweep.json, report.html and plots. A sweep that was stopped
@@ -75,13 +82,11 @@ def sweep(
     if plots:
         from terrafusion.fusion.reports.sweep import write_sweep_report
 
-        write_sweep_report(out, plan, table, {"command": " ".join(["terrafusion", *sys.argv[1:]])})
+        write_sweep_report(out, plan, table, {"command": command_line()})
     statuses, errors = (table.column(name).to_pylist() for name in ("status", "error"))
-    for line in [*summary_lines(statuses, errors), *failures]:
-        print(line)
-    print(f"written to {out}")
-    if statuses and set(statuses) == {"failed"}:
-        raise typer.Exit(1)
+    lines = [*summary_lines(statuses, errors), *failures]
+    all_failed = bool(statuses) and set(statuses) == {"failed"}
+    return Result(lines, f"written to {out}", read_json(out / "sweep.json"), int(all_failed))
 
 
 def summary_lines(statuses: Sequence[str], errors: Sequence[str | None]) -> list[str]:

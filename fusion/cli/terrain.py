@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
-import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.cli.command import Result, add_command
 from terrafusion.fusion.cli.common import progress_bar
+from terrafusion.fusion.cli.outputs import Output
 from terrafusion.fusion.cli.usage import CommandGroup
 
 if TYPE_CHECKING:
@@ -21,9 +23,8 @@ if TYPE_CHECKING:
 app = typer.Typer(help="The terrain detector: train its model, score it.", cls=CommandGroup)
 
 
-@app.command("train")
 def train(
-    out: Annotated[Path, typer.Option("--out", help="Model file (YAML) to write.")],
+    out: Path,
     logs: Annotated[
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: simulated runs.")
     ] = None,
@@ -31,7 +32,7 @@ def train(
         int | None,
         typer.Option(min=1, max=1000, help="Seeds of the simulated runs (3).", show_default=False),
     ] = None,
-) -> None:
+) -> Result:
     """Train the terrain model on simulated runs, or a classifier of one robot's grounds on its labelled logs.
 
     Without logs the twin drives over soils, slopes, payloads and speeds; one
@@ -40,11 +41,9 @@ def train(
     Example: terrafusion terrain train --out model.yaml
     Example: terrafusion terrain train --out grounds.yaml borealtc/*/imu_*.csv
     """
-    checked_output(out)
     if logs:
         no_seeds(seeds)
-        train_on_logs(logs, out)
-        return
+        return train_on_logs(logs, out)
     from terrafusion.fusion.training.train_detector import TrainingPlan, write_model
     from terrafusion.fusion.training.train_detector import train as run
 
@@ -52,14 +51,12 @@ def train(
     with progress("runs", plan.runs()) as tick:
         model, scores = run(plan, tick)
     write_model(model, out)
-    print_scores("held-out seed", scores)
-    print(f"temperature {model.temperature:g}; inputs {model.inputs_sha256[:16]}; written to {out}")
+    done = f"temperature {model.temperature:g}; inputs {model.inputs_sha256[:16]}; written to {out}"
+    return Result(score_lines("held-out seed", scores), done, {"out": str(out), **dataclasses.asdict(scores)})
 
 
-def train_on_logs(logs: list[str], out: Path) -> None:
+def train_on_logs(logs: list[str], out: Path) -> Result:
     """Fit, calibrate and write a classifier of labelled logs."""
-    import dataclasses
-
     from terrafusion.fusion.training.cross_validation import check_runs, hashes_of, open_runs, train_on
 
     runs = open_runs(logs)
@@ -68,10 +65,11 @@ def train_on_logs(logs: list[str], out: Path) -> None:
     model = dataclasses.replace(train_on(runs), inputs=hashes_of(logs), made_by=made_by)
     model.write(out)
     windows = sum(len(r.x) for r in runs)
-    print(f"{windows} windows of {len(runs)} runs on {', '.join(model.classes)}; written to {out}")
+    done = f"{windows} windows of {len(runs)} runs on {', '.join(model.classes)}; written to {out}"
+    document = {"out": str(out), "runs": len(runs), "windows": windows, "classes": list(model.classes)}
+    return Result((), done, document)
 
 
-@app.command("eval")
 def evaluate(
     logs: Annotated[
         list[str] | None, typer.Argument(help="Labelled logs of one robot; none: new simulated runs.")
@@ -91,7 +89,7 @@ def evaluate(
         list[str] | None, typer.Option("--test", help="Labelled logs of another robot (may be given again).")
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="JSON file for the scores of the logs.")] = None,
-) -> None:
+) -> Result:
     """Score a terrain model on new simulated runs, or a classifier on labelled logs, cross-validated by run.
 
     With logs: five folds of whole runs; delay of detecting changes of ground,
@@ -103,17 +101,13 @@ def evaluate(
     Example: terrafusion terrain eval --out figures.json borealtc/*/imu_*.csv
     Example: terrafusion terrain eval --model grounds.yaml another_day/*/imu_*.csv
     """
-    if out is not None:
-        checked_output(out)
     if logs:
         no_seeds(seeds)
         if model is None:
-            evaluate_logs(logs, test or [], out)
-        elif test:
+            return evaluate_logs(logs, test or [], out)
+        if test:
             raise TerrafusionError("--test needs a model trained by this command", remedy="leave out --model")
-        else:
-            evaluate_model(model, logs, out)
-        return
+        return evaluate_model(model, logs, out)
     if test or out is not None:
         raise TerrafusionError("--test and --out need labelled logs", remedy="name the logs to train on")
     from terrafusion.fusion.terrain.classifier import load_terrain_model
@@ -122,25 +116,23 @@ def evaluate(
     loaded = load_terrain_model(model)
     with progress("runs", trials.count(seeds or 1)) as tick:
         results = trials.run(loaded, seeds or 1, tick)
-    for name, scores in results.items():
-        print_scores(name, scores)
-        print()
+    lines = [line for name, scores in results.items() for line in [*score_lines(name, scores), ""]]
+    return Result(lines, "", {name: dataclasses.asdict(scores) for name, scores in results.items()})
 
 
-def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> None:
-    """Cross-validate labelled logs; print and write the scores."""
+def evaluate_logs(logs: list[str], test: list[str], out: Path | None) -> Result:
+    """Cross-validate labelled logs; write the scores where asked for."""
     from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
     from terrafusion.fusion.training.surface_report import STEPS, lines_of, report_on
 
     runs, others = open_runs(logs), open_runs(test) if test else []
     with progress("steps", STEPS) as tick:
         report = report_on(runs, others, tick)
-    print("\n".join(lines_of(report)))
-    write_scores(report | {"inputs": hashes_of([*logs, *test])}, out)
+    return scored(report | {"inputs": hashes_of([*logs, *test])}, lines_of(report), out)
 
 
-def evaluate_model(model: Path, logs: list[str], out: Path | None) -> None:
-    """Score a model on labelled logs that it was not trained on; print and write the scores."""
+def evaluate_model(model: Path, logs: list[str], out: Path | None) -> Result:
+    """Score a model on labelled logs that it was not trained on; write the scores where asked for."""
     from terrafusion.fusion.training.cross_validation import hashes_of, open_runs
     from terrafusion.fusion.training.softmax import read_softmax
     from terrafusion.fusion.training.surface_report import figures_lines, score
@@ -154,16 +146,17 @@ def evaluate_model(model: Path, logs: list[str], out: Path | None) -> None:
             remedy="give other logs; without --model they are left out in turn",
         )
     report = score(classifier, open_runs(logs))
-    print("\n".join(figures_lines(report)))
-    write_scores(report | {"inputs": inputs}, out)
+    return scored(report | {"inputs": inputs}, figures_lines(report), out)
 
 
-def write_scores(report: dict[str, Any], out: Path | None) -> None:
-    """Write scores as JSON if `out` is given."""
-    from terrafusion.datasets.core.json_text import to_json
+def scored(report: dict[str, Any], lines: list[str], out: Path | None) -> Result:
+    """Scores as the result of the command, also written as JSON if `out` is given."""
+    from terrafusion.datasets.core.json_text import finite, to_json
+    from terrafusion.fusion.reports.page import write_text
 
     if out is not None:
-        out.write_text(to_json(report, indent=1) + "\n", encoding="utf-8")
+        write_text(out, to_json(report, indent=1) + "\n")
+    return Result(lines, "" if out is None else f"written to {out}", finite(report))
 
 
 def no_seeds(seeds: int | None) -> None:
@@ -172,27 +165,19 @@ def no_seeds(seeds: int | None) -> None:
         raise TerrafusionError("--seeds is for simulated runs", remedy="leave it out, or the logs")
 
 
-def print_scores(name: str, scores: DetectorScores) -> None:
-    """Print the scores as a table."""
+def score_lines(name: str, scores: DetectorScores) -> list[str]:
+    """The scores as a table."""
     median, p95, largest = scores.switch_delay_s
-    print(f"{name}: {scores.windows} windows")
-    print(f"{'true ground':13s} " + " ".join(f"{c:>12s}" for c in scores.classes))
-    for truth, row in zip(scores.classes, scores.confusion, strict=False):
-        if any(row):
-            print(f"{truth:13s} " + " ".join(f"{share:12.3f}" for share in row))
-    print(f"macro-F1 {scores.macro_f1:.3f}; ECE {scores.ece:.3f}; unknown {scores.unknown_share:.3f}")
-    print(
+    rows = [(truth, row) for truth, row in zip(scores.classes, scores.confusion, strict=False) if any(row)]
+    return [
+        f"{name}: {scores.windows} windows",
+        f"{'true ground':13s} " + " ".join(f"{c:>12s}" for c in scores.classes),
+        *(f"{truth:13s} " + " ".join(f"{share:12.3f}" for share in row) for truth, row in rows),
+        f"macro-F1 {scores.macro_f1:.3f}; ECE {scores.ece:.3f}; unknown {scores.unknown_share:.3f}",
         f"ground change detected after {median:.1f} s (median), {p95:.1f} s (95 %), {largest:.1f} s (max); "
-        f"missed {scores.switches_missed:.1%}; false changes {scores.false_switches_per_min:.2f}/min"
-    )
-    print(f"one update {scores.update_ms:.2f} ms")
-
-
-def checked_output(path: Path) -> None:
-    """Refuse an output file that cannot be written, before the long work starts."""
-    folder = path.absolute().parent
-    if path.is_dir() or not folder.is_dir() or not os.access(path if path.exists() else folder, os.W_OK):
-        raise TerrafusionError("cannot be written", file=path, remedy="give a file in an existing folder")
+        f"missed {scores.switches_missed:.1%}; false changes {scores.false_switches_per_min:.2f}/min",
+        f"one update {scores.update_ms:.2f} ms",
+    ]
 
 
 @contextlib.contextmanager
@@ -201,3 +186,8 @@ def progress(what: str, total: int) -> Iterator[Callable[[], None]]:
     with progress_bar(what) as report:
         steps = itertools.count(1)
         yield (lambda: report(next(steps) / total)) if report is not None else lambda: None
+
+
+MODEL = Output("Model file (YAML) to write.", suffix=".yaml", mark="made_by: terrafusion terrain train")
+add_command(app, "train", train, output=MODEL)
+add_command(app, "eval", evaluate, files={"out": None})

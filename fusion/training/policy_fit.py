@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.noise.policy import SCHEMA, Policy, SensorNoise, within_ranges
 from terrafusion.fusion.training.ground_samples import (
     ACCEL_S,
@@ -244,5 +245,4 @@ def write_policy(policy: Policy, path: Path, made_by: str) -> None:
     }
     yaml = YAML()
     yaml.default_flow_style = False
-    with path.open("w", encoding="utf-8") as out:
-        yaml.dump(content, out)
+    write_atomically(path, lambda part: yaml.dump(content, part))

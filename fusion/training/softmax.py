@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import ConfigError
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.datasets.core.yaml_file import read_yaml
 from terrafusion.fusion.terrain.sequence import PatchFilter
 from terrafusion.fusion.training.surface_features import (
@@ -123,8 +124,7 @@ class SoftmaxModel:
         yaml = YAML()
         yaml.default_flow_style = None
         yaml.width = 110
-        with path.open("w", encoding="utf-8") as out:
-            yaml.dump(content, out)
+        write_atomically(path, lambda part: yaml.dump(content, part))
 
 
 def _change_evidence(p: Array) -> float:

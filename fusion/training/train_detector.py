@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.files import write_atomically
 from terrafusion.fusion.terrain.classifier import SCHEMA, UNKNOWN, LikelihoodTable, Mixture, TerrainModel
 from terrafusion.fusion.terrain.features import FEATURES, MIN_SPEED_MPS, SLIP, Window, extract
 from terrafusion.fusion.terrain.sequence import PatchFilter
@@ -223,8 +224,7 @@ def write_model(model: TerrainModel, path: Path) -> None:
     yaml = YAML()
     yaml.default_flow_style = None
     yaml.width = 110
-    with path.open("w", encoding="utf-8") as out:
-        yaml.dump(content, out)
+    write_atomically(path, lambda part: yaml.dump(content, part))
 
 
 def _listed(mixture: Mixture) -> list[dict[str, Any]]:

@@ -126,8 +126,8 @@ def test_truncated_mcap(share: float, good_log: Path, tmp_path: Path, terrafusio
 
 
 @pytest.mark.parametrize("words", [
-    "replay LOG", "replay LOG --out r --mode magic", "replay LOG --out r --colour red", "replay", "fly",
-    "simulate straight", "simulate straight --out s --seed many", "simulate straight --out s --slope-deg up",
+    "replay LOG --out r --mode magic", "replay LOG --out r --colour red", "replay", "fly",
+    "simulate straight --out s --seed many", "simulate straight --out s --slope-deg up",
     "replay LOG --out r --stamps arrival", "replay LOG --out r --topic imu", "convert LOG", "demo extra",
 ])  # fmt: skip
 def test_wrong_usage_is_status_2(words: str, good_log: Path, tmp_path: Path, terrafusion) -> None:

@@ -9,12 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
 from terrafusion.datasets.core.recording import Recording
 from terrafusion.datasets.readers import formats, open_recording
-from terrafusion.fusion.cli import convert, inspect
+from terrafusion.fusion.cli.main import app
 
 FILES = {
     "meta.yaml": "start_ns: 1700000000000000000\nvehicle: nobody_knows\nterrain: gravel\ntrack_m: 0.5\n",
@@ -38,9 +37,6 @@ def log(tmp_path: Path) -> Path:
 
 def run(capsys: pytest.CaptureFixture[str], *words: str | Path) -> tuple[int, str, str]:
     """Exit status, output and error text, by the rules of the console script."""
-    app = typer.Typer(pretty_exceptions_enable=False)
-    app.command("inspect")(inspect.inspect)
-    app.command("convert")(convert.convert)
     try:
         status = app([str(word) for word in words], standalone_mode=False) or 0
     except TerrafusionError as error:
@@ -248,7 +244,7 @@ def test_convert_to_mcap_and_back(log: Path, tmp_path: Path, capsys: pytest.Capt
     }  # fmt: skip
     status, _, err = run(capsys, "convert", log, tmp_path / "a.mcap")
     assert (status, err.count("\n")) == (1, 1)
-    assert run(capsys, "convert", log, tmp_path / "a.mcap", "--overwrite")[0] == 0
+    assert run(capsys, "convert", log, tmp_path / "a.mcap", "--force")[0] == 0
 
 
 @pytest.mark.parametrize(

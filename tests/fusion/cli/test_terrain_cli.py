@@ -14,10 +14,11 @@ from terrafusion.fusion.training.detector_scores import DetectorScores
 
 @pytest.mark.parametrize(("app", "command"), [(terrain.app, "train"), (policy.app, "fit")])
 def test_an_output_that_cannot_be_written_is_told_at_once(app: object, command: str, tmp_path: Path) -> None:
-    for out in (tmp_path, tmp_path / "missing" / "file.yaml"):
+    (tmp_path / "file").touch()
+    for out in (tmp_path, tmp_path / "file" / "model.yaml"):
         result = CliRunner().invoke(app, [command, "--out", str(out)])  # type: ignore[arg-type]
         assert isinstance(result.exception, TerrafusionError)
-        assert "existing folder" in str(result.exception)
+        assert "cannot be written" in str(result.exception)
 
 
 def test_no_seeds_is_wrong_usage(tmp_path: Path) -> None:
@@ -35,8 +36,7 @@ def test_scores_are_printed_for_the_grounds_that_occurred(capsys: pytest.Capture
     scores = DetectorScores(
         ("mud", "ice", "unknown"), confusion, 0.9, 0.01, 0.0, (1.0, 1.5, 2.0), 0.0, 0.1, 0.2, 50
     )
-    terrain.print_scores("trial", scores)
-    lines = capsys.readouterr().out.splitlines()
+    lines = terrain.score_lines("trial", scores)
     assert lines[0] == "trial: 50 windows"
     assert [line.split()[0] for line in lines[2:4]] == ["mud", "macro-F1"]
     with terrain.progress("drives", 3) as tick:

@@ -1,0 +1,163 @@
+"""What all commands share: options, the place of results, what is printed, and how they end."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import inspect
+import io
+import json
+import sys
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.cli.outputs import Output, check_file
+
+PANEL = "Options of all commands"
+INTERRUPTED = 130
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command has to tell.
+
+    Attributes:
+        lines: printed in full, unless `--quiet`.
+        done: the last line.
+        document: what `--json` prints.
+        status: exit status.
+        details: printed with `--verbose`.
+        short: printed with `--quiet`; by default `done`.
+    """
+
+    lines: Sequence[str] = ()
+    done: str = ""
+    document: Any = None
+    status: int = 0
+    details: Sequence[str] = ()
+    short: str = ""
+
+
+Quiet = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Print one line and errors.", rich_help_panel=PANEL)
+]
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", help="Print details, all options, and where an error arose.", rich_help_panel=PANEL
+    ),
+]
+AsJson = Annotated[
+    bool,
+    typer.Option("--json", help="Print one JSON document, all else to stderr.", rich_help_panel=PANEL),
+]
+Force = Annotated[
+    bool,
+    typer.Option("--force", help="Replace what this command did not write.", rich_help_panel=PANEL),
+]
+
+
+def add_command(
+    app: typer.Typer,
+    name: str,
+    body: Callable[..., Result],
+    *,
+    output: Output | None = None,
+    instead: tuple[str, Output] | None = None,
+    files: Mapping[str, str | None] | None = None,
+    as_json: bool = True,
+) -> None:
+    """Make a function a command that has the shared options.
+
+    Args:
+        body: takes the command's own options and, where it writes, `out: Path`; returns what to print.
+        output: what it writes at `out`; gives a plain `out: Path` the option `--out`.
+        instead: what it writes with an option that is called so.
+        files: options that are further files to write, each with a word of the files it may replace.
+        as_json: whether it has `--json`.
+    """
+    signature = inspect.signature(body, eval_str=True)
+    shared = {"quiet": Quiet, "verbose": Verbose}
+    shared |= {"as_json": AsJson} if as_json else {}
+    shared |= {"force": Force} if output is not None or files else {}
+    asked = [
+        inspect.Parameter(word, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=kind)
+        for word, kind in shared.items()
+    ]
+
+    own = {one.name: one.replace(kind=one.KEYWORD_ONLY) for one in signature.parameters.values()}
+    if output is not None and own["out"].annotation is Path:
+        option = Annotated[Path | None, typer.Option("--out", help=f"{output.help} Default: a dated name.")]
+        own["out"] = own["out"].replace(annotation=option, default=None)
+
+    @functools.wraps(body)
+    def command(context: typer.Context, **given: Any) -> None:
+        how = {word: given.pop(word) for word in shared}
+        called = context.command_path.partition(" ")[2]
+        kind = instead[1] if instead is not None and given[instead[0]] else output
+        if kind is not None:
+            given["out"] = kind.place(given["out"], called, subject_of(given[next(iter(own))]), how["force"])
+        for option, mark in (files or {}).items():
+            if given[option] is not None:
+                check_file(given[option], how["force"], mark)
+        if how["verbose"]:
+            print("\n".join(f"{key} = {value}" for key, value in given.items()), file=sys.stderr)
+        try:
+            with _told(how["quiet"], how.get("as_json", False)):
+                result = body(**given)
+        except TerrafusionError:
+            if how["verbose"]:
+                traceback.print_exc()
+            raise
+        except (KeyboardInterrupt, typer.Abort):
+            print(f"error: {interrupted(given.get('out'), kind)}", file=sys.stderr)
+            raise typer.Exit(INTERRUPTED) from None
+        show(result, how["quiet"], how["verbose"], how.get("as_json", False))
+        if result.status:
+            raise typer.Exit(result.status)
+
+    context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD, annotation=typer.Context)
+    everything = [context, *own.values(), *asked]
+    command.__signature__ = signature.replace(parameters=everything)  # type: ignore[attr-defined]
+    command.__annotations__ = {one.name: one.annotation for one in everything}
+    app.command(name)(command)
+
+
+@contextlib.contextmanager
+def _told(quiet: bool, as_json: bool) -> Iterator[None]:
+    """Send what is printed during the work to nowhere, or to standard error, as the options ask."""
+    if not (quiet or as_json):
+        yield
+        return
+    with contextlib.redirect_stdout(io.StringIO() if quiet else sys.stderr):
+        yield
+
+
+def show(result: Result, quiet: bool, verbose: bool, as_json: bool) -> None:
+    """Print a result; with `as_json` its document alone is on standard output."""
+    details = result.details if verbose else ()
+    lines = [result.short or result.done] if quiet else [*result.lines, *details, result.done]
+    for line in lines if lines[-1] else lines[:-1]:
+        print(line, file=sys.stderr if as_json else sys.stdout)
+    if as_json:
+        print(json.dumps(result.document, indent=2, allow_nan=False))
+
+
+def subject_of(first: object) -> str:
+    """The log, or other thing, that the command is about: its first argument, if that is a text."""
+    first = first[0] if isinstance(first, list) and first else first
+    return first if isinstance(first, str) else ""
+
+
+def interrupted(out: Path | None, output: Output | None) -> str:
+    """What is kept of an interrupted command, and where."""
+    if output is None or out is None or not out.exists():
+        return "interrupted; nothing was written"
+    more = "; the same command with this --out continues" if output.goes_on else ""
+    return f"interrupted; what was finished is kept in {out}{more}"
