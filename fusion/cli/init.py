@@ -77,7 +77,7 @@ def init(
     from terrafusion.fusion.cli.init_page import ask, choose_sensors, contents_lines, result_lines
     from terrafusion.fusion.cli.inspect_page import print_lines
     from terrafusion.fusion.init.answers import Answers
-    from terrafusion.fusion.init.vehicle import first_vehicle
+    from terrafusion.fusion.init.vehicle import first_vehicle, generic_rig
 
     if out.suffix not in (".yaml", ".yml"):
         raise ConfigError("--out is no YAML file", file=out, remedy="give a name such as my_robot.yaml")
@@ -102,10 +102,11 @@ def init(
         recording = open_recording(log, **reading(rig, entries, stamps, columns, repair_clock))
         return clock_accepted(recording) if repair_clock else recording
 
-    print_lines(contents_lines(open_log(None)))
+    first = open_log(generic_rig())
+    print_lines(contents_lines(first))
     answers = ask(answers, topics)
     with progress_bar("calibrating the sensors") as progress:
-        found = first_vehicle(open_log, answers, progress)
+        found = first_vehicle(open_log, first, answers, progress)
     _write(out, log, found)
     print_lines(result_lines(found, out))
     lines = ["", *([] if no_verdict else [*_verdict(found, out), ""])]

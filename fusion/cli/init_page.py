@@ -77,15 +77,12 @@ def _number_to(last: int) -> int:
 
 
 def contents_lines(recording: Recording) -> Iterator[Line]:
-    """Channels with rates and gaps, and what the reader noted."""
+    """Channels with rates and gaps."""
     from terrafusion.datasets.checks.measures import Measures
     from terrafusion.datasets.checks.summary import summarise
 
-    page = summarise(recording, Measures(), [])
-    yield from clock_table(page["channels"])
+    yield from clock_table(summarise(recording, Measures(), [])["channels"])
     yield "", ""
-    for note in page["notes"]:
-        yield from entry("note", "dim", note)
 
 
 def ask(answers: Answers, topics: dict[str, str]) -> Answers:
@@ -130,7 +127,7 @@ def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
             yield from entry(
                 "not seen", "dim", f"{', '.join(missing)}: taken as usual, learned while driving"
             )
-    for note in found.notes:
+    for note in (*found.notes, *found.recording.notes):
         yield from entry("note", "dim", note)
     for finding in found.repaired:
         yield from entry("repaired", "yellow", f"{finding.channel}: {finding.what}; {finding.fix}")

@@ -34,20 +34,9 @@ FLAGS = {
 
 
 def geometry_lines(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
-    """The lines of drive, wheels, track, sensors' places and mass.
-
-    Args:
-        recording: the log.
-        measured: with the rig of `base` and the radius of `answers`.
-        answers: what the user said.
-        base: the vehicle that the file extends.
-
-    Raises:
-        DataError: the radius that fits the fixes is none of a wheel.
-    """
+    """The lines of drive, track, sensors' places and mass; the arguments as in `radius_line`."""
     drive = _drive(recording, answers, base)
     lines = {"drive": drive}
-    lines |= _radius(recording, measured, answers, base)
     lines |= _track(recording, measured.yaw, answers, base, str(drive.value))
     if drive.value in STEERED_DRIVES:
         lines["wheelbase_m"] = _given(
@@ -81,8 +70,18 @@ def _drive(recording: Recording, answers: Answers, base: VehicleParams) -> Draft
     return DraftLine(base.drive.type, f"assumed, as of '{base.name}'; else give {FLAGS['drive']}")
 
 
-def _radius(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
-    """The radius; the fixes give it where neither user nor log does. None for wheels in m/s."""
+def radius_line(recording: Recording, measured: Measures, answers: Answers, base: VehicleParams) -> Draft:
+    """The radius; the fixes give it where neither user nor log does. No line for wheels in m/s.
+
+    Args:
+        recording: the log.
+        measured: with the rig of `base` and the numbers of `answers`.
+        answers: what the user said.
+        base: the vehicle that the file extends.
+
+    Raises:
+        DataError: the radius that fits the fixes is none of a wheel.
+    """
     name, wheels, stated = "wheel_radius_m", recording.wheels, recording.overrides.wheel_radius_m
     given = answers.wheel_radius_m
     if wheels is None or (wheels.unit == "mps" and given is None):

@@ -21,7 +21,7 @@ from terrafusion.datasets.core.robot import KnownNumber
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.fusion.init.answers import Answers
 from terrafusion.fusion.init.draft import Draft, DraftLine, write_draft
-from terrafusion.fusion.init.geometry import geometry_lines
+from terrafusion.fusion.init.geometry import geometry_lines, radius_line
 from terrafusion.fusion.sensor_calibration import SensorCalibration, calibrate_sensors
 from terrafusion.twin.model.library import is_named
 from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle
@@ -69,30 +69,49 @@ def base_of(recording: Recording) -> VehicleParams:
     return load_vehicle(str(recording.vehicle) if named else "generic")
 
 
+def generic_rig() -> Rig:
+    """The geometry with which a log of an unknown robot is read first."""
+    return load_vehicle("generic").rig()
+
+
 def first_vehicle(
     open_log: Open,
+    first: Recording,
     answers: Answers,
     progress: Callable[[float], None] | None = None,
 ) -> FirstVehicle:
     """Measure what the log shows, and lay out the file.
 
+    Args:
+        open_log: reads the log.
+        first: the log as read with `generic_rig`.
+        answers: what the user knows.
+        progress: called with the share done of the longest step, 0 to 1.
+
     Raises:
         DataError: the log cannot be read, or is wrong in a way that no repair removes.
         ConfigError: an answer is out of range.
     """
-    recording = open_log(load_vehicle("generic").rig())
-    base = base_of(recording)
-    rig = _with_radius(base.rig(), answers)
-    recording = open_log(rig)
+    _refuse_without_wheels(first)
+    base = base_of(first)
+    rig = _with_geometry(base.rig(), answers)
+    recording = first if rig == generic_rig() else open_log(rig)
     measured = measure([recording], rig)
     unmeasured: tuple[str, ...] = ()
     named = DraftLine(base.name, "what is not below is as of this vehicle")
     draft: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
+    radius = radius_line(recording, measured, answers, base)
+    for line in radius.values():  # the effective track scales with it
+        if isinstance(line.value, KnownNumber):
+            measured = measure([recording], dataclasses.replace(rig, wheel_radius_m=line.value.number))
+    draft |= radius
     draft |= geometry_lines(recording, measured, answers, base)
     if base.name != "generic":  # what nobody measured here is better known in its own file
         draft = {name: line for name, line in draft.items() if not line.assumed}
         known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
         unmeasured += (known,)
+    if recording.imu_frame_id:
+        draft["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the IMU's messages")
     if answers.topics:
         draft["topics"] = DraftLine(answers.topics, "chosen among several sensors of a kind")
     with tempfile.TemporaryDirectory(prefix="terrafusion-") as folder:
@@ -105,7 +124,19 @@ def first_vehicle(
     return FirstVehicle(draft, recording, repaired, findings, measured, calibration, notes)
 
 
-def _with_radius(rig: Rig, answers: Answers) -> Rig:
+def _refuse_without_wheels(recording: Recording) -> None:
+    """Raises DataError where nothing can be measured, with what the reader says of wheels."""
+    if recording.wheels is None or not len(recording.wheels):
+        notes = [note for note in recording.notes if note.startswith("wheels: ")]
+        raise DataError(
+            "; ".join(["the log has no wheel speeds", *notes]),
+            file=recording.name,
+            channel="wheels",
+            remedy="name their topic with --topic wheels=/NAME, or add wheels.csv to a log folder",
+        )
+
+
+def _with_geometry(rig: Rig, answers: Answers) -> Rig:
     radius, track = answers.wheel_radius_m, answers.track_m
     return dataclasses.replace(
         rig,
@@ -128,7 +159,7 @@ def _mounted(
     if axes is not None:
         turned = dict(draft)
         turned["imu_axes"] = DraftLine(axes.imu_axes, f"its axes along body x, y, z; {axes.evidence}")
-        turned["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the messages that this turns")
+        turned["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the IMU's messages")
         recording_turned, rig = _read(open_log, turned, file)
         found = run_checks(recording_turned, rig)
         if not any(finding.imu_axes for finding in found):  # the reader of the log turns by the file

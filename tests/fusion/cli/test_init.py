@@ -112,6 +112,16 @@ def test_mounting_and_radius_of_an_unknown_robot_in_a_bag(bag: Path, tmp_path: P
     assert done.output.splitlines()[-1].startswith(f"next: terrafusion replay {bag} --vehicle {out}")
 
 
+def test_the_effective_track_is_that_of_the_radius_found(drive: Recording, tmp_path: Path) -> None:
+    log = write_log_folder(drive, tmp_path / "log")
+    factors = []
+    for radius in ([], ["--wheel-radius", str(RADIUS_M)]):
+        done = run(log, "--out", tmp_path / "own.yaml", "--no-verdict", "--force", *radius)
+        assert done.exit_code == 0, done.exception
+        factors.append(file_of(tmp_path / "own.yaml")["yaw_factor"]["value"])
+    assert factors[0] == pytest.approx(factors[1], rel=0.02)
+
+
 def test_a_wrong_mounting_in_a_log_folder_is_repaired_by_a_command(drive: Recording, tmp_path: Path) -> None:
     log = write_log_folder(sensor_frame(drive, HUSKY), tmp_path / "log")
     out = tmp_path / "own.yaml"
@@ -147,6 +157,10 @@ def test_what_is_wrong_is_one_line(drive: Recording, tmp_path: Path, monkeypatch
         assert done.exit_code == 1, words
         assert expected in str(done.exception), words
         assert "\n" not in str(done.exception)
+    still = write_log_folder(dataclasses.replace(drive, wheels=None), tmp_path / "still")
+    done = run(still)
+    assert done.exit_code == 1
+    assert "no wheel speeds; name their topic" in str(done.exception)
     for flag, text, expected in (
         ("--drive", "skid", "skid_steer"),
         ("--track", "51cm", "0.12:data_sheet"),
