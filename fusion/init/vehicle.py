@@ -96,32 +96,51 @@ def first_vehicle(
     base = base_of(first)
     rig = _with_geometry(base.rig(), answers)
     recording = first if rig == generic_rig() else open_log(rig)
-    measured = measure([recording], rig)
-    unmeasured: tuple[str, ...] = ()
     named = DraftLine(base.name, "what is not below is as of this vehicle")
-    draft: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
-    radius = radius_line(recording, measured, answers, base)
-    for line in radius.values():  # the effective track scales with it
-        if isinstance(line.value, KnownNumber):
-            measured = measure([recording], dataclasses.replace(rig, wheel_radius_m=line.value.number))
-    draft |= radius
-    draft |= geometry_lines(recording, measured, answers, base)
-    if base.name != "generic":  # what nobody measured here is better known in its own file
-        draft = {name: line for name, line in draft.items() if not line.assumed}
-        known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
-        unmeasured += (known,)
-    if recording.imu_frame_id:
-        draft["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the IMU's messages")
-    if answers.topics:
-        draft["topics"] = DraftLine(answers.topics, "chosen among several sensors of a kind")
+    head: Draft = {"extends": named, "name": DraftLine(answers.name, "of the robot")}
+    tail = _messages(recording, answers)
+    measured, geometry = _geometry(recording, answers, base, rig)
     with tempfile.TemporaryDirectory(prefix="terrafusion-") as folder:
         file = Path(folder) / "vehicle.yaml"
-        recording, repaired, findings = _mounted(open_log, draft, file)
-        calibration, notes = _calibrated(recording, write_draft(file, draft, "draft"), progress)
+        mounted = _mounted(open_log, head | geometry | tail, file)
+        if mounted.turned:  # what is measured about z holds only now
+            tail = mounted.axes | tail
+            measured, geometry = _geometry(mounted.recording, answers, base, rig)
+        draft = head | geometry | tail
+        calibration, notes = _calibrated(mounted.recording, write_draft(file, draft, "draft"), progress)
+    if base.name != "generic":
+        known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
+        notes = (known, *notes)
     if calibration is not None:
         draft |= _learned_lines(calibration, draft)
-    notes = (*unmeasured, *notes)
-    return FirstVehicle(draft, recording, repaired, findings, measured, calibration, notes)
+    return FirstVehicle(
+        draft, mounted.recording, mounted.repaired, mounted.findings, measured, calibration, notes
+    )
+
+
+def _geometry(
+    recording: Recording, answers: Answers, base: VehicleParams, rig: Rig
+) -> tuple[Measures, Draft]:
+    """What is measured between the channels, and the lines of the geometry that follow."""
+    measured = measure([recording], rig)
+    lines = radius_line(recording, measured, answers, base)
+    for line in list(lines.values()):  # the effective track scales with it
+        if isinstance(line.value, KnownNumber):
+            measured = measure([recording], dataclasses.replace(rig, wheel_radius_m=line.value.number))
+    lines |= geometry_lines(recording, measured, answers, base)
+    if base.name != "generic":  # what nobody measured here is better known in its own file
+        lines = {name: line for name, line in lines.items() if not line.assumed}
+    return measured, lines
+
+
+def _messages(recording: Recording, answers: Answers) -> Draft:
+    """Lines of the IMU's frame, and of the topics that the user chose."""
+    lines: Draft = {}
+    if recording.imu_frame_id:
+        lines["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the IMU's messages")
+    if answers.topics:
+        lines["topics"] = DraftLine(answers.topics, "chosen among several sensors of a kind")
+    return lines
 
 
 def _refuse_without_wheels(recording: Recording) -> None:
@@ -145,26 +164,39 @@ def _with_geometry(rig: Rig, answers: Answers) -> Rig:
     )
 
 
-def _mounted(
-    open_log: Open, draft: Draft, file: Path
-) -> tuple[Recording, tuple[Finding, ...], tuple[Finding, ...]]:
-    """The log read with the draft, which gets the axes of the IMU; else repaired. Errors are gone after it.
+@dataclass(frozen=True, eq=False)
+class _Mounted:
+    """The log with its IMU in body axes: by the line `axes` of the file, or `repaired`."""
+
+    recording: Recording
+    axes: Draft
+    repaired: tuple[Finding, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def turned(self) -> bool:
+        """Whether it is another log than before."""
+        return bool(self.axes or self.repaired)
+
+
+def _mounted(open_log: Open, draft: Draft, file: Path) -> _Mounted:
+    """The log read with the draft and, where that helps, the axes of its IMU; else repaired.
 
     Raises:
-        DataError: one that no repair removes.
+        DataError: it has an error that no repair removes.
     """
     recording, rig = _read(open_log, draft, file)
     findings = run_checks(recording, rig)
-    axes = next((finding for finding in findings if finding.imu_axes), None)
-    if axes is not None:
-        turned = dict(draft)
-        turned["imu_axes"] = DraftLine(axes.imu_axes, f"its axes along body x, y, z; {axes.evidence}")
-        turned["imu_frame"] = DraftLine(recording.imu_frame_id.lstrip("/"), "of the IMU's messages")
-        recording_turned, rig = _read(open_log, turned, file)
-        found = run_checks(recording_turned, rig)
+    axes: Draft = {}
+    wrong = next((finding for finding in findings if finding.imu_axes), None)
+    if wrong is not None:
+        frame = DraftLine(recording.imu_frame_id.lstrip("/"), "of the IMU's messages")
+        comment = f"IMU axes along body x, y, z: {wrong.evidence}"
+        lines: Draft = {"imu_axes": DraftLine(wrong.imu_axes, comment), "imu_frame": frame}
+        turned, turned_rig = _read(open_log, draft | lines, file)
+        found = run_checks(turned, turned_rig)
         if not any(finding.imu_axes for finding in found):  # the reader of the log turns by the file
-            draft |= turned
-            recording, findings = recording_turned, found
+            recording, rig, findings, axes = turned, turned_rig, found, lines
     repaired: list[Finding] = []
     if any(finding.severity == "error" for finding in findings):
         recording, repaired = repair(recording, rig)
@@ -177,7 +209,7 @@ def _mounted(
                 channel=finding.channel,
                 remedy=f"{finding.fix}; then run this again",
             )
-    return recording, tuple(repaired), tuple(findings)
+    return _Mounted(recording, axes, tuple(repaired), tuple(findings))
 
 
 def _read(open_log: Open, draft: Draft, file: Path) -> tuple[Recording, Rig]:

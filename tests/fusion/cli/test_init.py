@@ -100,6 +100,7 @@ def test_mounting_and_radius_of_an_unknown_robot_in_a_bag(bag: Path, tmp_path: P
     assert robot["imu_axes"] == list(HUSKY)
     assert robot["imu_frame"] == "front_imu"
     assert robot["topics"] == {"imu": "/rover/front/imu"}
+    assert robot["yaw_factor"]["value"] == pytest.approx(0.6, abs=0.1)  # by the gyro as it is mounted
     radius = robot["wheel_radius_m"]
     assert radius["known"] == "calibrated"
     assert radius["value"] == pytest.approx(RADIUS_M, rel=0.03)
