@@ -16,7 +16,7 @@ from terrafusion.datasets.core.planar_alignment import planar_rotation
 from terrafusion.datasets.core.sensors import ImuSpec
 from terrafusion.fusion.graph import slow_states
 from terrafusion.fusion.graph.key_state import KeyState
-from terrafusion.fusion.inputs.door import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers, beyond
+from terrafusion.fusion.inputs.door import MOST_AWAY_M, MOST_HEIGHT_M, as_number, as_numbers
 from terrafusion.fusion.inputs.streams import GnssFix, ImuStream, WheelStream
 from terrafusion.fusion.noise.policy import SensorNoise
 
@@ -29,6 +29,8 @@ LEAST_RATIO = 0.3
 BIAS_SIGMA_RADPS = 0.004
 """Least prior of the gyro's bias where the robot did not stand at the start: data sheets and drivers promise
 less than is found (0.0035 rad/s on a Husky whose driver removes it at rest)."""
+LEAST_SIGMA, MOST_YAW_RAD = 1e-6, 100.0
+"""Of a given start: sigma in m or rad, and a heading, which more than degrees exceed."""
 SLIP_SIGMA = 0.05
 """Relative error of wheel speed against GNSS velocity (assumed)."""
 
@@ -158,11 +160,14 @@ def checked_start(
             f"sigmas {position_sigma_m} m, {yaw_sigma_rad} rad of the start are not positive",
             remedy="give 1 sigma",
         )
-    if beyond(position[:2], MOST_AWAY_M) or abs(position[2]) > MOST_HEIGHT_M:
+    far_m = max(*np.abs(position[:2]).tolist(), position_sigma_m)
+    if far_m > MOST_AWAY_M or abs(position[2]) > MOST_HEIGHT_M or abs(yaw_rad) > MOST_YAW_RAD:
         raise DataError(
-            f"start at {position.tolist()} m lies beyond the earth", remedy="give metres east and north"
+            f"start at {position.tolist()} m with yaw {yaw_rad:g} lies beyond the earth",
+            remedy="give metres east and north, and radians",
         )
-    return KnownStart(position, yaw_rad, position_sigma_m, yaw_sigma_rad)
+    sigma_m, sigma_rad = max(position_sigma_m, LEAST_SIGMA), max(min(yaw_sigma_rad, np.pi), LEAST_SIGMA)
+    return KnownStart(position, yaw_rad, sigma_m, sigma_rad)
 
 
 def heading_from_motion(

@@ -27,6 +27,7 @@ from terrafusion.fusion.estimate.estimate import Innovation, State
 from terrafusion.fusion.estimator import snapshot
 from terrafusion.fusion.estimator.aiding import AidingSensors
 from terrafusion.fusion.estimator.alignment import Start, checked_start, initial_state
+from terrafusion.fusion.estimator.breakdown import starts_anew
 from terrafusion.fusion.estimator.friction import friction_estimator
 from terrafusion.fusion.estimator.gates import WheelGate, wheel_innovation
 from terrafusion.fusion.estimator.gnss import GnssUpdater
@@ -114,7 +115,7 @@ class Estimator:
         self._state: State | None = None
         self._fresh: State | None = None
         self._covariance = np.zeros((self.chain.dim, self.chain.dim))
-        self._silent, self.wheels_rejected = False, 0
+        self._silent, self.wheels_rejected, self.breakdowns = False, 0, 0
         self._stationarity = StationarityDetector(config.rig)
         self.monitor = MotionMonitor(config.rig)
         self._propagator, self._frame = Propagator(self._preintegrator), OdometryFrame()
@@ -246,6 +247,7 @@ class Estimator:
         self.imu.late.wait_ns = self.wheels.late.wait_ns = 0
         self._advance(last=True)
 
+    @starts_anew
     def _advance(self, last: bool = False) -> None:
         if not self.chain.nodes:
             start = self._search.find(self.imu, self.wheels, last)
@@ -362,10 +364,7 @@ class Estimator:
         return self._covariance
 
     def _upkeep(self) -> None:
-        """Heading check, smoothing, terrain and learning: what no state waits for.
-
-        Done in the call after a keyframe's, at the latest before the next keyframe.
-        """
+        """Heading check, smoothing, terrain, learning: a call after a keyframe, or before the next one."""
         state, self._fresh = self._fresh, None
         if state is None:
             return

@@ -10,6 +10,10 @@ from terrafusion.fusion.inputs.streams import SHOCK_MPS2, SPIN_RADPS
 def notes_of(estimator: Estimator) -> tuple[str, ...]:
     """Notes on fixes, heading, skidding, IMU spikes, late samples and aiding sensors of a finished run."""
     gnss, notes = estimator.gnss, []
+    if times := estimator.breakdowns:
+        notes.append(
+            f"the numbers broke down {times} times, and the estimator started anew: check units and axes"
+        )
     if gnss.local and not gnss.unaligned:
         notes.append("no GNSS fix came: the path is local, its start and heading are arbitrary")
     elif gnss.local:

@@ -227,6 +227,8 @@ def checked_fix(
         raise DataError(
             f"a velocity of shape {velocity.shape}", channel="gnss", remedy="give east, north, up"
         )
+    if velocity is not None:  # the estimator refuses and counts it; its square must not overflow
+        velocity = np.clip(velocity, -MOST_TRAVEL_M, MOST_TRAVEL_M)
     sigma_v_mps = as_number(sigma_v_mps, "velocity sigma", "gnss")
     if not 0.0 < sigma_v_mps < np.inf:  # as drivers tell that they do not know it
         velocity = None

@@ -40,7 +40,7 @@ class Study:
 
 READS_LOGS = (
     "good_logs", "survey", "field_table", "fault_injection", "benchmark", "effective_track", "opponents",
-    "outage_terms", "known_changes", "grounds",
+    "outage_terms", "known_changes", "grounds", "fault_matrix",
 )  # fmt: skip
 
 
@@ -57,6 +57,24 @@ STUDIES = (
         {
             "field_logs_changed": r"field logs \d+, of which a repair would change (\d+)",
             "runs_changed": r"simulated runs \d+, of which a repair would change (\d+)",
+        },
+    ),
+    Study(
+        "fuzz",
+        "Does any input of readers, YAML, live API or command line end in a crash, a hang or too much memory?",
+        _module("fuzz", "--readers", "2000", "--yaml", "2000", "--live", "1000", "--cli", "1000"),
+        40,
+        {"cases": r"all (\d+) cases", "defects": r"all \d+ cases, defects (\d+)"},
+    ),
+    Study(
+        "fault_matrix",
+        "Do faults of sensors, clocks and links end in a crash, or in a wrong estimate that passes as good?",
+        _module("fault_matrix.matrix", "--out", OUT),
+        25,
+        {
+            "cells": r"cells (\d+)",
+            **{name: rf"{name} (\d+ of \d+)" for name in ("crash", "hang", "slow", "not_finite", "silent")},
+            "good_refused": r"ok and yet not good (\d+ of \d+)",
         },
     ),
     Study(

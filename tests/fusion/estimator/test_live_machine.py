@@ -8,5 +8,5 @@ from tests.fusion.estimator.live_machine import LiveMachine
 
 TestLive = LiveMachine.TestCase
 TestLive.settings = settings(
-    max_examples=30, stateful_step_count=12, deadline=None, suppress_health_check=list(HealthCheck)
+    max_examples=12, stateful_step_count=10, deadline=None, suppress_health_check=list(HealthCheck)
 )

@@ -87,7 +87,14 @@ def test_lists_will_do_and_odd_probabilities_are_none() -> None:
 
 @pytest.mark.parametrize(
     "start",
-    [("x", 0.0, 0.1, 0.1), (None, 0.0, 0.1, 0.1), ([0.0] * 3, 0.0, None, 0.1), ([1e300] * 3, 0.0, 1.0, 1.0)],
+    [
+        ("x", 0.0, 0.1, 0.1),
+        (None, 0.0, 0.1, 0.1),
+        ([0.0] * 3, 0.0, None, 0.1),
+        ([1e300] * 3, 0.0, 1.0, 1.0),
+        ([0.0] * 3, 0.0, 1e300, 0.1),
+        ([0.0] * 3, 1e16, 0.1, 0.1),
+    ],
 )
 def test_a_start_that_is_none_is_refused(start: tuple[Any, ...]) -> None:
     with pytest.raises(DataError):

@@ -1,0 +1,45 @@
+"""Where the numbers of an estimator break down, it refuses the sample, starts anew and counts it.
+
+Sensors that contradict each other beyond all that a graph can hold (an accelerometer in g, wheels in rev/min)
+end in numbers that are not finite or in a system that has no solution.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from terrafusion.datasets.core.errors import DataError
+
+BREAKDOWN = (ArithmeticError, np.linalg.LinAlgError, RuntimeError)
+"""What NumPy, GTSAM and the elimination raise where a system has no solution."""
+
+
+def starts_anew(advance: Callable[..., None]) -> Callable[..., None]:
+    """A method that makes keyframes, guarded: where the numbers break down, the estimator starts anew.
+
+    It is as it was made, without its buffers and a given start; `breakdowns` counts on.
+    """
+
+    @functools.wraps(advance)
+    def guarded(estimator: Any, last: bool = False) -> None:
+        before = estimator.latest()
+        try:
+            with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+                advance(estimator, last)
+            state = estimator.latest()
+            if state is not before and not np.isfinite(state.covariance.sum() + state.position_m.sum()):
+                raise ArithmeticError("a state is not finite")
+        except BREAKDOWN:
+            count = estimator.breakdowns + 1
+            estimator.__init__(estimator.config, estimator._on_state, estimator._on_innovation)
+            estimator.breakdowns = count
+            raise DataError(
+                "the sensors contradict each other so far that no state fits them; the estimator starts anew",
+                remedy="check units, axes and vehicle file with `terrafusion inspect`",
+            ) from None
+
+    return guarded

@@ -1,0 +1,49 @@
+"""Numbers that break down end a state, not the estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from terrafusion.datasets.core.errors import DataError
+from terrafusion.datasets.core.messages import Message
+from terrafusion.fusion.estimator.estimator import Estimator
+from terrafusion.fusion.estimator.notes import notes_of
+from tests.fusion.estimator.live_machine import drive
+
+
+def add_all(estimator: Estimator, messages: Iterator[Message]) -> None:
+    for message in messages:
+        estimator.add(message)
+
+
+@pytest.mark.parametrize("error", [ArithmeticError, OverflowError, RuntimeError, np.linalg.LinAlgError])
+def test_it_starts_anew_says_so_and_goes_on(error: type[Exception], monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, rest = Estimator.for_vehicle("elevate"), iter(drive())
+    while estimator.latest() is None:
+        estimator.add(next(rest))
+
+    def fails(*_: object) -> None:
+        raise error("a keyframe is not determined")
+
+    monkeypatch.setattr(estimator.chain, "solve", fails)
+    with pytest.raises(DataError, match="starts anew"):
+        add_all(estimator, rest)
+    assert estimator.latest() is None
+    assert estimator.status in ("waiting", "aligning")
+    assert any("broke down 1 times" in note for note in notes_of(estimator))
+    add_all(estimator, rest)
+    state = estimator.latest()
+    assert state is not None
+    assert np.isfinite(state.covariance).all()
+
+
+def test_a_state_that_is_not_finite_is_not_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    estimator, rest = Estimator.for_vehicle("elevate"), iter(drive())
+    while estimator.latest() is None:
+        estimator.add(next(rest))
+    monkeypatch.setattr(estimator.chain, "covariance", lambda: np.full((estimator.chain.dim,) * 2, np.nan))
+    with pytest.raises(DataError, match="starts anew"):
+        add_all(estimator, rest)

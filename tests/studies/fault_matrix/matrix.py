@@ -1,0 +1,249 @@
+"""A matrix of faults: does the estimator, or its verdict, fail silently?
+
+    python -m tests.studies.fault_matrix.matrix --cells 1000 --seconds 1500 --out OUT
+
+A cell is one or two faults, a log, a mode and live or batch, drawn at random with a seed: cell i is the same
+in every run, and a run goes on where one was stopped. The truth is kept from the verdict; where a log has
+none, the estimate of the clean log stands for it. *Silent*: an error of more than 10 m or, for more than 1 %
+of the time, of five sigmas, while the verdict is good.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import functools
+import json
+import os
+import signal
+import time
+import traceback
+import warnings
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.datasets.core.recording import Overrides, Recording
+from terrafusion.datasets.readers import open_recording
+from terrafusion.fusion.metrics.scores import Outage, score
+from terrafusion.fusion.replay import ReplayResult, replay
+from terrafusion.twin.model.vehicle import VehicleParams, load_vehicle, with_overrides
+from terrafusion.twin.scenario.scenario import DriveSegment, RouteLeg, Scenario
+from terrafusion.twin.simulate import simulate
+from tests.studies.fault_matrix.faults import FAULTS
+
+TWIN = ("skid", "steered")
+FIELD = {"husky": ("husky_parkinglot/test1", 130.0, 60.0), "pathfinder": ("wvu_pathfinder/s5t1", 80.0, 40.0)}
+MODES = ("fixed", "robust", "adaptive", "innovation")
+FAR_M, FIVE_SIGMA, STRAY = 10.0, 25.0, 0.01
+SLOWER, HANG_S = 10.0, 120
+BAD = ("crash", "hang", "slow", "not_finite", "silent")
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """One trial."""
+
+    number: int
+    log: str
+    mode: str
+    batch: bool
+    faults: tuple[str, ...]
+
+    @classmethod
+    def drawn(cls, number: int, logs: tuple[str, ...]) -> Cell:
+        """The cell of a number."""
+        rng = np.random.default_rng([30, number])
+        names = list(FAULTS)
+        # The first fault goes round, so that each is met equally often; half the cells have a second one.
+        first = names[number % len(names)]
+        second = [str(rng.choice([n for n in names if n != first]))] if rng.random() < 0.5 else []
+        log, mode = str(rng.choice(list(logs))), str(rng.choice(list(MODES)))
+        return cls(number, log, mode, bool(rng.random() < 0.3), (first, *second))
+
+    def faulty(self, log: Recording) -> Recording:
+        """The log with the faults of the cell in it."""
+        rng = np.random.default_rng([31, self.number])
+        for name in self.faults:
+            log = FAULTS[name](log, rng)
+        return log
+
+
+@functools.cache
+def vehicle_of(name: str) -> VehicleParams | None:
+    """The robot of a log; None for what the log says."""
+    if name == "steered":
+        return with_overrides(load_vehicle("elevate"), Overrides(drive="ackermann"))
+    return load_vehicle("elevate") if name == "skid" else None
+
+
+@functools.cache
+def clean_log(name: str) -> Recording:
+    """A drive of the twin of 40 s, or a slice of a field log."""
+    vehicle = vehicle_of(name)
+    if vehicle is not None:
+        legs = (
+            DriveSegment(3.0),
+            DriveSegment(9.0, 0.9, 0.15),
+            DriveSegment(9.0, 0.6, -0.35),
+            DriveSegment(9.0, 1.0, 0.05),
+            DriveSegment(10.0, 0.8, 0.3),
+        )
+        scenario = Scenario("matrix", 40.0, drive=legs, route=(RouteLeg("grass"),), heading_deg=35.0)
+        return simulate(scenario, vehicle=vehicle, seed=8)
+    path, begin_s, seconds = FIELD[name]
+    log = open_recording(path)
+    begin_ns = log.start_ns + round(begin_s * 1e9)
+    end_ns = begin_ns + round(seconds * 1e9)
+    cut = {key: channel.between(begin_ns, end_ns) for key, channel in log.channels().items()}
+    return dataclasses.replace(log, start_ns=begin_ns, truth=None, truth_channels=(), **cut)
+
+
+@functools.cache
+def clean_run(name: str, mode: str, batch: bool) -> tuple[ReplayResult, float]:
+    """The clean log, replayed, and its seconds in all."""
+    begun = time.process_time()
+    log = dataclasses.replace(clean_log(name), truth=None, truth_channels=())
+    result = replay(log, vehicle=vehicle_of(name), mode=mode, batch=batch)
+    return result, time.process_time() - begun
+
+
+def error_of(result: ReplayResult, name: str, mode: str) -> tuple[float, float]:
+    """Largest error of the position, m, and the share of times with more than five sigmas."""
+    if name in TWIN:
+        errors = score(
+            result.estimate, clean_log(name), antenna_m=result.vehicle.sensors.gnss.antenna_m
+        ).errors
+        assert errors is not None
+        return float(errors.distance_m().max()), float(np.mean(2.0 * errors.nees() > FIVE_SIGMA))
+    ours, truth = result.estimate.trajectory, clean_run(name, mode, True)[0].estimate.trajectory
+    at = np.clip(np.searchsorted(truth.t_ns, ours.t_ns), 0, len(truth) - 1)
+    inside = (ours.t_ns >= truth.t_ns[0]) & (ours.t_ns <= truth.t_ns[-1])
+    error = np.array(
+        [np.interp(ours.t_ns, truth.t_ns, truth.position_m[:, i]) - ours.position_m[:, i] for i in (0, 1)]
+    )[:, inside]
+    assert ours.covariance is not None
+    assert truth.covariance is not None
+    P = (ours.covariance[:, :2, :2] + truth.covariance[at, :2, :2])[inside]
+    if not inside.any():
+        return 0.0, 0.0
+    square = np.einsum("in,nij,jn->n", error, np.linalg.inv(P), error)
+    return float(np.hypot(*error).max()), float(np.mean(square > FIVE_SIGMA))
+
+
+def tried(cell: Cell) -> dict[str, Any]:
+    """The outcome of a cell: refused, or a verdict and errors, or a defect."""
+    row: dict[str, Any] = dataclasses.asdict(cell)
+    clean_s = clean_run(cell.log, cell.mode, cell.batch)[1]
+    begun = time.process_time()
+    signal.signal(signal.SIGALRM, _hangs)
+    signal.alarm(HANG_S)
+    try:
+        log = dataclasses.replace(cell.faulty(clean_log(cell.log)), truth=None, truth_channels=())
+        outages = (Outage(25.0, 8.0),) if cell.number % 8 == 0 else ()
+        result = replay(log, vehicle=vehicle_of(cell.log), mode=cell.mode, batch=cell.batch, outages=outages)
+        seconds = time.process_time() - begun
+        signal.alarm(0)
+        row |= judged(result, cell) | {"seconds": round(seconds, 2)}
+        row["slower"] = round(seconds / max(clean_s, 0.1), 1)
+        if row["outcome"] == "ok" and row["slower"] > SLOWER:
+            row["outcome"] = "slow"
+    except TerrafusionError as error:
+        row |= {"outcome": "refused", "why": str(error)[:200]}
+    except TimeoutError:
+        row["outcome"] = "hang"
+    except Exception:
+        row |= {"outcome": "crash", "why": traceback.format_exc()[-600:]}
+    finally:
+        signal.alarm(0)
+    return row
+
+
+def judged(result: ReplayResult, cell: Cell) -> dict[str, Any]:
+    """Verdict, errors and what becomes of them."""
+    path = result.estimate.trajectory
+    finite = bool(np.isfinite(path.position_m).all() and np.isfinite(path.covariance).all())
+    if not finite:
+        return {"outcome": "not_finite"}
+    off_m, beyond = error_of(result, cell.log, cell.mode)
+    wrong = off_m > FAR_M or beyond > STRAY
+    value = result.verdict.value
+    outcome = "silent" if wrong and value == "good" else "warned" if wrong else "ok"
+    return {
+        "outcome": outcome,
+        "verdict": value,
+        "off_m": round(off_m, 2),
+        "beyond": round(beyond, 3),
+        "why": result.verdict.reasons[0][:200],
+    }
+
+
+def _hangs(*_: Any) -> None:
+    raise TimeoutError
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """Counts by fault, by log and mode, and the cells that failed."""
+    lines = [f"cells {len(rows)}"]
+    total = Counter(row["outcome"] for row in rows)
+    names = ("ok", "warned", "refused", *BAD)
+    for name in names:
+        lines.append(f"{name} {total[name]} of {len(rows)}")
+    doubted = sum(row["outcome"] == "ok" and row["verdict"] != "good" for row in rows)
+    lines.append(f"ok and yet not good {doubted} of {total['ok']}")
+    lines += ["", "| fault | cells | " + " | ".join(names) + " |", "| --- " * (len(names) + 2) + "|"]
+    for fault in FAULTS:
+        own = Counter(row["outcome"] for row in rows if fault in row["faults"])
+        lines.append(f"| {fault} | {sum(own.values())} | " + " | ".join(str(own[n]) for n in names) + " |")
+    for key in ("log", "mode", "batch"):
+        for value in sorted({row[key] for row in rows}):
+            own = Counter(row["outcome"] for row in rows if row[key] == value)
+            counts = " | ".join(str(own[n]) for n in names)
+            lines.append(f"| {key} {value} | {sum(own.values())} | {counts} |")
+    failed = [row for row in rows if row["outcome"] in BAD]
+    lines += ["", "Cells that failed:", ""]
+    for row in failed:
+        lines.append(
+            f"- {row['number']} {row['outcome']}: {' + '.join(row['faults'])}; {row['log']}, {row['mode']}, "
+            f"{'batch' if row['batch'] else 'live'}: {row.get('off_m')} m, {row.get('beyond')} beyond 5 sigma"
+        )
+    return "\n".join(lines)
+
+
+def run(cells: int, seconds: float, out: Path, first: int = 0) -> list[dict[str, Any]]:
+    """Try cells in turn until all are done or the time is over; what is in `out` is not done again."""
+    data = os.environ.get("TERRAFUSION_DATA", "")
+    logs = (*TWIN, *FIELD) if data else TWIN
+    out.mkdir(parents=True, exist_ok=True)
+    file, rows, until = out / "cells.jsonl", [], time.monotonic() + seconds
+    if file.is_file():
+        rows = [json.loads(line) for line in file.read_text(encoding="utf-8").splitlines()]
+    done = {row["number"] for row in rows}
+    with file.open("a", encoding="utf-8") as kept:
+        for number in range(first, first + cells):
+            if time.monotonic() > until:
+                break
+            if number not in done:
+                rows.append(tried(Cell.drawn(number, logs)))
+                kept.write(json.dumps(rows[-1]) + "\n")
+                kept.flush()
+    return sorted(rows, key=lambda row: row["number"])
+
+
+def main() -> None:
+    """Run and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0] if __doc__ else None)
+    parser.add_argument("--cells", type=int, default=1000)
+    parser.add_argument("--first", type=int, default=0)
+    parser.add_argument("--seconds", type=float, default=1500.0, help="stop after so long")
+    parser.add_argument("--out", type=Path, required=True)
+    given = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print(table(run(given.cells, given.seconds, given.out, given.first)))
+
+
+if __name__ == "__main__":
+    main()
