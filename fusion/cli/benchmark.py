@@ -13,7 +13,7 @@ from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for the results; an interrupted benchmark continues.",
-    ("parts", "benchmark.json", "benchmark.md", "ratios.png", "report.html"),
+    ("config.json", "parts", "benchmark.json", "benchmark.md", "ratios.png", "report.html"),
     ("parts",),
     goes_on=True,
 )

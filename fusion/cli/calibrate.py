@@ -37,7 +37,7 @@ LogsArgument = Annotated[
 ]
 OUTPUT = Output(
     "Folder for calibration.json, YAML files, report.html; with --sensors a YAML file.",
-    ("calibration.json", "vehicle.yaml", "soil*.yaml", "report.html"),
+    ("config.json", "calibration.json", "vehicle.yaml", "soil*.yaml", "report.html"),
     ("calibration.json",),
 )
 SENSORS_OUTPUT = Output("A vehicle file.", suffix=".yaml", mark="known: calibrated")
@@ -111,6 +111,7 @@ def calibrate(
     from terrafusion.fusion.reports.calibration import write_calibration
     from terrafusion.twin.calibrate.calibrate import PARAMETERS
     from terrafusion.twin.calibrate.calibrate import calibrate as fit
+    from terrafusion.twin.model.vehicle import load_vehicle
     from terrafusion.twin.scenario.scenario import MAX_SLOPE_DEG
 
     if not 0.0 <= slope_deg <= MAX_SLOPE_DEG:
@@ -128,7 +129,9 @@ def calibrate(
         )  # fmt: skip
     write_calibration(out, found, vehicle, named_soils(soils, found), {"command": command_line()})
     lines = [*summary(found), *(_suggested(found) if suggest else [])]
-    return Result(lines, f"written to {out}", read_json(out / "calibration.json"))
+    return Result(
+        lines, f"written to {out}", read_json(out / "calibration.json"), vehicle=load_vehicle(vehicle)
+    )
 
 
 def _suggested(found: Calibration) -> list[str]:

@@ -34,6 +34,7 @@ class Result:
         status: exit status.
         details: printed with `--verbose`.
         short: printed with `--quiet`; by default `done`.
+        vehicle: `VehicleParams` of the run, for `config.json`.
     """
 
     lines: Sequence[str] = ()
@@ -42,6 +43,7 @@ class Result:
     status: int = 0
     details: Sequence[str] = ()
     short: str = ""
+    vehicle: Any = None
 
 
 Quiet = Annotated[
@@ -111,6 +113,10 @@ def add_command(
         try:
             with _told(how["quiet"], how.get("as_json", False)):
                 result = body(**given)
+                if kind is not None and "config.json" in kind.names:
+                    from terrafusion.fusion.cli.used_config import write_config
+
+                    write_config(given["out"], called, given, result.vehicle)
         except TerrafusionError:
             if how["verbose"]:
                 traceback.print_exc()

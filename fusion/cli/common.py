@@ -49,6 +49,8 @@ RepairClockOption = Annotated[
     typer.Option("--repair-clock", help="Correct steps of a clock instead of refusing the log."),
 ]
 
+UNNAMED = ("--quiet", "-q", "--verbose", "--json", "--force")
+
 
 def parse_topics(entries: list[str] | None) -> dict[str, str]:
     """`channel=/name` entries as a mapping; a malformed one is wrong usage (exit status 2)."""
@@ -171,8 +173,14 @@ def _refuse(log: str, findings: list[Finding]) -> None:
 
 
 def command_line() -> str:
-    """The command as it was typed."""
-    return shlex.join(["terrafusion", *sys.argv[1:]])
+    """The command as it was typed, without where its results go and what it prints."""
+    words, kept = iter(sys.argv[1:]), ["terrafusion"]
+    for word in words:
+        if word == "--out":
+            next(words, None)
+        elif word not in UNNAMED and not word.startswith("--out="):
+            kept.append(word)
+    return shlex.join(kept)
 
 
 def read_json(path: Path) -> Any:

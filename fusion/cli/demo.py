@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 OUTPUT = Output(
     "Folder for the log, the results and report.html.",
-    ("log", "fixed", "adaptive", "report.html"),
+    ("config.json", "log", "fixed", "adaptive", "report.html"),
     ("log/meta.yaml", "fixed/metrics.json"),
 )
 OUTAGE_START_S, OUTAGE_S = 75.0, 60.0
@@ -55,7 +55,9 @@ def demo(
             results.append(result)
         write_comparison(out / "report.html", TITLE, results)
     document = {result.mode: read_json(out / result.mode / "metrics.json") for result in results}
-    return Result(_comparison(results), f"report: {out / 'report.html'}", document)
+    return Result(
+        _comparison(results), f"report: {out / 'report.html'}", document, vehicle=results[0].vehicle
+    )
 
 
 def _comparison(results: list[ReplayResult]) -> list[str]:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 OUTPUT = Output(
     "Folder for diagnosis.json and report.html.",
-    ("diagnosis.json", "judge.json", "report.html"),
+    ("config.json", "diagnosis.json", "judge.json", "report.html"),
     ("diagnosis.json",),
 )
 RunsArgument = Annotated[

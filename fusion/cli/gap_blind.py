@@ -14,7 +14,16 @@ from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for blind.json, report.html and the sealed labels.",
-    ("labels.*", "commitment.json", "answers.*", "oracle.jsonl", "blind.json", "sheet.png", "report.html"),
+    (
+        "config.json",
+        "labels.*",
+        "commitment.json",
+        "answers.*",
+        "oracle.jsonl",
+        "blind.json",
+        "sheet.png",
+        "report.html",
+    ),
     ("labels.sealed",),
     goes_on=True,
 )

@@ -33,7 +33,15 @@ if TYPE_CHECKING:
 
 OUTPUT = Output(
     "Folder for the results and report.html.",
-    ("metrics.json", "estimate.csv", "trajectory.tum", "weights.jsonl", "report.html", "estimate.mcap"),
+    (
+        "config.json",
+        "metrics.json",
+        "estimate.csv",
+        "trajectory.tum",
+        "weights.jsonl",
+        "report.html",
+        "estimate.mcap",
+    ),
     ("metrics.json",),
     mark="terrafusion.replay/",
 )
@@ -167,7 +175,13 @@ def replay(
     warnings = [f"log check, {f.channel}: {f.what} ({f.evidence}); {f.fix}" for f in findings]
     lines = [*unseen, *summary(result), *assumed_and_noted(result, warnings)]
     done = f"written to {out}"
-    return Result(lines, done, read_json(out / "metrics.json"), short=f"{result.verdict.lines()[0]}; {done}")
+    return Result(
+        lines,
+        done,
+        read_json(out / "metrics.json"),
+        short=f"{result.verdict.lines()[0]}; {done}",
+        vehicle=result.vehicle,
+    )
 
 
 def _write_bag(result: ReplayResult, path: Path) -> list[str]:

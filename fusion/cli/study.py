@@ -13,7 +13,7 @@ from terrafusion.fusion.cli.outputs import Output
 
 OUTPUT = Output(
     "Folder for the tables, metrics.json and report.html.",
-    ("plan.json", "agreement.*", "metrics.json", "batch.csv", "report.html", "*.mcap"),
+    ("config.json", "plan.json", "agreement.*", "metrics.json", "batch.csv", "report.html", "*.mcap"),
     ("plan.json",),
     mark='"quick"',
 )

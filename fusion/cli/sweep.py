@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 OUTPUT = Output(
     "Folder for the results; an unfinished one goes on.",
-    ("sweep.json", "runs.parquet", "parts", "recordings", "report.html", "*.png"),
+    ("config.json", "sweep.json", "runs.parquet", "parts", "recordings", "report.html", "*.png"),
     ("sweep.json",),
     goes_on=True,
 )
@@ -86,7 +86,9 @@ def sweep(
     statuses, errors = (table.column(name).to_pylist() for name in ("status", "error"))
     lines = [*summary_lines(statuses, errors), *failures]
     all_failed = bool(statuses) and set(statuses) == {"failed"}
-    return Result(lines, f"written to {out}", read_json(out / "sweep.json"), int(all_failed))
+    return Result(
+        lines, f"written to {out}", read_json(out / "sweep.json"), int(all_failed), vehicle=plan.vehicle
+    )
 
 
 def summary_lines(statuses: Sequence[str], errors: Sequence[str | None]) -> list[str]:

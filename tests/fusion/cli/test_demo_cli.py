@@ -44,7 +44,13 @@ def test_the_comparison_is_printed(demo: tuple[Path, str]) -> None:
 
 def test_its_files(demo: tuple[Path, str]) -> None:
     folder, out = demo
-    assert {path.name for path in folder.iterdir()} == {"log", "fixed", "adaptive", "report.html"}
+    assert {path.name for path in folder.iterdir()} == {
+        "log",
+        "fixed",
+        "adaptive",
+        "report.html",
+        "config.json",
+    }
     schema = json.loads((ROOT / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8"))
     printed = next(line for line in out.splitlines() if line.startswith("position error")).split()[-2:]
     for mode, shown in zip(("fixed", "adaptive"), printed, strict=True):

@@ -65,6 +65,26 @@ def test_a_log_is_only_replaced_by_what_made_it(here: Path, good_log: Path, terr
     assert terrafusion("convert", good_log, "a.mcap", "--force").status == 0
 
 
+def test_the_configuration_lies_beside_the_results(here: Path, good_log: Path, terrafusion) -> None:
+    for out in ("a", "b"):
+        words = ("--gnss-outage", "10:5", "--mode", "fixed", "--json")
+        assert terrafusion("replay", good_log, "--out", out, *words).status == 0
+    text = (here / "a" / "config.json").read_bytes()
+    assert text == (here / "b" / "config.json").read_bytes()
+    config = json.loads(text)
+    assert config["command"] == "replay"
+    assert config["command_line"] == f"terrafusion replay {good_log} --gnss-outage 10:5 --mode fixed"
+    assert config["options"]["mode"] == "fixed"
+    assert config["options"]["batch"] is False, "defaults are in it"
+    assert config["vehicle"]["name"] == "elevate"
+    assert len(config["vehicle"]["sha256"]) == 64
+    assert {"terrafusion", "gtsam", "casadi", "Python"} <= set(config["versions"])
+    shutil.rmtree(here / "a")
+    assert terrafusion("replay", good_log, "--out", "a", "--vehicle", "husky").status == 0
+    other = json.loads((here / "a" / "config.json").read_text())
+    assert other["vehicle"]["sha256"] != config["vehicle"]["sha256"]
+
+
 def test_quiet_is_one_line(here: Path, good_log: Path, terrafusion) -> None:
     done = terrafusion("replay", good_log, "--quiet", "--out", "out")
     assert (done.status, done.err) == (0, "")

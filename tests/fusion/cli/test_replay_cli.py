@@ -17,7 +17,7 @@ from terrafusion.fusion.cli.common import load_rig
 
 ROOT = Path(__file__).parents[3]
 SCHEMA = json.loads((ROOT / "docs" / "schemas" / "metrics.schema.json").read_text(encoding="utf-8"))
-FILES = {"metrics.json", "estimate.csv", "trajectory.tum", "weights.jsonl", "report.html"}
+FILES = {"metrics.json", "estimate.csv", "trajectory.tum", "weights.jsonl", "report.html", "config.json"}
 WEIGHTS = {"t_s", "t_ns", "sensor", "before", "after", "unit", "reason"}
 
 SCENARIO = """\

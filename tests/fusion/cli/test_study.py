@@ -67,7 +67,7 @@ def documented() -> list[dict[str, str]]:
 def test_its_files(reproduced: tuple[Path, str]) -> None:
     folder, out = reproduced
     names = {"plan.json", "agreement.csv", "agreement.md", "metrics.json", "batch.csv", "report.html"}
-    assert {path.name for path in folder.iterdir()} == names
+    assert {path.name for path in folder.iterdir()} == names | {"config.json"}
     assert out.splitlines()[-1] == f"report: {folder / 'report.html'}"
     for case in CASES:
         assert case.label in out

@@ -35,10 +35,11 @@ def test_a_sweep_leaves_table_report_and_plots(terrafusion: Any, file: Path) -> 
     assert lines[-1] == "written to out"
     names = sorted(path.name for path in Path("out").iterdir())
     assert names == [
+        "config.json",
         "energy_slip.png", "maps_0.png", "maps_1.png", "mobility.png", "report.html", "runs.parquet",
         "sweep.json",
     ]  # fmt: skip
-    for name in names[:4]:
+    for name in names[1:5]:
         assert Path("out", name).read_bytes().startswith(b"\x89PNG")
     page = Path("out/report.html").read_text()
     assert "Climbing &lt;sand&gt; &amp; co. elevate drives drive: 32 runs" in page
@@ -52,7 +53,12 @@ def test_no_plots_and_recordings_of_chosen_runs(terrafusion: Any, file: Path) ->
         "sweep", file, "--out", "out", "--jobs", 1, "--no-plots", "--recordings", 7, "--recordings", 3
     )
     assert done.status == 0
-    assert sorted(path.name for path in Path("out").iterdir()) == ["recordings", "runs.parquet", "sweep.json"]
+    assert sorted(path.name for path in Path("out").iterdir()) == [
+        "config.json",
+        "recordings",
+        "runs.parquet",
+        "sweep.json",
+    ]
     logs = sorted(path.name for path in Path("out/recordings").iterdir())
     assert logs == ["run-000003", "run-000007"]
     looked = terrafusion("inspect", "out/recordings/run-000003")
