@@ -397,6 +397,17 @@ def test_without_references_a_large_effect_does_not_pass_for_noise(effects: tupl
     assert values_of(found)["gyro_bias/constant"] == pytest.approx(0.05, abs=0.005)
 
 
+@pytest.mark.parametrize("first", [900, 950])
+def test_sigma_covers_a_delay_on_top_of_one_that_references_have(first: int) -> None:
+    """Their own delay is removed to first order only, so the further one comes out 8 ms too long."""
+    late = {"imu_time_offset/shift": 0.05}
+    found = diagnose(runs(first, 2, {"imu_time_offset/shift": 0.11}), runs(100, 8, late), VEHICLE)
+    answer = checked(found)
+    assert answer["named"] == ["imu_time_offset"]
+    number = answer["causes"][0]["parameters"]["imu_time_offset/shift"]
+    assert abs(number["value"] - 0.06) < 1.5 * number["sigma"] < 0.03
+
+
 def test_nonsense_is_refused(references: list[Recording]) -> None:
     with pytest.raises(DataError, match="no run"):
         diagnose([], references, VEHICLE)

@@ -24,6 +24,7 @@ from terrafusion.twin.gap.infer.detect import Detection
 from terrafusion.twin.gap.infer.goodness_of_fit import GoodnessOfFit
 from terrafusion.twin.gap.infer.posterior import PooledScores
 from terrafusion.twin.gap.infer.refit import Refit
+from terrafusion.twin.gap.rollout.delay import DELAYS
 
 Array = NDArray[np.float64]
 
@@ -33,9 +34,9 @@ either (assumed)."""
 UNKNOWN = OUTSIDE_SHARE
 """Probability of an unknown cause, given a gap, above which that is the verdict: more than its prior."""
 LAW_SIGMA_MOTION, LAW_SIGMA_SENSOR = 0.2, 0.03
-"""1 sigma, as a share of its value, by which the size of an effect on the motion, and of one of the sensors
-alone, is wrong because the robot's law is not the twin's. Set on development trials
-(docs/evidence/gap-blind.md)."""
+"""1 sigma, as a share of its value, by which the size of an effect on the motion or of a delay, which is read
+off the motion, and of another one of the sensors, is wrong because the robot's law is not the twin's. Set on
+development trials (docs/evidence/gap-blind.md)."""
 CLASSED = 5  # most probable causes whose look-alikes are sought
 
 
@@ -180,5 +181,6 @@ def _size_sigma(
 ) -> Array:
     """1 sigma (k,) of sizes: of noise, at least as the references scatter, and of the law."""
     noise = np.maximum(np.sqrt(np.diag(covariance)), pooled.marginal.sigmas(columns))
-    law = [LAW_SIGMA_MOTION if candidates.keys[i] in candidates.moving else LAW_SIGMA_SENSOR for i in columns]
+    motion = {*candidates.moving, *DELAYS}
+    law = [LAW_SIGMA_MOTION if candidates.keys[i] in motion else LAW_SIGMA_SENSOR for i in columns]
     return np.asarray(np.hypot(noise, law * np.abs(value)))
