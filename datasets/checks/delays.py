@@ -54,8 +54,23 @@ def check_clocks(context: CheckContext) -> Iterator[Finding]:
     elif drifts := clock_drifts(context.recording, pairs):
         yield drift_finding(context.recording, drifts)
     else:
-        offsets = list(_offset_findings(context.recording, pairs))
-        yield from offsets or _late_fixes(context)
+        corrected = _on_one_clock(context)
+        if corrected is not context:
+            pairs = signal_pairs(CheckContext(without_stuck(corrected.recording), context.rig))
+        offsets = list(_offset_findings(corrected.recording, pairs))
+        yield from offsets or _late_fixes(corrected)
+
+
+def _on_one_clock(context: CheckContext) -> CheckContext:
+    """The context less the delays that the vehicle file has, as the estimator takes them out."""
+    recording = context.recording
+    for name, number in (("gnss", "gnss_delay_s"), ("wheels", "wheel_delay_s")):
+        late_ns, channel = round(context.known(number) * 1e9), getattr(recording, name)
+        if late_ns and channel is not None:
+            recording = retimed(recording, name, channel.t_ns - late_ns)
+    if recording is context.recording:
+        return context
+    return dataclasses.replace(context, recording=recording)
 
 
 def _offset_findings(recording: Recording, pairs: SensorPairs) -> Iterator[Finding]:

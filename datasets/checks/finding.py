@@ -63,6 +63,11 @@ class CheckContext:
         """Wheel radius of the log, else of the rig, whatever the unit of the wheel speeds."""
         return self.recording.overrides.wheel_radius_m or (self.rig.wheel_radius_m if self.rig else None)
 
+    def known(self, name: str) -> float:
+        """A number of the vehicle file's `SensorNumbers` that the estimator corrects by; 0 without one."""
+        number = getattr(self.rig.known, name) if self.rig else None
+        return 0.0 if number is None else float(number.number)
+
     def since_start_s(self, t_ns: np.int64 | int) -> float:
         """Seconds from the start of the recording."""
         return (int(t_ns) - self.recording.start_ns) * 1e-9  # Python integers: int64 could overflow

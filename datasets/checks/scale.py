@@ -61,6 +61,7 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
     )
     if scale.source == "truth":
         evidence += "; scores against this truth are then not independent of it"
+    known = 1.0 + context.known("wheel_scale")
     units = _fitting_units(context, scale, float(np.std(fits.scale) / np.median(fits.scale)))
     if units:
         factor = units[0].factor
@@ -72,9 +73,9 @@ def check_speed_scale(context: CheckContext) -> Iterator[Finding]:
             f"multiply them by {factor:.6g}" if len(units) == 1 else "give the unit: more than one fits",
             scaled("wheels", factor, "speed") if len(units) == 1 else None,
         )  # fmt: skip
-    elif scale.ratio > MOST_SLIP_FREE and scale.low > SURELY_MORE:
+    elif scale.ratio > MOST_SLIP_FREE * known and scale.low > SURELY_MORE * known:
         yield _too_slow(context, scale, evidence, wheels.unit, radius)
-    elif (scale.ratio < SMALL or scale.high < FIRM_SLIP) and is_firm(context.recording):
+    elif (scale.ratio < SMALL * known or scale.high < FIRM_SLIP * known) and is_firm(context.recording):
         fitting = f"radius ({radius * scale.ratio:.4f} m fits)" if wheels.unit == "radps" else "speeds"
         yield Finding(
             "wheel-scale", "warning", "wheels",

@@ -108,14 +108,15 @@ def first_vehicle(
             measured, geometry = _geometry(mounted.recording, answers, base, rig)
         draft = head | geometry | tail
         calibration, notes = _calibrated(mounted.recording, write_draft(file, draft, "draft"), progress)
+        findings = mounted.findings
+        if calibration is not None:
+            draft |= _learned_lines(calibration, draft)
+            learned = load_vehicle(write_draft(file, draft, "draft")).rig()
+            findings = tuple(run_checks(mounted.recording, learned))
     if base.name != "generic":
         known = f"the log is of '{base.name}', which the library knows: --vehicle {base.name} needs no file"
         notes = (known, *notes)
-    if calibration is not None:
-        draft |= _learned_lines(calibration, draft)
-    return FirstVehicle(
-        draft, mounted.recording, mounted.repaired, mounted.findings, measured, calibration, notes
-    )
+    return FirstVehicle(draft, mounted.recording, mounted.repaired, findings, measured, calibration, notes)
 
 
 def _geometry(

@@ -17,6 +17,7 @@ from terrafusion.datasets.core.channels import Channel, Wheels
 from terrafusion.datasets.core.errors import DataError
 from terrafusion.datasets.core.frames import enu_to_geodetic
 from terrafusion.datasets.core.recording import Recording
+from terrafusion.datasets.core.robot import KnownNumber, SensorNumbers
 from terrafusion.datasets.core.sensors import Rig
 from terrafusion.datasets.readers import open_recording
 from terrafusion.datasets.writers import write_log_folder
@@ -422,3 +423,16 @@ def test_clock_set_back_is_found_and_repaired(good: Recording, rig: Rig, tmp_pat
     assert good.imu is not None
     assert repaired.imu is not None
     assert_like(repaired.imu, good.imu, Case(lambda r: r, "", "", time_s=1e-6))
+
+
+def test_what_the_vehicle_file_corrects_is_no_finding(good: Recording, rig: Rig) -> None:
+    """Fixes 1.2 s late and wheels that read a fifth too little: warnings, unless the file has both."""
+    bare = dataclasses.replace(good, truth=None, command=None)
+    wrong = late("gnss", 1.2)(change("wheels", speed=lambda s: s / 1.2, angle_rad=lambda a: None)(bare))
+    codes = {finding.code for finding in run_checks(wrong, rig)}
+    assert {"clock-offset", "wheel-radius"} <= codes
+    learned = SensorNumbers(
+        gnss_delay_s=KnownNumber(1.2, "calibrated", 0.05), wheel_scale=KnownNumber(0.2, "calibrated", 0.01)
+    )
+    known = {finding.code for finding in run_checks(wrong, dataclasses.replace(rig, known=learned))}
+    assert codes - known == {"clock-offset", "wheel-radius"}
