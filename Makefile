@@ -4,11 +4,12 @@ VENV := .venv
 BIN := $(VENV)/bin
 SOURCES := $(shell find datasets twin fusion -name '*.py' -o -name '*.yaml' -o -name '*.[ch]' -o -name '*.j2' -o -name '*.css') pyproject.toml README.md
 
-.PHONY: demo test lint help clean
+.PHONY: demo test lint docs help clean
 
 help:
 	@echo "make demo   drive a simulated robot over three grounds, localise it twice, write demo-out/report.html"
 	@echo "make test   the whole test suite (set TERRAFUSION_DATA to a folder of field logs to include those)"
+	@echo "make docs   the documentation as a site, build/site/index.html"
 	@echo "make lint   ruff, mypy and the import layers"
 
 demo: $(VENV)/installed
@@ -16,6 +17,9 @@ demo: $(VENV)/installed
 
 test: $(VENV)/installed-dev
 	$(BIN)/python -m pytest -n auto --dist loadfile
+
+docs: $(VENV)/installed-dev
+	$(BIN)/python -m mkdocs build --strict --quiet
 
 lint: $(VENV)/installed-dev
 	$(BIN)/ruff check .

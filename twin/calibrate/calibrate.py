@@ -79,7 +79,9 @@ def calibrate(
         robust: down-weight outliers (Huber).
         channels: use only these, by name or beginning of a name (see `layout.OUTPUTS`).
         window_s: the pose starts anew after so long.
-        slope_deg, aspect_deg, payload_kg: the plane that all logs were driven on, and the load.
+        slope_deg: slope of the plane that all logs were driven on.
+        aspect_deg: direction in which it rises.
+        payload_kg: the load.
         progress: called with the share done, 0 to 1.
 
     Raises:

@@ -201,25 +201,3 @@ def test_forms_that_cannot_work_are_refused(own_forms) -> None:
     catalogue.register(astray)
     with pytest.raises(ConfigError, match=r"own/d: sets mass_kg in the stage 'body'"):
         simulate(SHORT, effects={"own/d": 0.5})
-
-
-def test_the_table_of_the_docs_is_the_catalogue() -> None:
-    """Every parameter with its unit, typical size, range and law; nothing else."""
-    rows = re.findall(r"^\| `([^`]+)`(?:, `([^`]+)`)? \|(.*)\|$", DOCS.read_text(), re.M)
-    table = {}
-    for first, second, rest in rows:  # `.../x`, `y` is a row of two parameters
-        for key in (first, f"{first.rpartition('/')[0]}/{second}") if second else (first,):
-            table[key] = [cell.strip() for cell in rest.split("|")]
-    known = {
-        form.parameter_key(p): (form, p) for form in catalogue.built_in().values() for p in form.parameters
-    }
-    assert list(table) == list(known)
-    for key, (form, p) in known.items():
-        size = f"{p.scale:g} {p.unit}".rstrip()
-        assert table[key] == [
-            size,
-            f"{p.low:g} to {p.high:g}",
-            ", ".join(form.terms),
-            form.equation,
-            form.source,
-        ]
