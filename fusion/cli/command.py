@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import typer
 
 from terrafusion.datasets.core.errors import TerrafusionError
+from terrafusion.fusion.cli.common import PROGRESS
 from terrafusion.fusion.cli.outputs import Output, check_file
 
 PANEL = "Options of all commands"
@@ -101,6 +102,7 @@ def add_command(
     @functools.wraps(body)
     def command(context: typer.Context, **given: Any) -> None:
         how = {word: given.pop(word) for word in shared}
+        PROGRESS.bar, PROGRESS.lines = not how["quiet"], how["verbose"]
         called = context.command_path.partition(" ")[2]
         kind = instead[1] if instead is not None and given[instead[0]] else output
         if kind is not None:
@@ -149,6 +151,7 @@ def show(result: Result, quiet: bool, verbose: bool, as_json: bool) -> None:
     """Print a result; with `as_json` its document alone is on standard output."""
     details = result.details if verbose else ()
     lines = [result.short or result.done] if quiet else [*result.lines, *details, result.done]
+    lines = [result.done] if as_json else lines  # the rest is in the document
     for line in lines if lines[-1] else lines[:-1]:
         print(line, file=sys.stderr if as_json else sys.stdout)
     if as_json:

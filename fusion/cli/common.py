@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -190,13 +192,43 @@ def read_json(path: Path) -> Any:
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[float], None] | None]:
-    """A progress bar on a terminal, updated with the share done (0 to 1); None in a pipe."""
+    """A bar with the remaining time on a terminal, updated with the share done (0 to 1).
+
+    In a pipe None; with `--verbose` a line every few seconds.
+    """
     if not sys.stderr.isatty():
-        yield None
+        yield _progress_lines(what) if PROGRESS.lines else None
         return
     from rich.console import Console
     from rich.progress import Progress
 
-    with Progress(console=Console(stderr=True), transient=True) as bar:
+    with Progress(console=Console(stderr=True), transient=True, disable=not PROGRESS.bar) as bar:
         task = bar.add_task(what, total=1.0)
         yield lambda share: bar.update(task, completed=share)
+
+
+@dataclass
+class ProgressOptions:
+    """Whether progress is shown: as a bar on a terminal, as lines in a pipe."""
+
+    bar: bool = True
+    lines: bool = False
+
+
+PROGRESS = ProgressOptions()
+LINE_EVERY_S = 5.0
+
+
+def _progress_lines(what: str) -> Callable[[float], None]:
+    """Prints share and remaining time on standard error, at most a line every few seconds."""
+    begun = time.monotonic()
+    last = [begun]
+
+    def tell(share: float) -> None:
+        now = time.monotonic()
+        if share > 0.0 and now - last[0] >= LINE_EVERY_S:
+            last[0] = now
+            left_s = (now - begun) * (1.0 - share) / share
+            print(f"{what}: {share:.0%}, {left_s:.0f} s left", file=sys.stderr, flush=True)
+
+    return tell

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from terrafusion.fusion.cli.command import Result
+from terrafusion.fusion.cli.common import PROGRESS
 from terrafusion.fusion.cli.inspect_page import styled_lines
 
 if TYPE_CHECKING:
@@ -110,11 +111,11 @@ def _bar(total_bytes: int) -> Iterator[Callable[[CatalogFile, int], None]]:
         yield lambda entry, done: None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn
 
     bytes_of: dict[str, int] = {}
-    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    columns = (TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=not PROGRESS.bar) as bar:
         task = bar.add_task("", total=total_bytes)
 
         def advance(entry: CatalogFile, done: int) -> None:

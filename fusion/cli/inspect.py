@@ -30,7 +30,7 @@ def inspect(
     Changes nothing; `terrafusion convert --apply-fixes` applies the repairs.
     The keys of `--json` are in docs/reference/conventions.md. Clock steps are
     findings, too. Several recordings in one file are summarised; LOG#0 shows
-    the first alone.
+    the first alone. Exit status 1 where a finding is an error.
 
     Examples:
 
@@ -49,7 +49,13 @@ def inspect(
     reading(None, topic, stamps, columns, repair_clock=True)  # reports wrong usage for any kind of log
     trials = trials_of(log) if columns is None else None
     page = trials or inspected(log, vehicle, topic, stamps, columns)
-    return Result(styled_lines(trials_lines(page) if trials else page_lines(page)), "", page)
+    return Result(
+        styled_lines(trials_lines(page) if trials else page_lines(page)), "", page, int(_has_errors(page))
+    )
+
+
+def _has_errors(page: dict[str, Any]) -> bool:
+    return any(finding["severity"] == "error" for finding in page.get("findings", ()))
 
 
 def inspected(

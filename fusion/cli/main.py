@@ -27,6 +27,7 @@ from terrafusion.fusion.cli import (
     live,
     policy,
     replay,
+    self_check,
     simulate,
     study,
     sweep,
@@ -80,6 +81,7 @@ add_command(app, "gap-blind", gap_blind.gap_blind, output=gap_blind.OUTPUT)
 add_command(app, "allan", allan.allan, as_json=False)
 add_command(app, "study", study.study, output=study.OUTPUT)
 add_command(app, "replay", replay.replay, output=replay.OUTPUT, files={"rerun": None})
+add_command(app, "self-check", self_check.self_check)
 add_command(app, "live", live.live, as_json=False)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")

@@ -144,3 +144,26 @@ def test_ctrl_c_is_status_130_and_one_line(
     done = terrafusion(*words.replace("LOG", str(good_log)).split())
     assert (done.status, done.err.count("\n")) == (130, 1), done
     assert told in done.err
+
+
+def test_inspect_fails_where_a_finding_is_an_error(here: Path, good_log: Path, terrafusion) -> None:
+    assert terrafusion("inspect", good_log).status == 0
+    shutil.copytree(good_log, here / "log")
+    rows = (here / "log" / "imu.csv").read_text().splitlines()
+    column = rows[0].split(",").index("gyro_z_radps")
+    cells = [row.split(",") for row in rows[1:]]
+    for row in cells:
+        row[column] = "1e9"
+    (here / "log" / "imu.csv").write_text("\n".join([rows[0], *map(",".join, cells)]) + "\n")
+    done = terrafusion("inspect", "log", "--json")
+    assert (done.status, done.err) == (1, "")
+    assert any(finding["severity"] == "error" for finding in json.loads(done.out)["findings"])
+
+
+def test_progress_is_lines_in_a_pipe_where_asked_for(
+    here: Path, good_log: Path, terrafusion, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("terrafusion.fusion.cli.common.LINE_EVERY_S", 0.0)
+    assert terrafusion("replay", good_log, "--out", "a").err == ""
+    lines = terrafusion("replay", good_log, "--out", "b", "--verbose").err.splitlines()
+    assert any(re.fullmatch(r"adaptive short: \d+%, \d+ s left", line) for line in lines), lines[-3:]

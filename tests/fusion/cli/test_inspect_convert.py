@@ -122,7 +122,7 @@ def known_log(tmp_path: Path) -> Path:
 
 def test_inspect_measures(known_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "inspect", known_log, "--json")
-    assert status == 0
+    assert status == 1, "gravity along +y is an error"
     page = json.loads(out)
     measured = page["measured"]
     assert (page["licence"], page["source"], page["recordings"]) == ("MIT", "a test", 1)
