@@ -17,6 +17,7 @@ from terrafusion.fusion.cli import (
     allan,
     benchmark,
     calibrate,
+    completion,
     convert,
     demo,
     fetch,
@@ -82,6 +83,7 @@ add_command(app, "allan", allan.allan, as_json=False)
 add_command(app, "study", study.study, output=study.OUTPUT)
 add_command(app, "replay", replay.replay, output=replay.OUTPUT, files={"rerun": None})
 add_command(app, "self-check", self_check.self_check)
+add_command(app, "completion", completion.completion, as_json=False)
 add_command(app, "live", live.live, as_json=False)
 app.add_typer(terrain.app, name="terrain")
 app.add_typer(policy.app, name="policy")
@@ -89,6 +91,7 @@ app.add_typer(policy.app, name="policy")
 
 def main() -> None:
     """Run the command line: 0 done, 1 a known error in one line, 2 wrong usage, 130 Ctrl-C."""
+    completion.answer_shells()
     try:
         sys.exit(app(prog_name="terrafusion", standalone_mode=False))
     except UsageError as error:
