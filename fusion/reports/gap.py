@@ -11,8 +11,9 @@ from terrafusion.fusion.benchmark.estimator_gap import Compared
 from terrafusion.fusion.reports.gap_text import either, numbers, percent, sections, verdict_line
 from terrafusion.fusion.reports.page import TWIN_LIBRARIES, write_page, write_text
 from terrafusion.fusion.reports.plots import gap as plots
-from terrafusion.twin.gap.answer.credible_sets import LEAST_PROBABILITY, credible_sets
+from terrafusion.twin.gap.answer.credible_sets import credible_sets
 from terrafusion.twin.gap.answer.diagnosis import GapDiagnosis
+from terrafusion.twin.gap.answer.verdict import LEAST_PROBABILITY
 from terrafusion.twin.gap.rollout.nuisance import CHANNEL_UNITS
 
 MOST_RUNS = 3

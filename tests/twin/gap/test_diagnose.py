@@ -397,6 +397,32 @@ def test_without_references_a_large_effect_does_not_pass_for_noise(effects: tupl
     assert values_of(found)["gyro_bias/constant"] == pytest.approx(0.05, abs=0.005)
 
 
+DRAG = {"motion_resistance", "drivetrain_friction", "mud_adhesion"}
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        {"motion_resistance/in_motion": 0.05},
+        {"drivetrain_friction/coulomb": 0.6},
+        {"mud_adhesion/suction": 2000.0},
+    ],
+)
+def test_rolling_resistance_dry_friction_and_suction_are_one_set(
+    references: list[Recording], effect: dict[str, float]
+) -> None:
+    """Their signatures correlate by 0.97 to 0.999; what remains is about as much as a law is wrong."""
+    found = diagnose(runs(900, 2, effect), references, VEHICLE)
+    answer = checked(found)
+    assert answer["verdict"] == "ambiguous"
+    assert len(answer["named"]) == 1
+    first, *others = answer["sets"]
+    assert set(first["effects"]) == DRAG
+    assert first["probability"] > 0.9
+    assert all(len(s["effects"]) <= 4 for s in others)
+    assert "which these drives cannot tell apart" in " ".join(" ".join(screen(found)).split())
+
+
 @pytest.mark.parametrize("first", [900, 950])
 def test_sigma_covers_a_delay_on_top_of_one_that_references_have(first: int) -> None:
     """Their own delay is removed to first order only, so the further one comes out 8 ms too long."""

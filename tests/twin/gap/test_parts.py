@@ -256,8 +256,8 @@ def test_an_effect_is_wholly_like_itself() -> None:
     null = learn_null(_scores(np.random.default_rng(1), 20, np.zeros(len(CANDIDATES.keys) + 6)), 3)
     pooled = PooledScores.of(_scores(np.random.default_rng(2), 3, np.zeros(len(CANDIDATES.keys) + 6)), null)
     does, size = pooled.information[:, 3], float(pooled.information[3, 3])
-    assert similarity(pooled, does, size, [3, 4]) == pytest.approx(1.0)
-    assert similarity(pooled, does, size, [5]) < 0.5
+    assert similarity(pooled.information, does, size, [3, 4]) == pytest.approx(1.0)
+    assert similarity(pooled.information, does, size, [5]) < 0.5
 
 
 def test_what_a_silent_law_does_is_what_its_fit_takes_away() -> None:
@@ -274,7 +274,11 @@ def test_what_a_silent_law_does_is_what_its_fit_takes_away() -> None:
     pooled = dataclasses.replace(gap, information=information)
     does, size = effect_signal(pooled, [silent], lambda: after)
     assert size == pytest.approx(gap.square - after.square)
-    assert similarity(pooled, does, size, [other]) > 0.8 > 2.0 * similarity(pooled, does, size, [third])
+    assert (
+        similarity(pooled.information, does, size, [other])
+        > 0.8
+        > 2.0 * similarity(pooled.information, does, size, [third])
+    )
     _, nothing = effect_signal(pooled, [silent], lambda: pooled)
     assert nothing == pytest.approx(0.0, abs=1e-9)
     _, by_signature = effect_signal(gap, [other], lambda: pooled)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from terrafusion.twin.gap.answer.verdict import GapVerdict
+from terrafusion.twin.gap.answer.verdict import LEAST_PROBABILITY, GapVerdict
 
 MOST_UNNAMED = 3
-LEAST_PROBABILITY = 0.01  # of a set that is not named
 
 
 @dataclass(frozen=True)
@@ -35,11 +34,10 @@ def credible_sets(verdict: GapVerdict) -> list[CredibleSet]:
     for cause in verdict.causes:
         if len(sets) >= len(named) + MOST_UNNAMED:
             break
-        if cause.effect in used:
+        if cause.effect in used or cause.probability < LEAST_PROBABILITY:
             continue
         members = tuple(name for name in cause.members if name not in used)
         used.update(members)
         probability = min(sum(by_name[name].probability for name in members), 1.0)
-        if probability >= LEAST_PROBABILITY:
-            sets.append(CredibleSet(members, probability, named=False))
+        sets.append(CredibleSet(members, probability, named=False))
     return sorted(sets, key=lambda s: (not s.named, -s.probability))

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from terrafusion.twin.gap.answer.look_alikes import same_signature, signatures
 from terrafusion.twin.gap.data.candidates import Hypothesis
 from terrafusion.twin.gap.infer.cause_posterior import CausePosterior, CauseResidual
 from terrafusion.twin.gap.infer.channels import ErrorProducts, Unexplained
@@ -195,7 +196,9 @@ class EffectSearch:
     def _promising(self, found: EffectSet) -> list[Hypothesis]:
         """Laws that are worth a refit beside those found."""
         candidates, table = self.refit.evidence.candidates, self.refit.table
-        factors, left = found.further.effects, dict[Hypothesis, float]()
+        alike = self._alike(found)
+        factors = {k: v for k, v in found.further.effects.items() if k not in alike}
+        left = dict[Hypothesis, float]()
         for law in candidates.hypotheses:
             if law.effect in factors:
                 bounds = candidates.bounds(law.columns)
@@ -207,6 +210,18 @@ class EffectSearch:
         return list(
             dict.fromkeys([found.further.best[k] for k in by_factor] + [best_law[k] for k in by_left])
         )
+
+    def _alike(self, found: EffectSet) -> set[str]:
+        """Effects whose signature is that of one found: beside it they explain where its law is wrong."""
+        evidence = self.refit.evidence
+        whole = signatures(evidence.runs, len(evidence.candidates.keys))
+        parts = (found.one(effect) for effect in found.effects)
+        return {
+            name
+            for part in parts
+            if part is not None
+            for name in same_signature(whole, evidence.candidates, part[0], part[1], [*found.further.effects])
+        }
 
 
 def _joined(laws: Laws) -> Hypothesis:

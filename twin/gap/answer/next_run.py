@@ -147,7 +147,9 @@ def _remaining_sigmas(pooled: PooledScores, evidence: GapEvidence, true: Cause, 
     at = np.asarray(true.columns)
     signal = pooled.information[:, at] @ true.value
     square = float(true.value @ signal[at])
-    return math.sqrt(max(unlike_square(pooled, evidence.candidates, signal, square, other)[1], 0.0))
+    return math.sqrt(
+        max(unlike_square(pooled.information, evidence.candidates, signal, square, other)[1], 0.0)
+    )
 
 
 def forecast(evidence: GapEvidence, sigma: Array, name: str, effects: set[str]) -> Array:

@@ -17,7 +17,12 @@ from terrafusion.twin.gap.answer.effect_search import (
     joint_log_odds,
     null_explained,
 )
-from terrafusion.twin.gap.answer.look_alikes import effect_signal, look_alikes
+from terrafusion.twin.gap.answer.look_alikes import (
+    effect_signal,
+    look_alikes,
+    same_signature,
+    signatures,
+)
 from terrafusion.twin.gap.data.candidates import SOIL_STRENGTH, Candidates
 from terrafusion.twin.gap.infer.cause_posterior import OUTSIDE_SHARE, CausePosterior
 from terrafusion.twin.gap.infer.detect import Detection
@@ -37,7 +42,7 @@ LAW_SIGMA_MOTION, LAW_SIGMA_SENSOR = 0.2, 0.03
 """1 sigma, as a share of its value, by which the size of an effect on the motion or of a delay, which is read
 off the motion, and of another one of the sensors, is wrong because the robot's law is not the twin's. Set on
 development trials (docs/evidence/gap-blind.md)."""
-CLASSED = 5  # most probable causes whose look-alikes are sought
+LEAST_PROBABILITY = 0.01  # of a cause whose look-alikes are sought
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +148,9 @@ class _CauseSizes:
         failed = fit is not None and bool(fit.failure)
         if fit is not None and not failed:
             columns, value, covariance, least = fit.columns, fit.value, fit.covariance, fit.explained
-        members = self._members(effect, columns, refitted=fit is not None and not failed)
+        members: tuple[str, ...] = (effect,)
+        if probability >= LEAST_PROBABILITY:
+            members = self._members(effect, columns, value, refitted=fit is not None and not failed)
         share = None
         if not failed:
             share = explained_share(pooled, candidates.columns(effect), self.floor, least)
@@ -159,11 +166,9 @@ class _CauseSizes:
         """Effects that were found together, several at least."""
         return self.found.effects if self.found is not None and len(self.found.laws) > 1 else ()
 
-    def _members(self, effect: str, columns: Sequence[int], refitted: bool) -> tuple[str, ...]:
+    def _members(self, effect: str, columns: Sequence[int], value: Array, refitted: bool) -> tuple[str, ...]:
         """The effect and its look-alikes, without those found beside it."""
         pooled, odds, order = self.pooled, self.posterior.odds, self.posterior.ranked()
-        if order.index(effect) >= CLASSED:
-            return (effect,)
         candidates, law = self.search.refit.evidence.candidates, self.posterior.laws[effect]
         signal, square = effect_signal(
             pooled, columns, lambda: self.search.remaining([(law,)])[0][0] if refitted else pooled
@@ -172,6 +177,8 @@ class _CauseSizes:
         alike = look_alikes(pooled, candidates, signal, square, others)
         close = [k for k in others if abs(odds[k] - odds[effect]) < SAME_ODDS]
         close = list(look_alikes(pooled, candidates, signal, square, close, NEARLY_ALIKE))
+        whole = signatures(self.search.refit.evidence.runs, len(candidates.keys))
+        close += same_signature(whole, candidates, columns, value, others)
         beside = self._together() if effect in self._together() else ()
         return (effect, *(k for k in others if k not in beside and (k in alike or k in close)))
 
