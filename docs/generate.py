@@ -80,7 +80,7 @@ def api_page() -> str:
         if home is None:
             continue
         path = f"terrafusion.{home.rstrip(':').replace(':', '.')}"
-        lines += [f"## tf.{name}", "", f"::: {path}", ""]
+        lines += [f"::: {path}", f"    options: {{heading: tf.{name}, toc_label: tf.{name}, heading_level: 2}}", ""]
     return "\n".join(lines)
 
 
