@@ -80,7 +80,11 @@ def api_page() -> str:
         if home is None:
             continue
         path = f"terrafusion.{home.rstrip(':').replace(':', '.')}"
-        lines += [f"::: {path}", f"    options: {{heading: tf.{name}, toc_label: tf.{name}, heading_level: 2}}", ""]
+        lines += [
+            f"::: {path}",
+            f"    options: {{heading: tf.{name}, toc_label: tf.{name}, heading_level: 2}}",
+            "",
+        ]
     return "\n".join(lines)
 
 
@@ -181,6 +185,28 @@ GENERATED = {
     "reference/schemas.md": schemas_page,
     "reference/all-effects.md": effects_page,
 }
+
+
+SECTIONS = {
+    "Tutorials": "tutorials",
+    "How-to": "how-to",
+    "Reference": "reference",
+    "Explanation": "explanation",
+    "Evidence": "evidence",
+}
+
+
+def on_config(config: Any) -> Any:
+    """The navigation: every page of each folder, after those that are made from the code."""
+    nav: list[Any] = ["README.md"]
+    for title, folder in SECTIONS.items():
+        made = [name for name in GENERATED if name.startswith(f"{folder}/")]
+        written = [f"{folder}/{path.name}" for path in sorted((ROOT / "docs" / folder).glob("*.md"))]
+        nav.append({title: [*made, *written]})
+    nav[-1]["Evidence"].append({"Studies": [f"evidence/results/{path.name}" for path in results()]})
+    nav.append({"Project": list(SHOWN.values())})
+    config.nav = nav
+    return config
 
 
 def on_files(files: Any, config: Any) -> Any:
