@@ -135,7 +135,8 @@ def result_lines(found: FirstVehicle, out: Path) -> Iterator[Line]:
                 "not seen", "dim", f"{', '.join(missing)}: taken as usual, learned while driving"
             )
     for note in (*found.notes, *found.recording.notes):
-        yield from entry("note", "dim", note)
+        if not note.startswith("repaired: "):  # listed below
+            yield from entry("note", "dim", note)
     for finding in found.repaired:
         yield from entry("repaired", "yellow", f"{finding.channel}: {finding.what}; {finding.fix}")
     for finding in found.findings:

@@ -156,7 +156,8 @@ def _given(
         )
         return DraftLine(answer, f"{unit}{axes}; given{other}")
     if stated is not None:
-        return DraftLine(KnownNumber(stated, "assumed"), f"{unit}{axes}; as the log states")
+        value = tuple(round(v, 6) for v in stated) if isinstance(stated, tuple) else round(stated, 6)
+        return DraftLine(KnownNumber(value, "assumed"), f"{unit}{axes}; as the log states")
     spread = f" +- {NUMBERS[name].sigma:g}" if name in NUMBERS else ""
     words = f"{unit}{axes}; assumed{spread}, as of '{base.name}'; else give {FLAGS[name]}"
     return DraftLine(KnownNumber(usual, "assumed"), words + ("; only the twin uses it" * (name == "mass_kg")))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import os
 from pathlib import Path
 
+import jsonschema
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
@@ -22,6 +24,7 @@ from tests.datasets.ros_bags import MAKE2, Message, write_ros2
 
 HUSKY = ("-z", "-x", "+y")
 RADIUS_M = 0.175
+ROOT = Path(__file__).parents[3]
 FIX = "sensor_msgs/msg/NavSatFix"
 
 
@@ -106,6 +109,8 @@ def test_mounting_and_radius_of_an_unknown_robot_in_a_bag(bag: Path, tmp_path: P
     assert radius["value"] == pytest.approx(RADIUS_M, rel=0.03)
     assert robot["track_m"] == {"value": 0.51, "known": "measured"}
     assert all("  # " in line for line in out.read_text().splitlines()[2:])
+    schema = json.loads((ROOT / "docs" / "schemas" / "vehicle.schema.json").read_text())
+    jsonschema.validate({"robot": robot}, schema)
     vehicle = load_vehicle(out)
     assert (vehicle.name, vehicle.body.mass_kg, vehicle.sensors.imu.axes) == ("own", 32.0, HUSKY)
     assert "assumed   drive = skid_steer" in done.output
@@ -131,6 +136,7 @@ def test_a_wrong_mounting_in_a_log_folder_is_repaired_by_a_command(drive: Record
     robot = file_of(out)
     assert "imu_axes" not in robot  # the columns of a log folder are in body axes by contract
     assert robot["wheel_radius_m"] == {"value": 0.2, "known": "measured"}
+    assert not [line for line in done.output.splitlines() if line.startswith("note      repaired")]
     assert robot["wheel_scale"]["value"] == pytest.approx(RADIUS_M / 0.2 - 1.0, abs=0.03)
     assert "gravity stands on" in done.output
     lines = done.output.splitlines()
