@@ -119,13 +119,13 @@ def add_command(
                     from terrafusion.fusion.cli.used_config import write_config
 
                     write_config(given["out"], called, given, result.vehicle)
-        except TerrafusionError:
-            if how["verbose"]:
+        except BaseException as error:
+            if is_interrupt(error):
+                print(f"error: {interrupted(given.get('out'), kind)}", file=sys.stderr)
+                sys.exit(INTERRUPTED)
+            if how["verbose"] and isinstance(error, TerrafusionError):
                 traceback.print_exc()
             raise
-        except (KeyboardInterrupt, typer.Abort):
-            print(f"error: {interrupted(given.get('out'), kind)}", file=sys.stderr)
-            raise typer.Exit(INTERRUPTED) from None
         show(result, how["quiet"], how["verbose"], how.get("as_json", False))
         if result.status:
             raise typer.Exit(result.status)
@@ -162,6 +162,13 @@ def subject_of(first: object) -> str:
     """The log, or other thing, that the command is about: its first argument, if that is a text."""
     first = first[0] if isinstance(first, list) and first else first
     return first if isinstance(first, str) else ""
+
+
+def is_interrupt(error: BaseException | None) -> bool:
+    """Whether Ctrl-C is the cause: a library that is being loaded turns it into an error of its own."""
+    while error is not None and not isinstance(error, (KeyboardInterrupt, typer.Abort)):
+        error = error.__cause__ or error.__context__
+    return error is not None
 
 
 def interrupted(out: Path | None, output: Output | None) -> str:

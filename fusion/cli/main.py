@@ -34,7 +34,7 @@ from terrafusion.fusion.cli import (
     sweep,
     terrain,
 )
-from terrafusion.fusion.cli.command import add_command
+from terrafusion.fusion.cli.command import INTERRUPTED, add_command
 from terrafusion.fusion.cli.usage import CommandGroup, UsageError, usage_line
 
 app = typer.Typer(
@@ -93,7 +93,10 @@ def main() -> None:
     """Run the command line: 0 done, 1 a known error in one line, 2 wrong usage, 130 Ctrl-C."""
     completion.answer_shells()
     try:
-        sys.exit(app(prog_name="terrafusion", standalone_mode=False))
+        status = app(prog_name="terrafusion", standalone_mode=False)
+        if status == INTERRUPTED:  # before the command began
+            print("error: interrupted; nothing was written", file=sys.stderr)
+        sys.exit(status)
     except UsageError as error:
         print(f"error: {usage_line(error)}", file=sys.stderr)
         sys.exit(2)

@@ -137,7 +137,7 @@ def test_ctrl_c_is_status_130_and_one_line(
     words: str, told: str, here: Path, good_log: Path, terrafusion, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def stopped(*_: object, **__: object) -> None:
-        raise KeyboardInterrupt
+        raise ImportError("as a library that is being loaded") from KeyboardInterrupt()
 
     monkeypatch.setattr("terrafusion.fusion.replay.feed", stopped)
     monkeypatch.setattr("terrafusion.twin.sweep.run.open_workers", stopped)
